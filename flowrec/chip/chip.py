@@ -1,0 +1,68 @@
+"""What a chip is: fluid pixels, their size, the openings and the fluid that is assumed to flow through them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Side = Literal["left", "right", "top", "bottom"]
+Kind = Literal["inlet", "outlet"]
+Walls = Literal["smooth", "pixel"]
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A run of fluid pixels on the border of the mask, first to last inclusive along the side."""
+
+    side: Side
+    first: int
+    last: int
+    kind: Kind
+    value: float  # inlet: mean inward speed, um/s; outlet: pressure, Pa
+
+    @property
+    def width_px(self) -> int:
+        """Number of fluid pixels on the border."""
+        return self.last - self.first + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chip:
+    """Mask and assumed boundary values. Everything downstream (flow, planning, simulation) starts from one."""
+
+    name: str
+    mask: NDArray[np.bool_]  # (h, w) True in fluid
+    um_per_px: float
+    openings: tuple[Opening, ...]
+    viscosity_mpa_s: float
+    density_kg_m3: float
+    depth_um: float | None = None  # None: two-dimensional; else depth-averaged friction -12 mu v / depth^2
+    walls: Walls = "smooth"
+
+    @property
+    def size_um(self) -> tuple[float, float]:
+        """Width and height of the mask in um."""
+        return self.mask.shape[1] * self.um_per_px, self.mask.shape[0] * self.um_per_px
+
+    @property
+    def boundary_values(self) -> NDArray[np.float64]:
+        """(openings,) inlets: mean inward speed, um/s; outlets: pressure, Pa."""
+        return np.array([opening.value for opening in self.openings], np.float64)
+
+    def with_boundary(
+        self, values: ArrayLike, viscosity_mpa_s: float | None = None, density_kg_m3: float | None = None
+    ) -> Chip:
+        """The same chip with other boundary values (openings,) and fluid."""
+        openings = tuple(
+            replace(opening, value=float(value))
+            for opening, value in zip(self.openings, np.asarray(values, np.float64), strict=True)
+        )
+        return replace(
+            self,
+            openings=openings,
+            viscosity_mpa_s=self.viscosity_mpa_s if viscosity_mpa_s is None else viscosity_mpa_s,
+            density_kg_m3=self.density_kg_m3 if density_kg_m3 is None else density_kg_m3,
+        )

@@ -1,0 +1,271 @@
+"""Every record that flowrec keeps: frozen, read-only, units in the field names.
+
+Whatever a stage carries from one frame to the next is one of these, and each of them is recorded
+(see topics.py), so a session can be replayed from any tick. The wire format is derived from these
+annotations in store/; nothing is declared twice.
+
+Chip frame: origin at the centre of the mask's pixel (0, 0), x right, y down; headings from +x towards +y.
+Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on the session clock.
+"""
+
+from __future__ import annotations
+
+import functools
+import typing
+from dataclasses import dataclass, fields
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# The second word is the wire form: a `vector` becomes a repeated double that viewers can plot,
+# an `array` keeps its shape and its bytes.
+Vector = Annotated[NDArray[np.float64], "vector"]
+Matrix = Annotated[NDArray[np.float64], "array"]
+Raster = Annotated[NDArray[np.float32], "array"]
+Image = Annotated[NDArray[np.uint8], "array"]
+
+
+@functools.cache
+def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
+    """Name and dtype of each array field of a message type, in order."""
+    found = []
+    for name, hint in typing.get_type_hints(message_type, include_extras=True).items():
+        for option in (hint, *typing.get_args(hint)):
+            if typing.get_origin(option) is Annotated:
+                scalar = typing.get_args(typing.get_args(typing.get_args(option)[0])[1])[0]
+                found.append((name, np.dtype(scalar)))
+    return tuple(found)
+
+
+class Message:
+    """Base of all records: fixes the dtype of the arrays and makes them read-only."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for name, dtype in array_fields(type(self)):  # type: ignore[arg-type]
+            given = getattr(self, name)
+            if given is None:
+                continue
+            array = np.ascontiguousarray(given, dtype)
+            if array.flags.writeable:
+                array = array.view()
+                array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def same_as(self, other: object) -> bool:
+        """Bit for bit the same record (NaN equals NaN)."""
+        if type(other) is not type(self):
+            return False
+        for field in fields(self):  # type: ignore[arg-type]
+            mine, theirs = getattr(self, field.name), getattr(other, field.name)
+            if isinstance(mine, np.ndarray) and isinstance(theirs, np.ndarray):
+                if mine.shape != theirs.shape or mine.tobytes() != theirs.tobytes():
+                    return False
+            elif mine != theirs and not (mine != mine and theirs != theirs):
+                return False
+        return True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame(Message):
+    """One camera image. The stamp is the middle of the exposure."""
+
+    stamp_ns: int
+    index: int
+    image: Image  # (h, w) grey levels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Applied(Message):
+    """What the coils really did up to this frame, read back from the rig, not what was asked of them."""
+
+    stamp_ns: int
+    frequency_hz: float  # of the rotating field, now
+    heading_rad: float
+    amplitude_mt: float
+    currents_a: Vector  # (3,) coil currents x, y, z, now
+    # (2,) revolutions along x and y since the previous frame: the integral of f (cos phi, sin phi) dt.
+    # Times um per revolution it is the robot's own displacement, whatever delay or switching lay in between.
+    turns: Vector
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OperatorEvent(Message):
+    """Something a person did: stop, mark, note, pause, resume, zero."""
+
+    stamp_ns: int
+    action: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowField(Message):
+    """A steady flow on the pixels of the chip's mask. `request` numbers the work order that it answers."""
+
+    stamp_ns: int
+    request: int
+    method: str  # fvm, assimilate, pi_unet, ...
+    um_per_px: float
+    velocity_um_s: Raster  # (h, w, 2) x then y, at pixel centres; 0 in solid
+    pressure_pa: Raster  # (h, w); 0 in solid
+    std_um_s: Raster | None  # (h, w, 2) one standard deviation of each component, where the method knows it
+    boundary_values: Vector  # (openings,) inlets: mean inward speed, um/s; outlets: pressure, Pa
+    viscosity_mpa_s: float
+    density_kg_m3: float
+    note: str  # what the method says of its own result, for people
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route(Message):
+    """A path with the times at which it should be passed, or the honest answer that there is none."""
+
+    stamp_ns: int
+    request: int
+    method: str
+    reachable: bool
+    reason: str  # why not, when it is not
+    waypoints_um: Matrix  # (n, 2), n = 0 when unreachable
+    arrival_s: Vector  # (n,) since the start of the route, strictly increasing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track(Message):
+    """Where the robot is in one image. `seen` False keeps the last known position."""
+
+    stamp_ns: int
+    seen: bool
+    position_um: Vector  # (2,)
+    score: float  # 0 to 1, likeness to the robot's appearance
+    lost_frames: int  # in a row
+    radius_px: float  # of the robot's image, tracked slowly
+    roi_px: Vector  # (4,) x0, y0, x1, y1 of the searched region
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate(Message):
+    """The observer's belief about the robot and the flow that carries it."""
+
+    stamp_ns: int
+    position_um: Vector  # (2,)
+    flow_um_s: Vector  # (2,) the disturbance: flow velocity at the robot
+    covariance: Matrix  # (4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
+    nis: float  # normalised innovation squared; NaN on a frame without measurement
+    measured_um: Vector  # (2,) last measured position that went in
+    seen: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations(Message):
+    """Local flow measured along the way: what a refinement may use."""
+
+    stamp_ns: int
+    position_um: Matrix  # (n, 2)
+    flow_um_s: Matrix  # (n, 2)
+    std_um_s: Vector  # (n,) one standard deviation per component
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mission(Message):
+    """What the run is about just now and which work it waits for."""
+
+    stamp_ns: int
+    phase: str  # start, survey, refine, plan, navigate, done
+    since_ns: int  # when the phase began
+    request: int  # number of the latest work order
+    wanted: str  # solve, survey_route, refine, route; '' when nothing is pending
+    requested_ns: int  # when it was ordered
+    start_um: Vector  # (2,) where the ordered route begins
+    goal_um: Vector  # (2,)
+    finished: bool
+    outcome: str  # reached, survey complete, unreachable, stopped, lost, ...; '' while under way
+    note: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Demand(Message):
+    """The motion that the controller asks of the robot."""
+
+    stamp_ns: int
+    velocity_um_s: Vector  # (2,) relative to the fluid
+    reference_um: Vector  # (2,) where the robot should be now
+    progress_s: float  # time along the route, slowed while the robot lags behind
+    error_um: float  # distance to the reference, NaN without one
+    saturated: bool
+    sent_um_s: Matrix  # (m, 2) the latest demands, oldest first: what may still be on its way to the coils
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Currents(Message):
+    """The rotating field and the coil currents that make it."""
+
+    stamp_ns: int
+    frequency_hz: float
+    heading_rad: float
+    amplitude_mt: float
+    phase_rad: float  # one accumulator over all frequency and heading changes
+    currents_a: Vector  # (3,) x, y, z at this phase
+    saturated: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Event(Message):
+    """Something worth telling a person, said by the pipeline."""
+
+    stamp_ns: int
+    level: str  # info, warning, error
+    text: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timing(Message):
+    """Wall time of each part of this tick. Diagnostic: never compared."""
+
+    stamp_ns: int
+    track_ms: float
+    observe_ms: float
+    control_ms: float
+    sinks_ms: float
+    total_ms: float
+    queue_mb: float  # waiting for the disk
+    dropped_frames: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth(Message):
+    """What only a simulated rig can know. Recorded for judging; no stage ever sees it."""
+
+    stamp_ns: int
+    position_um: Vector  # (2,)
+    flow_um_s: Vector  # (2,) true flow at the robot
+    clearance_um: float  # from the robot's surface to the nearest wall
+    contacts: int  # wall contacts so far
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """All that is known after one frame: the latest message of each topic."""
+
+    stamp_ns: int = -1
+    frame: Frame | None = None
+    applied: Applied | None = None
+    operator: OperatorEvent | None = None
+    assumed: FlowField | None = None
+    refined: FlowField | None = None
+    route: Route | None = None
+    track: Track | None = None
+    estimate: Estimate | None = None
+    observations: Observations | None = None
+    mission: Mission | None = None
+    demand: Demand | None = None
+    currents: Currents | None = None
+    event: Event | None = None
+    timing: Timing | None = None
+    truth: Truth | None = None
+    true_field: FlowField | None = None
+
+    @property
+    def field(self) -> FlowField | None:
+        """The best flow known: refined where there is one, else assumed."""
+        return self.refined if self.refined is not None else self.assumed

@@ -1,0 +1,40 @@
+"""The robot as every room sees it: how it moves, how big it is, where its limits are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """Kinematics xdot = u (cos phi, sin phi) + v(x) with u = k f (the paper's eq. kinematic).
+
+    None means: chosen to fit the chip when the configuration is resolved.
+    """
+
+    radius_um: float | None = None
+    um_per_rev: float = 25.0  # k: distance rolled per revolution of the field
+    max_speed_um_s: float | None = None  # v_max, relative to the fluid
+    step_out_hz: float | None = None  # above it the robot no longer follows the field
+    step_out_margin: float = 0.9  # share of the step-out frequency that is ever commanded
+    delay_s: float = 0.04  # from command to motion
+
+    @property
+    def radius(self) -> float:
+        """Radius in um of a resolved robot."""
+        assert self.radius_um is not None, "robot.radius_um is resolved with the chip"
+        return self.radius_um
+
+    @property
+    def speed_limit_um_s(self) -> float:
+        """The fastest speed through the fluid that may be commanded, um/s."""
+        assert self.max_speed_um_s is not None and self.step_out_hz is not None, "robot is resolved with the chip"
+        return min(self.max_speed_um_s, self.step_out_margin * self.step_out_hz * self.um_per_rev)
+
+    def rolled_speed_um_s(self, frequency_hz: float) -> float:
+        """Speed at a field frequency: proportional up to step-out, then the mean of Adler's equation, um/s."""
+        assert self.step_out_hz is not None
+        if frequency_hz <= self.step_out_hz:
+            return self.um_per_rev * frequency_hz
+        return self.um_per_rev * (frequency_hz - math.sqrt(frequency_hz**2 - self.step_out_hz**2))
