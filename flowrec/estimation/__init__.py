@@ -1,0 +1,8 @@
+"""Track and applied field to Estimate; estimates to observations of the flow."""
+
+from flowrec.estimation.kalman import Kalman
+from flowrec.estimation.luenberger import Luenberger
+from flowrec.estimation.observer import Observer
+from flowrec.estimation.sampler import Sampler
+
+__all__ = ["Kalman", "Luenberger", "Observer", "Sampler"]

@@ -1,0 +1,11 @@
+"""Chip and boundary values to a flow field: grid, equations, solver, sampling.
+
+Secrets: where the wall lies (outline), numbering of faces (grid), the balance of a face (momentum), conservation of
+mass (stream), factorisation and Newton's method (system), units and messages (solver), interpolation (sampling).
+"""
+
+from flowrec.flow.modes import FlowModes
+from flowrec.flow.sampling import sample
+from flowrec.flow.solver import FlowSolver
+
+__all__ = ["FlowModes", "FlowSolver", "sample"]

@@ -1,0 +1,11 @@
+"""Ticks to Rerun: the only room that imports rerun.
+
+Secrets: the picture plane (scene), colours (palette), speed maps and their scale (maps), arrows, names (entities),
+what is logged when (log), the layout (blueprint), the file (rrd), the live view's process and its queue (live, feed),
+where the viewer is and whether there is a screen (viewer), pictures without a screen (screenshot).
+"""
+
+from flowrec.view.rrd import write_rrd
+from flowrec.view.scene import Scene
+
+__all__ = ["Scene", "write_rrd"]

@@ -1,0 +1,5 @@
+"""Frame to Track."""
+
+from flowrec.vision.tracker import Tracker
+
+__all__ = ["Tracker"]

@@ -1,0 +1,5 @@
+"""`python -m flowrec`."""
+
+from flowrec.cli import main
+
+main()

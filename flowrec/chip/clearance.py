@@ -1,0 +1,75 @@
+"""Distance to the walls, and whether a robot may be at a point."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from flowrec.chip.chip import Chip
+from flowrec.errors import ChipError
+
+
+def clearance_um(mask: NDArray[np.bool_], um_per_px: float) -> NDArray[np.float32]:
+    """Signed distance (h, w) in um from each pixel centre to the nearest wall, negative in solid.
+
+    The wall lies half way between the centres of a fluid and a solid pixel: exact for walls along the pixels, up to
+    a fifth of a pixel too near for oblique ones. A channel cut by the border goes on straight beyond it.
+    """
+    if mask.all():
+        return np.full(mask.shape, np.inf, np.float32)
+    pad = 16
+    padded = np.pad(mask, pad, mode="edge")
+    inside = distance_transform_edt(padded)
+    outside = distance_transform_edt(~padded)
+    signed = np.where(padded, inside - 0.5, 0.5 - outside)[pad:-pad, pad:-pad]
+    return np.ascontiguousarray(signed * um_per_px, np.float32)
+
+
+def half_widths_um(chip: Chip) -> NDArray[np.float64]:
+    """Half width of the channel (h, w) at the pixels of its centreline, NaN elsewhere.
+
+    On the centreline the distance to the wall has no slope. A centreline that runs between two pixel centres, at
+    a distance s from one of them, shows there as the slope s (px) and as half the width less s.
+    """
+    distance = clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px
+    down, right = np.gradient(distance)
+    slope = np.hypot(down, right)
+    central = chip.mask & (slope <= 0.55)
+    return np.where(central, (distance + slope) * chip.um_per_px, np.nan)
+
+
+def median_width_um(chip: Chip) -> float:
+    """The width of the channels that is exceeded along half of their length, um."""
+    half = half_widths_um(chip)
+    return 2.0 * float(np.nanmedian(half)) if np.isfinite(half).any() else chip.um_per_px
+
+
+def nearest_fluid(chip: Chip, point_um: ArrayLike, clearance: float = 0.0) -> NDArray[np.float64] | None:
+    """The pixel centre (2,) nearest to a point with at least this clearance in um; None when there is none."""
+    rows, columns = np.nonzero(chip.mask & (clearance_um(chip.mask, chip.um_per_px) >= clearance))
+    if not len(rows):
+        return None
+    centres = np.stack((columns, rows), -1) * chip.um_per_px
+    nearest = centres[np.argmin(np.sum((centres - np.asarray(point_um, np.float64)) ** 2, -1))]
+    return np.asarray(nearest, np.float64)
+
+
+def check_point(chip: Chip, point_um: ArrayLike, what: str, clearance: float = 0.0) -> None:
+    """Raise ChipError unless a point (2,) in um lies in the fluid with this clearance in um; `what` names it."""
+    x, y = (float(value) for value in np.asarray(point_um, np.float64))
+    column, row = round(x / chip.um_per_px), round(y / chip.um_per_px)
+    height, width = chip.mask.shape
+    if not (0 <= column < width and 0 <= row < height):
+        trouble = f"is outside the chip, which is {chip.size_um[0]:g} x {chip.size_um[1]:g} um"
+    elif not chip.mask[row, column]:
+        trouble = "is in a wall"
+    elif clearance_um(chip.mask, chip.um_per_px)[row, column] < clearance:
+        trouble = f"is nearer to a wall than {clearance:g} um"
+    else:
+        return
+    near = nearest_fluid(chip, (x, y), clearance)
+    after = (
+        "no point of this chip would do" if near is None else f"the nearest that would do is {near[0]:g},{near[1]:g}"
+    )
+    raise ChipError(f"{chip.name}: {what} {x:g},{y:g} um {trouble}; {after}")

@@ -1,0 +1,133 @@
+"""Openings: the runs of fluid on the border of a mask, and which of them are taken for inlets.
+
+Rule where nothing is said: the widest opening on the left is the inlet; where the left has none, the widest of all
+(of equal ones the first, in the order left, right, top, bottom and along the side). All others are outlets at 0 Pa.
+Runs shorter than three pixels are channels grazed by the border and stay closed, as does the shorter of two runs
+that meet in a corner pixel: both are one hole in the border, and an opening lies on one side.
+A border pixel of fluid without an opening is a wall.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.chip.chip import Opening, Side
+from flowrec.errors import ChipError
+
+SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
+MIN_OPENING_PX = 3
+DEFAULT_INLET_UM_S = 200.0
+
+
+def border(mask: NDArray[np.bool_], side: Side) -> NDArray[np.bool_]:
+    """Fluid along one side of a mask (h, w): from the top for left and right, from the left for top and bottom."""
+    line: NDArray[np.bool_] = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}[side]
+    return line
+
+
+def border_runs(mask: NDArray[np.bool_], side: Side) -> list[tuple[int, int]]:
+    """First and last pixel of each run of fluid along a side."""
+    steps = np.diff(np.concatenate(([0], border(mask, side).astype(np.int8), [0])))
+    return list(zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True))
+
+
+def _meet(a: Opening, b: Opening, shape: tuple[int, ...]) -> bool:
+    """Two runs on different sides share the pixel in the corner."""
+    last = {"left": shape[0] - 1, "right": shape[0] - 1, "top": shape[1] - 1, "bottom": shape[1] - 1}
+    if {a.side, b.side} not in ({"left", "top"}, {"left", "bottom"}, {"right", "top"}, {"right", "bottom"}):
+        return False
+    at_a = a.last == last[a.side] if b.side in ("bottom", "right") else a.first == 0
+    at_b = b.last == last[b.side] if a.side in ("bottom", "right") else b.first == 0
+    return at_a and at_b
+
+
+def find_openings(mask: NDArray[np.bool_]) -> tuple[Opening, ...]:
+    """Every opening of a mask, all as outlets at 0 Pa. () where there is none."""
+    found = [
+        Opening(side, first, last, "outlet", 0.0)
+        for side in SIDES
+        for first, last in border_runs(mask, side)
+        if last - first + 1 >= MIN_OPENING_PX
+    ]
+    closed: set[Opening] = set()
+    for a, b in itertools.combinations(found, 2):
+        if _meet(a, b, mask.shape):
+            closed.add(min(b, a, key=lambda opening: opening.width_px))
+    return tuple(opening for opening in found if opening not in closed)
+
+
+def guess_inlets(openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
+    """The rule above, with the inlet at the default speed."""
+    left = [opening for opening in openings if opening.side == "left"]
+    inlet = max(left or openings, key=lambda opening: opening.width_px)
+    return tuple(replace(o, kind="inlet", value=DEFAULT_INLET_UM_S) if o is inlet else o for o in openings)
+
+
+def opening_names(openings: Iterable[Opening]) -> tuple[str, ...]:
+    """`side:number` of each opening, counted along its side in the order of the pixels."""
+    openings = tuple(openings)
+    return tuple(
+        f"{o.side}:{sum(other.side == o.side and other.first < o.first for other in openings)}" for o in openings
+    )
+
+
+def name_inlets(openings: tuple[Opening, ...], inlets: Iterable[str], where: str) -> tuple[Opening, ...]:
+    """Make the named openings inlets and all others outlets at 0 Pa; an inlet keeps the speed it had.
+
+    Raises ChipError for a name that fits no opening.
+    """
+    names = opening_names(openings)
+    chosen: set[str] = set()
+    for wanted in inlets:
+        fitting = {name for name in names if wanted in (name, name.split(":")[0])}
+        if not fitting:
+            near = difflib.get_close_matches(wanted, names, 1, 0.0)[0]
+            raise ChipError(f"{where}: no opening {wanted!r}; it has {', '.join(names)}. Did you mean {near!r}?")
+        chosen |= fitting
+    return tuple(
+        (o if o.kind == "inlet" else replace(o, kind="inlet", value=DEFAULT_INLET_UM_S))
+        if name in chosen
+        else (o if o.kind == "outlet" else replace(o, kind="outlet", value=0.0))
+        for name, o in zip(names, openings, strict=True)
+    )
+
+
+def check_openings(mask: NDArray[np.bool_], openings: tuple[Opening, ...], where: str) -> None:
+    """Raise ChipError unless the openings lie on fluid, apart from each other, with an inlet and an outlet."""
+    for opening in openings:
+        what = f"opening {opening.side} {opening.first}-{opening.last}"
+        line = border(mask, opening.side)
+        if not 0 <= opening.first <= opening.last < len(line):
+            raise ChipError(f"{where}: {what} is not within 0-{len(line) - 1}; pixels count from 0, first to last")
+        if not line[opening.first : opening.last + 1].all():
+            runs = ", ".join(f"{a}-{b}" for a, b in border_runs(mask, opening.side)) or "none"
+            raise ChipError(f"{where}: {what} lies on a wall; the fluid on that side is at {runs}")
+        if not np.isfinite(opening.value):
+            raise ChipError(f"{where}: {what} has no finite speed or pressure; give speed_um_s or pressure_pa")
+    for a, b in itertools.combinations(openings, 2):
+        if a.side == b.side and a.first <= b.last and b.first <= a.last:
+            raise ChipError(f"{where}: two openings on the {a.side} overlap at {b.first}-{b.last}; remove one")
+    kinds = {opening.kind for opening in openings}
+    if not openings:
+        raise ChipError(
+            f"{where}: no opening; let the fluid reach the border of the mask with at least {MIN_OPENING_PX} pixels"
+        )
+    if "inlet" not in kinds:
+        raise ChipError(f'{where}: no inlet; name one, for example chip.inlets = ["{opening_names(openings)[0]}"]')
+    if "outlet" not in kinds:
+        raise ChipError(f"{where}: no outlet; the fluid must be able to leave through at least one opening")
+
+
+def set_inlet_speed(openings: tuple[Opening, ...], speed_um_s: float) -> tuple[Opening, ...]:
+    """Give the fastest inlet this mean speed in um/s; the others keep their ratio to it."""
+    fastest = max((abs(o.value) for o in openings if o.kind == "inlet"), default=0.0)
+    return tuple(
+        replace(o, value=o.value * speed_um_s / fastest if fastest > 0 else speed_um_s) if o.kind == "inlet" else o
+        for o in openings
+    )

@@ -1,0 +1,60 @@
+"""Vessel cases (*.npz): a mask of a real vessel with the flow that is assumed in it.
+
+Such a file also holds the truth that an experiment is judged by. Only what an experimenter would know is read here:
+mask, px, op_side, op_a, op_b, op_type and the keys that end in _assumed.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.chip.chip import Chip, Opening, Side
+from flowrec.chip.files import check_chip
+from flowrec.errors import ChipError
+
+KEYS = ("mask", "px", "rho_assumed", "mu_assumed", "op_side", "op_a", "op_b", "op_type", "op_u_assumed", "op_p_assumed")
+# Row 0 is their south (y grows with the row), and our top (y points down): the same array, no flip.
+_SIDES: dict[str, Side] = {"W": "left", "E": "right", "S": "top", "N": "bottom"}
+
+
+def read_vessel_case(path: Path) -> Chip:
+    """The chip of a vessel case, with pixel walls, on which its reference is defined. SI to um, mPa s."""
+    try:
+        with np.load(path, allow_pickle=False) as case:
+            missing = [key for key in KEYS if key not in case.files]
+            if missing:
+                raise ChipError(f"{path}: no {', '.join(missing)}; a vessel case has {', '.join(KEYS)}")
+            known: dict[str, NDArray[Any]] = {key: case[key] for key in KEYS}
+    except FileNotFoundError as error:
+        raise ChipError(f"{path}: no such vessel case; give the path of an .npz file") from error
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise ChipError(f"{path}: not a readable .npz vessel case ({error})") from error
+    mask = np.ascontiguousarray(known["mask"], np.bool_)
+    if mask.ndim != 2:
+        raise ChipError(f"{path}: mask has {mask.ndim} dimensions; it must be an image (h, w)")
+    mask.flags.writeable = False
+    openings = []
+    for side, first, last, kind, speed, pressure in zip(*(known[key] for key in KEYS[4:]), strict=True):
+        if str(side) not in _SIDES or str(kind) not in ("inlet", "outlet"):
+            raise ChipError(f"{path}: opening {side} {kind}; sides are W, E, S, N, types inlet and outlet")
+        if kind == "inlet":
+            openings.append(Opening(_SIDES[str(side)], int(first), int(last), "inlet", float(speed) * 1e6))
+        else:
+            openings.append(Opening(_SIDES[str(side)], int(first), int(last), "outlet", float(pressure)))
+    chip = Chip(
+        path.stem,
+        mask,
+        float(known["px"]) * 1e6,
+        tuple(openings),
+        float(known["mu_assumed"]) * 1e3,
+        float(known["rho_assumed"]),
+        None,
+        "pixel",
+    )
+    check_chip(chip, str(path))
+    return chip

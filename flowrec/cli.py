@@ -1,0 +1,296 @@
+"""The command line: thin verbs, late imports, errors in one line.
+
+Exit status: 0 done, 1 failed, 2 bad usage, 3 done but something was lost or differs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+import flowrec
+from flowrec.errors import FlowrecError
+
+app = typer.Typer(
+    name="flowrec",
+    help="Record, replay and look at missions of magnetic micro-robots that swim in flow.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+bench = typer.Typer(help="Measure flowrec itself.", no_args_is_help=True)
+app.add_typer(bench, name="bench")
+
+REFINE_METHODS = ("assimilate", "pi_unet")
+DEFAULT_REFINE = "pi_unet"
+
+View = Literal["spawn", "serve", "rrd", "none"]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"flowrec {flowrec.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Record, replay and look at missions of magnetic micro-robots that swim in flow."""
+
+
+@app.command()
+def record(
+    config: Annotated[Path | None, typer.Argument(help="Configuration (TOML); examples in sessions/.")] = None,
+    rig: Annotated[str | None, typer.Option(help="Which rig: simulated.")] = None,
+    goal: Annotated[str | None, typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Session file; by default named by date and sample.")] = None,
+    sets: Sets = None,
+    view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",
+    realtime: Annotated[bool, typer.Option("--realtime", help="Keep the simulated rig to the wall clock.")] = False,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and print the resolved configuration.")] = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run a mission (survey, refine, plan, navigate) and record every stage of it."""
+    from flowrec.config import load_config, to_toml
+    from flowrec.record import prepare, print_summary
+    from flowrec.record import record as run_record
+
+    settings = list(sets or [])
+    if rig is not None:
+        settings.append(f"rig={rig}")
+    if goal is not None:
+        settings.append(f"mission.goal={_point(goal)}")
+    if seed is not None:
+        settings.append(f"simulated.seed={seed}")
+    if duration is not None:
+        settings.append(f"duration_s={duration}")
+    chosen = load_config(config, settings)
+    if dry_run:
+        typer.echo(to_toml(prepare(chosen)[0]))
+        return
+    recorded = run_record(chosen, out, view, realtime, overwrite)
+    if as_json:
+        typer.echo(json.dumps({"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}))
+    else:
+        print_summary(recorded)
+    raise typer.Exit(recorded.exit_status)
+
+
+@app.command()
+def replay(
+    session: Annotated[Path, typer.Argument(help="Session to replay (.mcap).")],
+    refine: Annotated[
+        str | None, typer.Option(metavar="[METHOD]", help=f"Refine the flow anew; alone: {DEFAULT_REFINE}.")
+    ] = None,
+    plan: Annotated[str | None, typer.Option(metavar="METHOD", help="Plan with another planner.")] = None,
+    observer: Annotated[str | None, typer.Option(metavar="NAME", help="Observe with another filter.")] = None,
+    controller: Annotated[str | None, typer.Option(metavar="NAME", help="Control with another law.")] = None,
+    sets: Sets = None,
+    from_s: Annotated[float | None, typer.Option("--from", metavar="TIME", help="Resume at this second.")] = None,
+    verify: Annotated[bool, typer.Option("--verify", help="Compare with the recording, message by message.")] = False,
+    refly: Annotated[
+        bool, typer.Option("--refly", help="Fly both plans in a simulator with the refined flow.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Session file of the replay.")] = None,
+    frames: Annotated[bool, typer.Option("--frames", help="Copy the camera images into the replay's file.")] = False,
+    view: Annotated[Literal["rrd", "none"], typer.Option(help="Write an .rrd with both side by side.")] = "none",
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
+    from flowrec import replay as verb
+    from flowrec.status import say, table
+
+    change = verb.Change(refine, plan, observer, controller, tuple(sets or ()))
+    if verify and refly:
+        raise typer.BadParameter("--verify only compares; it goes without --refly")
+    target = out if out is not None or verify else verb.default_out(session)
+    done = verb.replay(session, change, from_s, verify, target, overwrite, frames)
+    if verify:
+        same, lines = verb.verdict(done)
+        if as_json:
+            typer.echo(json.dumps({"session": str(session), "same": same, "lines": lines}))
+        else:
+            for line in lines:
+                typer.echo(line)
+        raise typer.Exit(0 if same else 3)
+    rows = verb.before_and_after(done)
+    if refly:
+        rows += verb.refly(
+            done, target.with_name(f"{target.stem}_refly.mcap") if target is not None else None, overwrite
+        )
+    if as_json:
+        typer.echo(
+            json.dumps(
+                {
+                    "session": str(session),
+                    "out": str(target),
+                    "wall_s": done.wall_s,
+                    "duration_s": done.duration_s,
+                    "rows": [{"quantity": a, "recorded": b, "replayed": c} for a, b, c in rows],
+                }
+            )
+        )
+    else:
+        table(f"Replay of {session.name}", ("", "recorded", "replayed"), rows)
+        say(f"{done.report.ticks} ticks ({done.duration_s:.1f} s) replayed in {done.wall_s:.1f} s -> {target}")
+        if done.replayed.field is not None and done.replayed.field.note:
+            say(f"{done.replayed.field.method}: {done.replayed.field.note}")
+    if view == "rrd" and target is not None:
+        from flowrec.export import write_rrd_of
+
+        write_rrd_of(target)
+
+
+@app.command()
+def view(
+    session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
+    out: Annotated[Path | None, typer.Option(help="Where to write the .rrd; beside the session by default.")] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
+    ] = None,
+    time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+) -> None:
+    """Write the .rrd of a session and open it in Rerun."""
+    from flowrec.export import write_rrd_of
+    from flowrec.status import say
+    from flowrec.view import open_viewer
+    from flowrec.view import screenshot as take
+
+    if not session.exists():
+        raise FlowrecError(f"{session}: no such file; flowrec record makes one")
+    rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out)
+    if screenshot is not None:
+        for problem in take(rrd, screenshot, time_s=time):
+            say(problem)
+        say(f"{screenshot} written")
+    elif not no_open:
+        said = open_viewer(rrd)
+        if said:
+            say(said)
+
+
+@app.command()
+def export(
+    session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
+    out: Annotated[Path | None, typer.Option(help="Where to write the .rrd; beside the session by default.")] = None,
+) -> None:
+    """Write the .rrd of a session without opening it."""
+    from flowrec.export import write_rrd_of
+
+    write_rrd_of(session, out)
+
+
+@app.command()
+def info(
+    session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
+    as_json: AsJson = False,
+) -> None:
+    """What a session is: how it ended, how long, what is in it, where it comes from."""
+    from flowrec.session import describe
+    from flowrec.status import table
+
+    facts, topics = describe(session)
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "facts": facts, "topics": topics}))
+        return
+    table(session.name, ("", "value"), list(facts.items()))
+    table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(help="Session (.mcap).")],
+    second: Annotated[Path, typer.Argument(help="Session to compare it with.")],
+    as_json: AsJson = False,
+) -> None:
+    """Compare two sessions, every message of every tick; exit status 3 where they differ."""
+    from flowrec.compare import compare_sessions
+    from flowrec.store import SessionReader
+
+    comparison = compare_sessions(SessionReader(first), SessionReader(second))
+    if as_json:
+        typer.echo(json.dumps({"identical": comparison.identical, "ticks": comparison.ticks}))
+    else:
+        if comparison.first is not None:
+            typer.echo(f"first difference: {comparison.first}")
+        typer.echo(
+            f"{comparison.ticks} ticks: "
+            + ("identical" if comparison.identical else f"{comparison.different_ticks} of them differ")
+        )
+    raise typer.Exit(0 if comparison.identical else 3)
+
+
+@bench.command("loop")
+def bench_loop(
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    ticks: Annotated[int, typer.Option(help="Frames per measurement.")] = 900,
+) -> None:
+    """Time of one tick with recording and viewing on and off, and the speed of a replay."""
+    from flowrec.bench.loop import measure, show
+
+    figures = measure(ticks)
+    show(figures)
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+def _point(text: str) -> str:
+    """`1200,800` as a TOML pair; a name stays a name."""
+    parts = text.split(",")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        return text
+    if len(numbers) != 2:
+        raise typer.BadParameter(f"{text!r}: a point is two numbers in um, as in --goal 1200,800", param_hint="--goal")
+    return f"[{numbers[0]}, {numbers[1]}]"
+
+
+def with_default_refine(words: list[str]) -> list[str]:
+    """`--refine` may stand alone: give it its method, so that a session path after it is not taken for one."""
+    full: list[str] = []
+    for number, word in enumerate(words):
+        full.append(word)
+        following = words[number + 1] if number + 1 < len(words) else "-"
+        alone = following.startswith("-") or following.endswith(".mcap")
+        if word == "--refine" and alone:
+            full.append(DEFAULT_REFINE)
+    return full
+
+
+def main() -> None:
+    """Entry point: run the command line, turn our errors into one line and an exit status."""
+    try:
+        app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec")
+    except FlowrecError as error:
+        sys.stderr.write(f"flowrec: {error}\n")
+        sys.exit(error.exit_status)
+    except BrokenPipeError:
+        # The reader of our output has gone (flowrec info ... | head); nothing left to say.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

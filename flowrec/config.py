@@ -1,0 +1,274 @@
+"""Config: what a run is. TOML in and out, `--set key=value`, unknown keys refused with the nearest known one.
+
+Every section is the frozen dataclass of the stage it sets, so a setting is declared once, where it is used.
+`resolve` fills what was left to fit the chip (None) and turns named places into points; a session carries the
+resolved configuration, so a replay needs nothing else.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, get_type_hints
+
+import tomli_w
+from pydantic import TypeAdapter, ValidationError
+
+from flowrec.chip import ChipSettings, check_point, median_width_um
+from flowrec.chip.calibration import Calibration
+from flowrec.chip.chip import Chip
+from flowrec.chip.places import opening_point_um
+from flowrec.control import Coils, Controller
+from flowrec.control.mission import PHASES, Commander
+from flowrec.errors import UsageError
+from flowrec.estimation import Observer, Sampler
+from flowrec.flow import FlowSolver
+from flowrec.planning import Planner, SurveyPlanner
+from flowrec.refine import Refiner
+from flowrec.robot import Robot
+from flowrec.settings import CameraSettings, Simulated
+from flowrec.vision import Tracker
+
+
+@dataclass(frozen=True, slots=True)
+class Worker:
+    """How results of slow stages reach the loop."""
+
+    # A simulated run that does not keep real time adopts each result exactly this long after it was ordered, so
+    # that the same seed gives the same session; a live run adopts it on the first frame after it is done.
+    adopt_after_s: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """How a session is written."""
+
+    flush_s: float = 0.5  # at most this much of the end is lost when the process is killed
+    queue_mb: float = 256.0  # waiting for the disk before a live run drops camera frames
+    operator: str = ""
+    notes: str = ""
+    sample: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """What a run starts from."""
+
+    field: str = ""  # session whose flow field is taken over instead of solving: survey once, navigate often
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A whole run, one section per room."""
+
+    rig: Literal["simulated"] = "simulated"
+    duration_s: float | None = None  # None: until the mission is finished
+    chip: ChipSettings = field(default_factory=ChipSettings)
+    robot: Robot = field(default_factory=Robot)
+    camera: CameraSettings = field(default_factory=CameraSettings)
+    simulated: Simulated = field(default_factory=Simulated)
+    start: Start = field(default_factory=Start)
+    tracker: Tracker = field(default_factory=Tracker)
+    observer: Observer = field(default_factory=Observer)
+    sampler: Sampler = field(default_factory=Sampler)
+    flow: FlowSolver = field(default_factory=FlowSolver)
+    refine: Refiner = field(default_factory=Refiner)
+    survey: SurveyPlanner = field(default_factory=SurveyPlanner)
+    plan: Planner = field(default_factory=Planner)
+    mission: Commander = field(default_factory=Commander)
+    control: Controller = field(default_factory=Controller)
+    coils: Coils = field(default_factory=Coils)
+    worker: Worker = field(default_factory=Worker)
+    recording: Recording = field(default_factory=Recording)
+
+
+_ADAPTER = TypeAdapter(Config)
+
+
+def load_config(path: Path | None = None, sets: Iterable[str] = ()) -> Config:
+    """Defaults, then the TOML file, then each `key=value` of `sets` (value as in TOML, or a bare word)."""
+    tree: dict[str, Any] = {}
+    if path is not None:
+        tree = _read_toml(path)
+    for text in sets:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
+        _put(tree, key.strip().split("."), _value(value.strip()))
+    return _config_from(tree, str(path) if path is not None else "--set")
+
+
+def config_from_toml(text: str, where: str) -> Config:
+    """The Config that `to_toml` wrote; `where` names its origin in errors."""
+    try:
+        return _config_from(tomllib.loads(text), where)
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
+
+
+def to_toml(config: Config) -> str:
+    """The whole configuration as TOML; settings that are None are left out."""
+    return tomli_w.dumps(_without_none(asdict(config)))
+
+
+def with_sets(config: Config, sets: Iterable[str]) -> Config:
+    """The configuration with some `key=value` changed."""
+    tree = _without_none(asdict(config))
+    for text in sets:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
+        _put(tree, key.strip().split("."), _value(value.strip()))
+    return _config_from(tree, "--set")
+
+
+def resolve(config: Config, chip: Chip) -> Config:
+    """Fill in what was left to fit the chip, place the camera, and turn named places into points.
+
+    A robot that nobody described is made to suit the chip: radius 50 um, or a fifth of the median channel width
+    where that is narrower, but at least three camera pixels; v_max 600 um/s, or twice the fastest inlet.
+    """
+    camera, robot = config.camera, config.robot
+    width_um, height_um = chip.size_um
+    if camera.um_per_px is None:
+        fit = max(width_um / camera.width_px, height_um / camera.height_px)
+        camera = replace(camera, um_per_px=fit)
+    assert camera.um_per_px is not None
+    if robot.radius_um is None:
+        channel_um = median_width_um(chip)
+        radius = min(max(min(50.0, 0.2 * channel_um), 3.0 * camera.um_per_px), 0.25 * channel_um)
+        robot = replace(robot, radius_um=round(radius, 2))
+    if robot.max_speed_um_s is None:
+        inlets = [opening.value for opening in chip.openings if opening.kind == "inlet"]
+        robot = replace(robot, max_speed_um_s=max(600.0, 2.0 * max(inlets, default=0.0)))
+    assert robot.max_speed_um_s is not None
+    if robot.max_speed_um_s <= 0:
+        raise UsageError(f"robot.max_speed_um_s = {robot.max_speed_um_s:g}: the robot must move; give a positive speed")
+    if robot.step_out_hz is None:
+        robot = replace(robot, step_out_hz=1.2 * robot.max_speed_um_s / robot.um_per_rev)
+    if camera.rate_hz is None:
+        rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), 100.0)
+        camera = replace(camera, rate_hz=round(rate, 1))
+    resolved = replace(config, camera=camera, robot=robot)
+    mission = config.mission
+    mission = replace(
+        mission,
+        start=_point(chip, mission.start, "start", robot),
+        goal=_point(chip, mission.goal, "goal", robot),
+    )
+    return replace(resolved, mission=mission)
+
+
+def calibration_of(config: Config, chip: Chip) -> Calibration:
+    """Camera pixels to chip coordinates: the chip is centred in the image."""
+    camera = config.camera
+    assert camera.um_per_px is not None, "resolve() first"
+    width_um, height_um = chip.size_um
+    half = 0.5 * chip.um_per_px
+    x = width_um / 2 - half - camera.um_per_px * (camera.width_px - 1) / 2
+    y = height_um / 2 - half - camera.um_per_px * (camera.height_px - 1) / 2
+    return Calibration(camera.um_per_px, (x, y))
+
+
+def _point(chip: Chip, place: tuple[float, float] | str, what: str, robot: Robot) -> tuple[float, float]:
+    if isinstance(place, str):
+        return opening_point_um(chip, place, 5.0 * robot.radius)
+    check_point(chip, place, what, robot.radius)
+    return place
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise UsageError(f"{path}: no such configuration; examples are in sessions/") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: can not be read as a TOML configuration ({error})") from error
+    except tomllib.TOMLDecodeError as error:
+        raise UsageError(f"{path}: not valid TOML ({error}); mend that line") from error
+
+
+def _value(text: str) -> Any:
+    """A value as TOML writes it; a bare word is a string, so that shells need no double quoting."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
+    for key in keys[:-1]:
+        inner = tree.setdefault(key, {})
+        if not isinstance(inner, dict):
+            raise UsageError(f"--set {'.'.join(keys)}: {key!r} is a value, not a section")
+        tree = inner
+    tree[keys[-1]] = value
+
+
+def _config_from(tree: dict[str, Any], where: str) -> Config:
+    phases = tree.get("mission", {}).get("phases") if isinstance(tree.get("mission", {}), dict) else None
+    if isinstance(phases, str):
+        tree["mission"]["phases"] = [phase.strip() for phase in phases.split(",") if phase.strip()]
+    _refuse_unknown(tree, Config, "", where)
+    try:
+        config = _ADAPTER.validate_python(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("tuple", "str", "function")))
+        raise UsageError(f"{where}: {key} = {first['input']!r}: {first['msg'].lower()}") from error
+    for phase in config.mission.phases:
+        if phase not in PHASES:
+            raise UsageError(f"{where}: mission.phases: no phase {phase!r}; choose from {', '.join(PHASES)}")
+    _refuse_nonsense(config, where)
+    return config
+
+
+def _refuse_nonsense(config: Config, where: str) -> None:
+    """Numbers that no run can be made of."""
+    positive = {
+        "robot.radius_um": config.robot.radius_um,
+        "robot.um_per_rev": config.robot.um_per_rev,
+        "robot.max_speed_um_s": config.robot.max_speed_um_s,
+        "robot.step_out_hz": config.robot.step_out_hz,
+        "camera.um_per_px": config.camera.um_per_px,
+        "camera.rate_hz": config.camera.rate_hz,
+        "camera.width_px": config.camera.width_px,
+        "camera.height_px": config.camera.height_px,
+        "chip.um_per_px": config.chip.um_per_px,
+        "duration_s": config.duration_s,
+    }
+    for key, value in positive.items():
+        if value is not None and not value > 0:
+            raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
+
+
+def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:
+    hints = get_type_hints(section)
+    for key, value in tree.items():
+        if key not in hints:
+            near = difflib.get_close_matches(prefix + key, list(_all_keys(Config, "")), n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + name for name in hints)}"
+            raise UsageError(f"{where}: unknown key {prefix + key}; {hint}")
+        inner = hints[key]
+        if is_dataclass(inner) and isinstance(inner, type):
+            if not isinstance(value, dict):
+                raise UsageError(f"{where}: {prefix + key} is a section, not a value; set one of its keys")
+            _refuse_unknown(value, inner, f"{prefix}{key}.", where)
+
+
+def _all_keys(section: type, prefix: str) -> Iterable[str]:
+    for key, inner in get_type_hints(section).items():
+        yield prefix + key
+        if is_dataclass(inner) and isinstance(inner, type):
+            yield from _all_keys(inner, f"{prefix}{key}.")
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
+    if isinstance(value, (list, tuple)):
+        return [_without_none(inner) for inner in value]
+    return value

@@ -1,0 +1,205 @@
+"""The commander: which phase a run is in, what work it waits for, and when it is over."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowrec.messages import Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
+from flowrec.robot import Robot
+from flowrec.units import seconds
+
+PHASES = ("survey", "refine", "plan", "navigate")
+
+
+@dataclass(frozen=True, slots=True)
+class Commander:
+    """Phases of the mission and the limits that end it.
+
+    `phases` is any selection of survey, refine, plan, navigate; navigate always plans first. `start` and `goal`
+    are points (x, y) in um on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
+    """
+
+    phases: tuple[str, ...] = PHASES
+    start: tuple[float, float] | str = "inlet"
+    goal: tuple[float, float] | str = "outlet"
+    goal_tolerance_um: float | None = None  # None: the robot's radius
+    survey_limit_s: float = 120.0
+    navigate_limit_s: float = 300.0
+    find_limit_s: float = 3.0  # to see the robot for the first time
+    lost_limit_frames: int = 90  # in a row without seeing it before the run gives up
+    replan_error_um: float | None = None  # None: six radii; blown this far off the route, plan anew
+
+    def decide(
+        self,
+        previous: Mission | None,
+        track: Track,
+        estimate: Estimate,
+        assumed: FlowField | None,
+        refined: FlowField | None,
+        route: Route | None,
+        operator: OperatorEvent | None,
+        demand: Demand | None,
+        robot: Robot,
+    ) -> Mission:
+        """The mission after this frame; the previous object itself while nothing changes.
+
+        `demand` is the one of the frame before: it tells how far the robot is from its route.
+        """
+        now_ns = track.stamp_ns
+        if previous is None:
+            return self._first(now_ns, assumed)
+        if previous.finished:
+            return previous
+        if operator is not None and operator.stamp_ns == now_ns and operator.action in ("stop", "zero"):
+            return self._finish(previous, now_ns, "stopped", operator.text or f"operator: {operator.action}")
+        if (verdict := self._lost(previous, track, now_ns)) is not None:
+            return verdict
+        answer = self._answer(previous, assumed, refined, route)
+        if previous.wanted and answer is None:
+            return previous
+        return self._advance(previous, now_ns, track, estimate, answer, route, demand, robot)
+
+    def _first(self, now_ns: int, assumed: FlowField | None) -> Mission:
+        goal = np.asarray(self.goal, np.float64)
+        known = assumed is not None  # a field of an earlier session was handed in
+        return Mission(
+            stamp_ns=now_ns,
+            phase="start",
+            since_ns=now_ns,
+            request=0 if known else 1,
+            wanted="" if known else "solve",
+            requested_ns=now_ns,
+            start_um=np.asarray(self.start, np.float64),
+            goal_um=goal,
+            finished=False,
+            outcome="",
+            note="",
+        )
+
+    def _lost(self, previous: Mission, track: Track, now_ns: int) -> Mission | None:
+        if track.seen:
+            return None
+        if previous.phase == "start":
+            if seconds(now_ns - previous.since_ns) > self.find_limit_s:
+                return self._finish(
+                    previous, now_ns, "not found", f"no robot seen in the image for {self.find_limit_s:g} s"
+                )
+        elif track.lost_frames > self.lost_limit_frames:
+            return self._finish(previous, now_ns, "lost", f"robot not seen in {track.lost_frames} frames")
+        return None
+
+    @staticmethod
+    def _answer(
+        mission: Mission, assumed: FlowField | None, refined: FlowField | None, route: Route | None
+    ) -> FlowField | Route | None:
+        """The result that the mission waits for, once it is there."""
+        answers = {"solve": assumed, "refine": refined, "survey_route": route, "route": route}
+        result = answers.get(mission.wanted)
+        return result if result is not None and result.request == mission.request else None
+
+    def _advance(
+        self,
+        previous: Mission,
+        now_ns: int,
+        track: Track,
+        estimate: Estimate,
+        answer: FlowField | Route | None,
+        route: Route | None,
+        demand: Demand | None,
+        robot: Robot,
+    ) -> Mission:
+        """What follows when no work is pending, or it has just been answered."""
+        if previous.phase == "start":
+            if isinstance(answer, Route):  # the survey's
+                if answer.reachable:
+                    return self._enter(previous, now_ns, "survey", answer.reason)
+                return self._next_after("survey", previous, now_ns, estimate, f"no survey: {answer.reason}")
+            if not track.seen:
+                return replace(previous, stamp_ns=now_ns, wanted="") if previous.wanted else previous
+            if "survey" in self.phases:
+                return self._order(previous, now_ns, "start", "survey_route", estimate)
+            return self._next_after("survey", previous, now_ns, estimate, "")
+        if previous.phase == "survey":
+            assert route is not None
+            late = seconds(now_ns - previous.since_ns) > self.survey_limit_s
+            if late or self._at_end(estimate, route, demand, robot):
+                note = "survey cut short by its time limit" if late else ""
+                return self._next_after("survey", previous, now_ns, estimate, note)
+            return previous
+        if previous.phase == "refine":
+            note = answer.note if isinstance(answer, FlowField) else ""
+            return self._next_after("refine", previous, now_ns, estimate, note)
+        if previous.phase == "plan":
+            assert isinstance(answer, Route)
+            if not answer.reachable:
+                return self._finish(previous, now_ns, "unreachable", answer.reason)
+            return self._next_after("plan", previous, now_ns, estimate, answer.reason)
+        return self._navigate(previous, now_ns, track, estimate, demand, robot)
+
+    def _navigate(
+        self, previous: Mission, now_ns: int, track: Track, estimate: Estimate, demand: Demand | None, robot: Robot
+    ) -> Mission:
+        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else robot.radius
+        if track.seen and math.dist(estimate.position_um, previous.goal_um) <= tolerance_um:
+            return self._finish(previous, now_ns, "reached", "")
+        if seconds(now_ns - previous.since_ns) > self.navigate_limit_s:
+            return self._finish(previous, now_ns, "timeout", f"goal not reached in {self.navigate_limit_s:g} s")
+        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * robot.radius
+        if track.seen and demand is not None and demand.error_um > limit_um:
+            note = f"blown {demand.error_um:.0f} um off the route: planning anew"
+            return self._order(previous, now_ns, "plan", "route", estimate, note)
+        return previous
+
+    def _next_after(self, done: str, previous: Mission, now_ns: int, estimate: Estimate, note: str) -> Mission:
+        """Enter the first chosen phase behind `done`, or end the run."""
+        chosen = [*self.phases, "plan"] if "navigate" in self.phases else list(self.phases)
+        for phase in PHASES[PHASES.index(done) + 1 :]:
+            if phase not in chosen:
+                continue
+            if phase == "refine":
+                return self._order(previous, now_ns, "refine", "refine", estimate, note)
+            if phase == "plan":
+                return self._order(previous, now_ns, "plan", "route", estimate, note)
+            return self._enter(previous, now_ns, "navigate", note)
+        return self._finish(previous, now_ns, f"{done} complete", note)
+
+    @staticmethod
+    def _at_end(estimate: Estimate, route: Route, demand: Demand | None, robot: Robot) -> bool:
+        """Reached, or the reference has arrived and the robot is as near as it will come."""
+        close = math.dist(estimate.position_um, route.waypoints_um[-1]) <= robot.radius
+        arrived = demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2 * robot.radius
+        return close or arrived
+
+    @staticmethod
+    def _enter(previous: Mission, now_ns: int, phase: str, note: str) -> Mission:
+        return replace(previous, stamp_ns=now_ns, phase=phase, since_ns=now_ns, wanted="", note=note)
+
+    @staticmethod
+    def _order(previous: Mission, now_ns: int, phase: str, wanted: str, estimate: Estimate, note: str = "") -> Mission:
+        return replace(
+            previous,
+            stamp_ns=now_ns,
+            phase=phase,
+            since_ns=previous.since_ns if phase == previous.phase else now_ns,
+            request=previous.request + 1,
+            wanted=wanted,
+            requested_ns=now_ns,
+            start_um=estimate.position_um,
+            note=note,
+        )
+
+    @staticmethod
+    def _finish(previous: Mission, now_ns: int, outcome: str, note: str) -> Mission:
+        return replace(
+            previous,
+            stamp_ns=now_ns,
+            phase="done",
+            since_ns=now_ns,
+            wanted="",
+            finished=True,
+            outcome=outcome,
+            note=note,
+        )

@@ -1,0 +1,45 @@
+"""What a person should hear about a tick: phase changes, adopted results, loss of the robot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowrec.messages import Event, Tick
+
+
+def narrate(last: Tick, tick: Tick) -> Event | None:
+    """An event when something worth telling has happened between two ticks, else None."""
+    lines: list[str] = []
+    level = "info"
+    mission, before = tick.mission, last.mission
+    if tick.assumed is not None and tick.assumed is not last.assumed:
+        peak = float(np.linalg.norm(tick.assumed.velocity_um_s, axis=-1).max())
+        lines.append(f"assumed flow adopted ({tick.assumed.method}), peak {peak:.0f} um/s")
+    if tick.refined is not None and tick.refined is not last.refined:
+        note = f": {tick.refined.note}" if tick.refined.note else ""
+        lines.append(f"refined flow adopted ({tick.refined.method}){note}")
+    if tick.route is not None and tick.route is not last.route:
+        if tick.route.reachable:
+            length = float(np.linalg.norm(np.diff(tick.route.waypoints_um, axis=0), axis=1).sum())
+            lines.append(
+                f"route adopted ({tick.route.method}): {length / 1000:.2f} mm in {tick.route.arrival_s[-1]:.1f} s"
+            )
+        else:
+            level = "warning"
+            lines.append(f"no route ({tick.route.method}): {tick.route.reason}")
+    if tick.track is not None and last.track is not None and tick.track.seen != last.track.seen:
+        lines.append("robot seen" if tick.track.seen else "robot lost from view")
+        level = "info" if tick.track.seen else "warning"
+    if mission is not None and (before is None or mission.phase != before.phase):
+        said = f"{mission.outcome}" if mission.finished else mission.phase
+        lines.append(f"mission: {said}" + (f" ({mission.note})" if mission.note else ""))
+        if mission.finished and mission.outcome not in (
+            "reached",
+            "survey complete",
+            "refine complete",
+            "plan complete",
+        ):
+            level = "warning"
+    if not lines:
+        return None
+    return Event(tick.stamp_ns, level, "; ".join(lines))

@@ -1,0 +1,92 @@
+"""`kalman`: position and flow from filterpy's Kalman filter, the flow as a random walk.
+
+State [x, y, vx, vy]; x' = x + v dt + d with d the displacement by the field as really applied; v' = v + noise of
+spectral density q (continuous white acceleration of the flow along the path). The normalised innovation squared (NIS)
+has mean 2 when R and q are right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from flowrec.messages import Applied, Estimate, Track
+from flowrec.robot import Robot
+from flowrec.units import seconds
+
+_H = np.eye(2, 4)
+_B = np.eye(4, 2)
+_UNKNOWN_UM = 1e4  # one sigma of a position that has never been measured
+
+
+@dataclass(frozen=True, slots=True)
+class Kalman:
+    """Settings; None is scaled to the robot.
+
+    A robot of 50 um that swims at 600 um/s is the measure: q = 1000 um2/s3 gives NIS 2 there. In a channel of another
+    size and speed the flow along the path changes as v^2 / L within L / v, so q goes as v^3 / L.
+    """
+
+    position_noise_um: float | None = None  # one sigma of a measured position; None: 4 % of the radius
+    flow_noise_um2_s3: float | None = None  # q
+    drift_um2_s: float = 4.0  # of the position: Brownian motion and uneven rolling
+    gate_nis: float = 25.0  # a measurement less likely than this is not used at once ...
+    gate_growth: float = 4.0  # ... but the position's variance is multiplied, so that a real jump is soon believed
+
+    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
+        """One predict and, where the robot was seen, one update."""
+        assert robot.max_speed_um_s is not None
+        scale = (robot.max_speed_um_s / 600.0) ** 3 / (robot.radius / 50.0)
+        q = self.flow_noise_um2_s3 if self.flow_noise_um2_s3 is not None else 1000.0 * scale
+        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius
+        # The filter lives for one step: all it knows is in the messages, so a replay can start anywhere.
+        kalman = KalmanFilter(dim_x=4, dim_z=2, dim_u=2)
+        kalman.H = _H
+        kalman.R = np.eye(2) * sigma_um**2
+        if previous is None:
+            flow_um_s = 0.5 * robot.max_speed_um_s
+            kalman.x = np.array([*track.position_um, 0.0, 0.0])
+            kalman.P = np.diag([_UNKNOWN_UM**2, _UNKNOWN_UM**2, flow_um_s**2, flow_um_s**2])
+        else:
+            kalman.x = np.concatenate((previous.position_um, previous.flow_um_s))
+            kalman.P = previous.covariance.copy()
+            dt = seconds(track.stamp_ns - previous.stamp_ns)
+            kalman.predict(
+                u=robot.um_per_rev * applied.turns, B=_B, F=_transition(dt), Q=_noise(dt, q, self.drift_um2_s)
+            )
+        nis = float("nan")
+        if track.seen:
+            innovation = track.position_um - kalman.x[:2]
+            nis = float(innovation @ np.linalg.solve(kalman.P[:2, :2] + kalman.R, innovation))
+            if nis <= self.gate_nis:
+                kalman.update(track.position_um)
+            else:
+                kalman.P[:2, :2] *= self.gate_growth
+        covariance = 0.5 * (kalman.P + kalman.P.T)
+        return Estimate(
+            stamp_ns=track.stamp_ns,
+            position_um=kalman.x[:2],
+            flow_um_s=kalman.x[2:],
+            covariance=covariance,
+            nis=nis,
+            measured_um=track.position_um,
+            seen=track.seen,
+        )
+
+
+def _transition(dt: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    matrix = np.eye(4)
+    matrix[0, 2] = matrix[1, 3] = dt
+    return matrix
+
+
+def _noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Process noise of a random-walk velocity over dt, with a random walk of the position on top."""
+    noise = np.zeros((4, 4))
+    for axis in (0, 1):
+        noise[axis, axis] = q * dt**3 / 3 + drift * dt
+        noise[axis, axis + 2] = noise[axis + 2, axis] = q * dt**2 / 2
+        noise[axis + 2, axis + 2] = q * dt
+    return noise

@@ -1,0 +1,46 @@
+"""`luenberger`: the paper's disturbance observer, eq. (19): d vhat/dt = L_p (dx/dt - d xhat/dt)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowrec.messages import Applied, Estimate, Track
+from flowrec.robot import Robot
+from flowrec.units import seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Luenberger:
+    """With xhat' = u + vhat it is a first-order low pass on the measured drift, discretised exactly."""
+
+    gain_per_s: float = 1.0  # L_p, the same on both axes
+    position_noise_um: float | None = None  # one sigma, for the stated covariance only; None: 4 % of the radius
+
+    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
+        """The position is the measured one; the covariance is nominal: noise through the low pass, no dynamics."""
+        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius
+        moved = robot.um_per_rev * applied.turns
+        flow = np.zeros(2) if previous is None else previous.flow_um_s
+        position = track.position_um
+        dt = 0.0 if previous is None else seconds(track.stamp_ns - previous.stamp_ns)
+        if previous is not None and dt > 0:
+            if track.seen and previous.seen:
+                drift = (track.position_um - previous.measured_um - moved) / dt
+                flow = flow + (1.0 - math.exp(-self.gain_per_s * dt)) * (drift - flow)
+            elif not track.seen:
+                position = previous.position_um + moved + flow * dt
+        share = 1.0 - math.exp(-self.gain_per_s * dt) if dt > 0 else 1.0
+        # Differences of neighbouring positions are anticorrelated: the low pass leaves gain * sigma * sqrt(2 share).
+        flow_variance = max(2.0 * (self.gain_per_s * sigma_um) ** 2, 2.0 * share * (self.gain_per_s * sigma_um) ** 2)
+        return Estimate(
+            stamp_ns=track.stamp_ns,
+            position_um=position,
+            flow_um_s=flow,
+            covariance=np.diag([sigma_um**2, sigma_um**2, flow_variance, flow_variance]),
+            nis=float("nan"),
+            measured_um=track.position_um,
+            seen=track.seen,
+        )

@@ -1,0 +1,70 @@
+"""Estimates along the way to Observations: the local flow that a refinement may use."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowrec.messages import Estimate, Observations
+from flowrec.robot import Robot
+from flowrec.units import nanoseconds, seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Sampler:
+    """Keeps one observation every so often. The filter's memory makes neighbours alike and late; both are allowed for.
+
+    A filter that weighs position and velocity by gains K_x and K_v answers to a changing flow K_x / K_v later. An
+    observation is therefore placed where the robot was that long ago, and its standard deviation is raised so
+    that observations closer in time than that do not count the same noise twice.
+    """
+
+    spacing_radii: float = 0.8  # least way between two observations, in radii of the robot
+    interval_s: float = 0.1  # and least time
+    settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
+    floor_um_s: float = 2.0  # no observation claims a smaller sigma
+    capacity: int = 2000  # the oldest go first
+
+    def collect(
+        self, previous: Observations | None, before: Estimate | None, estimate: Estimate, robot: Robot
+    ) -> Observations | None:
+        """The observations after this frame; the previous object itself when none is due."""
+        assert robot.max_speed_um_s is not None
+        variance = 0.5 * (estimate.covariance[2, 2] + estimate.covariance[3, 3])
+        if before is None or not estimate.seen or not before.seen:
+            return previous
+        if not estimate.nis < 25.0 and not math.isnan(estimate.nis):
+            return previous
+        if variance > (self.settled_share * robot.max_speed_um_s) ** 2:
+            return previous
+        lag_s = _lag_s(estimate)
+        dt = seconds(estimate.stamp_ns - before.stamp_ns)
+        position = estimate.position_um - lag_s * (estimate.position_um - before.position_um) / dt
+        if previous is not None and len(previous.position_um):
+            way = math.dist(position, previous.position_um[-1])
+            soon = estimate.stamp_ns < previous.stamp_ns + nanoseconds(self.interval_s)
+            if soon or way < self.spacing_radii * robot.radius:
+                return previous
+            wait_s = seconds(estimate.stamp_ns - previous.stamp_ns)
+        else:
+            wait_s = math.inf
+        sigma = max(self.floor_um_s, math.sqrt(variance * (1.0 + 2.0 * lag_s / wait_s)))
+        if previous is None:
+            return Observations(estimate.stamp_ns, position[None], estimate.flow_um_s[None], np.array([sigma]))
+        keep = slice(-self.capacity + 1, None)
+        return Observations(
+            estimate.stamp_ns,
+            np.concatenate((previous.position_um[keep], position[None])),
+            np.concatenate((previous.flow_um_s[keep], estimate.flow_um_s[None])),
+            np.concatenate((previous.std_um_s[keep], [sigma])),
+        )
+
+
+def _lag_s(estimate: Estimate) -> float:
+    """K_x / K_v = P_xx / P_xv of a filter that couples them, 0 for one that states no coupling."""
+    coupling = 0.5 * (estimate.covariance[0, 2] + estimate.covariance[1, 3])
+    if coupling <= 0:
+        return 0.0
+    return float(min(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) / coupling, 1.0))

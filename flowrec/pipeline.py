@@ -1,0 +1,134 @@
+"""One tick: a frame comes in, currents go out. One call per stage, in order, nothing hidden.
+
+All state between ticks is the previous Tick, so the pipeline can be resumed anywhere (design: the one idea).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.chip import clearance_um
+from flowrec.chip.calibration import Calibration
+from flowrec.chip.chip import Chip
+from flowrec.config import Config, calibration_of
+from flowrec.control import Coils, Controller
+from flowrec.control.mission import Commander
+from flowrec.control.narrator import narrate
+from flowrec.estimation import Observer, Sampler
+from flowrec.flow import FlowSolver
+from flowrec.messages import Applied, FlowField, Frame, OperatorEvent, Route, Tick, Track, Truth
+from flowrec.planning import Planner, SurveyPlanner
+from flowrec.refine import Refiner
+from flowrec.robot import Robot
+from flowrec.vision import Tracker
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Everything that reaches one tick from outside: the rig, the operator, the worker."""
+
+    stamp_ns: int
+    frame: Frame | None  # None only in a replay whose recording had to drop the image
+    applied: Applied
+    operator: OperatorEvent | None = None
+    assumed: FlowField | None = None  # adopted on this tick
+    refined: FlowField | None = None
+    route: Route | None = None
+    track: Track | None = None  # the recorded one, where `frame` was dropped
+    # For the record only: handed past the pipeline to the sinks, no stage sees them.
+    truth: Truth | None = None
+    true_field: FlowField | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pipeline:
+    """All stages of a run with the chip, the camera's calibration and the robot they work on."""
+
+    chip: Chip
+    calibration: Calibration
+    robot: Robot
+    clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
+    tracker: Tracker
+    observer: Observer
+    sampler: Sampler
+    commander: Commander
+    controller: Controller
+    coils: Coils
+    # The slow ones: run by work.py on order of the commander.
+    solver: FlowSolver
+    refiner: Refiner
+    survey: SurveyPlanner
+    planner: Planner
+
+
+def assemble(config: Config, chip: Chip) -> Pipeline:
+    """The stages of a resolved configuration on its chip."""
+    return Pipeline(
+        chip=chip,
+        calibration=calibration_of(config, chip),
+        robot=config.robot,
+        clearance_um=clearance_um(chip.mask, chip.um_per_px),
+        tracker=config.tracker,
+        observer=config.observer,
+        sampler=config.sampler,
+        commander=config.mission,
+        controller=config.control,
+        coils=config.coils,
+        solver=config.flow,
+        refiner=config.refine,
+        survey=config.survey,
+        planner=config.plan,
+    )
+
+
+def _no_lap(_stage: str) -> None:
+    """Ignore the end of a stage."""
+
+
+def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], None] = _no_lap) -> Tick:
+    """The tick after `last`, given what came in. `lap(stage)` is called as each stage ends, for timing only."""
+    p = pipeline
+    assumed = inputs.assumed or last.assumed
+    refined = inputs.refined or last.refined
+    route = inputs.route or last.route
+    if inputs.frame is not None:
+        track = p.tracker.track(last.track, inputs.frame, p.chip, p.calibration, p.robot)
+    else:
+        assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
+        track = inputs.track
+    lap("track")
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot)
+    observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
+    lap("observe")
+    mission = p.commander.decide(
+        last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, p.robot
+    )
+    demand = p.controller.control(
+        last.demand, mission, route, estimate, refined or assumed, p.robot, p.clearance_um, p.chip.um_per_px
+    )
+    currents = p.coils.drive(last.currents, demand, p.robot, mission.finished)
+    lap("control")
+    tick = replace(
+        last,
+        stamp_ns=inputs.stamp_ns,
+        frame=inputs.frame,
+        applied=inputs.applied,
+        operator=inputs.operator or last.operator,
+        assumed=assumed,
+        refined=refined,
+        route=route,
+        track=track,
+        estimate=estimate,
+        observations=observations,
+        mission=mission,
+        demand=demand,
+        currents=currents,
+        truth=None,
+        true_field=None,
+    )
+    event = narrate(last, tick)
+    return replace(tick, event=event) if event is not None else tick

@@ -1,0 +1,115 @@
+"""The planner stage: the way to a goal through a flow, or the honest answer that there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.chip.chip import Chip
+from flowrec.messages import FlowField, Route
+from flowrec.planning.lattice import backtrack, directions, search
+from flowrec.planning.paper import adjacency, search_paper
+from flowrec.planning.relax import relax
+from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
+from flowrec.planning.space import End, Space, attach_goal, attach_start, open_space, why_apart
+from flowrec.robot import Robot
+
+Method = Literal["astar_time", "astar_paper", "astar_length"]
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Planner:
+    """Flow-aware A* (science.md, section 3), and beside it what it is compared with.
+
+    astar_time: exact travel time on the pixels, admissible heuristic, then a local refinement of the path.
+    astar_paper: cost and heuristic as the paper prints them, neighbours by K-D tree.
+    astar_length: the shortest way, blind to the flow.
+    """
+
+    method: Method = "astar_time"
+    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: a quarter of it
+    speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
+    reach_px: int = 2  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
+    paper_radius_px: float = 3.5  # neighbours of astar_paper
+    refine: bool = True  # astar_time's path
+
+    def plan(self, field: FlowField, start_um: ArrayLike, goal_um: ArrayLike, chip: Chip, robot: Robot) -> Route:
+        """Route from start to goal, both (2,) um; stamp and request are 0.
+
+        A reachable route may carry a remark in `reason`. A start too near to a wall is joined to the nearest
+        place with room; where a channel leaves no room for the margin, the margin is given up.
+
+        Raises
+        ------
+        UsageError
+            If the robot has no speed, or field and chip do not fit together.
+        FlowError
+            If the field is not finite.
+        """
+        speed_um_s = planning_speed_um_s(self.speed_share, robot)
+        start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
+        wanted_um = 0.25 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
+        trouble = ""
+        for margin_um in dict.fromkeys((wanted_um, 0.0)):
+            space = open_space(chip, field, robot.radius, margin_um)
+            start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
+            trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
+            if not trouble:
+                route = self._through(space, field, start, goal, speed_um_s)
+                lean = f"no room for the margin of {wanted_um:.0f} um" if margin_um < wanted_um else ""
+                remarks = [lean, start.remark, goal.remark, route.reason]
+                return replace(route, reason="; ".join(remark for remark in remarks if remark))
+        return no_route(self.method, trouble)
+
+    def _through(self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float) -> Route:
+        """The route between two ends that geometry connects."""
+        px = space.um_per_px
+        nodes = self._search(space, self.method, start.node, goal.node, speed_um_s / px)
+        if nodes is None:
+            shortest = self._search(space, "astar_length", start.node, goal.node, 1.0)
+            assert shortest is not None, "free pixels that touch are joined by edges"
+            return no_route(self.method, too_fast(field, shortest * px, speed_um_s))
+        path = _between(nodes, start, goal)
+        if self.method == "astar_time" and self.refine:
+            even = np.ones_like(space.clearance)
+            refined = relax(path, space.clearance, space.need, space.vx, space.vy, even, speed_um_s / px)
+            route = timed_route(self.method, field, refined * px, speed_um_s, "")
+            if route.reachable:
+                return route
+        return timed_route(self.method, field, path * px, speed_um_s, "")
+
+    def _search(self, space: Space, method: Method, start: int, goal: int, speed: float) -> Points | None:
+        """(n, 2) pixels from node to node, None when the search finds no way; speed in px/s."""
+        if method == "astar_paper":
+            rows, columns = np.nonzero(space.free)
+            nodes = np.column_stack([columns, rows]).astype(np.float64)
+            number = {int(flat): k for k, flat in enumerate(rows * space.width + columns)}
+            velocity = np.column_stack([space.vx[rows, columns], space.vy[rows, columns]])
+            edges = adjacency(nodes, self.paper_radius_px, space.clearance, space.edge_need)
+            chain = search_paper(nodes, velocity, edges, number[start], number[goal], speed)
+            return nodes[chain] if len(chain) else None
+        cost, parent = search(
+            space.free,
+            space.clearance,
+            space.edge_need,
+            space.vx,
+            space.vy,
+            np.ones_like(space.clearance),
+            directions(self.reach_px),
+            start,
+            goal,
+            speed,
+            method == "astar_time",
+        )
+        return backtrack(parent, goal, space.width) if np.isfinite(cost[goal]) else None
+
+
+def _between(nodes: Points, start: End, goal: End) -> Points:
+    """The path (n, 2) px with its true ends put before and behind the nodes they are joined to."""
+    parts = [start.point[None] if start.point is not None else nodes[:0], nodes]
+    parts.append(goal.point[None] if goal.point is not None else nodes[:0])
+    return np.concatenate(parts)

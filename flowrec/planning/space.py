@@ -1,0 +1,193 @@
+"""Where a robot may be: the pixels far enough from the walls, and how points are attached to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from flowrec.chip import clearance_um
+from flowrec.chip.chip import Chip
+from flowrec.errors import FlowError, UsageError
+from flowrec.messages import FlowField
+from flowrec.planning.zermelo import bilinear, line_is_clear
+
+Points = NDArray[np.float64]
+Raster = NDArray[np.float64]
+
+# Between pixel centres the bilinear clearance dips below that of the centres by up to half a pixel (on the ridge of
+# an oblique channel, where the true one does not dip). With this slack free pixels that touch are always joined.
+_EDGE_SLACK_PX = 0.5
+_EIGHT = np.ones((3, 3), np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """Free pixels of a chip for one clearance, with the flow on them, all in pixels and seconds."""
+
+    clearance: Raster  # (h, w) to the nearest wall, negative in solid
+    fluid: NDArray[np.bool_]  # (h, w)
+    free: NDArray[np.bool_]  # (h, w) where the robot's centre may be: the nodes
+    radius: float  # of the robot
+    need: float  # clearance of nodes
+    vx: Raster  # (h, w)
+    vy: Raster  # (h, w)
+    um_per_px: float
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.free.shape[1])
+
+    @property
+    def edge_need(self) -> float:
+        """Clearance that every edge between nodes keeps."""
+        return max(self.need - _EDGE_SLACK_PX, 0.0)
+
+    def clearance_at(self, point: Points) -> float:
+        """Clearance (px) at a point (x, y) in px."""
+        return bilinear(self.clearance, float(point[0]), float(point[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class End:
+    """One end of a route: its node, and the point itself where the robot can be there."""
+
+    node: int  # flat index; -1 when there is trouble
+    point: Points | None  # (2,) px
+    remark: str = ""
+    trouble: str = ""
+
+
+def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float) -> Space:
+    """The space of a robot that keeps a margin from the walls.
+
+    Raises
+    ------
+    UsageError
+        If field and chip are not of the same pixels.
+    FlowError
+        If the field is not finite.
+    """
+    if field.velocity_um_s.shape[:2] != chip.mask.shape or not math.isclose(field.um_per_px, chip.um_per_px):
+        raise UsageError(
+            f"plan: the flow field has {field.velocity_um_s.shape[:2]} pixels of {field.um_per_px:g} um, chip "
+            f"{chip.name!r} has {chip.mask.shape} of {chip.um_per_px:g} um; solve the flow on this chip"
+        )
+    if not np.isfinite(field.velocity_um_s).all():
+        raise FlowError(f"plan: the flow field ({field.method}) is not finite everywhere; no route can be timed in it")
+    # A mask without walls has infinite clearance, which bilinear weights of 0 would turn into NaN.
+    far_px = float(sum(chip.mask.shape))
+    clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
+    need = (radius_um + margin_um) / chip.um_per_px
+    return Space(
+        clearance=clearance,
+        fluid=np.ascontiguousarray(chip.mask),
+        free=chip.mask & (clearance >= need),
+        radius=radius_um / chip.um_per_px,
+        need=need,
+        vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
+        vy=np.ascontiguousarray(field.velocity_um_s[..., 1], np.float64) / chip.um_per_px,
+        um_per_px=chip.um_per_px,
+    )
+
+
+def attach_start(space: Space, point_um: Points) -> End:
+    """Join the place where the robot is to the nodes, even when the flow has pushed it too near to a wall."""
+    return _attach(space, "start", point_um, max(3.0 * space.need, 3.0))
+
+
+def attach_goal(space: Space, point_um: Points) -> End:
+    """Join the goal to the nodes; a robot that can not stand there must come within its own radius of it."""
+    return _attach(space, "goal", point_um, max(space.radius, 1.0))
+
+
+def why_apart(space: Space, a: int, b: int) -> str:
+    """Why two nodes are not connected, '' when they are; names the narrowest place of the widest way."""
+    if _joined(space.free, a, b):
+        return ""
+    widest = _bottleneck(space.clearance, a, b)
+    if widest < 0.0:
+        return "no channel leads from start to goal"
+    # The place is where the way closes: the pixel of just that clearance that joins the two sides.
+    beyond = label(space.clearance > widest, _EIGHT)[0]
+    rows, columns = np.nonzero(space.clearance == widest)
+    place = (int(columns[0]), int(rows[0]))
+    for column, row in zip(columns, rows, strict=True):
+        around = beyond[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
+        if len(np.unique(around[around > 0])) > 1:
+            place = (int(column), int(row))
+            break
+    px = space.um_per_px
+    return (
+        f"the channel is too narrow at {place[0] * px:.0f},{place[1] * px:.0f} um: half its width there is "
+        f"{widest * px:.0f} um and the robot needs {space.need * px:.0f} um"
+    )
+
+
+def _attach(space: Space, name: str, point_um: Points, within: float) -> End:
+    point = point_um / space.um_per_px
+    h, w = space.free.shape
+    where = f"{name} {point_um[0]:.0f},{point_um[1]:.0f} um"
+    if not (np.isfinite(point).all() and -0.5 <= point[0] <= w - 0.5 and -0.5 <= point[1] <= h - 0.5):
+        return End(-1, None, trouble=f"{where} is outside the chip")
+    room = space.clearance_at(point)
+    if room <= 0.0:
+        return End(-1, None, trouble=f"{where} is in a wall")
+    if not space.free.any():
+        return End(
+            -1, None, trouble=f"no channel is wide enough: the robot needs {space.need * space.um_per_px:.0f} um"
+        )
+    node = _nearest_node(space, point, within)
+    if node < 0:
+        needs = f"the robot needs {space.need * space.um_per_px:.0f} um"
+        return End(-1, None, trouble=f"{where} is {room * space.um_per_px:.0f} um from a wall and {needs}")
+    if room >= min(space.need, space.radius) - _EDGE_SLACK_PX:
+        return End(node, point)
+    remark = f"{where} is only {room * space.um_per_px:.0f} um from a wall: joined to the nearest place with room"
+    # A start is where the robot is, so the route begins there all the same; a goal is replaced by its node.
+    return End(node, point if name == "start" else None, remark)
+
+
+def _nearest_node(space: Space, point: Points, within: float) -> int:
+    """Flat index of the nearest node that is seen from a point through fluid; -1 if none is near."""
+    x, y = float(point[0]), float(point[1])
+    left, top = max(0, math.floor(x - within)), max(0, math.floor(y - within))
+    window = space.free[top : math.ceil(y + within) + 1, left : math.ceil(x + within) + 1]
+    rows, columns = np.nonzero(window)
+    distances = np.hypot(columns + left - x, rows + top - y)
+    for k in np.argsort(distances, kind="stable"):
+        if distances[k] > within:
+            break
+        column, row = int(columns[k]) + left, int(rows[k]) + top
+        if line_is_clear(space.clearance, x, y, float(column), float(row), 0.0):
+            return row * space.width + column
+    return -1
+
+
+def _joined(allowed: NDArray[np.bool_], a: int, b: int) -> bool:
+    """Whether two pixels (flat indices) are connected by allowed pixels, corners included."""
+    parts = label(allowed, _EIGHT)[0].ravel()
+    return bool(parts[a] == parts[b] != 0)
+
+
+def _bottleneck(clearance: Raster, a: int, b: int) -> float:
+    """The clearance (px) of the narrowest place on the widest way between two pixels; -1 without any way.
+
+    It is one of the raster's values: bisection over them, one labelling a step.
+    """
+    flat = clearance.ravel()
+    values = np.unique(flat[(flat > 0.0) & (flat <= min(flat[a], flat[b]))])
+    if len(values) == 0 or not _joined(clearance >= values[0], a, b):
+        return -1.0
+    low, high = 0, len(values)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if _joined(clearance >= values[middle], a, b):
+            low = middle
+        else:
+            high = middle
+    return float(values[low])

@@ -1,0 +1,154 @@
+"""The survey's route: downstream along the assumed flow, in the middle of the channel, for a limited distance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.chip.chip import Chip, Opening
+from flowrec.messages import FlowField, Route
+from flowrec.planning.lattice import backtrack, directions, search
+from flowrec.planning.relax import relax
+from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route
+from flowrec.planning.space import Space, attach_start, open_space
+from flowrec.robot import Robot
+
+_METHOD = "survey"
+Raster = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyPlanner:
+    """A drive with the flow that brings the robot past as much of it as the distance allows.
+
+    Streamlines stop in stagnation and circle behind steps; so instead every node is reached on its fastest way from
+    the start (Dijkstra on travel time, dearer near walls), and among the ways short enough the one is taken along
+    which the flow helps most: the largest work of the flow, the integral of v . dl. It follows the main stream
+    through every junction and can neither stop nor circle.
+    """
+
+    distance_um: float | None = None  # None: half of the longest way downstream
+    speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
+    clearance_margin_um: float | None = None  # None: a quarter of the robot's radius
+    middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
+    outlet_gap_radii: float = 3.0  # left between the end of the route and any opening
+
+    def plan(
+        self, field: FlowField, start_um: ArrayLike, chip: Chip, robot: Robot, distance_um: float | None = None
+    ) -> Route:
+        """Route (stamp and request 0) downstream from a start (2,) um, at most `distance_um` long.
+
+        Raises
+        ------
+        UsageError
+            If the robot has no speed, or field and chip do not fit together.
+        FlowError
+            If the field is not finite.
+        """
+        speed_um_s = planning_speed_um_s(self.speed_share, robot)
+        limit_um = distance_um if distance_um is not None else self.distance_um
+        at = np.asarray(start_um, np.float64)
+        wanted_um = 0.25 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
+        route = no_route(_METHOD, "")
+        for margin_um in dict.fromkeys((wanted_um, 0.0)):
+            space = open_space(chip, field, robot.radius, margin_um)
+            route = self._downstream(space, field, at, chip, speed_um_s, limit_um)
+            if route.reachable:
+                lean = f"no room for the margin of {wanted_um:.0f} um" if margin_um < wanted_um else ""
+                return replace(route, reason="; ".join(remark for remark in (lean, route.reason) if remark))
+        return route
+
+    def _downstream(
+        self,
+        space: Space,
+        field: FlowField,
+        start_um: NDArray[np.float64],
+        chip: Chip,
+        speed_um_s: float,
+        limit_um: float | None,
+    ) -> Route:
+        start = attach_start(space, start_um)
+        if start.trouble:
+            return no_route(_METHOD, start.trouble)
+        px = space.um_per_px
+        weight = self._weight(space)
+        cost, parent = search(
+            space.free,
+            space.clearance,
+            space.edge_need,
+            space.vx,
+            space.vy,
+            weight,
+            directions(2),
+            start.node,
+            -1,
+            speed_um_s / px,
+            True,
+        )
+        length, work = _along_tree(cost, parent, space)
+        allowed = np.isfinite(cost) & (work > 0.0) & ~_near_openings(space, chip, self.outlet_gap_radii).ravel()
+        allowed[start.node] = False
+        if not allowed.any():
+            return no_route(_METHOD, "nothing lies downstream of the start before the chip ends")
+        longest_px = length[int(np.argmax(np.where(allowed, work, -np.inf)))]
+        limit_px = 0.5 * longest_px if limit_um is None else limit_um / px
+        allowed &= length <= limit_px
+        if not allowed.any():
+            return no_route(_METHOD, f"a survey of {limit_px * px:.0f} um is shorter than a pixel of the chip")
+        end = int(np.argmax(np.where(allowed, work, -np.inf)))
+        nodes = backtrack(parent, end, space.width)
+        path = nodes if start.point is None else np.concatenate([start.point[None], nodes])
+        smooth = relax(path, space.clearance, space.need, space.vx, space.vy, weight, speed_um_s / px)
+        for candidate in (smooth, path):
+            route = timed_route(_METHOD, field, candidate * px, speed_um_s, start.remark)
+            if route.reachable:
+                break
+        return route
+
+    def _weight(self, space: Space) -> Raster:
+        """(h, w) >= 1: what time costs, most next to the walls, least in the middle of the channel."""
+        nearness = space.need / np.maximum(space.clearance, space.need)
+        return 1.0 + self.middle_pull * nearness**2
+
+
+def _along_tree(
+    cost: NDArray[np.float64], parent: NDArray[np.int64], space: Space
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Length (h*w,) in px and work of the flow (h*w,) in px2/s along the way to each node of the search's tree."""
+    length, work = np.zeros(len(cost)), np.zeros(len(cost))
+    vx, vy = space.vx.ravel(), space.vy.ravel()
+    # Parents are settled before their children, so in order of cost one pass is enough.
+    for node in np.argsort(cost, kind="stable")[: int(np.isfinite(cost).sum())]:
+        before = parent[node]
+        if before < 0:
+            continue
+        dx = node % space.width - before % space.width
+        dy = node // space.width - before // space.width
+        length[node] = length[before] + np.hypot(dx, dy)
+        work[node] = work[before] + 0.5 * (dx * (vx[node] + vx[before]) + dy * (vy[node] + vy[before]))
+    return length, work
+
+
+def _near_openings(space: Space, chip: Chip, gap_radii: float) -> NDArray[np.bool_]:
+    """(h, w) pixels nearer to an opening than the gap."""
+    h, w = space.free.shape
+    y, x = np.mgrid[0:h, 0:w]
+    near = np.zeros((h, w), np.bool_)
+    for opening in chip.openings:
+        column, row = _nearest_on(opening, x, y)
+        near |= np.hypot(x - column, y - row) < gap_radii * space.radius
+    return near
+
+
+def _nearest_on(
+    opening: Opening, x: NDArray[np.int64], y: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The nearest point of an opening's border run to each pixel."""
+    h, w = x.shape
+    if opening.side in ("left", "right"):
+        edge = -0.5 if opening.side == "left" else w - 0.5
+        return np.full((h, w), edge), np.clip(y, opening.first, opening.last).astype(np.float64)
+    edge = -0.5 if opening.side == "top" else h - 0.5
+    return np.clip(x, opening.first, opening.last).astype(np.float64), np.full((h, w), edge)

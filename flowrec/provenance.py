@@ -1,0 +1,82 @@
+"""Where a session comes from: version, commit and local changes, packages, host, time.
+
+Recorded first in every file, so that a result can be traced to the code that made it.
+"""
+
+from __future__ import annotations
+
+import getpass
+import platform
+import subprocess
+import time
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import flowrec
+
+PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "opencv-python-headless",
+    "filterpy",
+    "torch",
+    "mcap",
+    "foxglove-sdk",
+    "protobuf",
+    "rerun-sdk",
+    "pydantic",
+)
+_DIFF_LIMIT = 200_000  # characters; a larger change is cut and says so
+
+
+def provenance() -> dict[str, str]:
+    """Facts about code, machine and moment as text, for the head of a session."""
+    facts = {
+        "flowrec": flowrec.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "host": platform.node(),
+        "user": _user(),
+        "wall_time": datetime.now(UTC).isoformat(),
+        "wall_ns": str(time.time_ns()),
+        "monotonic_ns": str(time.monotonic_ns()),
+    }
+    for package in PACKAGES:
+        try:
+            facts[f"package.{package}"] = version(package)
+        except PackageNotFoundError:
+            facts[f"package.{package}"] = "not installed"
+    source = Path(flowrec.__file__).resolve().parent
+    commit = _git(source, "rev-parse", "HEAD")
+    # Only a checkout of flowrec itself counts, not a repository that a virtual environment happens to lie in.
+    if commit and _git(source, "ls-files", "--error-unmatch", "__init__.py"):
+        facts["git_commit"] = commit
+        diff = _git(source, "diff", "HEAD", "--", ".")
+        if diff:
+            cut = f"\n... cut at {_DIFF_LIMIT} characters" if len(diff) > _DIFF_LIMIT else ""
+            facts["git_diff"] = diff[:_DIFF_LIMIT] + cut
+    return facts
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container may run under a number without a name
+        return "unknown"
+
+
+def _git(folder: Path, *words: str) -> str:
+    """Answer of git, or '' where there is no git or no repository: a wheel has neither."""
+    try:
+        done = subprocess.run(  # noqa: S603
+            ["git", "-C", str(folder), *words],  # noqa: S607
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip() if done.returncode == 0 else ""

@@ -1,0 +1,200 @@
+"""`flowrec record`: drive a mission on a rig and write every stage to one session file."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from flowrec.chip import load_chip
+from flowrec.chip.chip import Chip
+from flowrec.config import Config, resolve
+from flowrec.errors import SessionError, UsageError
+from flowrec.flow.metrics import relative_rmse
+from flowrec.messages import Demand, FlowField, Tick
+from flowrec.pipeline import Pipeline, assemble
+from flowrec.rigs.simulated import SimulatedRig
+from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
+from flowrec.session import length_mm, session_header
+from flowrec.status import StatusLine, say, table, warn
+from flowrec.store import SessionReader, SessionWriter
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What a finished recording is known by."""
+
+    path: Path
+    report: RunReport
+    facts: dict[str, str]
+
+    @property
+    def exit_status(self) -> int:
+        """0 reached its end, 1 did not."""
+        return 0 if self.report.outcome in GOOD_ENDS else 1
+
+
+# Ends that are what was asked for; `unreachable` is an honest answer, said before anything was risked.
+GOOD_ENDS = ("reached", "unreachable", "survey complete", "refine complete", "plan complete", "stopped", "time over")
+
+
+class Witness:
+    """A sink that keeps what the summary tells: the true flow, and the distance to the reference while navigating."""
+
+    def __init__(self) -> None:
+        self.true_field: FlowField | None = None
+        self._square_um2 = 0.0
+        self._count = 0
+        self._last: Demand | None = None
+
+    def write(self, tick: Tick) -> None:
+        self.true_field = tick.true_field or self.true_field
+        demand = tick.demand
+        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != "navigate":
+            return
+        self._last = demand
+        if math.isfinite(demand.error_um):
+            self._square_um2 += demand.error_um**2
+            self._count += 1
+
+    @property
+    def rms_um(self) -> float:
+        """Root mean square distance to the reference, NaN when nothing was navigated."""
+        return math.sqrt(self._square_um2 / self._count) if self._count else math.nan
+
+
+def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
+    """The resolved configuration, its chip and its pipeline. Warns where the plan will have to be honest."""
+    chip = load_chip(config.chip)
+    config = resolve(config, chip)
+    assert config.robot.max_speed_um_s is not None
+    for opening in chip.openings:
+        if opening.kind == "inlet" and opening.value > config.robot.max_speed_um_s:
+            warn(
+                f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
+                f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
+            )
+    return config, chip, assemble(config, chip)
+
+
+def default_path(config: Config, folder: Path | None = None) -> Path:
+    """date_operator_sample_number.mcap, the first number that is free."""
+    sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
+    words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
+    stem = "_".join(word.replace(" ", "-") for word in words if word)
+    folder = folder or Path()
+    for number in range(1, 10_000):
+        path = folder / f"{stem}_{number:03d}.mcap"
+        if not path.exists() and not path.with_name(path.name + ".partial").exists():
+            return path
+    raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
+
+
+def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
+    """Assumed and refined flow at the end of an earlier session, on the same chip."""
+    last = SessionReader(path).tick_before(None)
+    fields = {name: field for name in ("assumed", "refined") if (field := getattr(last, name)) is not None}
+    if "assumed" not in fields:
+        raise UsageError(f"start.field = {path}: that session holds no flow field; survey and refine first")
+    shape = fields["assumed"].velocity_um_s.shape[:2]
+    if shape != chip.mask.shape or not math.isclose(fields["assumed"].um_per_px, chip.um_per_px):
+        raise UsageError(f"start.field = {path}: its field is for another chip ({shape[1]} x {shape[0]} pixels)")
+    return fields
+
+
+def record(
+    config: Config, out: Path | None = None, view: str = "none", realtime: bool = False, overwrite: bool = False
+) -> Recorded:
+    """Run the mission of `config` and write it to `out`; `view` is spawn, serve, rrd or none."""
+    config, chip, pipeline = prepare(config)
+    path = out if out is not None else default_path(config)
+    fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
+    header = session_header(config, chip)
+    rig = SimulatedRig(
+        chip,
+        config.robot,
+        pipeline.calibration,
+        config.camera,
+        config.simulated,
+        config.mission.start,
+        duration_s=config.duration_s,
+        realtime=realtime,
+    )
+    worker: Worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
+    if fields:
+        worker = Preloaded(worker, fields)
+    stop = StopSwitch()
+    witness = Witness()
+    with ExitStack() as stack:
+        writer = stack.enter_context(
+            SessionWriter(
+                path,
+                header,
+                flush_s=config.recording.flush_s,
+                queue_bytes=int(config.recording.queue_mb * 1e6),
+                block=not realtime,
+                overwrite=overwrite,
+            )
+        )
+        sinks: list[Sink] = [writer, witness]
+        if view in ("spawn", "serve"):
+            # Late: importing Rerun takes a second, and most runs do without.
+            from flowrec.export import scene_of
+            from flowrec.view import LiveView
+
+            live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
+            say(live.message)
+            sinks.append(live)
+        status = stack.enter_context(StatusLine(path.resolve().parent, lambda: writer.bytes_written).shown())
+        with stop.armed():
+            report = run(
+                pipeline,
+                rig,
+                worker,
+                sinks,
+                stop=stop,
+                on_tick=status,
+                queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
+            )
+        facts = facts_of(chip, report, witness.true_field)
+        facts["frames dropped"] = str(writer.dropped_frames)
+        if math.isfinite(witness.rms_um):
+            facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
+        outcome = {"outcome": report.outcome, "note": report.note} | {
+            key.replace(" ", "_"): value for key, value in facts.items()
+        }
+        writer.close(outcome)
+    facts["file"] = f"{path} ({path.stat().st_size / 1e6:.1f} MB)"
+    if view == "rrd":
+        from flowrec.export import write_rrd_of
+
+        facts["recording for Rerun"] = str(write_rrd_of(path))
+    return Recorded(path, report, facts)
+
+
+def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dict[str, str]:
+    """The summary of a run, in the order in which a person wants it."""
+    facts = {"outcome": report.outcome + (f" ({report.note})" if report.note else "")}
+    last = report.last
+    facts["duration"] = f"{report.duration_s:.1f} s, {report.ticks} frames, computed in {report.wall_s:.1f} s"
+    if last.mission is not None and last.route is not None and last.route.reachable and last.mission.phase == "done":
+        facts["route"] = (
+            f"{length_mm(last.route):.2f} mm, planned {last.route.arrival_s[-1]:.1f} s ({last.route.method})"
+        )
+    if true_field is not None:
+        facts["wall contacts"] = str(report.contacts)
+        for name, field in (("assumed", last.assumed), ("refined", last.refined)):
+            if field is not None:
+                error = relative_rmse(field, true_field, chip.mask)
+                facts[f"{name} flow error"] = f"{100 * error.v:.1f} % of the true flow ({field.method})"
+    if last.observations is not None:
+        facts["flow observations"] = str(len(last.observations.position_um))
+    return facts
+
+
+def print_summary(recorded: Recorded) -> None:
+    """The table at the end of a run and what to do next."""
+    table("Session", ("", "value"), list(recorded.facts.items()))
+    say(f"next: flowrec replay {recorded.path} --refine    flowrec view {recorded.path}")

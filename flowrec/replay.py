@@ -1,0 +1,496 @@
+"""`flowrec replay`: run the pipeline again over a recorded session, the same or with other stages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from flowrec.chip.chip import Chip
+from flowrec.compare import Comparison
+from flowrec.config import Config, with_sets
+from flowrec.errors import SessionError, UsageError
+from flowrec.flow import sample
+from flowrec.flow.metrics import relative_rmse
+from flowrec.messages import Demand, FlowField, Observations, Route, Tick
+from flowrec.pipeline import Pipeline, assemble
+from flowrec.planning import travel_time
+from flowrec.rigs.recorded import RecordedRig
+from flowrec.rigs.simulated import SimulatedRig
+from flowrec.run import LockstepWorker, Preloaded, RunReport, Sink, StopSwitch, run
+from flowrec.session import file_sha256, length_mm, open_session, session_header
+from flowrec.status import progress, say
+from flowrec.store import SessionReader, SessionWriter
+from flowrec.topics import BY_FIELD
+from flowrec.units import nanoseconds, seconds
+from flowrec.work import FILLS, no_observations, work
+
+# Which results of the worker a changed section makes stale.
+STALE: dict[str, frozenset[str]] = {
+    "flow": frozenset({"assumed", "refined", "route"}),
+    "tracker": frozenset({"refined", "route"}),
+    "observer": frozenset({"refined", "route"}),
+    "sampler": frozenset({"refined", "route"}),
+    "refine": frozenset({"refined", "route"}),
+    "mission": frozenset({"refined", "route"}),
+    "robot": frozenset({"route"}),
+    "survey": frozenset({"route"}),
+    "plan": frozenset({"route"}),
+}
+# What a recording has settled once and for all.
+FIXED = ("chip", "camera", "rig", "simulated")
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a replay does differently: the verbs of the command line."""
+
+    refine: str | None = None
+    plan: str | None = None
+    observer: str | None = None
+    controller: str | None = None
+    sets: tuple[str, ...] = ()
+
+    def apply(self, config: Config) -> Config:
+        """The recorded configuration with the changes; a what-if never replans on a robot that can not follow."""
+        words = {
+            "refine.method": self.refine,
+            "plan.method": self.plan,
+            "observer.method": self.observer,
+            "control.method": self.controller,
+        }
+        sets = [f"{key}={value}" for key, value in words.items() if value is not None] + list(self.sets)
+        if not sets:
+            return config
+        changed = with_sets(config, sets)
+        phases = changed.mission.phases
+        if self.refine is not None and "refine" not in phases:
+            phases = tuple(dict.fromkeys((*phases, "refine", "plan")))
+        mission = replace(changed.mission, phases=phases, replan_error_um=math.inf)
+        return replace(changed, mission=mission)
+
+
+@dataclass(slots=True)
+class Replayed:
+    """What a replay found."""
+
+    source: Path
+    config: Config
+    chip: Chip
+    report: RunReport
+    recorded: Tick
+    replayed: Tick
+    true_field: FlowField | None
+    comparison: Comparison
+    out: Path | None = None
+    wall_s: float = 0.0
+    duration_s: float = 0.0
+    frames_missing: int = 0
+    commands: CommandDifference = field(default_factory=lambda: CommandDifference())
+    worker_results: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class CommandDifference:
+    """A sink's tally of how far the replayed demand is from the recorded one."""
+
+    compared: int = 0
+    changed: int = 0
+    first_ns: int | None = None
+    _square: float = 0.0
+    largest_um_s: float = 0.0
+
+    def add(self, was: Demand | None, now: Demand | None) -> None:
+        """Compare one pair of demands."""
+        if was is None or now is None:
+            return
+        self.compared += 1
+        difference = math.dist(was.velocity_um_s, now.velocity_um_s)
+        self._square += difference**2
+        self.largest_um_s = max(self.largest_um_s, difference)
+        if difference > 1.0:  # um/s: below that nobody would see it
+            self.changed += 1
+            self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
+
+    @property
+    def rms_um_s(self) -> float:
+        """Root mean square difference of the demanded velocity."""
+        return math.sqrt(self._square / self.compared) if self.compared else 0.0
+
+
+def stale_results(recorded: Config, changed: Config) -> frozenset[str]:
+    """The worker results that must be made anew; changing what a recording has settled is a UsageError."""
+    stale: frozenset[str] = frozenset()
+    for section in fields(Config):
+        if getattr(recorded, section.name) == getattr(changed, section.name):
+            continue
+        if section.name in FIXED:
+            raise UsageError(
+                f"--set {section.name}...: a replay can not change the {section.name} of a recording; "
+                "record again, or use --refly"
+            )
+        stale |= STALE.get(section.name, frozenset())
+    return stale
+
+
+def replay(
+    path: Path,
+    change: Change,
+    from_s: float | None = None,
+    verify: bool = False,
+    out: Path | None = None,
+    overwrite: bool = False,
+    frames: bool = False,
+) -> Replayed:
+    """Replay `path` with `change`; write the result to `out` when given (without camera frames unless `frames`)."""
+    reader, recorded_config, chip = open_session(path)
+    config = change.apply(recorded_config)
+    stale = stale_results(recorded_config, config)
+    if change.refine is not None:
+        stale |= STALE["refine"]
+    if verify and (stale or config != recorded_config):
+        raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
+    pipeline = assemble(config, chip)
+    start_ns = nanoseconds(from_s) if from_s is not None else None
+    if start_ns is not None and not reader.first_ns <= start_ns <= reader.last_ns:
+        raise UsageError(
+            f"--from {from_s:g}: {path} runs from {seconds(reader.first_ns):g} s to {seconds(reader.last_ns):g} s"
+        )
+    start = reader.tick_before(start_ns) if start_ns is not None else Tick()
+    rig = RecordedRig(reader, start_ns, stale)
+    worker = LockstepWorker(pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale)
+    _resubmit(reader, start, worker)
+    checker = WorkerCheck(pipeline) if verify else None
+    comparison, commands = Comparison(), CommandDifference()
+    truth: list[FlowField] = [] if start.true_field is None else [start.true_field]
+
+    def on_tick(tick: Tick) -> None:
+        comparison.add(rig.recorded, tick)
+        commands.add(rig.recorded.demand, tick.demand)
+        if tick.true_field is not None:
+            truth.append(tick.true_field)
+        if checker is not None:
+            checker.see(tick)
+        done(seconds(tick.stamp_ns - first_ns))
+
+    stop = StopSwitch()
+    first_ns = start_ns if start_ns is not None else reader.first_ns
+    with ExitStack() as stack:
+        sinks: list[Sink] = []
+        writer = None
+        if out is not None:
+            parent = {"file": path.name, "sha256": file_sha256(path)}
+            writer = stack.enter_context(
+                SessionWriter(
+                    out,
+                    session_header(config, chip, parent),
+                    flush_s=config.recording.flush_s,
+                    queue_bytes=int(config.recording.queue_mb * 1e6),
+                    block=True,
+                    overwrite=overwrite,
+                )
+            )
+            sinks.append(writer if frames else WithoutFrames(writer))
+        done = stack.enter_context(progress(f"replaying {path.name}", max(seconds(reader.last_ns - first_ns), 1e-3)))
+        with stop.armed():
+            report = run(pipeline, rig, worker, sinks, start=start, stop=stop, on_tick=on_tick, end_when_finished=False)
+        last = report.last
+        if stale and not stop.reason:
+            last = _closing_work(pipeline, config, report.last, rig.recorded, stale)
+            if last is not report.last and sinks:
+                sinks[0].write(last)
+        if writer is not None:
+            writer.close({"outcome": "replayed", "note": f"replay of {path.name}", "ticks": str(report.ticks)})
+    if report.ticks == 0:
+        raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
+    return Replayed(
+        source=path,
+        config=config,
+        chip=chip,
+        report=report,
+        recorded=rig.recorded,
+        replayed=last,
+        true_field=truth[-1] if truth else None,
+        comparison=comparison,
+        out=out,
+        wall_s=report.wall_s,
+        duration_s=report.duration_s,
+        frames_missing=rig.frames_missing,
+        commands=commands,
+        worker_results=checker.results if checker is not None else [],
+    )
+
+
+def adoption_stamps(reader: SessionReader) -> dict[int, int]:
+    """For each work order of a recording, by number, the tick that adopted its result."""
+    stamps: dict[int, int] = {}
+    for name in ("assumed", "refined", "route"):
+        for message in reader.messages(name):
+            assert isinstance(message, FlowField | Route)
+            stamps[message.request] = message.stamp_ns
+    return stamps
+
+
+class WithoutFrames:
+    """A sink that leaves the camera images in the parent session, which the replay names by hash."""
+
+    def __init__(self, writer: SessionWriter) -> None:
+        self._writer = writer
+
+    def write(self, tick: Tick) -> None:
+        self._writer.write(replace(tick, frame=None))
+
+
+class WorkerCheck:
+    """Does each recorded work order again and compares the adopted result with its topic's tolerance."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pipeline = pipeline
+        self._made: dict[int, FlowField | Route] = {}
+        self._asked = 0
+        self._last = Tick()
+        self.comparison = Comparison()
+        self.results: list[str] = []
+
+    def see(self, tick: Tick) -> None:
+        """Take note of one tick: new orders are worked on, adopted results compared."""
+        for name in ("assumed", "refined", "route"):
+            adopted = getattr(tick, name)
+            if adopted is None or adopted is getattr(self._last, name) or adopted.request not in self._made:
+                continue
+            made = replace(self._made.pop(adopted.request), stamp_ns=adopted.stamp_ns)
+            topic = BY_FIELD[name]
+            differs = self.comparison.add_pair(topic, adopted, made, tick.stamp_ns)
+            count = self.comparison.topics[topic.path]
+            same = "identical" if adopted.same_as(made) else f"within tolerance ({count.first})"
+            self.results.append(
+                f"{topic.path} {adopted.method}: {'DIFFERENT: ' + str(count.first) if differs else same}"
+            )
+        mission = tick.mission
+        if mission is not None and mission.wanted and mission.request > self._asked:
+            self._asked = mission.request
+            self._made[mission.request] = work(self._pipeline, tick)
+        self._last = tick
+
+    @property
+    def same(self) -> bool:
+        """Whether every result could be made again."""
+        return self.comparison.same
+
+
+def _resubmit(reader: SessionReader, start: Tick, worker: LockstepWorker) -> None:
+    """An order that was on its way at the starting tick is given again, with what was known when it was given."""
+    mission = start.mission
+    if mission is None or not mission.wanted:
+        return
+    answer = getattr(start, FILLS[mission.wanted])
+    if answer is None or answer.request != mission.request:
+        worker.submit(reader.tick_before(mission.requested_ns))
+
+
+def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick, stale: frozenset[str]) -> Tick:
+    """Refine and plan after the last frame what the recording ended too early to adopt, or never asked for."""
+    mission = last.mission
+    if mission is None or last.assumed is None:
+        return last
+    stamp_ns = last.stamp_ns + 1
+    tick = replace(last, stamp_ns=stamp_ns, event=None)
+    number = mission.request
+    if "refined" in stale and "refine" in config.mission.phases and last.refined is None:
+        number += 1
+        order = replace(mission, stamp_ns=stamp_ns, wanted="refine", request=number, requested_ns=stamp_ns)
+        refined = work(pipeline, replace(tick, mission=order))
+        assert isinstance(refined, FlowField)
+        tick = replace(tick, refined=refined)
+    wants_route = "plan" in config.mission.phases or "navigate" in config.mission.phases
+    planned = last.route is not None and last.route is not recorded.route and mission.phase in ("navigate", "done")
+    if "route" in stale and wants_route and (tick.refined is not last.refined or not planned):
+        assert last.estimate is not None
+        order = replace(
+            mission,
+            stamp_ns=stamp_ns,
+            wanted="route",
+            request=number + 1,
+            requested_ns=stamp_ns,
+            start_um=_planned_from(recorded, last),
+        )
+        route = work(pipeline, replace(tick, mission=order))
+        assert isinstance(route, Route)
+        tick = replace(tick, route=route)
+    return tick if tick.refined is not last.refined or tick.route is not last.route else last
+
+
+def _planned_from(recorded: Tick, last: Tick) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Where the recorded route began, else where the robot is."""
+    if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
+        return recorded.route.waypoints_um[0]
+    assert last.estimate is not None
+    return last.estimate.position_um
+
+
+def residual_um_s(flow: FlowField, observations: Observations) -> float:
+    """Root mean square of observed minus mapped flow, um/s, both components together."""
+    miss = observations.flow_um_s - sample(flow, observations.position_um)
+    return float(np.sqrt((miss**2).sum(axis=1).mean())) if len(miss) else math.nan
+
+
+def before_and_after(done: Replayed) -> list[tuple[str, str, str]]:
+    """Rows of quantity, recorded, replayed: what the change is worth."""
+    was, now = done.recorded, done.replayed
+    rows: list[tuple[str, str, str]] = []
+
+    def flow_error(flow: FlowField | None) -> str:
+        if flow is None or done.true_field is None:
+            return "-"
+        return f"{100 * relative_rmse(flow, done.true_field, done.chip.mask).v:.1f} %"
+
+    observations = now.observations or was.observations or no_observations(0)
+    rows.append(("map", _map_name(was), _map_name(now)))
+    if done.true_field is not None:
+        rows.append(("flow error, assumed", flow_error(was.assumed), flow_error(now.assumed)))
+        rows.append(("flow error, refined", flow_error(was.refined), flow_error(now.refined)))
+    if len(observations.position_um) and was.field is not None and now.field is not None:
+        rows.append(
+            (
+                f"residual of {len(observations.position_um)} observations",
+                f"{residual_um_s(was.field, observations):.1f} um/s",
+                f"{residual_um_s(now.field, observations):.1f} um/s",
+            )
+        )
+    if was.route is not None or now.route is not None:
+        rows.append(("planner", _planner(was.route), _planner(now.route)))
+        rows.append(("path length", _length(was.route), _length(now.route)))
+        if now.field is not None:
+            limit = done.config.plan.speed_share * done.config.robot.speed_limit_um_s
+            rows.append(
+                (
+                    f"travel time on the {now.field.method} map",
+                    _time_on(was.route, now.field, limit),
+                    _time_on(now.route, now.field, limit),
+                )
+            )
+    commands = done.commands
+    since = f", first at {seconds(commands.first_ns):.2f} s" if commands.first_ns is not None else ""
+    rows.append(
+        (
+            "commands that differ",
+            "-",
+            f"{commands.changed} of {commands.compared} ticks (rms {commands.rms_um_s:.0f} um/s{since})",
+        )
+    )
+    return rows
+
+
+def _map_name(tick: Tick) -> str:
+    return tick.field.method if tick.field is not None else "none"
+
+
+def _planner(route: Route | None) -> str:
+    return "none" if route is None else route.method if route.reachable else f"{route.method}: unreachable"
+
+
+def _length(route: Route | None) -> str:
+    return f"{length_mm(route):.2f} mm" if route is not None and route.reachable else "-"
+
+
+def _time_on(route: Route | None, flow: FlowField, limit_um_s: float) -> str:
+    if route is None or not route.reachable:
+        return "-"
+    arrival_s, feasible = travel_time(flow, route.waypoints_um, limit_um_s)
+    return f"{arrival_s[-1]:.1f} s" if feasible else "can not be followed"
+
+
+def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tuple[str, str, str]]:
+    """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
+
+    Both start where the recorded route began and use the same seed; rows of quantity, recorded, replayed.
+    """
+    flow = done.replayed.field
+    if flow is None or done.recorded.mission is None or done.recorded.route is None:
+        raise UsageError(
+            "--refly: the session has no map or no route to fly; replay it with --refine --plan astar_time"
+        )
+    source_config = open_session(done.source)[1]
+    start = tuple(float(value) for value in _planned_from(done.recorded, done.replayed))
+    rows = []
+    flights = {
+        "recorded": (source_config, done.recorded, None),
+        "replayed": (done.config, done.replayed, out),
+    }
+    reports: dict[str, RunReport] = {}
+    for name, (config, tick, target) in flights.items():
+        assert len(start) == 2
+        mission = replace(config.mission, phases=("plan", "navigate"), start=start, replan_error_um=None)
+        flown = replace(config, mission=mission)
+        pipeline = assemble(flown, done.chip)
+        rig = SimulatedRig(
+            done.chip, flown.robot, pipeline.calibration, flown.camera, flown.simulated, start, true_field=flow
+        )
+        known: Mapping[str, FlowField] = {
+            key: value for key in ("assumed", "refined") if (value := getattr(tick, key)) is not None
+        }
+        worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
+        sinks: list[Sink] = []
+        with ExitStack() as stack:
+            if target is not None:
+                parent = {"file": done.source.name, "sha256": file_sha256(done.source)}
+                header = session_header(flown, done.chip, parent)
+                writer = stack.enter_context(SessionWriter(target, header, block=True, overwrite=overwrite))
+                sinks.append(writer)
+            say(f"reflying as {name} ...")
+            reports[name] = report = run(pipeline, rig, worker, sinks)
+            if target is not None:
+                writer.close({"outcome": report.outcome, "note": f"refly of {done.source.name}"})
+    rows.append(("reflown: outcome", reports["recorded"].outcome, reports["replayed"].outcome))
+    rows.append(("reflown: navigation", *(_navigation_s(reports[name]) for name in ("recorded", "replayed"))))
+    rows.append(("reflown: wall contacts", *(str(reports[name].contacts) for name in ("recorded", "replayed"))))
+    return rows
+
+
+def _navigation_s(report: RunReport) -> str:
+    """Time from the adopted route to the end."""
+    mission, route = report.last.mission, report.last.route
+    if mission is None or route is None or not mission.finished:
+        return "-"
+    return (
+        f"{seconds(mission.since_ns - route.stamp_ns):.1f} s (planned {route.arrival_s[-1]:.1f} s)"
+        if len(route.arrival_s)
+        else "-"
+    )
+
+
+def verdict(done: Replayed) -> tuple[bool, list[str]]:
+    """Lines that say how the replay compares with the recording, and whether it is the same."""
+    comparison = done.comparison
+    lines = []
+    for topic, count in comparison.topics.items():
+        total = count.identical + count.within_tolerance + count.different
+        lines.append(
+            f"{topic:20s} {count.identical} of {total} identical"
+            + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
+            + (f", {count.different} DIFFERENT" if count.different else "")
+        )
+    lines.extend(done.worker_results)
+    same = comparison.same and not any("DIFFERENT" in line for line in done.worker_results)
+    if done.frames_missing:
+        lines.append(f"{done.frames_missing} frames were dropped by the recording; their recorded tracks stood in")
+    if comparison.first is not None:
+        lines.append(f"first difference: {comparison.first}")
+    lines.append(
+        f"{comparison.ticks} ticks: "
+        + ("every tick identical" if comparison.identical else "the same within tolerance" if same else "NOT the same")
+    )
+    return same, lines
+
+
+def default_out(path: Path) -> Path:
+    """SESSION_replay_001.mcap beside the session, the first number that is free."""
+    for number in range(1, 1000):
+        out = path.with_name(f"{path.stem}_replay_{number:03d}.mcap")
+        if not out.exists():
+            return out
+    raise SessionError(f"{path.parent}: 999 replays of {path.name} are here; name one with --out")

@@ -1,0 +1,66 @@
+"""The rig of a replay: everything arrives as it did, nothing is sent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from flowrec.messages import Currents, Tick
+from flowrec.pipeline import Inputs
+from flowrec.store import SessionReader
+
+
+class RecordedRig:
+    """Plays a session's inputs. Worker results of fields in `recompute` are left out: the replay makes its own.
+
+    `recorded` is the recorded tick that belongs to the inputs last yielded, for comparing.
+    """
+
+    def __init__(
+        self, reader: SessionReader, start_ns: int | None = None, recompute: frozenset[str] = frozenset()
+    ) -> None:
+        self._reader = reader
+        self._start_ns = start_ns
+        self._recompute = recompute
+        self.recorded = Tick()
+        self.frames_missing = 0
+
+    def __enter__(self) -> RecordedRig:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Nothing to switch off."""
+
+    def inputs(self) -> Iterator[Inputs]:
+        """One Inputs per recorded tick after the start."""
+        before = self._reader.tick_before(self._start_ns) if self._start_ns is not None else Tick()
+        for tick in self._reader.ticks(self._start_ns):
+            if tick.applied is None or tick.applied is before.applied:
+                continue  # not a whole tick: the one a crash cut off, or messages of an operator alone
+            self.recorded = tick
+            frame = tick.frame if tick.frame is not before.frame else None
+            track = None
+            if frame is None:
+                if tick.track is None or tick.track is before.track:
+                    before = tick
+                    continue  # a crash left the inputs without an image: nothing to replay
+                self.frames_missing += 1
+                track = tick.track
+            yield Inputs(
+                stamp_ns=tick.stamp_ns,
+                frame=frame,
+                applied=tick.applied,
+                operator=tick.operator if tick.operator is not before.operator else None,
+                assumed=tick.assumed if self._adopted("assumed", tick, before) else None,
+                refined=tick.refined if self._adopted("refined", tick, before) else None,
+                route=tick.route if self._adopted("route", tick, before) else None,
+                track=track,
+                truth=tick.truth if tick.truth is not before.truth else None,
+                true_field=tick.true_field if tick.true_field is not before.true_field else None,
+            )
+            before = tick
+
+    def apply(self, currents: Currents) -> None:
+        """Recorded coils hear nothing."""
+
+    def _adopted(self, field: str, tick: Tick, before: Tick) -> bool:
+        return field not in self._recompute and getattr(tick, field) is not getattr(before, field)

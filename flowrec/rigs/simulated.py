@@ -1,0 +1,231 @@
+"""The simulated rig: a microscope, coils and a robot in a flow that is not quite the assumed one.
+
+It knows what no stage may know, and says it only in `truth` and `true_field`. Everything is drawn from the seed and
+from what is applied: same seed, same commands, same bytes, however long the loop takes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.chip.calibration import Calibration
+from flowrec.chip.chip import Chip
+from flowrec.chip.clearance import check_point, clearance_um
+from flowrec.errors import RigError
+from flowrec.flow import FlowSolver
+from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
+from flowrec.pipeline import Inputs
+from flowrec.rigs.debris import Debris
+from flowrec.rigs.microscope import Microscope
+from flowrec.rigs.swimmer import Swimmer
+from flowrec.robot import Robot
+from flowrec.settings import CameraSettings, Simulated
+from flowrec.units import NS_PER_S, nanoseconds, seconds
+
+_COILS = 3
+_DEFAULT_RATE_HZ = 30.0
+
+
+def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
+    """The chip with the boundary values and the viscosity that really hold, drawn from the seed.
+
+    Each inlet speed times 1 +- inlet_speed_error, the viscosity times 1 +- viscosity_error, each outlet's pressure
+    plus up to +- outlet_pressure_error of the pressure drop across the chip; all uniform. One outlet alone keeps its
+    pressure: only differences drive a flow.
+    """
+    rng = np.random.default_rng([simulated.seed, 5])
+    inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
+    draws = rng.uniform(-1.0, 1.0, len(inlet))
+    viscosity = chip.viscosity_mpa_s * (1.0 + simulated.viscosity_error * float(rng.uniform(-1.0, 1.0)))
+    values = chip.boundary_values * np.where(inlet, 1.0 + simulated.inlet_speed_error * draws, 1.0)
+    changed = chip.with_boundary(values, viscosity)
+    if simulated.outlet_pressure_error == 0.0 or np.count_nonzero(~inlet) < 2:
+        return changed
+    pressure = solver.solve(changed).pressure_pa[chip.mask]
+    drop = float(pressure.max() - pressure.min())
+    values = values + np.where(inlet, 0.0, simulated.outlet_pressure_error * drop * draws)
+    return chip.with_boundary(values, viscosity)
+
+
+class SimulatedRig:
+    """Camera, coils and the world between them. A context manager; `inputs()` yields frames, `apply()` takes currents.
+
+    Parameters
+    ----------
+    chip, calibration : the chip as it is assumed, and where the camera looks at it
+    robot : resolved (no None); its delay is from `apply` to motion
+    start_um : (2,) where the robot's centre is on the first frame
+    duration_s : None goes on for ever
+    realtime : pace the frames to the wall clock; none is skipped, a late one is just late
+    true_field : a flow to use instead of solving for one, for tests and for known flows
+
+    Raises RigError or ChipError for settings that no world can be made of.
+    """
+
+    def __init__(
+        self,
+        chip: Chip,
+        robot: Robot,
+        calibration: Calibration,
+        camera: CameraSettings,
+        simulated: Simulated,
+        start_um: ArrayLike,
+        duration_s: float | None = None,
+        realtime: bool = False,
+        true_field: FlowField | None = None,
+    ) -> None:
+        _refuse_nonsense(camera, simulated)
+        check_point(chip, start_um, "start", robot.radius)
+        self._chip = chip
+        self._robot = robot
+        self._calibration = calibration
+        self._camera = camera
+        self._simulated = simulated
+        x, y = (float(value) for value in np.asarray(start_um, np.float64))
+        self._start_um = (x, y)
+        self._rate_hz = _DEFAULT_RATE_HZ if camera.rate_hz is None else camera.rate_hz
+        self._frames = math.inf if duration_s is None else max(1.0, math.floor(duration_s * self._rate_hz) + 1)
+        self._realtime = realtime
+        self._field = true_field
+        self._delay_ns = nanoseconds(robot.delay_s if simulated.delay_s is None else simulated.delay_s)
+        self._now_ns = 0
+        # What the coils do now, and what is on its way to them: (stamp of its effect, command).
+        self._acting: Currents | None = None
+        self._coming: list[tuple[int, Currents]] = []
+        self._latest: Currents | None = None
+
+    def __enter__(self) -> SimulatedRig:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.zero()
+
+    def apply(self, currents: Currents) -> None:
+        """Send a command; the field changes when the delay is over. The same message again is no new command."""
+        if currents is self._latest:
+            return
+        self._latest = currents
+        self._coming.append((self._now_ns + self._delay_ns, currents))
+
+    def zero(self) -> None:
+        """Send no field and no currents."""
+        stopped = Currents(self._now_ns, 0.0, 0.0, 0.0, 0.0, np.zeros(_COILS), False)
+        self.apply(stopped)
+
+    def inputs(self) -> Iterator[Inputs]:
+        """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
+        field = self._true_field()
+        walls = clearance_um(self._chip.mask, self._chip.um_per_px)
+        radius, seed, px = self._robot.radius, self._simulated.seed, self._chip.um_per_px
+        swimmer = Swimmer(self._start_um, self._robot, self._simulated, field.velocity_um_s, walls, px)
+        debris = Debris(self._chip, self._camera.debris, radius, field.velocity_um_s, walls, seed)
+        microscope = Microscope(self._chip.mask, px, self._calibration, self._camera, seed)
+        moving = slice(0, len(debris.points_um) - debris.still)
+        for n in range(moving.stop, len(debris.points_um)):
+            microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))
+        debris.drift(0.0)  # compiles, so that the second frame is not late
+        began = math.inf
+        index = 0
+        while index < self._frames:
+            stamp = round(index * NS_PER_S / self._rate_hz)
+            before = swimmer.position_um
+            turns = self._advance(swimmer, stamp)
+            elapsed = seconds(stamp - self._now_ns)
+            if elapsed > 0:
+                debris.drift(elapsed)
+            self._now_ns = stamp
+            image = microscope.image(
+                None if swimmer.gone else swimmer.position_um,
+                radius,
+                (swimmer.position_um - before) / elapsed if elapsed > 0 else np.zeros(2),
+                debris.points_um[moving],
+                debris.radii_um[moving],
+                debris.darkness[moving],
+            )
+            if self._realtime:
+                # An image is there when its exposure is over. The first one, with all that it takes, sets the clock.
+                began = min(began, time.monotonic())
+                ready = began + seconds(stamp) + 0.5 * self._camera.exposure_s
+                time.sleep(max(0.0, ready - time.monotonic()))
+            yield Inputs(
+                stamp_ns=stamp,
+                frame=Frame(stamp, index, image),
+                applied=self._applied(stamp, turns),
+                truth=Truth(stamp, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
+                true_field=field if index == 0 else None,
+            )
+            index += 1
+
+    def _true_field(self) -> FlowField:
+        if self._field is None:
+            solver = FlowSolver(k=self._simulated.k)
+            truth = true_chip(self._chip, self._simulated, solver)
+            self._field = replace(solver.solve(truth), method="truth", note="drawn from the seed of the simulated rig")
+        if self._field.velocity_um_s.shape[:2] != self._chip.mask.shape:
+            raise RigError(
+                f"true flow has {self._field.velocity_um_s.shape[:2]} pixels, the chip {self._chip.mask.shape}; "
+                "solve it on this chip"
+            )
+        return self._field
+
+    def _advance(self, swimmer: Swimmer, until_ns: int) -> NDArray[np.float64]:
+        """Let the world go on to a stamp, switching the field exactly when commands arrive. Returns the turns (2,)."""
+        turns = np.zeros(2)
+        now = self._now_ns
+        while True:
+            switch = self._coming[0][0] if self._coming else until_ns
+            end = min(max(switch, now), until_ns)
+            if end > now and self._acting is None:
+                swimmer.advance(seconds(end - now), 0.0, 0.0, 0.0)
+            elif end > now and self._acting is not None:
+                field = self._acting
+                swimmer.advance(seconds(end - now), field.frequency_hz, field.heading_rad, field.amplitude_mt)
+                if field.amplitude_mt > 0:
+                    heading = np.array([math.cos(field.heading_rad), math.sin(field.heading_rad)])
+                    turns += field.frequency_hz * seconds(end - now) * heading
+            now = end
+            if not (self._coming and self._coming[0][0] <= now):
+                return turns
+            self._acting = self._coming.pop(0)[1]
+
+    def _applied(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
+        field = self._acting
+        if field is None:
+            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(_COILS), turns)
+        return Applied(stamp_ns, field.frequency_hz, field.heading_rad, field.amplitude_mt, field.currents_a, turns)
+
+
+def _refuse_nonsense(camera: CameraSettings, simulated: Simulated) -> None:
+    """Raise RigError for numbers that no world can be made of."""
+    positive = {
+        "camera.width_px": camera.width_px,
+        "camera.height_px": camera.height_px,
+        "camera.photons_per_level": camera.photons_per_level,
+        "camera.background": camera.background,
+        "camera.rate_hz": _DEFAULT_RATE_HZ if camera.rate_hz is None else camera.rate_hz,
+        "simulated.k": simulated.k,
+    }
+    for name, value in positive.items():
+        if not (math.isfinite(value) and value > 0):
+            raise RigError(f"{name} = {value:g}: the simulated rig needs more than zero")
+    at_least_zero = {
+        "camera.debris": camera.debris,
+        "camera.exposure_s": camera.exposure_s,
+        "camera.blur_px": camera.blur_px,
+        "camera.read_noise": camera.read_noise,
+        "simulated.position_noise_um": simulated.position_noise_um,
+        "simulated.seed": simulated.seed,
+        "simulated.delay_s": simulated.delay_s or 0.0,
+    }
+    for name, value in at_least_zero.items():
+        if not (math.isfinite(value) and value >= 0):
+            raise RigError(f"{name} = {value:g}: the simulated rig can not take less than zero")
+    for name in ("inlet_speed_error", "viscosity_error"):
+        if not 0 <= getattr(simulated, name) < 1:
+            raise RigError(f"simulated.{name} = {getattr(simulated, name):g}: it is a share, from 0 to below 1")

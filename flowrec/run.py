@@ -1,0 +1,292 @@
+"""The one loop. Record and replay differ only in the rig and in where the worker's results come from."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
+from types import FrameType
+from typing import Protocol
+
+from flowrec import work as working
+from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Timing
+from flowrec.pipeline import Inputs, Pipeline, step
+from flowrec.units import nanoseconds, seconds
+from flowrec.work import FILLS, work
+
+
+class Rig(Protocol):
+    """Camera and coils. Leaving the context zeroes the coils."""
+
+    def __enter__(self) -> Rig: ...
+
+    def __exit__(self, *error: object) -> None: ...
+
+    def inputs(self) -> Iterator[Inputs]:
+        """What arrives, frame by frame."""
+
+    def apply(self, currents: Currents) -> None:
+        """Send a command to the coils."""
+
+
+class Sink(Protocol):
+    """Takes every tick and must not keep the loop waiting."""
+
+    def write(self, tick: Tick) -> None:
+        """Take one tick."""
+
+
+class Worker(Protocol):
+    """Does the slow stages beside the loop."""
+
+    def submit(self, order: Tick) -> None:
+        """Start on `order.mission`."""
+
+    def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
+        """Results to be adopted on the tick of this stamp, by field of Tick."""
+
+    def close(self) -> None:
+        """Let go of processes."""
+
+
+class LockstepWorker:
+    """Adopts each result a fixed time after its order: same seed, same session, however fast the machine is.
+
+    `schedule` (request number to stamp) overrides the time: a replay adopts where the recording did. Orders for
+    fields outside `fills` are somebody else's (in a replay: recorded).
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        adopt_after_s: float,
+        schedule: Mapping[int, int] | None = None,
+        fills: Iterable[str] = ("assumed", "refined", "route"),
+    ) -> None:
+        self._pipeline = pipeline
+        self._after_ns = nanoseconds(adopt_after_s)
+        self._schedule = dict(schedule or {})
+        self._fills = frozenset(fills)
+        self._order: Tick | None = None
+
+    def submit(self, order: Tick) -> None:
+        assert order.mission is not None
+        if FILLS[order.mission.wanted] in self._fills:
+            self._order = order
+
+    def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
+        if self._order is None:
+            return {}
+        mission = self._order.mission
+        assert mission is not None
+        if stamp_ns < self._schedule.get(mission.request, mission.requested_ns + self._after_ns):
+            return {}
+        return {FILLS[mission.wanted]: replace(self.drain(), stamp_ns=stamp_ns)}
+
+    def drain(self) -> FlowField | Route:
+        """Do the pending order now."""
+        assert self._order is not None
+        order, self._order = self._order, None
+        return work(self._pipeline, order)
+
+    @property
+    def pending(self) -> bool:
+        """Whether an order waits."""
+        return self._order is not None
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class ProcessWorker:
+    """Works in a process of its own, so that the control loop of a live run never waits for it."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self._pool = ProcessPoolExecutor(
+            1, mp_context=get_context("spawn"), initializer=working.start_process, initargs=(pipeline,)
+        )
+        self._pool.submit(working.warm_up)
+        self._pending: tuple[str, Future[FlowField | Route]] | None = None
+
+    def submit(self, order: Tick) -> None:
+        assert order.mission is not None
+        known = Tick(
+            stamp_ns=order.stamp_ns,
+            assumed=order.assumed,
+            refined=order.refined,
+            observations=order.observations,
+            mission=order.mission,
+        )
+        self._pending = (FILLS[order.mission.wanted], self._pool.submit(working.work_in_process, known))
+
+    def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
+        if self._pending is None or not self._pending[1].done():
+            return {}
+        name, future = self._pending
+        self._pending = None
+        return {name: replace(future.result(), stamp_ns=stamp_ns)}
+
+    def close(self) -> None:
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Preloaded:
+    """A worker whose first results are fields of an earlier session, adopted on the first tick."""
+
+    def __init__(self, worker: Worker, fields: Mapping[str, FlowField]) -> None:
+        self._worker = worker
+        self._fields = dict(fields)
+
+    def submit(self, order: Tick) -> None:
+        self._worker.submit(order)
+
+    def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
+        fields, self._fields = self._fields, {}
+        return {name: replace(field, stamp_ns=stamp_ns, request=0) for name, field in fields.items()} | dict(
+            self._worker.due(stamp_ns)
+        )
+
+    def close(self) -> None:
+        self._worker.close()
+
+
+@dataclass(slots=True)
+class StopSwitch:
+    """Raised by Ctrl-C or SIGTERM, read by the loop, which then ends the run in good order."""
+
+    reason: str = ""
+
+    @contextmanager
+    def armed(self) -> Iterator[StopSwitch]:
+        """Catch SIGINT and SIGTERM; a second one gets through."""
+
+        def stop(number: int, _frame: FrameType | None) -> None:
+            if self.reason:
+                raise KeyboardInterrupt
+            self.reason = signal.Signals(number).name
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+@dataclass(slots=True)
+class RunReport:
+    """How a run went, for the outcome record and the summary."""
+
+    outcome: str = "time over"
+    note: str = ""
+    ticks: int = 0
+    duration_s: float = 0.0
+    wall_s: float = 0.0
+    contacts: int = 0
+    last: Tick = field(default_factory=Tick)
+
+
+def run(
+    pipeline: Pipeline,
+    rig: Rig,
+    worker: Worker,
+    sinks: Sequence[Sink],
+    start: Tick | None = None,
+    stop: StopSwitch | None = None,
+    on_tick: Callable[[Tick], None] | None = None,
+    queue_state: Callable[[], tuple[float, int]] = lambda: (0.0, 0),
+    end_when_finished: bool = True,
+) -> RunReport:
+    """Run until the rig ends, the mission is finished and the coils are at zero, or somebody stops it.
+
+    `start` is the tick to resume from; `queue_state` tells MB waiting for the disk and frames dropped.
+    A stage that fails leaves its inputs, and only those, as the last tick in the sinks.
+    """
+    report = RunReport()
+    tick = start if start is not None else Tick()
+    first_ns: int | None = None
+    clock = time.perf_counter
+    began = clock()
+    laps: dict[str, float] = {}
+    mark = clock()
+    sinks_ms = 0.0
+
+    def lap(stage: str) -> None:
+        nonlocal mark
+        now = clock()
+        laps[stage] = (now - mark) * 1e3
+        mark = now
+
+    with ExitStack() as stack:
+        stack.callback(worker.close)
+        stack.enter_context(rig)
+        for arrived in rig.inputs():
+            begin = mark = clock()
+            inputs = replace(arrived, **worker.due(arrived.stamp_ns))
+            if stop is not None and stop.reason:
+                asked = OperatorEvent(inputs.stamp_ns, "stop", f"stopped by {stop.reason}")
+                inputs = replace(inputs, operator=asked)
+            last = tick
+            mark = clock()
+            try:
+                tick = step(pipeline, last, inputs, lap)
+            except Exception:
+                _write(sinks, _only_inputs(last, inputs))
+                raise
+            assert tick.currents is not None
+            assert tick.mission is not None
+            rig.apply(tick.currents)
+            if tick.mission.wanted and (last.mission is None or tick.mission.request != last.mission.request):
+                worker.submit(tick)
+            lap("apply")
+            queue_mb, dropped = queue_state()
+            timing = Timing(
+                stamp_ns=tick.stamp_ns,
+                track_ms=laps["track"],
+                observe_ms=laps["observe"],
+                control_ms=laps["control"] + laps["apply"],
+                sinks_ms=sinks_ms,  # of the tick before: this one's are still to come
+                total_ms=(clock() - begin) * 1e3 + sinks_ms,
+                queue_mb=queue_mb,
+                dropped_frames=dropped,
+            )
+            recorded = replace(tick, timing=timing, truth=inputs.truth, true_field=inputs.true_field)
+            _write(sinks, recorded)
+            lap("sinks")
+            sinks_ms = laps["sinks"]
+            first_ns = tick.stamp_ns if first_ns is None else first_ns
+            report.ticks += 1
+            report.duration_s = seconds(tick.stamp_ns - first_ns)
+            report.contacts = inputs.truth.contacts if inputs.truth is not None else report.contacts
+            if on_tick is not None:
+                on_tick(recorded)
+            if end_when_finished and tick.mission.finished and tick.currents.amplitude_mt == 0.0:
+                break
+    report.wall_s = clock() - began
+    report.last = tick
+    if tick.mission is not None and tick.mission.finished:
+        report.outcome, report.note = tick.mission.outcome, tick.mission.note
+    return report
+
+
+def _write(sinks: Sequence[Sink], tick: Tick) -> None:
+    for sink in sinks:
+        sink.write(tick)
+
+
+def _only_inputs(last: Tick, inputs: Inputs) -> Tick:
+    """The tick that could not be completed: what was known before, and the inputs that broke it."""
+    return replace(
+        last,
+        stamp_ns=inputs.stamp_ns,
+        frame=inputs.frame,
+        applied=inputs.applied,
+        operator=inputs.operator or last.operator,
+        assumed=inputs.assumed or last.assumed,
+        refined=inputs.refined or last.refined,
+        route=inputs.route or last.route,
+    )

@@ -1,0 +1,76 @@
+"""A session as the verbs handle it: what is written before the first frame, and what is read back to go on with it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from flowrec.chip import chip_files, chip_from_files
+from flowrec.chip.chip import Chip
+from flowrec.config import Config, config_from_toml, to_toml
+from flowrec.messages import Route
+from flowrec.provenance import provenance
+from flowrec.store import SessionHeader, SessionReader
+
+
+def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:
+    """Everything that must be in a file before its first frame."""
+    png, toml = chip_files(chip)
+    facts = provenance() | {
+        "operator": config.recording.operator,
+        "sample": config.recording.sample,
+        "notes": config.recording.notes,
+        "seed": str(config.simulated.seed),
+    }
+    return SessionHeader(to_toml(config), png, toml, facts, dict(parent or {}))
+
+
+def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:
+    """A session with the configuration and the chip that it carries."""
+    reader = SessionReader(path)
+    config = config_from_toml(reader.header.config_toml, f"{path}: config.toml inside")
+    return reader, config, chip_from_files(reader.header.chip_png, reader.header.chip_toml)
+
+
+def file_sha256(path: Path) -> str:
+    """Hash of a file's content, by which a replay names its parent."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def length_mm(route: Route) -> float:
+    """Length of a route in mm."""
+    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum()) / 1000.0
+
+
+def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
+    """Facts about a session for people, and its message counts by topic."""
+    reader, config, chip = open_session(path)
+    said = reader.header.provenance
+    width_um, height_um = chip.size_um
+    facts = {
+        "outcome": reader.outcome.get("outcome", "unknown") + _bracketed(reader.outcome.get("note", "")),
+        "duration": f"{reader.duration_s:.1f} s",
+        "size": f"{path.stat().st_size / 1e6:.1f} MB",
+        "chip": f"{chip.name}, {width_um / 1000:.2f} x {height_um / 1000:.2f} mm, {len(chip.openings)} openings",
+        "rig": config.rig,
+        "phases": " -> ".join(config.mission.phases),
+        "stages": f"{config.observer.method}, {config.refine.method}, {config.plan.method}, {config.control.method}",
+        "recorded": said.get("wall_time", "unknown"),
+        "by": f"flowrec {said.get('flowrec', '?')}" + _bracketed(said.get("git_commit", "")[:10]),
+    }
+    if reader.header.parent:
+        facts["replay of"] = reader.header.parent.get("file", "?")
+    facts |= {
+        key.replace("_", " "): value
+        for key, value in reader.outcome.items()
+        if key not in ("outcome", "note", "duration")
+    }
+    return facts, dict(reader.counts)
+
+
+def _bracketed(text: str) -> str:
+    return f" ({text})" if text else ""

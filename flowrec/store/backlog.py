@@ -1,0 +1,79 @@
+"""What waits for the disk: a queue bounded by bytes, from the control loop to the writer's thread."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from flowrec.messages import Message
+
+News = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """The new messages of one tick and about what they weigh in memory."""
+
+    stamp_ns: int
+    news: News
+    nbytes: int
+
+
+class Backlog:
+    """First in, first out; `close` lets the thread drain it, `abandon` frees everyone who waits."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        self.nbytes = 0  # waiting, or in the hands of the thread
+        self._limit = limit_bytes
+        self._entries: deque[Entry] = deque()
+        self._changed = threading.Condition()
+        self._closed = self._abandoned = False
+
+    def has_room(self, nbytes: int) -> bool:
+        """Whether that many bytes fit in; an empty queue takes anything."""
+        return self.nbytes == 0 or self.nbytes + nbytes <= self._limit
+
+    def wait_for_room(self, nbytes: int) -> None:
+        """Block until that many bytes fit in, or until the queue is abandoned."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._abandoned or self.has_room(nbytes))
+
+    def put(self, entry: Entry) -> None:
+        """Append; never blocks."""
+        with self._changed:
+            self._entries.append(entry)
+            self.nbytes += entry.nbytes
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float | None) -> Entry | None:
+        """The next entry, None after the time is over or when the closed queue has run dry."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._entries or self._closed, timeout_s)
+            return self._entries.popleft() if self._entries else None
+
+    def done(self, entry: Entry) -> None:
+        """The entry has been dealt with: its bytes are free again."""
+        with self._changed:
+            self.nbytes -= entry.nbytes
+            self._changed.notify_all()
+
+    @property
+    def drained(self) -> bool:
+        """Closed, with nothing left to take."""
+        with self._changed:
+            return self._closed and not self._entries
+
+    def close(self) -> None:
+        """Nothing more will come."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def abandon(self) -> None:
+        """Forget what waits; the disk has failed."""
+        with self._changed:
+            self._closed = self._abandoned = True
+            self._entries.clear()
+            self.nbytes = 0
+            self._changed.notify_all()

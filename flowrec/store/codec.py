@@ -1,0 +1,173 @@
+"""Message <-> bytes, one codec per message type, bit for bit.
+
+Frames and events travel in standard schemas (standard.py); all others field by field, as schemas.py lays them out.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from flowrec.errors import SessionError
+from flowrec.messages import Event, Frame, Message, OperatorEvent
+from flowrec.store import standard
+from flowrec.store.form import Codec, Payload
+from flowrec.store.schemas import FieldForm, array_schema, forms_of, schema_of
+
+_M = TypeVar("_M", bound=Message)
+_PACKERS: dict[Any, Callable[[Any], Any]] = {int: operator.index, float: float, bool: bool, str: str}
+# Up to here a loop over the wire's values is quicker than numpy's general conversion.
+_SHORT_VECTOR = 64
+
+
+_codecs: dict[type[Any], Codec] = {
+    Frame: standard.frame_codec(),
+    Event: standard.event_codec(),
+    OperatorEvent: standard.operator_codec(),
+}
+
+
+def codec_of(message_type: type[Any]) -> Codec:
+    """The codec of a message type; made once."""
+    codec = _codecs.get(message_type)
+    if codec is None:
+        schema = schema_of(message_type)
+        codec = Codec(schema, _encoder(message_type, schema.wire), _decoder(message_type, schema.wire))
+        _codecs[message_type] = codec
+    return codec
+
+
+def encode(message: Message) -> bytes:
+    """One message as bytes; errors as `encode_record`."""
+    return b"".join(encode_record(message)[1])
+
+
+def encode_record(message: Message) -> tuple[int | None, Payload]:
+    """The MCAP sequence that a message must have, if any, and its payload in parts, large arrays uncopied.
+
+    Raises
+    ------
+    SessionError : a value that does not fit the message's declaration, such as an int beyond 64 bit.
+    """
+    codec = codec_of(type(message))
+    try:
+        try:
+            return codec.sequence(message), codec.encode(message)
+        except UnicodeEncodeError:
+            # Half a character from a terminal must not end a run: it is kept in spelled-out form.
+            return codec.sequence(message), codec.encode(_without_surrogates(message))
+    except (TypeError, ValueError, OverflowError) as error:
+        kind, stamp_ns = type(message).__name__, message_stamp(message)
+        raise SessionError(f"a {kind} at {stamp_ns} ns can not be stored: {error}") from error
+
+
+def decode(message_type: type[_M], payload: bytes | memoryview, sequence: int = 0) -> _M:
+    """One message from its bytes; `sequence` is MCAP's, where a Frame keeps its index.
+
+    Raises
+    ------
+    SessionError : bytes that are no such message.
+    """
+    try:
+        message: _M = codec_of(message_type).decode(payload, sequence)
+    except (DecodeError, ValueError, TypeError, OverflowError) as error:
+        raise SessionError(f"damaged {message_type.__name__}: {error}") from error
+    return message
+
+
+def message_stamp(message: Message) -> int:
+    """The stamp that every message type has, in ns."""
+    stamp: int = message.stamp_ns  # type: ignore[attr-defined]
+    return stamp
+
+
+def _without_surrogates(message: _M) -> _M:
+    changes = {}
+    for form in forms_of(type(message)):
+        value = getattr(message, form.name)
+        changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+    return type(message)(**changes)
+
+
+def _encoder(message_type: type[Any], wire: Any) -> Callable[[Any], Payload]:
+    packers = [(form.name, _packer(form), form.optional) for form in forms_of(message_type)]
+
+    def encode(message: Any) -> Payload:
+        values = {}
+        for name, pack, optional in packers:
+            value = getattr(message, name)
+            if value is not None:
+                values[name] = pack(value)
+            elif not optional:
+                raise ValueError(f"{name} is missing")
+        return (wire(**values).SerializeToString(),)
+
+    return encode
+
+
+def _packer(form: FieldForm) -> Callable[[Any], Any]:
+    if form.kind == "vector":
+        return _packed_vector
+    if form.kind == "array":
+        return _packed_array
+    return _PACKERS[form.kind]
+
+
+def _packed_vector(value: NDArray[Any]) -> list[float]:
+    if value.ndim != 1:
+        raise ValueError(f"a vector of shape {value.shape}")
+    numbers: list[float] = value.tolist()
+    return numbers
+
+
+def _packed_array(value: NDArray[Any]) -> Any:
+    return array_schema().wire(shape=value.shape, dtype=value.dtype.str, data=value.tobytes())
+
+
+def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview, int], Any]:
+    parse = wire.FromString
+    unpackers = [_unpacker(form) for form in forms_of(message_type)]
+
+    def decode(payload: bytes | memoryview, sequence: int) -> Any:
+        parsed = parse(payload)
+        return message_type(*[unpack(parsed) for unpack in unpackers])
+
+    return decode
+
+
+def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
+    name, dtype = form.name, form.dtype
+    present: Callable[[Any], Any]
+    if form.kind == "vector":
+
+        def present(parsed: Any) -> Any:
+            values = getattr(parsed, name)
+            count = len(values)
+            return np.fromiter(values, np.float64, count) if count < _SHORT_VECTOR else np.array(values, np.float64)
+
+    elif form.kind == "array":
+        assert dtype is not None
+
+        def present(parsed: Any) -> Any:
+            return _unpacked_array(getattr(parsed, name), dtype)
+
+    else:
+        present = operator.attrgetter(name)
+    if not form.optional:
+        return present
+    return lambda parsed: present(parsed) if parsed.HasField(name) else None
+
+
+def _unpacked_array(parsed: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+    if parsed.dtype != dtype.str:
+        raise ValueError(f"an array of {parsed.dtype!r} where {dtype.str!r} belongs")
+    shape, data = tuple(parsed.shape), parsed.data
+    if math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of shape {shape} in {len(data)} bytes")
+    return np.frombuffer(data, dtype).reshape(shape)

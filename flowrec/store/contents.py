@@ -1,0 +1,118 @@
+"""Whether a file is a session of this flowrec, and what it says about itself."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+from google.protobuf import descriptor_pb2
+from mcap.records import ChunkIndex, Statistics
+
+import flowrec
+from flowrec.errors import SessionError
+from flowrec.store.codec import codec_of
+from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
+from flowrec.store.source import Source
+from flowrec.topics import BY_PATH
+
+
+class Contents:
+    """The index of a session file.
+
+    Attributes
+    ----------
+    source : the file.
+    fields : field of Tick by channel number, for the topics that this flowrec knows.
+    chunks : where the messages are.
+    statistics : how many there are.
+    outcome : how the run ended.
+    flowrec_version : of the program that wrote it.
+
+    Raises
+    ------
+    SessionError : it is none, or not for this flowrec.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.source = Source(path)
+        try:
+            self._open()
+        except BaseException:
+            self.source.close()
+            raise
+
+    def _open(self) -> None:
+        path, header = self.source.path, self.source.header
+        if header.profile != PROFILE:
+            raise SessionError(
+                f"{path}: is an MCAP file of another program (profile {header.profile!r}, library {header.library!r});"
+                " flowrec reads what `flowrec record` has written"
+            )
+        self._summary = self.source.read_summary()
+        metadata = self._metadata()
+        if SESSION not in metadata:
+            raise SessionError(
+                f"{path}: is an MCAP file without the record {SESSION!r}, so not a session;"
+                " flowrec reads what `flowrec record` has written"
+            )
+        self.flowrec_version = metadata[SESSION].get("flowrec_version", "?")
+        self._check_version(metadata[SESSION].get("format_version", ""))
+        self.outcome = metadata.get(OUTCOME, {})
+        self.chunks: list[ChunkIndex] = self._summary.chunks
+        assert self._summary.statistics is not None  # Source has seen to it
+        self.statistics: Statistics = self._summary.statistics
+        self.fields = {
+            channel.id: BY_PATH[channel.topic].field
+            for channel in self._summary.channels.values()
+            if channel.topic in BY_PATH
+        }
+        for channel in self.fields:
+            self._check_schema(channel)
+
+    @functools.cached_property
+    def header(self) -> SessionHeader:
+        """Read when asked for: the network's weights may be large."""
+        attachments = {index.name: self.source.attachment(index) for index in self._summary.attachments}
+        try:
+            return header_from(self._metadata(), attachments)
+        except KeyError as error:
+            raise self.source.damaged(0, f"the record {error} is missing") from error
+        except UnicodeDecodeError as error:
+            raise self.source.damaged(0, error) from error
+
+    def _metadata(self) -> dict[str, dict[str, str]]:
+        return {index.name: self.source.metadata(index) for index in self._summary.metadata}
+
+    def _check_version(self, version: str) -> None:
+        if version == str(FORMAT_VERSION):
+            return
+        what = f"{self.source.path}: is a session of format {version!r}, written by flowrec {self.flowrec_version}"
+        newer = version.isdecimal() and int(version) > FORMAT_VERSION
+        need = f"install flowrec {self.flowrec_version} or later" if newer else "it is damaged or was edited"
+        raise SessionError(f"{what}; this is flowrec {flowrec.__version__} with format {FORMAT_VERSION}: {need}")
+
+    def _check_schema(self, channel_number: int) -> None:
+        channel = self._summary.channels[channel_number]
+        found = self._summary.schemas[channel.schema_id]
+        expected = codec_of(BY_PATH[channel.topic].type).schema
+        same_kind = (found.name, found.encoding, channel.message_encoding) == (expected.name, "protobuf", "protobuf")
+        # The standard schemas may gain fields and comments with a new foxglove-sdk and stay what they are.
+        if same_kind and (found.data == expected.data or not expected.name.startswith("flowrec.")):
+            return
+        with self.source.parsing(0):
+            theirs, ours = _fields_of(found.data), _fields_of(expected.data)
+        differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
+        raise SessionError(
+            f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
+            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {flowrec.__version__})"
+        )
+
+
+def _fields_of(data: bytes) -> set[tuple[str, bytes]]:
+    files = descriptor_pb2.FileDescriptorSet.FromString(data).file
+    return {
+        (f"{message.name}.{field.name}", field.SerializeToString(deterministic=True))
+        for file in files
+        for message in file.message_type
+        for field in message.field
+    }

@@ -1,0 +1,170 @@
+"""The bytes of an MCAP file as it grows, and the summary that closes it.
+
+mcap's own Writer can neither set the zstd level nor keep chunk groups apart, hence this one on top of its records.
+Layout: https://mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    MessageIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+MAGIC = b"\x89MCAP0\r\n"
+
+
+class McapFile:
+    """An MCAP file open for appending. Every call ends with the bytes handed to the operating system.
+
+    Raises
+    ------
+    OSError : from any method, when the disk refuses.
+    """
+
+    def __init__(self, path: Path, *, truncate: bool = False) -> None:
+        self.size = 0
+        self._crc = 0
+        self._schemas: list[McapRecord] = []
+        self._channels: list[McapRecord] = []
+        self._chunks: list[McapRecord] = []
+        self._attachments: list[McapRecord] = []
+        self._metadata: list[McapRecord] = []
+        self._counts: dict[int, int] = {}
+        self._span: tuple[int, int] | None = None
+        self._file = path.open("wb" if truncate else "xb", buffering=0)
+
+    def start(self, profile: str, library: str) -> None:
+        """Magic and header."""
+        self._append(MAGIC + _bytes_of(Header(profile=profile, library=library)))
+
+    def add(self, record: Metadata | Attachment | Schema | Channel) -> None:
+        """A record outside the chunks."""
+        data = _bytes_of(record)
+        if isinstance(record, Schema):
+            self._schemas.append(record)
+        elif isinstance(record, Channel):
+            self._channels.append(record)
+            self._counts[record.id] = 0
+        elif isinstance(record, Metadata):
+            self._metadata.append(MetadataIndex(offset=self.size, length=len(data), name=record.name))
+        else:
+            self._attachments.append(
+                AttachmentIndex(
+                    offset=self.size,
+                    length=len(data),
+                    log_time=record.log_time,
+                    create_time=record.create_time,
+                    data_size=len(record.data),
+                    name=record.name,
+                    media_type=record.media_type,
+                )
+            )
+        self._append(data)
+
+    def add_chunk(self, chunk: Chunk, indexes: list[MessageIndex]) -> None:
+        """A sealed chunk, followed by its message indexes in the same write."""
+        start, body = self.size, _bytes_of(chunk)
+        parts, offsets, end = [body], {}, start + len(body)
+        for index in indexes:
+            parts.append(_bytes_of(index))
+            offsets[index.channel_id] = end
+            end += len(parts[-1])
+            self._counts[index.channel_id] += len(index.records)
+        self._append(b"".join(parts))
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(body),
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.message_end_time,
+                message_index_length=end - start - len(body),
+                message_index_offsets=offsets,
+                message_start_time=chunk.message_start_time,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
+        first, last = self._span or (chunk.message_start_time, chunk.message_end_time)
+        self._span = min(first, chunk.message_start_time), max(last, chunk.message_end_time)
+
+    def finish(self) -> None:
+        """Data end, summary and footer; then the file is whole."""
+        self._append(_bytes_of(DataEnd(data_section_crc=self._crc)))
+        start = self.size
+        groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+        summary, offsets = bytearray(), bytearray()
+        for opcode, records in groups:
+            group = b"".join(map(_bytes_of, records))
+            if group:
+                at = start + len(summary)
+                offsets += _bytes_of(SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(group)))
+                summary += group
+        offset_start = start + len(summary)
+        footer = _bytes_of(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0))
+        # The checksum covers all of the summary up to itself, the last four bytes of the footer.
+        tail = bytes(summary + offsets) + footer[:-4]
+        self._append(tail + zlib.crc32(tail).to_bytes(4, "little") + MAGIC)
+
+    def sync(self) -> None:
+        """Have the disk itself keep what was appended."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file as it is; without `finish` it can only be recovered."""
+        self._file.close()
+
+    def _append(self, data: bytes) -> None:
+        self._crc = zlib.crc32(data, self._crc)
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        self.size += len(data)
+
+    def _statistics(self) -> Statistics:
+        first, last = self._span or (0, 0)
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts={channel: count for channel, count in self._counts.items() if count},
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=last,
+            message_start_time=first,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
+
+
+def _bytes_of(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data

@@ -1,0 +1,133 @@
+"""Derived views for other viewers: what Rerun and Foxglove show of a bare session file. The reader ignores them.
+
+Positions are in um, one unit of the 3D view = 1 um, in the chip's frame (origin at pixel (0, 0), x right, y down),
+so that pose, path and grid lie over each other; the frame_id is empty because a named one needs a transform tree.
+Both flow previews use one colour scale, viridis from 0 to the highest speed of the first field; solid is black.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flowrec.messages import Estimate, FlowField, Message, Route, Track
+from flowrec.store.schemas import foxglove_schema
+from flowrec.store.standard import timestamp
+
+_FLOAT32 = 7  # foxglove.PackedElementField.NumericType
+
+
+@dataclass(frozen=True, slots=True)
+class Mirror:
+    """One derived topic."""
+
+    path: str
+    schema: str
+    source: str
+
+
+ROBOT_POSE = Mirror("/view/robot_pose", "PoseInFrame", "estimate, else track")
+PATH = Mirror("/view/path", "PosesInFrame", "route")
+PATH_POINTS = Mirror("/view/path_points", "PointCloud", "route")
+FLOW_ASSUMED = Mirror("/view/flow_assumed", "CompressedImage", "assumed")
+FLOW_REFINED = Mirror("/view/flow_refined", "CompressedImage", "refined")
+FLOW_REFINED_GRID = Mirror("/view/flow_refined_grid", "Grid", "refined")
+
+MIRRORS = (ROBOT_POSE, PATH, PATH_POINTS, FLOW_ASSUMED, FLOW_REFINED, FLOW_REFINED_GRID)
+
+
+class Mirrors:
+    """Makes the derived messages of one session; remembers the colour scale."""
+
+    def __init__(self) -> None:
+        self.top_um_s: float | None = None  # speed at the bright end of the scale, set by the first field
+
+    def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, bytes]]:
+        """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
+        robot = news.get("estimate") or news.get("track")
+        if isinstance(robot, (Estimate, Track)):
+            yield ROBOT_POSE, robot.stamp_ns, _pose_in_frame(robot)
+        route = news.get("route")
+        if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
+            yield PATH, route.stamp_ns, _poses_in_frame(route)
+            yield PATH_POINTS, route.stamp_ns, _point_cloud(route)
+        for name, mirror in (("assumed", FLOW_ASSUMED), ("refined", FLOW_REFINED)):
+            field = news.get(name)
+            if isinstance(field, FlowField) and _drawable(field):
+                yield mirror, field.stamp_ns, self._preview(field)
+                if mirror is FLOW_REFINED:
+                    yield FLOW_REFINED_GRID, field.stamp_ns, _grid(field)
+
+    def _preview(self, field: FlowField) -> bytes:
+        speed = np.nan_to_num(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]), posinf=0.0)
+        if self.top_um_s is None:
+            self.top_um_s = float(speed.max()) or 1.0
+        grey = np.clip(speed * (255.0 / self.top_um_s), 0.0, 255.0).astype(np.uint8)
+        colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
+        colours[speed == 0.0] = 0
+        _, png = cv2.imencode(".png", colours)
+        image = _wire("CompressedImage")(timestamp=timestamp(field.stamp_ns), format="png", data=png.tobytes())
+        return _serialized(image)
+
+
+def _drawable(field: FlowField) -> bool:
+    return field.velocity_um_s.ndim == 3 and field.velocity_um_s.shape[2] == 2 and field.velocity_um_s.size > 0
+
+
+def _wire(name: str) -> Any:
+    return foxglove_schema(name).wire
+
+
+def _serialized(parsed: Any) -> bytes:
+    data: bytes = parsed.SerializeToString()
+    return data
+
+
+def _pose(x_um: float, y_um: float) -> dict[str, dict[str, float]]:
+    return {"position": {"x": x_um, "y": y_um, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
+def _pose_in_frame(robot: Estimate | Track) -> bytes:
+    pose = _pose(float(robot.position_um[0]), float(robot.position_um[1]))
+    return _serialized(_wire("PoseInFrame")(timestamp=timestamp(robot.stamp_ns), pose=pose))
+
+
+def _poses_in_frame(route: Route) -> bytes:
+    poses = [_pose(x, y) for x, y in route.waypoints_um.tolist()]
+    return _serialized(_wire("PosesInFrame")(timestamp=timestamp(route.stamp_ns), poses=poses))
+
+
+def _point_cloud(route: Route) -> bytes:
+    points = np.zeros((len(route.waypoints_um), 3), "<f4")
+    points[:, :2] = route.waypoints_um
+    cloud = _wire("PointCloud")(
+        timestamp=timestamp(route.stamp_ns),
+        pose=_pose(0.0, 0.0),
+        point_stride=12,
+        fields=_float_fields("x", "y", "z"),
+        data=points.tobytes(),
+    )
+    return _serialized(cloud)
+
+
+def _grid(field: FlowField) -> bytes:
+    width, size_um = field.velocity_um_s.shape[1], field.um_per_px
+    grid = _wire("Grid")(
+        timestamp=timestamp(field.stamp_ns),
+        pose=_pose(-0.5 * size_um, -0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
+        column_count=width,
+        cell_size={"x": size_um, "y": size_um},
+        row_stride=8 * width,
+        cell_stride=8,
+        fields=_float_fields("vx", "vy"),
+        data=field.velocity_um_s.astype("<f4", copy=False).tobytes(),
+    )
+    return _serialized(grid)
+
+
+def _float_fields(*names: str) -> list[dict[str, Any]]:
+    return [{"name": name, "offset": 4 * place, "type": _FLOAT32} for place, name in enumerate(names)]

@@ -1,0 +1,139 @@
+"""Protobuf schemas: ours derived from the dataclasses in messages.py, the standard ones taken from foxglove-sdk.
+
+The secret of this file is the wire layout. Fields are numbered in the order of the dataclass:
+
+    int -> sint64    float -> double    bool -> bool    str -> string
+    vector -> packed repeated double    array -> flowrec.Array    `X | None` -> the same with presence
+"""
+
+from __future__ import annotations
+
+import functools
+import types
+import typing
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, cast
+
+import foxglove.messages
+import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+from flowrec.messages import array_fields
+
+_Field = descriptor_pb2.FieldDescriptorProto
+_SCALARS: dict[Any, Any] = {
+    int: _Field.TYPE_SINT64,
+    float: _Field.TYPE_DOUBLE,
+    bool: _Field.TYPE_BOOL,
+    str: _Field.TYPE_STRING,
+}
+_ARRAY_FILE = "flowrec/Array.proto"
+
+_pool = descriptor_pool.DescriptorPool()
+_files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """One protobuf message type.
+
+    Attributes
+    ----------
+    name : full name, `flowrec.Track`.
+    data : serialized FileDescriptorSet with everything it depends on.
+    wire : the class that holds one such message.
+    """
+
+    name: str
+    data: bytes
+    wire: Any
+
+
+@dataclass(frozen=True, slots=True)
+class FieldForm:
+    """How one field of a dataclass travels: `kind` is int, float, bool, str, "vector" or "array"."""
+
+    name: str
+    kind: Any
+    optional: bool
+    dtype: np.dtype[Any] | None
+
+
+def forms_of(message_type: type[Any]) -> tuple[FieldForm, ...]:
+    """The wire form of each field, in order.
+
+    Raises
+    ------
+    TypeError : an annotation that no wire form is known for; a defect of messages.py.
+    """
+    hints = typing.get_type_hints(message_type, include_extras=True)
+    dtypes = dict(array_fields(cast(Any, message_type)))
+    forms = []
+    for field in fields(message_type):
+        hint, optional = hints[field.name], False
+        if typing.get_origin(hint) in (typing.Union, types.UnionType):
+            options = [option for option in typing.get_args(hint) if option is not types.NoneType]
+            hint, optional = options[0], True
+        kind = typing.get_args(hint)[1] if typing.get_origin(hint) is Annotated else hint
+        if kind == "vector" and optional:
+            kind = "array"  # a repeated field can not be absent
+        if kind not in _SCALARS and kind not in ("vector", "array"):
+            raise TypeError(f"{message_type.__name__}.{field.name}: no wire form for {hint!r}")
+        forms.append(FieldForm(field.name, kind, optional, dtypes.get(field.name)))
+    return tuple(forms)
+
+
+@functools.cache
+def array_schema() -> Schema:
+    """`flowrec.Array`: shape, numpy's name of the little-endian dtype, and the values in C order."""
+    file = descriptor_pb2.FileDescriptorProto(name=_ARRAY_FILE, package="flowrec", syntax="proto3")
+    message = file.message_type.add(name="Array")
+    message.field.add(name="shape", number=1, type=_Field.TYPE_UINT32, label=_Field.LABEL_REPEATED)
+    message.field.add(name="dtype", number=2, type=_Field.TYPE_STRING, label=_Field.LABEL_OPTIONAL)
+    message.field.add(name="data", number=3, type=_Field.TYPE_BYTES, label=_Field.LABEL_OPTIONAL)
+    return _add(file, "flowrec.Array")
+
+
+def schema_of(message_type: type[Any]) -> Schema:
+    """The schema derived from a message dataclass; may be asked for once per type, codec.py keeps it."""
+    name = message_type.__name__
+    file = descriptor_pb2.FileDescriptorProto(name=f"flowrec/{name}.proto", package="flowrec", syntax="proto3")
+    message = file.message_type.add(name=name)
+    for number, form in enumerate(forms_of(message_type), 1):
+        field = message.field.add(name=form.name, number=number, label=_Field.LABEL_OPTIONAL)
+        if form.kind == "vector":
+            field.type, field.label = _Field.TYPE_DOUBLE, _Field.LABEL_REPEATED
+        elif form.kind == "array":
+            array_schema()
+            field.type, field.type_name = _Field.TYPE_MESSAGE, ".flowrec.Array"
+            if _ARRAY_FILE not in file.dependency:
+                file.dependency.append(_ARRAY_FILE)
+        else:
+            field.type = _SCALARS[form.kind]
+            if form.optional:  # proto3 presence is spelled as a one-of with a single member
+                field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
+                message.oneof_decl.add(name=f"_{form.name}")
+    return _add(file, f"flowrec.{name}")
+
+
+@functools.cache
+def foxglove_schema(name: str) -> Schema:
+    """A standard schema: `RawImage`, `Log`, `PoseInFrame`, ..."""
+    declared = getattr(foxglove.messages, name).get_schema()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(declared.data).file:
+        if file.name not in _files:
+            _files[file.name] = file
+            _pool.Add(file)
+    return _schema(declared.name, declared.data)
+
+
+def _add(file: descriptor_pb2.FileDescriptorProto, name: str) -> Schema:
+    _files[file.name] = file
+    _pool.Add(file)
+    closure = descriptor_pb2.FileDescriptorSet(file=[*(_files[needed] for needed in file.dependency), file])
+    return _schema(name, closure.SerializeToString(deterministic=True))
+
+
+def _schema(name: str, data: bytes) -> Schema:
+    wire = message_factory.GetMessageClass(_pool.FindMessageTypeByName(name))
+    return Schema(name, data, wire)

@@ -1,0 +1,241 @@
+"""Ticks -> session file, without holding up the control loop."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, cast
+
+from flowrec.errors import SessionError
+from flowrec.messages import Message, Tick, array_fields
+from flowrec.store.backlog import Backlog, Entry, News
+from flowrec.store.codec import message_stamp
+from flowrec.store.header import SessionHeader
+from flowrec.store.recorder import Recorder
+from flowrec.topics import TOPICS
+
+PARTIAL_SUFFIX = ".partial"
+_MESSAGE_BYTES = 500  # about what a message weighs besides its arrays
+_FIELDS = tuple(topic.field for topic in TOPICS)
+_ARRAYS = {topic.type: tuple(name for name, _ in array_fields(cast(Any, topic.type))) for topic in TOPICS}
+
+
+class SessionWriter:
+    """Records ticks in a new session file; `write` returns at once, a thread encodes, compresses and writes.
+
+    Until `close` the file is named `PATH.partial`; then it gets its name in one step. A message is written in
+    the first tick that holds it, with the tick's stamp as log time; the arrays of a message must not change
+    afterwards. To be used as a context manager: an exception that leaves the block becomes the outcome.
+
+    Parameters
+    ----------
+    path : file to make.
+    header : what goes first into the file and is on the disk when the constructor returns.
+    flush_s : at most this much of a run is lost when the process is killed, in s.
+    overwrite : replace an existing file, and the remains of an unfinished one.
+    block : what to do when the disk is slower than the run. True: `write` waits (simulation).
+        False: images are dropped and counted, nothing else ever is (live run).
+    queue_limit_bytes : how much may wait for the disk.
+
+    Raises
+    ------
+    SessionError : the path can not be written, or is taken.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        header: SessionHeader,
+        *,
+        flush_s: float = 0.5,
+        overwrite: bool = False,
+        block: bool = False,
+        queue_limit_bytes: int = 256 << 20,
+    ) -> None:
+        self.path = Path(path)
+        self.partial_path = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
+        self.ticks = 0  # written so far
+        self.dropped_frames = 0  # for want of a faster disk
+        self._block = block
+        self._overwrite = overwrite
+        self._last: dict[str, Message | None] = dict.fromkeys(_FIELDS)
+        self._last_ns = -1
+        self._failure: BaseException | None = None
+        self._closed = False
+        self._refuse_if_taken()
+        try:
+            self._recorder = Recorder(self.partial_path, header, flush_s=flush_s, truncate=overwrite)
+        except OSError as error:
+            raise _not_writable(self.partial_path, error) from error
+        self._backlog = Backlog(queue_limit_bytes)
+        self._thread = threading.Thread(target=self._work, name="session-writer", daemon=True)
+        self._thread.start()
+
+    @property
+    def queue_bytes(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._backlog.nbytes
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file so far."""
+        return self._recorder.size
+
+    def write(self, tick: Tick) -> None:
+        """Record what is new in this tick.
+
+        Raises
+        ------
+        SessionError : the disk has failed, a message does not fit its declaration (both are told on a later
+            call than the one that they concern), the session is closed, or the stamp does not grow.
+        """
+        self._raise_failure()
+        if self._closed:
+            raise SessionError(f"{self.path}: the session is closed; nothing more can be written to it")
+        if tick.stamp_ns <= self._last_ns:
+            raise SessionError(
+                f"{self.path}: the tick at {tick.stamp_ns} ns does not come after the one at {self._last_ns} ns;"
+                " stamps of a session must grow, check the clock of the rig"
+            )
+        self._last_ns = tick.stamp_ns
+        self.ticks += 1
+        news, nbytes = self._news_of(tick)
+        if not self._backlog.has_room(nbytes):
+            if self._block:
+                self._backlog.wait_for_room(nbytes)
+                self._raise_failure()
+            elif "frame" in news:
+                nbytes -= _nbytes(news.pop("frame"))
+                self.dropped_frames += 1
+        if news:
+            self._backlog.put(Entry(tick.stamp_ns, news, nbytes))
+
+    def close(self, outcome: Mapping[str, str] | None = None) -> None:
+        """Finish the file and give it its name; a second call does nothing.
+
+        Parameters
+        ----------
+        outcome : how the run ended, as text; numbers of ticks and of dropped frames are added.
+
+        Raises
+        ------
+        SessionError : the file could not be finished; what could be written stays in `PATH.partial`.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        self._backlog.close()
+        self._thread.join()
+        counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
+        try:
+            if self._failure is None:
+                self._finish({**(outcome or {"outcome": "ended"}), **counts})
+        finally:
+            self._recorder.close()
+        self._raise_failure()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.close()
+            return
+        stopped = isinstance(error, KeyboardInterrupt)
+        reason = f"{type(error).__name__}: {error}".rstrip(": ")
+        try:
+            self.close({"outcome": "stopped" if stopped else "failed", "reason": reason})
+        except SessionError as second:
+            if str(second) != str(error):  # the first one matters more
+                error.add_note(str(second))
+
+    def _news_of(self, tick: Tick) -> tuple[News, int]:
+        news: News = {}
+        nbytes, last = 0, self._last
+        for name in _FIELDS:
+            message = getattr(tick, name)
+            before = last[name]
+            if message is before or message is None:
+                continue
+            last[name] = message
+            # A stage that says the same thing again in a new object has said nothing new.
+            if before is None or message.stamp_ns != message_stamp(before) or not message.same_as(before):
+                news[name] = message
+                nbytes += _nbytes(message)
+        return news, nbytes
+
+    def _work(self) -> None:
+        try:
+            while not self._backlog.drained:
+                entry = self._backlog.take(self._recorder.patience_s)
+                if entry is not None:
+                    self._recorder.add(entry)
+                self._recorder.flush_if_due()
+                if entry is not None:
+                    self._backlog.done(entry)
+        except Exception as error:  # noqa: BLE001  whatever it is, the control loop has to hear of it
+            self._failure = error
+            self._backlog.abandon()
+
+    def _finish(self, outcome: Mapping[str, str]) -> None:
+        try:
+            self._recorder.finish(outcome)
+            self._refuse_if_taken(finished=True)
+            self.partial_path.replace(self.path)
+            _sync_directory(self.path.parent)
+        except OSError as error:
+            self._failure = error
+
+    def _raise_failure(self) -> None:
+        if self._failure is None:
+            return
+        if isinstance(self._failure, OSError):
+            raise _disk_failed(self.partial_path, self._failure) from self._failure
+        if isinstance(self._failure, SessionError):
+            raise SessionError(
+                f"{self.path}: {self._failure}; `flowrec recover {self.partial_path}` keeps what came before"
+            ) from self._failure
+        raise self._failure
+
+    def _refuse_if_taken(self, *, finished: bool = False) -> None:
+        if self._overwrite and not self.path.is_dir():
+            return
+        if self.path.exists():
+            kept = f" (the finished session stays in {self.partial_path})" if finished else ""
+            raise SessionError(f"{self.path}: exists already{kept}; choose another name with --out, or --overwrite it")
+        if not finished and self.partial_path.exists():
+            raise SessionError(
+                f"{self.partial_path}: is left from a run that did not finish; `flowrec recover {self.partial_path}`"
+                " saves it, another --out or --overwrite goes on without it"
+            )
+
+
+def _nbytes(message: Message) -> int:
+    arrays = [getattr(message, name) for name in _ARRAYS[type(message)]]
+    return _MESSAGE_BYTES + sum(int(array.nbytes) for array in arrays if array is not None)
+
+
+def _sync_directory(directory: Path) -> None:
+    """Have the disk keep the new name as well."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _not_writable(path: Path, error: OSError) -> SessionError:
+    if isinstance(error, FileNotFoundError):
+        return SessionError(f"{path.parent}: no such directory; make it, or choose another place with --out")
+    return SessionError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
+
+
+def _disk_failed(path: Path, error: OSError) -> SessionError:
+    what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
+    return SessionError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")

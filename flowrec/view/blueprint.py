@@ -1,0 +1,212 @@
+"""Which views a person sees first, and where. Every origin and every entity named here is logged by log.py."""
+
+from __future__ import annotations
+
+from collections.abc import Set as AbstractSet
+
+import rerun.blueprint as rrb
+
+from flowrec.view import entities as e
+from flowrec.view import palette
+from flowrec.view.maps import ColourBar
+from flowrec.view.scene import Scene
+
+_EVERYTHING = frozenset({"assumed", "refined", "change", "uncertainty", "truth", "true robot", "timing"})
+_COIL_WINDOW_S = 2.0  # the currents turn several times a second; a whole session of them is a solid block
+
+
+def blueprint(scene: Scene, has_replay: bool = False, present: AbstractSet[str] = _EVERYTHING) -> rrb.Blueprint:
+    """The layout for one session, or for a recorded and a replayed one beside each other.
+
+    `present` (see `TickLogger.present`) leaves out the views that would stay empty.
+    """
+    body = _replay(scene, present) if has_replay else _single(scene, present)
+    return rrb.Blueprint(
+        body,
+        rrb.TimePanel(state="collapsed", timeline=e.SESSION_TIME),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _single(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
+    first = _row(
+        [
+            _map(scene, "Flow speed: assumed", e.ASSUMED, e.SPEED_SCALE) if "assumed" in present else None,
+            _map(scene, "Flow speed: refined", e.REFINED, e.SPEED_SCALE) if "refined" in present else None,
+        ]
+    )
+    second = _row(
+        [
+            _map(scene, "Refined minus assumed speed", e.CHANGE, e.CHANGE_SCALE) if "change" in present else None,
+            _tabs(
+                _map(scene, "Flow speed: truth (simulated)", e.TRUE, e.SPEED_SCALE) if "truth" in present else None,
+                _map(scene, "Uncertainty (1 σ)", e.UNCERTAINTY, e.UNCERTAINTY_SCALE)
+                if "uncertainty" in present
+                else None,
+            ),
+        ]
+    )
+    camera = _camera(scene, "Camera: path, robot, goal, flow", ["$origin/**"], e.under("", "camera"))
+    maps = [row for row in (first, second) if row is not None]
+    above = rrb.Horizontal(camera, rrb.Vertical(*maps), column_shares=[1, 1]) if maps else camera
+    return rrb.Vertical(
+        above,
+        _phases([""]),
+        rrb.Horizontal(
+            _tabs(
+                _plot("Coil currents (A)", [e.CURRENT], window_s=_COIL_WINDOW_S),
+                _plot("Field frequency (Hz)", [e.FREQUENCY]),
+                _plot("Field heading (°)", [e.HEADING]),
+            ),
+            _tabs(
+                _plot("Tracking error (µm)", [e.TRACKING_ERROR]),
+                _plot("Estimate error (µm)", [e.ESTIMATE_ERROR]) if "true robot" in present else None,
+                _plot("Observer NIS", [e.NIS]),
+            ),
+            _tabs(
+                _plot("Flow at the robot: observer and map (µm/s)", [e.FLOW_SPEED]),
+                _plot("Components (µm/s)", [e.FLOW_COMPONENTS]),
+            ),
+            _tabs(
+                _events([e.EVENTS, e.OPERATOR]),
+                _plot("Timing (ms)", [e.TIMING]) if "timing" in present else None,
+            ),
+        ),
+        row_shares=[6.4, 1.05, 2.9],
+    )
+
+
+def _replay(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
+    old, new = "recorded", "replayed"
+    hidden = [e.under(new, e.TRAIL), e.under(old, e.ARROWS), e.under(new, e.OUTLINE)]
+    camera = _camera(
+        scene,
+        "Camera: recorded (orange) and replayed (cyan)",
+        [f"+ /{old}/camera/**", f"+ /{new}/camera/**", *(f"- {path}" for path in hidden)],
+        f"/{old}/camera",
+    )
+    first = _row(
+        [
+            _map(scene, "Recorded: refined speed", e.REFINED, e.SPEED_SCALE, old) if "refined" in present else None,
+            _map(scene, "Replayed: refined speed", e.REFINED, e.SPEED_SCALE, new)
+            if "replayed refined" in present
+            else None,
+        ]
+    )
+    second = _row(
+        [
+            _map(scene, "Assumed speed", e.ASSUMED, e.SPEED_SCALE, old) if "assumed" in present else None,
+            _tabs(
+                _map(scene, "Flow speed: truth (simulated)", e.TRUE, e.SPEED_SCALE, old)
+                if "truth" in present
+                else None,
+                _map(scene, "Replayed: uncertainty (1 σ)", e.UNCERTAINTY, e.UNCERTAINTY_SCALE, new)
+                if "replayed uncertainty" in present
+                else None,
+            ),
+        ]
+    )
+    maps = [row for row in (first, second) if row is not None]
+    above = rrb.Horizontal(camera, rrb.Vertical(*maps), column_shares=[1, 1]) if maps else camera
+    both = (old, new)
+    return rrb.Vertical(
+        above,
+        _phases(both),
+        rrb.Horizontal(
+            _tabs(
+                _plot("Command: field frequency (Hz)", [e.FREQUENCY], both),
+                _plot("Coil currents, recorded (A)", [e.CURRENT], (old,), _COIL_WINDOW_S),
+                _plot("Coil currents, replayed (A)", [e.CURRENT], (new,), _COIL_WINDOW_S),
+            ),
+            _plot("Command: field heading (°)", [e.HEADING], both),
+            _tabs(
+                _plot("Tracking error (µm)", [e.TRACKING_ERROR], both),
+                _plot("Estimate error (µm)", [e.ESTIMATE_ERROR], both) if "true robot" in present else None,
+                _plot("Observer NIS", [e.NIS], both),
+            ),
+            _plot("Flow at the robot: observer and map (µm/s)", [e.FLOW_SPEED], both),
+            _events([e.EVENTS, e.OPERATOR], both),
+        ),
+        row_shares=[6.4, 1.4, 2.9],
+    )
+
+
+def _row(parts: list[rrb.View | rrb.Container | None]) -> rrb.Container | None:
+    """What is there, side by side."""
+    there = [part for part in parts if part is not None]
+    return rrb.Horizontal(*there) if there else None
+
+
+def _tabs(*parts: rrb.View | None) -> rrb.View | rrb.Container | None:
+    """What is there, one behind the other, the first in front."""
+    there = [part for part in parts if part is not None]
+    if len(there) > 1:
+        return rrb.Tabs(*there, active_tab=0)
+    return there[0] if there else None
+
+
+def _camera(scene: Scene, name: str, contents: list[str], origin: str) -> rrb.View:
+    return rrb.Spatial2DView(
+        name=name,
+        origin=origin,
+        contents=contents,
+        background=palette.SOLID,
+        visual_bounds=_bounds(scene.image_bounds()),
+    )
+
+
+def _map(scene: Scene, name: str, entity: str, scale: str, prefix: str = "") -> rrb.View:
+    """A map with its colour bar and, to find one's way, the path, the robot and the goal."""
+    overlays = (e.OUTLINE, e.PATH, e.ROBOT)
+    return rrb.Spatial2DView(
+        name=name,
+        origin=e.under(prefix, entity.rsplit("/", 1)[0]),
+        contents=[
+            f"+ {e.under(prefix, entity)}",
+            f"+ {e.under(prefix, scale)}/**",
+            *(f"+ {e.under(prefix, overlay)}" for overlay in overlays),
+        ],
+        background=palette.SOLID,
+        visual_bounds=_bounds(ColourBar.beside(scene).bounds_with(scene)),
+    )
+
+
+def _bounds(box: tuple[float, float, float, float]) -> rrb.VisualBounds2D:
+    left, top, right, bottom = box
+    return rrb.VisualBounds2D(x_range=[left, right], y_range=[top, bottom])
+
+
+def _plot(
+    name: str, entities: list[str], prefixes: tuple[str, ...] = ("",), window_s: float | None = None
+) -> rrb.TimeSeriesView:
+    """Lines over the whole session, or over a window around the time cursor."""
+    ranges = None
+    if window_s is not None:
+        ranges = rrb.VisibleTimeRange(
+            e.SESSION_TIME,
+            start=rrb.TimeRangeBoundary.cursor_relative(seconds=-window_s),
+            end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.25 * window_s),
+        )
+    paths = [e.under(prefix, entity) for prefix in prefixes for entity in entities]
+    return rrb.TimeSeriesView(
+        name=name,
+        origin=paths[0] if len(paths) == 1 else "/",
+        contents=[f"+ {path}" for path in paths],
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=True),
+        time_ranges=ranges,
+    )
+
+
+def _phases(prefixes: list[str] | tuple[str, ...]) -> rrb.StateTimelineView:
+    paths = [e.under(prefix, entity) for entity in (e.PHASE, e.SIGHT) for prefix in prefixes]
+    return rrb.StateTimelineView(name="Mission", origin="/", contents=[f"+ {path}" for path in paths])
+
+
+def _events(entities: list[str], prefixes: tuple[str, ...] = ("",)) -> rrb.TextLogView:
+    paths = [e.under(prefix, entity) for prefix in prefixes for entity in entities]
+    return rrb.TextLogView(name="Events", origin="/", contents=[f"+ {path}" for path in paths])
+
+

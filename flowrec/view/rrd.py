@@ -1,0 +1,114 @@
+"""A session as one .rrd file: a cache for looking, the MCAP is the archive."""
+
+from __future__ import annotations
+
+import heapq
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import rerun as rr
+
+from flowrec.errors import SessionError
+from flowrec.messages import Tick
+from flowrec.units import seconds
+from flowrec.view.blueprint import blueprint
+from flowrec.view.log import TickLogger
+from flowrec.view.maps import SpeedScale
+from flowrec.view.scene import Scene
+
+APPLICATION = "flowrec"
+_PROGRESS_EVERY = 20  # ticks
+
+
+def write_rrd(
+    path: Path | str,
+    scene: Scene,
+    ticks: Iterable[Tick],
+    replayed_ticks: Iterable[Tick] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """Write ticks, with the replayed ones beside them if given; a file of this name appears when it is whole.
+
+    Parameters
+    ----------
+    progress : called now and then with the session time in s that is done, counted from the first tick.
+
+    Raises
+    ------
+    SessionError : the file cannot be written.
+    """
+    path = Path(path)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        # Opened here first: Rerun reports a directory that is missing or full only in its own log.
+        part.open("wb").close()
+        stream = open_stream(scene)
+        try:
+            stream.save(part)
+            _log_all(stream, scene, ticks, replayed_ticks, progress)
+            stream.flush()
+        finally:
+            stream.disconnect()
+        part.replace(path)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise SessionError(f"{path}: cannot be written: {reason}; choose another place with --out") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def open_stream(scene: Scene) -> rr.RecordingStream:
+    """A stream that carries the title and properties of a scene and flowrec's own timelines only."""
+    stream = rr.RecordingStream(APPLICATION)
+    rr.set_log_time_enabled(False, recording=stream)
+    rr.set_log_tick_enabled(False, recording=stream)
+    return stream
+
+
+def describe(stream: rr.RecordingStream, scene: Scene) -> None:
+    """Send what people read in the properties of a recording."""
+    stream.send_recording_name(scene.title)
+    if scene.properties:
+        stream.send_property("session", rr.AnyValues(**scene.properties))
+
+
+def _log_all(
+    stream: rr.RecordingStream,
+    scene: Scene,
+    ticks: Iterable[Tick],
+    replayed_ticks: Iterable[Tick] | None,
+    progress: Callable[[float], None] | None,
+) -> None:
+    describe(stream, scene)
+    replay = replayed_ticks is not None
+    speeds = SpeedScale()
+    recorded = TickLogger(stream, scene, "recorded" if replay else "", speeds=speeds)
+    replayed = TickLogger(stream, scene, "replayed", images=False, speeds=speeds) if replay else None
+    first_ns: int | None = None
+    index: int | None = None
+    for count, (stamp_ns, again, tick) in enumerate(_merged(ticks, replayed_ticks or ())):
+        first_ns = stamp_ns if first_ns is None else first_ns
+        if again:
+            assert replayed is not None
+            # Replayed ticks may come without frames, but happened on a recorded one.
+            replayed.log(tick, frame_index=index)
+        else:
+            index = tick.frame.index if tick.frame is not None else index
+            recorded.log(tick)
+        if progress is not None and count % _PROGRESS_EVERY == 0:
+            progress(seconds(stamp_ns - first_ns))
+    present = set(recorded.present)
+    if replayed is not None:
+        present |= {f"replayed {what}" for what in replayed.present}
+    # Last, when it is known which views have something to show. Rerun takes it wherever in the file it comes.
+    stream.send_blueprint(blueprint(scene, replay, present))
+
+
+def _merged(ticks: Iterable[Tick], replayed: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
+    """Both in the order of their stamps, the recorded tick before the replayed one."""
+
+    def named(source: Iterable[Tick], again: bool) -> Iterator[tuple[int, bool, Tick]]:
+        return ((tick.stamp_ns, again, tick) for tick in source)
+
+    return heapq.merge(named(ticks, False), named(replayed, True), key=lambda item: item[:2])

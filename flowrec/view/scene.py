@@ -1,0 +1,66 @@
+"""What stays the same during a session, and where it lies in a picture.
+
+All pictures share one plane: the camera's pixels as Rerun draws them. Rerun counts from the corner of the first
+pixel, flowrec from its centre; the half pixel between the two is added here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.chip.calibration import Calibration
+from flowrec.chip.chip import Chip
+from flowrec.robot import Robot
+
+_HALF_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where the pixels of an image lie in the picture plane: x = offset + scale * column, from pixel corners."""
+
+    scale: float
+    offset: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What is looked at. The properties are shown to people with the recording."""
+
+    chip: Chip
+    calibration: Calibration
+    robot: Robot
+    title: str
+    properties: dict[str, str] = field(default_factory=dict)
+    image_px: tuple[int, int] | None = None  # width and height of the camera's image; None: as the chip
+
+    def to_plane(self, points_um: ArrayLike) -> NDArray[np.float64]:
+        """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""
+        return self.calibration.to_px(points_um) + _HALF_PX
+
+    def length_px(self, length_um: float) -> float:
+        """A length in um in the picture plane."""
+        return length_um / self.calibration.um_per_px
+
+    def mask_placement(self, um_per_px: float) -> Placement:
+        """Where an image on the chip's mask lies."""
+        scale = um_per_px / self.calibration.um_per_px
+        x, y = self.to_plane((0.0, 0.0))  # of the centre of the mask's first pixel
+        return Placement(scale, (float(x) - _HALF_PX * scale, float(y) - _HALF_PX * scale))
+
+    def preview_placement(self, step: int) -> Placement:
+        """Where a camera image lies of which only each `step`-th row and column was kept."""
+        return Placement(float(step), (_HALF_PX * (1 - step), _HALF_PX * (1 - step)))
+
+    def chip_bounds(self) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom of the chip's mask in the picture plane."""
+        placement = self.mask_placement(self.chip.um_per_px)
+        (left, top), (h, w) = placement.offset, self.chip.mask.shape
+        return left, top, left + w * placement.scale, top + h * placement.scale
+
+    def image_bounds(self) -> tuple[float, float, float, float]:
+        """Left, top, right, bottom of the camera's image in the picture plane."""
+        return self.chip_bounds() if self.image_px is None else (0.0, 0.0, *map(float, self.image_px))

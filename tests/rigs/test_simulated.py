@@ -1,0 +1,217 @@
+import itertools
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.chip import ChipSettings, load_chip
+from flowrec.chip.calibration import Calibration
+from flowrec.errors import ChipError, RigError
+from flowrec.flow import FlowSolver
+from flowrec.messages import Currents, FlowField
+from flowrec.rigs.simulated import SimulatedRig, true_chip
+from flowrec.robot import Robot
+from flowrec.settings import CameraSettings, Simulated
+
+ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
+CAMERA = CameraSettings(width_px=256, height_px=64, rate_hz=30.0, debris=0)
+EXACT = Simulated(position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
+STRAIGHT = load_chip(ChipSettings("straight"))  # rows 22 to 41 of 64, 20 um a pixel: y from 430 to 830 um
+MIDDLE = 31.5 * 20.0
+
+
+def steady(vx, vy=0.0):
+    """A uniform flow on the straight chip."""
+    velocity = np.zeros((*STRAIGHT.mask.shape, 2), np.float32)
+    velocity[..., 0], velocity[..., 1] = vx, vy
+    values = STRAIGHT.boundary_values
+    return FlowField(0, 0, "known", 20.0, velocity, np.zeros(STRAIGHT.mask.shape), None, values, 1.0, 1000.0, "")
+
+
+def rig_with(start=(1000.0, MIDDLE), flow=None, simulated=EXACT, camera=CAMERA, duration_s=1.0, **more):
+    calibration = Calibration(STRAIGHT.size_um[0] / camera.width_px)
+    flow = steady(0.0) if flow is None else flow
+    return SimulatedRig(STRAIGHT, ROBOT, calibration, camera, simulated, start, duration_s, true_field=flow, **more)
+
+
+def command(frequency_hz, heading_rad=0.0, amplitude_mt=5.0):
+    return Currents(0, frequency_hz, heading_rad, amplitude_mt, 0.0, np.array([1.0, 2.0, 3.0]), False)
+
+
+def fly(rig, commands=()):
+    """All inputs, with `commands` (frame number to Currents) applied after their frames."""
+    commands = dict(commands)
+    seen = []
+    with rig:
+        for k, inputs in enumerate(rig.inputs()):
+            seen.append(inputs)
+            if k in commands:
+                rig.apply(commands[k])
+    return seen
+
+
+def test_the_same_seed_and_commands_give_the_same_bytes_at_any_pace():
+    commands = {2: command(10.0, 0.3), 9: command(15.0, -0.5)}
+    camera = replace(CAMERA, debris=12)
+    simulated = Simulated(seed=5)
+    first, second = (fly(rig_with(simulated=simulated, camera=camera, flow=steady(200.0)), commands) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        assert a.frame.same_as(b.frame)
+        assert a.truth.same_as(b.truth)
+        assert a.applied.same_as(b.applied)
+    other = fly(rig_with(simulated=replace(simulated, seed=6), camera=camera, flow=steady(200.0)), commands)
+    assert not first[5].frame.same_as(other[5].frame)
+
+
+def test_frames_are_stamped_by_index_over_rate_from_zero():
+    seen = fly(rig_with(camera=replace(CAMERA, rate_hz=29.97), duration_s=2.0))
+    assert [i.stamp_ns for i in seen] == [round(k * 1e9 / 29.97) for k in range(60)]
+    assert all(i.stamp_ns == i.frame.stamp_ns == i.applied.stamp_ns == i.truth.stamp_ns for i in seen)
+    assert seen[0].true_field is not None
+    assert all(i.true_field is None for i in seen[1:])
+
+
+def test_without_a_field_the_robot_goes_where_the_flow_goes():
+    seen = fly(rig_with(flow=steady(250.0, 30.0)), {0: command(20.0, amplitude_mt=0.0)})
+    moved = seen[-1].truth.position_um - seen[0].truth.position_um
+    assert np.allclose(moved, [250.0, 30.0])
+    assert np.allclose(seen[-1].applied.turns, 0.0)
+
+
+def test_a_command_acts_exactly_after_its_delay_and_the_readback_says_so():
+    # Sent on frame 3 (0.1 s), delay 0.04 s: it acts from 0.14 s, within the interval of frame 5.
+    seen = fly(rig_with(), {3: command(12.0, math.pi / 2)})
+    turns = np.array([i.applied.turns for i in seen])
+    assert np.all(turns[:5] == 0.0)
+    assert turns[5] == pytest.approx([0.0, 12.0 * (5 / 30 - 0.14)], abs=1e-8)
+    assert turns[6] == pytest.approx([0.0, 12.0 / 30], abs=1e-8)
+    assert seen[4].applied.frequency_hz == 0.0
+    assert seen[5].applied.frequency_hz == 12.0
+    assert seen[5].applied.currents_a.tolist() == [1.0, 2.0, 3.0]
+    positions = np.array([i.truth.position_um for i in seen])[:14]  # before it reaches the wall
+    assert np.allclose(np.diff(positions, axis=0), ROBOT.um_per_rev * turns[1:14], atol=1e-5)
+
+
+def test_several_commands_on_their_way_are_obeyed_in_order():
+    slow = replace(EXACT, delay_s=0.1)
+    seen = fly(rig_with(simulated=slow), {0: command(3.0), 1: command(6.0), 2: command(9.0)})
+    assert [round(i.applied.frequency_hz) for i in seen[:6]] == [0, 0, 0, 3, 6, 9]
+    total = sum(i.applied.turns[0] for i in seen)
+    assert total == pytest.approx((3.0 + 6.0) / 30 + 9.0 * (1.0 - 0.1 - 2 / 30), abs=1e-6)
+
+
+def test_above_step_out_the_robot_rolls_slower():
+    far = {f: fly(rig_with(), {0: command(f)})[-1].truth.position_um[0] for f in (20.0, 24.0, 40.0)}
+    assert far[24.0] > far[20.0] > far[40.0] > 1000.0
+
+
+def test_a_wall_stops_the_robot_at_its_radius_and_lets_it_slide_along():
+    heading = math.radians(30)
+    seen = fly(rig_with(duration_s=2.0), {0: command(12.0, heading)})
+    truth = seen[-1].truth
+    assert all(i.truth.clearance_um > -0.01 for i in seen)
+    assert truth.clearance_um == pytest.approx(0.0, abs=0.01)
+    assert truth.position_um[1] == pytest.approx(830.0 - 50.0, abs=0.1)
+    assert truth.position_um[0] - 1000.0 == pytest.approx(300.0 * math.cos(heading) * (2.0 - 0.04), rel=1e-3)
+    assert truth.contacts == 1
+
+
+def test_leaving_a_wall_and_coming_back_is_a_second_contact():
+    up, down = command(12.0, -math.pi / 2), command(12.0, math.pi / 2)
+    seen = fly(rig_with(duration_s=3.0), {0: down, 30: up, 40: down})
+    assert seen[29].truth.contacts == 1
+    assert seen[-1].truth.contacts == 2
+
+
+def test_a_robot_that_leaves_through_an_opening_is_in_no_image_any_more():
+    camera = replace(CAMERA, photons_per_level=1e9, read_noise=0.0)
+    seen = fly(rig_with(start=(5000.0, MIDDLE), flow=steady(400.0), camera=camera))
+    with_robot, without = seen[0].frame.image.astype(int), seen[-1].frame.image.astype(int)
+    assert with_robot.min() < 0.5 * without.min()
+    assert math.isnan(seen[-1].truth.clearance_um)
+    assert np.abs(without - seen[-2].frame.image).max() <= 1  # a level on the edge between two numbers
+
+
+def test_the_robot_is_drawn_where_the_truth_says_to_a_twentieth_of_a_pixel():
+    # Radius 4 px, some of it between pixels; the empty image is the one after it has left.
+    camera = replace(CAMERA, width_px=400, height_px=100, photons_per_level=1e9, read_noise=0.0)
+    empty = fly(rig_with(start=(5080.0, MIDDLE), flow=steady(600.0), camera=camera))[-1].frame.image.astype(float)
+    rig = rig_with(start=(1003.7, MIDDLE + 3.1), flow=steady(313.0, 41.0), camera=camera)
+    for inputs in itertools.islice(fly(rig), 0, None, 5):
+        dark = np.clip(empty - inputs.frame.image - 5.0, 0.0, None)  # less what rounding leaves everywhere
+        rows, columns = np.indices(dark.shape)
+        centre = np.array([(dark * columns).sum(), (dark * rows).sum()]) / dark.sum()
+        drawn = Calibration(STRAIGHT.size_um[0] / 400).to_um(centre)
+        assert drawn == pytest.approx(inputs.truth.position_um, abs=0.05 * 12.8)
+
+
+def test_noise_grows_with_the_square_root_of_light_and_is_fresh_in_every_frame():
+    camera = replace(CAMERA, photons_per_level=4.0, read_noise=0.0)
+    films = np.array(
+        [i.frame.image[30:34] for i in fly(rig_with(start=(100.0, MIDDLE), camera=camera, duration_s=6.0))]
+    )
+    level, variance = films[..., 60:].mean(0), films[..., 60:].var(0)
+    # A twelfth comes from rounding to whole grey levels.
+    assert np.mean(variance) == pytest.approx(np.mean(level) / 4.0 + 1 / 12, rel=0.02)
+    noise = films[..., 60:] - level
+    assert abs(np.mean(noise[1:] * noise[:-1])) < 0.03 * np.mean(variance)
+    assert abs(np.mean(noise[..., 1:] * noise[..., :-1])) < 0.03 * np.mean(variance)
+
+
+def test_debris_drifts_with_the_flow_and_never_runs_out():
+    camera = replace(CAMERA, debris=12, photons_per_level=1e9, read_noise=0.0)
+    seen = fly(rig_with(start=(2560.0, MIDDLE), flow=steady(500.0), camera=camera, duration_s=20.0))
+    clean = fly(rig_with(start=(2560.0, MIDDLE), flow=steady(500.0), camera=replace(camera, debris=0), duration_s=20.0))
+    changed = [np.abs(a.frame.image.astype(int) - b.frame.image).sum() for a, b in zip(seen, clean, strict=True)]
+    assert min(changed[::30]) > 0.3 * max(changed[::30])
+    assert not np.array_equal(seen[0].frame.image[22:42, :150], seen[5].frame.image[22:42, :150])
+
+
+def test_the_true_world_differs_from_the_assumed_one_within_its_bounds():
+    chip = load_chip(ChipSettings("vessels", seed=2))
+    solver = FlowSolver(1)
+    worlds = [true_chip(chip, Simulated(seed=seed), solver) for seed in range(12)]
+    inlets = np.array([world.boundary_values[0] for world in worlds]) / chip.boundary_values[0]
+    assert np.all(np.abs(inlets - 1.0) <= 0.2)
+    assert np.ptp(inlets) > 0.1
+    assert all(np.any(world.boundary_values[1:] != 0.0) for world in worlds)
+    exact = Simulated(inlet_speed_error=0.0, outlet_pressure_error=0.0, viscosity_error=0.0)
+    same = true_chip(chip, exact, solver)
+    assert np.array_equal(same.boundary_values, chip.boundary_values)
+    assert same.viscosity_mpa_s == chip.viscosity_mpa_s
+
+
+def test_the_robot_jitters_as_much_as_it_is_told_to():
+    simulated = replace(EXACT, position_noise_um=3.0)
+    ends = [
+        fly(rig_with(simulated=replace(simulated, seed=seed), camera=replace(CAMERA, height_px=8, width_px=32)))[
+            -1
+        ].truth
+        for seed in range(60)
+    ]
+    moved = np.array([truth.position_um for truth in ends]) - [1000.0, MIDDLE]
+    assert np.std(moved) == pytest.approx(3.0, rel=0.2)
+
+
+def test_in_real_time_frames_keep_to_the_clock():
+    rig = rig_with(realtime=True, camera=replace(CAMERA, rate_hz=50.0), duration_s=0.3)
+    began = time.monotonic()
+    seen = fly(rig)
+    assert len(seen) == 16
+    assert time.monotonic() - began >= 0.3
+
+
+def test_a_world_that_can_not_be_is_refused_in_one_line():
+    with pytest.raises(ChipError, match="start 1000,100 um is in a wall"):
+        rig_with(start=(1000.0, 100.0))
+    with pytest.raises(ChipError, match="nearer to a wall than 50 um"):
+        rig_with(start=(1000.0, 450.0))
+    with pytest.raises(RigError, match=r"camera\.photons_per_level = 0"):
+        rig_with(camera=replace(CAMERA, photons_per_level=0.0))
+    with pytest.raises(RigError, match=r"inlet_speed_error = 1\.5"):
+        rig_with(simulated=replace(EXACT, inlet_speed_error=1.5))
+    other = FlowSolver(1).solve(load_chip(ChipSettings("bifurcation")))
+    with pytest.raises(RigError, match="solve it on this chip"):
+        next(iter(rig_with(flow=other).inputs()))

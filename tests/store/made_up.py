@@ -1,0 +1,78 @@
+"""Ticks of a made-up run: nothing in them means anything, everything in them is recorded."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from flowrec.messages import (
+    Applied,
+    Currents,
+    Demand,
+    Estimate,
+    Event,
+    FlowField,
+    Frame,
+    Mission,
+    Observations,
+    OperatorEvent,
+    Route,
+    Tick,
+    Timing,
+    Track,
+    Truth,
+)
+from flowrec.store import SessionHeader
+
+PERIOD_NS = 16_666_667
+HEADER = SessionHeader(
+    config_toml='name = "made up"\n',
+    chip_png=b"\x89PNG not really",
+    chip_toml="um_per_px = 2.0\n",
+    provenance={"host": "lab", "operator": "Zoë", "seed": "7"},
+    weights={"unet.safetensors": bytes(range(256))},
+)
+
+
+def field_of(stamp_ns: int, rng: np.random.Generator, *, shape: tuple[int, int] = (24, 32)) -> FlowField:
+    velocity = rng.normal(0.0, 50.0, (*shape, 2))
+    velocity[:3] = 0.0
+    return FlowField(
+        stamp_ns, 1, "fvm", 2.0, velocity, rng.normal(size=shape), None, np.array([50.0, 0.0]), 1.0, 998.0, "made up"
+    )
+
+
+def ticks_of(count: int, *, shape: tuple[int, int] = (48, 64), seed: int = 0, images: int = 16) -> Iterator[Tick]:
+    rng = np.random.default_rng(seed)
+    # A few images in turn: making noise takes longer than recording it.
+    pictures = [np.clip(rng.normal(120.0, 3.0, shape), 0, 255).astype(np.uint8) for _ in range(images)]
+    tick = Tick()
+    for number in range(count):
+        now = 1_000_000_000 + number * PERIOD_NS
+        here = np.array([number * 0.5, 100.0 + np.sin(number / 9.0)])
+        nis = float("nan") if number % 7 == 0 else 1.0
+        news = {
+            "frame": Frame(now, number, pictures[number % images]),
+            "applied": Applied(now, 7.0, 0.1, 3.0, np.array([1.0, 2.0, 0.0]), np.array([0.1, 0.0])),
+            "track": Track(now, number % 7 != 0, here, 0.9, 0, 4.5, np.array([0.0, 0.0, 64.0, 48.0])),
+            "estimate": Estimate(now, here, rng.normal(size=2), np.eye(4), nis, here, True),
+            "demand": Demand(now, rng.normal(size=2), here, number / 60.0, 0.5, False, rng.normal(size=(4, 2))),
+            "currents": Currents(now, 7.0, 0.2, 3.0, 1.0, rng.normal(size=3), False),
+            "timing": Timing(now, 1.0, 0.2, 0.3, 0.1, 1.7, 0.0, 0),
+            "truth": Truth(now, here, rng.normal(size=2), 40.0, 0),
+        }
+        if number == 0:
+            news["assumed"] = field_of(now, rng)
+            news["true_field"] = field_of(now, rng)
+            news["event"] = Event(now, "info", "started: µ, 微, \U0001f9ea")
+        if number % 50 == 10:
+            news["refined"] = field_of(now, rng)
+            news["observations"] = Observations(now, rng.normal(size=(3, 2)), rng.normal(size=(3, 2)), np.ones(3))
+        if number % 50 == 12:
+            points = np.column_stack([np.linspace(0.0, 60.0, 20), np.full(20, 20.0)])
+            news["route"] = Route(now, 1, "astar", True, "", points, np.arange(20.0))
+            news["mission"] = Mission(now, "navigate", now, 1, "", 0, here, np.array([60.0, 20.0]), False, "", "")
+        if number % 50 == 20:
+            news["operator"] = OperatorEvent(now, "note", "a: b")
+        tick = replace(tick, stamp_ns=now, **news)
+        yield tick
