@@ -94,7 +94,8 @@ def default_path(config: Config, folder: Path | None = None) -> Path:
 
 def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
     """Assumed and refined flow at the end of an earlier session, on the same chip."""
-    last = SessionReader(path).tick_before(None)
+    reader = SessionReader(path)
+    last = reader.tick_before(reader.last_ns, with_frames=False)
     fields = {name: field for name in ("assumed", "refined") if (field := getattr(last, name)) is not None}
     if "assumed" not in fields:
         raise UsageError(f"start.field = {path}: that session holds no flow field; survey and refine first")
@@ -133,7 +134,7 @@ def record(
                 path,
                 header,
                 flush_s=config.recording.flush_s,
-                queue_bytes=int(config.recording.queue_mb * 1e6),
+                queue_limit_bytes=int(config.recording.queue_mb * 1e6),
                 block=not realtime,
                 overwrite=overwrite,
             )

@@ -160,7 +160,7 @@ def replay(
         raise UsageError(
             f"--from {from_s:g}: {path} runs from {seconds(reader.first_ns):g} s to {seconds(reader.last_ns):g} s"
         )
-    start = reader.tick_before(start_ns) if start_ns is not None else Tick()
+    start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
     worker = LockstepWorker(pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale)
     _resubmit(reader, start, worker)
@@ -189,7 +189,7 @@ def replay(
                     out,
                     session_header(config, chip, parent),
                     flush_s=config.recording.flush_s,
-                    queue_bytes=int(config.recording.queue_mb * 1e6),
+                    queue_limit_bytes=int(config.recording.queue_mb * 1e6),
                     block=True,
                     overwrite=overwrite,
                 )

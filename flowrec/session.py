@@ -14,6 +14,7 @@ from flowrec.config import Config, config_from_toml, to_toml
 from flowrec.messages import Route
 from flowrec.provenance import provenance
 from flowrec.store import SessionHeader, SessionReader
+from flowrec.topics import BY_FIELD
 
 
 def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:
@@ -69,7 +70,7 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
         for key, value in reader.outcome.items()
         if key not in ("outcome", "note", "duration")
     }
-    return facts, dict(reader.counts)
+    return facts, {BY_FIELD[name].path: count for name, count in reader.counts.items()}
 
 
 def _bracketed(text: str) -> str:

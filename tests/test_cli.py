@@ -113,7 +113,8 @@ def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:
     assert facts["outcome"].startswith("stopped")
     from flowrec.store import SessionReader
 
-    last = SessionReader(out).tick_before(None)
+    reader = SessionReader(out)
+    last = reader.tick_before(reader.last_ns)
     assert last.currents is not None
     assert last.currents.amplitude_mt == 0.0
     assert np.all(last.currents.currents_a == 0.0)

@@ -93,7 +93,7 @@ def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp
     assert after < 0.5 * before
     written = SessionReader(tmp_path / "refined.mcap")
     assert written.header.parent["file"] == session.name
-    assert written.tick_before(None).refined.same_as(done.replayed.refined)  # type: ignore[union-attr]
+    assert written.tick_before(written.last_ns).refined.same_as(done.replayed.refined)  # type: ignore[union-attr]
 
 
 def test_another_controller_changes_the_commands_and_nothing_before_them(session: Path) -> None:

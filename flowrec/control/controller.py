@@ -9,16 +9,31 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.laws import ff_fb_law, vector_law
+from flowrec.control.laws import ff_fb_law, saturated, shortened, vector_law
 from flowrec.control.prediction import blend, remembered, roll_forward
 from flowrec.control.reference import governed_pace, place_on, velocity_on
 from flowrec.control.walls import guarded
+from flowrec.flow import sample
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
 Vector = NDArray[np.float64]
 _FOLLOWING = ("survey", "navigate")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Aim:
+    """What the robot is to do: be at the reference now, and at the other one, moving, when a demand takes effect."""
+
+    reference_um: Vector
+    reference_then_um: Vector
+    moving_um_s: Vector
+    progress_s: float
+
+    @staticmethod
+    def at_rest(place_um: Vector) -> _Aim:
+        return _Aim(place_um, place_um, np.zeros(2), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,27 +79,99 @@ class Controller:
             return previous
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
-        following = mission.phase in _FOLLOWING and route is not None and route.reachable and len(route.arrival_s) > 0
-        reference, ahead, moving, progress_s = (
-            self._along(previous, mission, route, estimate, robot, dt_s)
-            if following and route is not None
-            else self._in_place(previous, mission, estimate)
-        )
-        error = reference - estimate.position_um
-        idle = mission.finished or not np.isfinite(reference).all()
+        aim = self._aim(previous, mission, route, estimate, robot, dt_s)
+        error = aim.reference_um - estimate.position_um
         demand, saturated = np.zeros(2), False
-        if not idle:
-            demand, saturated = self._law(
-                ahead, moving, estimate, field, robot, clearance_um, um_per_px, sent, dt_s
-            )
+        if not mission.finished and np.isfinite(error).all():
+            demand, saturated = self._law(aim, estimate, field, robot, clearance_um, um_per_px, sent, dt_s)
             if not estimate.seen:
                 demand = self._blind(previous, demand, robot, dt_s)
         return Demand(
             stamp_ns=estimate.stamp_ns,
             velocity_um_s=demand,
-            reference_um=reference,
-            progress_s=progress_s,
+            reference_um=aim.reference_um,
+            progress_s=aim.progress_s,
             error_um=math.hypot(error[0], error[1]),
             saturated=saturated,
             sent_um_s=remembered(sent, demand, dt_s, robot.delay_s),
         )
+
+    def _aim(
+        self,
+        previous: Demand | None,
+        mission: Mission,
+        route: Route | None,
+        estimate: Estimate,
+        robot: Robot,
+        dt_s: float,
+    ) -> _Aim:
+        """The reference of this frame."""
+        began = previous is None or mission.since_ns > previous.stamp_ns
+        if mission.finished or mission.phase not in _FOLLOWING or route is None or not route.reachable:
+            return _Aim.at_rest(self._place(previous, began, mission, estimate))
+        if previous is None or began or route.stamp_ns > previous.stamp_ns:
+            progress_s, pace = 0.0, 1.0
+        else:
+            span_s = max(dt_s, 1e-3)
+            pace = governed_pace(
+                place_on(route, previous.progress_s) - estimate.position_um,
+                velocity_on(route, previous.progress_s, span_s),
+                self.lag_free_radii * robot.radius,
+                self.lag_full_radii * robot.radius,
+            )
+            progress_s = min(previous.progress_s + pace * dt_s, float(route.arrival_s[-1]))
+        then_s = progress_s + pace * robot.delay_s
+        return _Aim(
+            reference_um=place_on(route, progress_s),
+            reference_then_um=place_on(route, then_s),
+            moving_um_s=pace * velocity_on(route, then_s, max(pace * dt_s, 1e-3)),
+            progress_s=progress_s,
+        )
+
+    @staticmethod
+    def _place(previous: Demand | None, began: bool, mission: Mission, estimate: Estimate) -> Vector:
+        """Where to stay: where the phase, or the robot after it was lost, was found; NaN while it never was."""
+        if previous is None or not np.isfinite(previous.reference_um).all():
+            return estimate.position_um if estimate.seen else np.full(2, np.nan)
+        if not estimate.seen and not previous.velocity_um_s.any() and not mission.finished:
+            return np.full(2, np.nan)
+        return estimate.position_um if began and not mission.finished else previous.reference_um
+
+    def _law(
+        self,
+        aim: _Aim,
+        estimate: Estimate,
+        field: FlowField | None,
+        robot: Robot,
+        clearance_um: NDArray[np.float32] | None,
+        um_per_px: float,
+        sent_um_s: NDArray[np.float64],
+        dt_s: float,
+    ) -> tuple[Vector, bool]:
+        """The demand (2,) um/s and whether the robot's limit cut it."""
+        limit_um_s = robot.speed_limit_um_s
+        if self.method == "vector":
+            belief = blend(field, estimate, self.map_error)
+            point = roll_forward(estimate.position_um, sent_um_s, dt_s, robot.delay_s, belief)
+            flow = belief.at(point)
+            wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, self.kp_per_s)
+            demand, cut = saturated(wanted, flow, limit_um_s)
+        else:
+            point = estimate.position_um
+            flow = sample(field, point) if field is not None else estimate.flow_um_s
+            wanted = ff_fb_law(aim.reference_um - point, aim.moving_um_s, flow, self.ff_fb_kp_per_s, dt_s)
+            demand, cut = shortened(wanted, limit_um_s)
+        if clearance_um is None or self.guard_radii <= 0.0:
+            return demand, cut
+        keep_um = self.guard_radii * robot.radius
+        demand = guarded(demand, flow, point, clearance_um, um_per_px, keep_um, self.guard_per_s)
+        demand, cut_again = shortened(demand, limit_um_s)
+        return demand, cut or cut_again
+
+    def _blind(self, previous: Demand | None, demand_um_s: Vector, robot: Robot, dt_s: float) -> Vector:
+        """The demand while the robot is not seen: never more than what is left of the last one, in the end nothing."""
+        last = previous.velocity_um_s if previous is not None else np.zeros(2)
+        left_um_s = math.hypot(last[0], last[1]) * math.exp(-dt_s / self.blind_s)
+        if left_um_s < 0.02 * robot.speed_limit_um_s:
+            return np.zeros(2)
+        return shortened(demand_um_s, left_um_s)[0]

@@ -55,16 +55,19 @@ def roll_forward(
     sent a delay before now is taking effect now.
     """
     point = np.array(position_um, np.float64)
-    elapsed = 0.0
+    elapsed = max(delay_s - len(sent_um_s) * dt_s, 0.0)  # before the first demand only the flow moves it
+    point = point + elapsed * flow.at(point)
     for k in range(len(sent_um_s), 0, -1):
-        until = delay_s - (k - 1) * dt_s  # the demand k frames ago acts until its successor does
+        until = delay_s - (k - 1) * dt_s  # the demand sent k frames ago acts until its successor does
         if until > elapsed:
             point = point + (until - elapsed) * (sent_um_s[-k] + flow.at(point))
             elapsed = until
     return point
 
 
-def remembered(sent_um_s: NDArray[np.float64], velocity_um_s: Vector, dt_s: float, delay_s: float) -> Vector:
+def remembered(
+    sent_um_s: NDArray[np.float64], velocity_um_s: Vector, dt_s: float, delay_s: float
+) -> NDArray[np.float64]:
     """(m, 2) the demands with the newest added, as many as a delay holds."""
     count = min(int(np.ceil(delay_s / dt_s - 1e-9)) + 1, 100) if dt_s > 0.0 else 1
     return np.concatenate([sent_um_s, velocity_um_s[None]])[-count:]

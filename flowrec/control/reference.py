@@ -22,13 +22,11 @@ def velocity_on(route: Route, time_s: float, over_s: float) -> Vector:
     return (place_on(route, time_s + over_s) - place_on(route, time_s)) / over_s
 
 
-def governed_pace(
-    error_um: Vector, velocity_um_s: Vector, free_um: float, full_um: float, slack_um: float
-) -> float:
+def governed_pace(error_um: Vector, velocity_um_s: Vector, free_um: float, full_um: float) -> float:
     """How fast the reference may go on, as a share of the planned pace: 1 in step, 0 when the robot is left behind.
 
     An error (reference minus robot, (2,)) sideways or behind brakes the reference, from `free_um` on until it waits
-    at `full_um`. A robot that the flow has carried ahead by more than `slack_um` pulls it forward, up to twice the
+    at `full_um`. A robot that the flow has carried ahead by more than `free_um` pulls it forward, up to twice the
     pace, rather than being driven back against the flow.
     """
     speed = float(np.hypot(velocity_um_s[0], velocity_um_s[1]))
@@ -40,4 +38,4 @@ def governed_pace(
             ahead = -along
             lag = math.sqrt(max(lag * lag - along * along, 0.0))
     braked = min(max((full_um - lag) / (full_um - free_um), 0.0), 1.0)
-    return braked * (1.0 + min(max((ahead - slack_um) / full_um, 0.0), 1.0))
+    return braked * (1.0 + min(max((ahead - free_um) / full_um, 0.0), 1.0))

@@ -58,14 +58,14 @@ class Grid:
             [0.5 * (u[..., :, 1:] + u[..., :, :-1]), 0.5 * (v[..., 1:, :] + v[..., :-1, :])],
             axis=-1,
         )
-        return self._blocks(cells).mean(axis=(-4, -2)) * self.mask[..., None]
+        return np.asarray(self._blocks(cells).mean(axis=(-4, -2)) * self.mask[..., None])
 
     def pressure(self, cells: Floats) -> Floats:
         """Averages (..., h, w) over the fluid subcells of each pixel of cell values (..., cells): zero in solid."""
         padded = np.concatenate([cells, np.zeros((*cells.shape[:-1], 1))], axis=-1)
         total = self._blocks(padded[..., self.number_p][..., None]).sum(axis=(-4, -2))[..., 0]
         count = self._blocks(self.fluid[..., None]).sum(axis=(-4, -2))[..., 0]
-        return total / np.maximum(count, 1) * self.mask
+        return np.asarray(total / np.maximum(count, 1) * self.mask)
 
     def _blocks(self, cells: NDArray[np.generic]) -> NDArray[np.float64]:
         """(..., h k, w k, c) as (..., h, k, w, k, c)."""

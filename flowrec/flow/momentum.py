@@ -114,7 +114,7 @@ def _component(
     viscous, flux, carried, gradient = into
     kind, number = own
     cross_kind, cross_number = cross
-    h, w = cells.shape
+    w = cells.shape[1]
     j, i = np.nonzero((kind != WALL) & (kind != INLET))
     me = number[j, i]
 
@@ -141,18 +141,18 @@ def _component(
         cell = at(cells, j, i if step > 0 else i - 1, -1)
         gradient.add(me, cell, -float(step))
     for above, step in enumerate((1, -1)):
-        row = j + (step > 0)
+        beyond_row = j + (step > 0)
         neighbour = at(number, j + step, i, -1)
         reach = np.full(len(j), 0.5)
         if distance is not None:
             reach = np.clip(_beside(distance, j, i, step), NEAREST, FARTHEST)
-        for half, column in enumerate((i - 1, i)):
-            beyond = at(cross_kind, row, column, -1)
-            passing = at(cross_number, row, column, -1)
+        for share, column in enumerate((i - 1, i)):
+            beyond = at(cross_kind, beyond_row, column, -1)
+            passing = at(cross_number, beyond_row, column, -1)
             opened = beyond == OPEN
             viscous.add(me, me, 0.5 * (opened + np.isin(beyond, (WALL, INLET)) / reach))
             viscous.add(np.where(opened, me, -1), neighbour, -0.5)
-            rows = (2 + 2 * above + half) * n + me
+            rows = (2 + 2 * above + share) * n + me
             flux.add(rows, passing, 0.5 * step)
             carried.add(rows, me, np.where(opened, 0.5, 1.0 * (beyond == OUTLET)))
             carried.add(np.where(opened, rows, -1), neighbour, 0.5)

@@ -88,8 +88,8 @@ class FlowSolver:
             request=0,
             method="fvm",
             um_per_px=chip.um_per_px,
-            velocity_um_s=equations.grid.velocity(moving) * UM_PER_M,  # type: ignore[arg-type]
-            pressure_pa=equations.grid.pressure(pressure) * scales.pressure,  # type: ignore[arg-type]
+            velocity_um_s=(equations.grid.velocity(moving) * UM_PER_M).astype(np.float32),
+            pressure_pa=(equations.grid.pressure(pressure) * scales.pressure).astype(np.float32),
             std_um_s=None,
             boundary_values=chip.boundary_values,
             viscosity_mpa_s=chip.viscosity_mpa_s,

@@ -88,7 +88,7 @@ def _chain_inlets(grid: Grid, label: Ints) -> tuple[Ints, dict[int, Floats]]:
             ra, rb = int(root[a]), int(root[b])
             if ra == rb:
                 raise FlowError(
-                    f"inlet {index} ({mouth.side}) leads into fluid without an outlet: make one of its openings an outlet"
+                    f"inlet {index} ({mouth.side}) leads into fluid without an outlet: make one of its openings one"
                 )
             shift = offset.get(a, np.zeros(openings)).copy()
             shift[index] += sign * share

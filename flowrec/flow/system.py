@@ -166,6 +166,4 @@ def _assemble(chip: Chip, k: int, friction: float) -> System:
     momentum = momenta.assemble(grid)
     stream = streams.assemble(grid)
     resisting = sp.csr_array(momentum.viscous + sp.diags_array(friction * momentum.volume))
-    return System(
-        grid, momentum, stream, resisting, factorise(stream.curl.T @ resisting @ stream.curl)
-    )
+    return System(grid, momentum, stream, resisting, factorise(stream.curl.T @ resisting @ stream.curl))

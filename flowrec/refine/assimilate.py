@@ -18,6 +18,7 @@ from flowrec.flow import FlowModes, FlowSolver
 from flowrec.messages import FlowField
 from flowrec.refine.sight import Floats, Sight
 
+FLOOR = 0.01  # of the fastest speed: nothing is known better than that share times model_error_share
 UNSEEN = 0.9  # share of the prior std above which an opening counts as not seen
 
 
@@ -28,7 +29,7 @@ class Assimilate:
     inlet_std_share: float = 0.25  # of the assumed inlet speed
     outlet_std_share: float = 0.10  # of the largest assumed |pressure|
     viscosity_std_share: float = 0.20  # of the assumed viscosity
-    model_error_share: float = 0.02  # of the flow speed: what a perfect set of parameters would leave
+    model_error_share: float = 0.03  # of the flow speed: what a perfect set of parameters would leave
     tail: float = 4.0  # degrees of freedom of the Student-t noise: small doubts outliers more
     max_iterations: int = 6  # linearisations
     tolerance: float = 1e-2  # largest last step, in prior standard deviations
@@ -95,7 +96,10 @@ class Assimilate:
         predicted = sight.of(base.velocity_um_s)
         design = sight.of(jacobian) * prior[:, None, None]  # (parameters, n, 2), in prior stds
         unfitted = sight.flow_um_s - predicted
-        variance = sight.std_um_s**2 + (self.model_error_share * np.linalg.norm(predicted, axis=-1)) ** 2
+        speed = np.linalg.norm(predicted, axis=-1)
+        # The floor keeps an observation of std 0 in stagnant fluid from ruling alone.
+        speed = np.maximum(speed, FLOOR * speed.max() + 1e-9)
+        variance = sight.std_um_s**2 + (self.model_error_share * speed) ** 2
         flat = design.reshape(len(prior), -1)
         start, step = (theta - mean) / prior, np.zeros(len(prior))
         for _ in range(50):
@@ -129,7 +133,7 @@ def _speed_around(field: FlowField, chip: Chip) -> Floats:
     square = (np.asarray(field.velocity_um_s, np.float64) ** 2).sum(axis=-1)
     share = uniform_filter(chip.mask.astype(np.float64), 5, mode="nearest")
     mean = uniform_filter(square, 5, mode="nearest") / np.maximum(share, 0.04)
-    return np.sqrt(np.maximum(mean, 0.0))
+    return np.asarray(np.sqrt(np.maximum(mean, FLOOR**2 * square.max())))
 
 
 def _note(chip: Chip, sight: Sight, std: Floats, prior: Floats) -> str:

@@ -34,14 +34,14 @@ class Sight:
 
 
 def sight(observations: Observations, mask: NDArray[np.bool_], um_per_px: float) -> Sight:
-    """The observations that are finite, have a positive std and lie between fluid pixels."""
+    """The observations that are finite, have a std and lie in a fluid pixel."""
     h, w = mask.shape
     points = observations.position_um / um_per_px
     usable = (
         np.isfinite(points).all(axis=1)
         & np.isfinite(observations.flow_um_s).all(axis=1)
         & np.isfinite(observations.std_um_s)
-        & (observations.std_um_s > 0.0)
+        & (observations.std_um_s >= 0.0)
         & (points >= -0.5).all(axis=1)
         & (points <= np.array([w, h]) - 0.5).all(axis=1)
     )

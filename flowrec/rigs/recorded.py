@@ -31,8 +31,8 @@ class RecordedRig:
         """Nothing to switch off."""
 
     def inputs(self) -> Iterator[Inputs]:
-        """One Inputs per recorded tick after the start."""
-        before = self._reader.tick_before(self._start_ns) if self._start_ns is not None else Tick()
+        """One Inputs per recorded tick, from the start on."""
+        before = self._reader.tick_before(self._start_ns - 1) if self._start_ns is not None else Tick()
         for tick in self._reader.ticks(self._start_ns):
             if tick.applied is None or tick.applied is before.applied:
                 continue  # not a whole tick: the one a crash cut off, or messages of an operator alone

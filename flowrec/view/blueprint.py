@@ -14,6 +14,8 @@ from flowrec.view.scene import Scene
 _EVERYTHING = frozenset({"assumed", "refined", "change", "uncertainty", "truth", "true robot", "timing"})
 _COIL_WINDOW_S = 2.0  # the currents turn several times a second; a whole session of them is a solid block
 
+_SEVERAL_LINES = frozenset({e.CURRENT, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
+
 
 def blueprint(scene: Scene, has_replay: bool = False, present: AbstractSet[str] = _EVERYTHING) -> rrb.Blueprint:
     """The layout for one session, or for a recorded and a replayed one beside each other.
@@ -51,10 +53,10 @@ def _single(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
     )
     camera = _camera(scene, "Camera: path, robot, goal, flow", ["$origin/**"], e.under("", "camera"))
     maps = [row for row in (first, second) if row is not None]
-    above = rrb.Horizontal(camera, rrb.Vertical(*maps), column_shares=[1, 1]) if maps else camera
+    above = rrb.Horizontal(camera, rrb.Vertical(*maps), column_shares=_camera_shares(scene)) if maps else camera
     return rrb.Vertical(
         above,
-        _phases([""]),
+        _phases([e.PHASE, e.SIGHT]),
         rrb.Horizontal(
             _tabs(
                 _plot("Coil currents (A)", [e.CURRENT], window_s=_COIL_WINDOW_S),
@@ -75,7 +77,7 @@ def _single(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
                 _plot("Timing (ms)", [e.TIMING]) if "timing" in present else None,
             ),
         ),
-        row_shares=[6.4, 1.05, 2.9],
+        row_shares=[6.4, 1.45, 2.7],
     )
 
 
@@ -110,11 +112,11 @@ def _replay(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
         ]
     )
     maps = [row for row in (first, second) if row is not None]
-    above = rrb.Horizontal(camera, rrb.Vertical(*maps), column_shares=[1, 1]) if maps else camera
+    above = rrb.Horizontal(camera, rrb.Vertical(*maps), column_shares=_camera_shares(scene)) if maps else camera
     both = (old, new)
     return rrb.Vertical(
         above,
-        _phases(both),
+        _phases([e.PHASE], both),
         rrb.Horizontal(
             _tabs(
                 _plot("Command: field frequency (Hz)", [e.FREQUENCY], both),
@@ -130,8 +132,15 @@ def _replay(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
             _plot("Flow at the robot: observer and map (µm/s)", [e.FLOW_SPEED], both),
             _events([e.EVENTS, e.OPERATOR], both),
         ),
-        row_shares=[6.4, 1.4, 2.9],
+        row_shares=[6.4, 1.45, 2.7],
     )
+
+
+def _camera_shares(scene: Scene) -> list[float]:
+    """Widths of camera and maps: as wide as the image needs on a usual screen, so that little stays grey."""
+    left, top, right, bottom = scene.image_bounds()
+    camera = min(max(0.34 * (right - left) / (bottom - top), 0.3), 0.55)
+    return [camera, 1.0 - camera]
 
 
 def _row(parts: list[rrb.View | rrb.Container | None]) -> rrb.Container | None:
@@ -191,22 +200,26 @@ def _plot(
             end=rrb.TimeRangeBoundary.cursor_relative(seconds=0.25 * window_s),
         )
     paths = [e.under(prefix, entity) for prefix in prefixes for entity in entities]
+    legend = len(paths) > 1 or entities[0] in _SEVERAL_LINES  # of a single line the title says it all
     return rrb.TimeSeriesView(
         name=name,
         origin=paths[0] if len(paths) == 1 else "/",
         contents=[f"+ {path}" for path in paths],
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=True),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         time_ranges=ranges,
     )
 
 
-def _phases(prefixes: list[str] | tuple[str, ...]) -> rrb.StateTimelineView:
-    paths = [e.under(prefix, entity) for entity in (e.PHASE, e.SIGHT) for prefix in prefixes]
+def _phases(entities: list[str], prefixes: tuple[str, ...] = ("",)) -> rrb.StateTimelineView:
+    paths = [e.under(prefix, entity) for entity in entities for prefix in prefixes]
     return rrb.StateTimelineView(name="Mission", origin="/", contents=[f"+ {path}" for path in paths])
 
 
 def _events(entities: list[str], prefixes: tuple[str, ...] = ("",)) -> rrb.TextLogView:
     paths = [e.under(prefix, entity) for prefix in prefixes for entity in entities]
-    return rrb.TextLogView(name="Events", origin="/", contents=[f"+ {path}" for path in paths])
-
-
+    return rrb.TextLogView(
+        name="Events",
+        origin="/",
+        contents=[f"+ {path}" for path in paths],
+        columns=rrb.TextLogColumns(timeline_columns=[e.SESSION_TIME], text_log_columns=["LogLevel", "Body"]),
+    )

@@ -55,12 +55,14 @@ class _Style:
     word: str
     path: palette.Rgb
     robot: palette.Rgb
+    width: float  # the recorded one is broad and below, so that both are seen where they coincide
+    label_at: float  # share of the path
 
 
 _STYLES = {
-    "": _Style("", palette.CYAN, palette.ORANGE),
-    "recorded": _Style("recorded ", palette.ORANGE, palette.ORANGE),
-    "replayed": _Style("replayed ", palette.CYAN, palette.CYAN),
+    "": _Style("", palette.CYAN, palette.ORANGE, 1.4, 0.06),
+    "recorded": _Style("recorded ", palette.ORANGE, palette.ORANGE, 2.6, 0.06),
+    "replayed": _Style("replayed ", palette.CYAN, palette.CYAN, 1.2, 0.25),
 }
 
 
@@ -96,6 +98,8 @@ class TickLogger:
         self._grid = arrow_grid(scene)
         self._bar = maps.ColourBar.beside(scene)
         self._names: dict[str, str] = {}
+        left, _, right, _ = scene.image_bounds()
+        self._label_px = (right - left) / 640.0  # about one line of text is 24 of these in the usual layout
         self._robot_px = scene.length_px(scene.robot.radius)
         turn = np.linspace(0.0, 2.0 * np.pi, 33)
         self._ring = np.stack([np.cos(turn), np.sin(turn)], 1)
@@ -155,35 +159,39 @@ class TickLogger:
             self._log(entity, maps.placed(placement), static=True)
         if self._images:
             self._log(e.IMAGE, maps.placed(self._scene.preview_placement(self._image_step)), static=True)
-        second = self._prefix == "replayed"  # drawn into the same plot as the recorded one
-        word = self._style.word
+        self._log_series()
+        self._log(e.PHASE, rr.StateConfiguration(values=list(_PHASES), colors=list(_PHASES.values())), static=True)
+        self._log(
+            e.SIGHT, rr.StateConfiguration(values=["seen", "lost"], colors=[palette.GREEN, palette.RED]), static=True
+        )
 
-        def lines(entity: str, *named: tuple[str, palette.Rgb], width: float = 1.5) -> None:
-            names, colours = zip(*((word + name, colour) for name, colour in named), strict=True)
-            self._log(
-                entity, rr.SeriesLines(names=names, colors=colours, widths=[width] * len(names)), static=True
-            )
+    def _log_series(self) -> None:
+        """Names and colours of all lines. One line of each session in a plot: the session's name says which."""
+
+        def lines(entity: str, *named: tuple[str, palette.Rgb]) -> None:
+            names = [self._style.word + name for name, _ in named]
+            if self._prefix and len(named) == 1:
+                names = [self._prefix]
+            colours = [colour for _, colour in named]
+            self._log(entity, rr.SeriesLines(names=names, colors=colours, widths=[1.5] * len(named)), static=True)
 
         own = self._style.path if self._prefix else palette.YELLOW
+        paler = palette.BLUE if self._prefix == "replayed" else palette.YELLOW
         lines(e.CURRENT, ("x (A)", palette.RED), ("y (A)", palette.GREEN), ("z (A)", palette.BLUE))
         lines(e.FREQUENCY, ("frequency (Hz)", own))
         lines(e.HEADING, ("heading (°)", own))
         lines(e.TRACKING_ERROR, ("tracking error (µm)", own))
-        lines(e.ESTIMATE_ERROR, ("estimate error, from truth (µm)", palette.GREEN))
+        lines(e.ESTIMATE_ERROR, ("estimate error (µm)", own))
+        lines(e.NIS, ("NIS", own))
+        truth = () if self._prefix == "replayed" else (("truth", palette.GREEN),)  # the same in both
+        lines(e.FLOW_SPEED, ("observer", self._style.path), ("map", paler), *truth)
         lines(
             e.FLOW_COMPONENTS,
-            ("vx observed (µm/s)", palette.CYAN if second or not word else palette.ORANGE),
-            ("vx on map (µm/s)", palette.BLUE if second or not word else palette.RED),
-            ("vy observed (µm/s)", palette.YELLOW if second or not word else palette.PURPLE),
-            ("vy on map (µm/s)", palette.ORANGE if second or not word else palette.GREY),
+            ("vx observer", palette.CYAN),
+            ("vx map", palette.BLUE),
+            ("vy observer", palette.YELLOW),
+            ("vy map", palette.ORANGE),
         )
-        lines(
-            e.FLOW_SPEED,
-            ("speed observed (µm/s)", self._style.path),
-            ("speed on map (µm/s)", palette.BLUE if self._prefix == "replayed" else palette.YELLOW),
-            ("true speed (µm/s)", palette.GREEN),
-        )
-        lines(e.NIS, ("NIS (expected 2)", own))
         lines(
             e.TIMING,
             ("track (ms)", palette.CYAN),
@@ -191,10 +199,6 @@ class TickLogger:
             ("control (ms)", palette.YELLOW),
             ("sinks (ms)", palette.BLUE),
             ("total (ms)", palette.WHITE),
-        )
-        self._log(e.PHASE, rr.StateConfiguration(values=list(_PHASES), colors=list(_PHASES.values())), static=True)
-        self._log(
-            e.SIGHT, rr.StateConfiguration(values=["seen", "lost"], colors=[palette.GREEN, palette.RED]), static=True
         )
 
     # ---- camera
@@ -210,18 +214,18 @@ class TickLogger:
         self.present.add("route")
         if not route.reachable or len(route.waypoints_um) < 2:
             self._log(e.PATH, rr.LineStrips2D([]))
+            self._log(e.PATH_LABEL, rr.Points2D([]))
             return
+        points = self._scene.to_plane(route.waypoints_um)
+        radius = rr.Radius.ui_points(self._style.width)
         self._log(
             e.PATH,
             rr.LineStrips2D(
-                [self._scene.to_plane(route.waypoints_um)],
-                colors=self._style.path,
-                radii=rr.Radius.ui_points(1.4),
-                labels=[f"{self._style.word}path"],
-                show_labels=bool(self._prefix),
-                draw_order=20.0,
+                [points], colors=self._style.path, radii=radius, draw_order=20.0 + (self._prefix == "replayed")
             ),
         )
+        at = points[int(self._style.label_at * (len(points) - 1))]
+        self._log(e.PATH_LABEL, _label(at, f"{self._style.word}path", self._style.path))
 
     def _log_mission(self, mission: Mission, last: Mission | None) -> None:
         if last is None or not np.array_equal(mission.goal_um, last.goal_um, equal_nan=True):
@@ -248,13 +252,7 @@ class TickLogger:
                 radii=rr.Radius.ui_points(1.2),
                 draw_order=25.0,
             ),
-            rr.Points2D(
-                [centre + (0.0, radius)],
-                labels=["goal"],
-                show_labels=True,
-                colors=palette.GREEN,
-                radii=rr.Radius.ui_points(0.0),
-            ),
+            _label(centre + (0.0, radius), "goal", palette.GREEN),
         )
 
     def _log_sight(self, track: Track, last: Track | None) -> None:
@@ -263,33 +261,25 @@ class TickLogger:
 
     def _log_estimate(self, estimate: Estimate, field: FlowField | None, truth: Truth | None) -> None:
         centre = self._scene.to_plane(estimate.position_um)
-        colour = self._style.robot if estimate.seen else palette.GREY
+        colour = self._style.robot if estimate.seen else palette.PALE
+        ring = [centre + self._robot_px * self._ring]
+        radius = rr.Radius.ui_points(self._style.width)
         self._log(
             e.ROBOT,
-            rr.LineStrips2D(
-                [centre + self._robot_px * self._ring], colors=colour, radii=rr.Radius.ui_points(1.5), draw_order=30.0
-            ),
+            rr.LineStrips2D(ring, colors=colour, radii=radius, draw_order=30.0 + (self._prefix == "replayed")),
         )
-        label = f"{self._style.word}robot" + ("" if estimate.seen else " (not seen)")
         # Recorded and replayed robots mostly coincide: their labels go to either side.
-        side = -1.0 if self._prefix == "recorded" else 1.0
-        self._log(
-            e.ROBOT_LABEL,
-            rr.Points2D(
-                [centre + (0.0, side * (self._robot_px + 4.0))],
-                labels=[label],
-                show_labels=True,
-                colors=colour,
-                radii=rr.Radius.ui_points(0.0),
-            ),
-        )
+        aside = self._robot_px + 2.0 if self._prefix != "recorded" else -self._robot_px - 24.0 * self._label_px
+        word = f"{self._style.word}robot" + ("" if estimate.seen else " (not seen)")
+        self._log(e.ROBOT_LABEL, _label(centre + (0.0, aside), word, colour))
         self._log_trail(estimate.stamp_ns, centre)
         flow = estimate.flow_um_s
         on_map = sample(field, estimate.position_um) if field is not None else np.full(2, np.nan)
         self._log(e.FLOW_COMPONENTS, rr.Scalars([flow[0], on_map[0], flow[1], on_map[1]]))
         speeds = [math.hypot(*flow), math.hypot(*on_map)]
         if truth is not None:
-            speeds.append(math.hypot(*truth.flow_um_s))
+            if self._prefix != "replayed":
+                speeds.append(math.hypot(*truth.flow_um_s))
             self._log(e.ESTIMATE_ERROR, rr.Scalars(math.dist(estimate.position_um, truth.position_um)))
             self.present.add("true robot")
         self._log(e.FLOW_SPEED, rr.Scalars(speeds))
@@ -308,7 +298,7 @@ class TickLogger:
             self._log(
                 e.TRAIL,
                 rr.LineStrips2D(
-                    [points], colors=(*self._style.robot, 150), radii=rr.Radius.ui_points(1.0), draw_order=15.0
+                    [points], colors=(*self._style.robot, 150), radii=rr.Radius.ui_points(1.0), draw_order=24.0
                 ),
             )
 
@@ -395,14 +385,13 @@ class TickLogger:
         self._log_scale(e.UNCERTAINTY_SCALE, scale)
 
     def _log_scale(self, entity: str, scale: palette.Scale) -> None:
-        image, where = self._bar.strip(scale)
-        self._log(f"{entity}/bar", image, where)
-        self._log(f"{entity}/ticks", self._bar.numbers(scale))
+        self._log(f"{entity}/bar", *self._bar.strip(scale))
+        self._log(f"{entity}/ticks", *self._bar.ticks(scale))
 
     def _log_arrows(self, field: FlowField) -> None:
         assert self._speeds.scale is not None
         origins, vectors, speed = flow_arrows(self._scene, field, self._grid)
-        radius = 0.04 * self._scene.length_px(self._grid[1])
+        radius = 0.07 * self._scene.length_px(self._grid[1])
         self._log(
             e.ARROWS,
             rr.Arrows2D(
@@ -425,11 +414,19 @@ class TickLogger:
         )
 
     def _log_event(self, event: Event) -> None:
-        self._log(e.EVENTS, rr.TextLog(event.text, level=_LEVELS.get(event.level, "INFO")))
+        self._log(e.EVENTS, rr.TextLog(self._said(event.text), level=_LEVELS.get(event.level, "INFO")))
 
     def _log_operator(self, event: OperatorEvent) -> None:
         text = f"operator: {event.action}" + (f": {event.text}" if event.text else "")
-        self._log(e.OPERATOR, rr.TextLog(text, level="INFO"))
+        self._log(e.OPERATOR, rr.TextLog(self._said(text), level="INFO"))
+
+    def _said(self, text: str) -> str:
+        return f"{self._prefix}: {text}" if self._prefix else text
+
+
+def _label(at: NDArray[np.float64], text: str, colour: palette.Rgb) -> rr.Points2D:
+    """A word that stays readable at any zoom, just below a point (2,) of the picture plane."""
+    return rr.Points2D([at], labels=[text], show_labels=True, colors=colour, radii=rr.Radius.ui_points(0.0))
 
 
 def _state(mission: Mission) -> str:

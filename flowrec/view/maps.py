@@ -84,13 +84,13 @@ class ColourBar:
         """To the right of the chip, a little lower than it."""
         _, top, right, bottom = scene.chip_bounds()
         height = bottom - top
-        return cls(right + 0.035 * height, top + 0.06 * height, 0.045 * height, 0.88 * height)
+        return cls(right + 0.035 * height, top + 0.13 * height, 0.045 * height, 0.82 * height)
 
     def bounds_with(self, scene: Scene) -> tuple[float, float, float, float]:
         """Left, top, right, bottom of the chip together with its bar and the numbers at it."""
         left, top, _, bottom = scene.chip_bounds()
         margin = 0.02 * (bottom - top)
-        return left - margin, top - margin, self.left + self.width + 0.25 * (bottom - top), bottom + margin
+        return left - margin, top - margin, self.left + self.width + 0.26 * (bottom - top), bottom + margin
 
     def strip(self, scale: Scale) -> tuple[rr.Image, rr.Transform3D]:
         """The colours, highest on top."""
@@ -99,14 +99,22 @@ class ColourBar:
         where = rr.Transform3D(translation=[self.left, self.top, 0.0], scale=[self.width, self.height / rows, 1.0])
         return rr.Image(scale.paint(values)), where
 
-    def numbers(self, scale: Scale) -> rr.Points2D:
-        """The ticks with their values, the highest with the unit."""
+    def ticks(self, scale: Scale) -> tuple[rr.LineStrips2D, rr.Points2D]:
+        """The ticks with their values to the right of them, and the unit above the bar."""
         share = (np.array(scale.ticks) - scale.low) / (scale.high - scale.low)
-        x = np.full(len(share), self.left + self.width)
         y = self.top + self.height * (1.0 - share)
-        sign = "+" if scale.colours == "change" else ""
-        labels = [f"{value:{sign}g}" if abs(value) > 1e-9 else "0" for value in scale.ticks]
-        labels[-1] += " µm/s"
-        return rr.Points2D(
-            np.stack([x, y], 1), labels=labels, show_labels=True, colors=palette.WHITE, radii=rr.Radius.ui_points(1.5)
+        right = self.left + self.width
+        dash = 0.25 * self.width
+        marks = rr.LineStrips2D(
+            [[[right, at], [right + dash, at]] for at in y], colors=palette.WHITE, radii=rr.Radius.ui_points(0.8)
         )
+        sign = "+" if scale.colours == "change" else ""
+        labels = [f"{value:{sign}g}" if abs(value) > 1e-9 * scale.high else "0" for value in scale.ticks]
+        labels.append("µm/s")
+        # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
+        at = [(right + 2.0 * self.width, row - 0.045 * self.height) for row in y]
+        at.append((self.left + 0.5 * self.width, self.top - 0.14 * self.height))
+        numbers = rr.Points2D(
+            at, labels=labels, show_labels=True, colors=palette.WHITE, radii=rr.Radius.ui_points(0)
+        )
+        return marks, numbers

@@ -21,6 +21,7 @@ RED: Rgb = (255, 84, 84)
 BLUE: Rgb = (92, 146, 255)
 PURPLE: Rgb = (196, 140, 255)
 GREY: Rgb = (150, 150, 158)
+PALE: Rgb = (206, 206, 212)
 WHITE: Rgb = (236, 236, 240)
 
 # Viridis for speeds: as bright as it is fast, also for the colour-blind; the others so that no map is mistaken.
@@ -54,8 +55,9 @@ class Scale:
     @classmethod
     def up_to(cls, largest: float, colours: Colours) -> Scale:
         """From zero (a change: from its negative) to a round number that is not below `largest`."""
-        step = _round_step(max(largest, 1e-9) / 4.0)
-        high = step * math.ceil(max(largest, 1e-9) / step - 1e-9)
+        largest = max(largest, 1e-9)
+        step = _round_step(largest / (3.0 if colours == "change" else 6.0))
+        high = step * math.ceil(largest / step - 1e-9)
         return cls(colours, -high if colours == "change" else 0.0, high, step)
 
     @property

@@ -1,0 +1,47 @@
+"""The refinement stage: an assumed flow and what the robot felt of the real one to a better flow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from flowrec.chip.chip import Chip
+from flowrec.errors import FlowError
+from flowrec.flow import FlowSolver
+from flowrec.messages import FlowField, Observations
+from flowrec.refine.assimilate import Assimilate
+from flowrec.refine.pi_unet import PiUnet
+from flowrec.refine.sight import sight
+
+
+@dataclass(frozen=True, slots=True)
+class Refiner:
+    """Which method refines, and the settings of each."""
+
+    method: Literal["assimilate", "pi_unet"] = "assimilate"
+    assimilate: Assimilate = field(default_factory=Assimilate)
+    pi_unet: PiUnet = field(default_factory=PiUnet)
+
+    def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
+        """Better field on the same pixels; stamp and request are those of `assumed`.
+
+        `chip` holds the assumed parameters. Without a usable observation `assumed` comes back with a note.
+
+        Raises
+        ------
+        FlowError
+            If field and chip differ in size, or the flow of the fitted parameters can not be computed.
+        """
+        if assumed.velocity_um_s.shape[:2] != chip.mask.shape:
+            raise FlowError(
+                f"the assumed field has {assumed.velocity_um_s.shape[:2]} pixels and the mask of chip '{chip.name}' "
+                f"{chip.mask.shape}: solve the flow again for this chip"
+            )
+        seen = sight(observations, chip.mask, chip.um_per_px)
+        if seen.count == 0:
+            why = "none of the observations lies in the fluid" if len(observations.std_um_s) else "no observations"
+            return replace(assumed, note=f"not refined: {why}")
+        if self.method == "assimilate":
+            return self.assimilate.fit(assumed, seen, chip, solver)
+        start = self.assimilate.fit(assumed, seen, chip, solver) if self.pi_unet.start == "assimilate" else assumed
+        return self.pi_unet.fit(start, seen, chip)

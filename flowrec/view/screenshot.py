@@ -1,0 +1,132 @@
+"""A picture of the viewer, with no screen needed: for people far from one, and for tests."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from rerun.experimental import ViewerClient, ViewerState
+
+from flowrec.errors import FlowrecError
+from flowrec.units import nanoseconds
+from flowrec.view import viewer
+from flowrec.view.entities import SESSION_TIME
+
+_T = TypeVar("_T")
+
+_START_S = 20.0
+_LOAD_S = 60.0
+_SETTLE_S = 1.0  # images are decoded and plots laid out over some frames
+_NOTICES_S = 4.5  # until the viewer's greetings have left the upper right corner
+
+
+def screenshot(
+    path: Path | str, out_png: Path | str, time_s: float | None = None, size: tuple[int, int] = (1920, 1080)
+) -> list[str]:
+    """Save what the viewer shows of a file (.rrd or .mcap) at a session time, at the end without one.
+
+    Returns the problems that the views report, one line each; of a file in order there are none.
+
+    Raises
+    ------
+    FlowrecError : there is no viewer, or it has no graphics to draw with, or does not read the file.
+    """
+    path, out_png = Path(path).resolve(), Path(out_png).resolve()
+    if not path.exists():
+        raise FlowrecError(f"{path}: no such file")
+    with _headless(size) as (client, began):
+        client.open(path.as_uri())
+        state = _until(lambda: _loaded(client), _LOAD_S)
+        if state is None:
+            raise FlowrecError(f"{path}: the viewer shows nothing of it; `rerun rrd verify {path}` says more")
+        timeline = _session_timeline(state)
+        if timeline is not None:
+            name, end_ns = timeline
+            at = np.timedelta64(end_ns if time_s is None else nanoseconds(time_s), "ns")
+            client.set_time(name, duration=at, play_state="paused")
+        time.sleep(max(_SETTLE_S, began + _NOTICES_S - time.monotonic()))
+        out_png.parent.mkdir(parents=True, exist_ok=True)
+        out_png.write_bytes(client.take_screenshot())
+        return [
+            f"{view.name}: {report.severity}: {report.summary}"
+            for view in client.get_state().views
+            for report in view.reports
+        ]
+
+
+@contextlib.contextmanager
+def _headless(size: tuple[int, int]) -> Iterator[tuple[ViewerClient, float]]:
+    """A viewer without a window, and when it began."""
+    with tempfile.TemporaryDirectory(prefix="flowrec-view-") as folder:
+        log = Path(folder, "viewer.log")
+        port = viewer.free_port()
+        arguments = ["--headless", "--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
+        try:
+            process = viewer.start([*arguments, "--hide-welcome-screen"], log)
+        except OSError as error:
+            raise FlowrecError(f"no screenshot: {error.strerror or error}; `pip install rerun-sdk`") from error
+        try:
+            began = time.monotonic()
+            client = _until(lambda: _connected(port, process), _START_S)
+            if client is None:
+                raise FlowrecError(f"no screenshot: the viewer does not start; {_why(log)}")
+            yield client, began
+        except ConnectionError as error:
+            process.poll()
+            raise FlowrecError(f"no screenshot: the viewer ended; {_why(log)}") from error
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _connected(port: int, process: subprocess.Popen[bytes]) -> ViewerClient | None:
+    """A client, once the viewer draws."""
+    if process.poll() is not None:
+        raise ConnectionError
+    try:
+        client = ViewerClient.connect(f"rerun+http://{viewer.LOOPBACK}:{port}/proxy")
+        client.get_state()
+    except ConnectionError:
+        return None
+    return client
+
+
+def _loaded(client: ViewerClient) -> ViewerState | None:
+    """What the viewer shows, once nothing is on its way any more."""
+    state = client.get_state()
+    return state if not state.loading and any(recording.timelines for recording in state.recordings) else None
+
+
+def _session_timeline(state: ViewerState) -> tuple[str, int] | None:
+    """Name and end in ns of the timeline that counts from the start of the session, if there is one."""
+    for recording in state.recordings:
+        for timeline in recording.timelines:
+            if timeline.name == SESSION_TIME and timeline.end is not None:
+                return timeline.name, int(timeline.end)
+    return None
+
+
+def _until(done: Callable[[], _T | None], limit_s: float) -> _T | None:
+    """The first result that is not None, within a time."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end:
+        result = done()
+        if result is not None:
+            return result
+        time.sleep(0.1)
+    return None
+
+
+def _why(log: Path) -> str:
+    """The viewer's last words."""
+    said = log.read_text(errors="replace")
+    if "render context" in said or "adapter" in said:
+        return "it has no graphics to draw with: install a driver, or `apt install mesa-vulkan-drivers` for a software one"
+    lines = [line for line in said.splitlines() if line.strip()]
+    return lines[-1] if lines else "it says nothing"

@@ -1,0 +1,87 @@
+"""Where Rerun's viewer is, whether there is a screen for it, and how it is started: bound to this machine only."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+LOOPBACK = "127.0.0.1"  # Rerun's own default is every interface
+# Marks the viewer as started by a program: it asks no questions on its first run.
+_ENVIRONMENT = {"RERUN_APP_ONLY": "true"}
+
+
+def executable() -> Path | None:
+    """The viewer itself, not the Python wrapper around it, which leaves an orphan behind when it is killed."""
+    named = os.environ.get("RERUN_CLI_PATH")
+    if named:
+        return Path(named) if Path(named).exists() else None
+    try:
+        import rerun_cli
+    except ImportError:
+        found = shutil.which("rerun")
+        return Path(found) if found else None
+    folder = Path(rerun_cli.__file__).parent
+    for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun"):
+        if (folder / name).exists():
+            return folder / name
+    return None
+
+
+def has_display() -> bool:
+    """Whether a window can open."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def free_port() -> int:
+    """A port on which nothing listens just now."""
+    with socket.socket() as trial:
+        trial.bind((LOOPBACK, 0))
+        return int(trial.getsockname()[1])
+
+
+def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[bytes]:
+    """Start the viewer with its server on the loopback only, in a session of its own.
+
+    Ctrl-C in the terminal does not reach it, so it can outlive the run and still show its end.
+
+    Raises
+    ------
+    OSError : there is no viewer, or it does not start.
+    """
+    program = executable()
+    if program is None:
+        raise FileNotFoundError("Rerun's viewer is not installed")
+    output = log.open("wb") if log is not None else subprocess.DEVNULL
+    try:
+        return subprocess.Popen(  # noqa: S603 - Rerun's own program, arguments are ours
+            [str(program), "--bind", LOOPBACK, *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+            env=os.environ | _ENVIRONMENT,
+        )
+    finally:
+        if not isinstance(output, int):
+            output.close()
+
+
+def open_viewer(path: Path | str) -> str:
+    """Open a file in the viewer's window; '' when that was done, else one line that says how to see it."""
+    path = Path(path)
+    if executable() is None:
+        return f"{path}: Rerun's viewer is not installed here; `pip install rerun-sdk`, then `rerun {path}`"
+    if not has_display():
+        return f"{path}: no screen here; copy the file and open it with `rerun {path.name}`"
+    try:
+        viewer = start(["--port", "auto", "--hide-welcome-screen", str(path.resolve())])
+    except OSError as error:
+        return f"{path}: Rerun's viewer does not start ({error.strerror or error}); try `rerun {path}`"
+    viewer.returncode = 0  # It stays open after us, and that is no leak.
+    return ""
