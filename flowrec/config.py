@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
+import numpy as np
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
 
@@ -51,6 +52,7 @@ class Recording:
     operator: str = ""
     notes: str = ""
     sample: str = ""
+    anonymous: bool = False  # leave host, user, platform and local changes out of the file, to hand it on
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +131,7 @@ def resolve(config: Config, chip: Chip) -> Config:
     """Fill in what was left to fit the chip, place the camera, and turn named places into points.
 
     A robot that nobody described is made to suit the chip: radius 50 um, or a fifth of the median channel width
-    where that is narrower, but at least three camera pixels; v_max 600 um/s, or twice the fastest inlet.
+    where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow.
     """
     camera, robot = config.camera, config.robot
     width_um, height_um = chip.size_um
@@ -142,13 +144,14 @@ def resolve(config: Config, chip: Chip) -> Config:
         radius = min(max(min(50.0, 0.2 * channel_um), 3.0 * camera.um_per_px), 0.25 * channel_um)
         robot = replace(robot, radius_um=round(radius, 2))
     if robot.max_speed_um_s is None:
-        inlets = [opening.value for opening in chip.openings if opening.kind == "inlet"]
-        robot = replace(robot, max_speed_um_s=max(600.0, 2.0 * max(inlets, default=0.0)))
+        peak = float(np.linalg.norm(config.flow.solve(chip).velocity_um_s, axis=-1).max())
+        robot = replace(robot, max_speed_um_s=max(600.0, round(1.3 * peak, 1)))
     assert robot.max_speed_um_s is not None
     if robot.max_speed_um_s <= 0:
         raise UsageError(f"robot.max_speed_um_s = {robot.max_speed_um_s:g}: the robot must move; give a positive speed")
     if robot.step_out_hz is None:
         robot = replace(robot, step_out_hz=1.2 * robot.max_speed_um_s / robot.um_per_rev)
+    assert robot.max_speed_um_s is not None
     if camera.rate_hz is None:
         rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), 100.0)
         camera = replace(camera, rate_hz=round(rate, 1))

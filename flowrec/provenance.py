@@ -31,14 +31,12 @@ PACKAGES = (
 _DIFF_LIMIT = 200_000  # characters; a larger change is cut and says so
 
 
-def provenance() -> dict[str, str]:
-    """Facts about code, machine and moment as text, for the head of a session."""
-    facts = {
-        "flowrec": flowrec.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "host": platform.node(),
-        "user": _user(),
+def provenance(anonymous: bool = False) -> dict[str, str]:
+    """Facts about code, machine and moment as text, for the head of a session; `anonymous` leaves the machine out."""
+    facts = {"flowrec": flowrec.__version__, "python": platform.python_version()}
+    if not anonymous:
+        facts |= {"platform": platform.platform(), "host": platform.node(), "user": _user()}
+    facts |= {
         "wall_time": datetime.now(UTC).isoformat(),
         "wall_ns": str(time.time_ns()),
         "monotonic_ns": str(time.monotonic_ns()),
@@ -53,7 +51,7 @@ def provenance() -> dict[str, str]:
     # Only a checkout of flowrec itself counts, not a repository that a virtual environment happens to lie in.
     if commit and _git(source, "ls-files", "--error-unmatch", "__init__.py"):
         facts["git_commit"] = commit
-        diff = _git(source, "diff", "HEAD", "--", ".")
+        diff = "" if anonymous else _git(source, "diff", "HEAD", "--", ".")
         if diff:
             cut = f"\n... cut at {_DIFF_LIMIT} characters" if len(diff) > _DIFF_LIMIT else ""
             facts["git_diff"] = diff[:_DIFF_LIMIT] + cut

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from flowrec.chip import load_chip
+from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.config import Config, resolve
 from flowrec.errors import SessionError, UsageError
@@ -76,6 +76,13 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
                 f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
                 f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
             )
+    blind_um = config.robot.delay_s * config.robot.max_speed_um_s
+    if blind_um > 0.5 * median_width_um(chip):
+        warn(
+            f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at {config.robot.max_speed_um_s:.0f}"
+            f" um/s goes {blind_um:.0f} um, more than half a channel: expect it to be swept into walls; "
+            "set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
+        )
     return config, chip, assemble(config, chip)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.compare import Comparison
@@ -324,10 +325,10 @@ def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick
     return tick if tick.refined is not last.refined or tick.route is not last.route else last
 
 
-def _planned_from(recorded: Tick, last: Tick) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def _planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
     """Where the recorded route began, else where the robot is."""
     if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
-        return recorded.route.waypoints_um[0]
+        return np.array(recorded.route.waypoints_um[0], np.float64)
     assert last.estimate is not None
     return last.estimate.position_um
 
@@ -416,7 +417,6 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
         )
     source_config = open_session(done.source)[1]
     start = tuple(float(value) for value in _planned_from(done.recorded, done.replayed))
-    rows = []
     flights = {
         "recorded": (source_config, done.recorded, None),
         "replayed": (done.config, done.replayed, out),
@@ -445,10 +445,12 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
             reports[name] = report = run(pipeline, rig, worker, sinks)
             if target is not None:
                 writer.close({"outcome": report.outcome, "note": f"refly of {done.source.name}"})
-    rows.append(("reflown: outcome", reports["recorded"].outcome, reports["replayed"].outcome))
-    rows.append(("reflown: navigation", *(_navigation_s(reports[name]) for name in ("recorded", "replayed"))))
-    rows.append(("reflown: wall contacts", *(str(reports[name].contacts) for name in ("recorded", "replayed"))))
-    return rows
+    was, now = reports["recorded"], reports["replayed"]
+    return [
+        ("reflown: outcome", was.outcome, now.outcome),
+        ("reflown: navigation", _navigation_s(was), _navigation_s(now)),
+        ("reflown: wall contacts", str(was.contacts), str(now.contacts)),
+    ]
 
 
 def _navigation_s(report: RunReport) -> str:

@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 from types import FrameType
-from typing import Protocol
+from typing import Any, Protocol
 
 from flowrec import work as working
 from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Timing
@@ -226,7 +226,8 @@ def run(
         stack.enter_context(rig)
         for arrived in rig.inputs():
             begin = mark = clock()
-            inputs = replace(arrived, **worker.due(arrived.stamp_ns))
+            due: dict[str, Any] = dict(worker.due(arrived.stamp_ns))
+            inputs = replace(arrived, **due)
             if stop is not None and stop.reason:
                 asked = OperatorEvent(inputs.stamp_ns, "stop", f"stopped by {stop.reason}")
                 inputs = replace(inputs, operator=asked)

@@ -20,7 +20,7 @@ from flowrec.topics import BY_FIELD
 def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:
     """Everything that must be in a file before its first frame."""
     png, toml = chip_files(chip)
-    facts = provenance() | {
+    facts = provenance(config.recording.anonymous) | {
         "operator": config.recording.operator,
         "sample": config.recording.sample,
         "notes": config.recording.notes,

@@ -28,7 +28,7 @@ class Simulated:
     """How the simulated world differs from what is assumed about it, and how the robot jitters. Drawn from the seed."""
 
     seed: int = 0
-    inlet_speed_error: float = 0.2  # each true inlet speed is the assumed one times 1 +- this, uniformly
+    inlet_speed_error: float = 0.25  # each true inlet speed is the assumed one times 1 +- (a third of this to all)
     outlet_pressure_error: float = (
         0.1  # each true outlet pressure differs by up to this share of the chip's pressure drop
     )

@@ -112,6 +112,8 @@ class Commander:
         robot: Robot,
     ) -> Mission:
         """What follows when no work is pending, or it has just been answered."""
+        if not track.seen and previous.phase != "start":
+            return previous  # nothing is begun with a robot that is out of sight
         if previous.phase == "start":
             if isinstance(answer, Route):  # the survey's
                 if answer.reachable:
@@ -130,8 +132,7 @@ class Commander:
                 return self._next_after("survey", previous, now_ns, estimate, note)
             return previous
         if previous.phase == "refine":
-            note = answer.note if isinstance(answer, FlowField) else ""
-            return self._next_after("refine", previous, now_ns, estimate, note)
+            return self._next_after("refine", previous, now_ns, estimate, "")
         if previous.phase == "plan":
             assert isinstance(answer, Route)
             if not answer.reachable:

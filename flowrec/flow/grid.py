@@ -25,7 +25,7 @@ class Mouth:
     kind: Kind
     faces: Ints  # (m,) numbers of moving faces
     inward: float  # sign of the face velocity that points into the chip
-    profile: Floats  # (m,) parabola of mean 1
+    profile: Floats  # (m,) parabola whose flux is that of speed 1 over the opening's pixels
     vertices: tuple[Ints, Ints]  # rows and columns of the m + 1 ends of the faces
 
 
@@ -110,7 +110,8 @@ def build(chip: Chip, k: int) -> Grid:
                 opening.kind,
                 (number_u if upright else number_v)[rows, columns],
                 1.0 if opening.side in ("left", "top") else -1.0,
-                parabola(len(rows)),
+                # The flux is that of the named pixels, however wide a smooth outline makes the opening.
+                parabola(len(rows)) * (opening.width_px * k / len(rows)),
                 (ends[0], ends[1]),
             )
         )
@@ -131,14 +132,20 @@ def _span(chip: Chip, fluid: NDArray[np.bool_], k: int, index: int) -> tuple[tup
     """Border cells of opening `index` and the indices of their border faces, as (rows, columns) each."""
     opening = chip.openings[index]
     h, w = fluid.shape
-    line = {"left": fluid[:, 0], "right": fluid[:, -1], "top": fluid[0], "bottom": fluid[-1]}[opening.side]
+    drawn, line = (
+        {"left": cells[:, 0], "right": cells[:, -1], "top": cells[0], "bottom": cells[-1]}[opening.side]
+        for cells in (chip.mask, fluid)
+    )
     # A smooth outline may lie up to half a pixel outside the pixels that the opening names.
-    low, high = max(opening.first * k - k // 2, 0), min((opening.last + 1) * k + k // 2, len(line))
+    slack = k // 2 if chip.walls == "smooth" else 0
+    low, high = max(opening.first * k - slack, 0), min((opening.last + 1) * k + slack, len(line))
     along = low + np.flatnonzero(line[low:high])
-    if len(along) == 0 or along[-1] - along[0] + 1 != len(along):
+    named = drawn[max(opening.first, 0) : opening.last + 1]
+    broken = len(along) == 0 or along[-1] - along[0] + 1 != len(along)
+    if broken or len(named) != opening.width_px or not named.all():
         raise FlowError(
             f"opening {index} ({opening.side} {opening.first}..{opening.last}) of chip '{chip.name}' is not one run "
-            f"of fluid at k={k}, walls={chip.walls}: correct its pixels or use walls='pixel'"
+            f"of fluid (k={k}, walls={chip.walls}): correct its pixels, or try walls='pixel'"
         )
     still = np.zeros_like(along)
     if opening.side == "left":

@@ -31,12 +31,23 @@ WORTH_KEEPING = 0.3
 
 def factorise(matrix: Any) -> Any:
     """LU factors of a matrix of symmetric pattern and dominant diagonal blocks."""
+    if matrix.shape[0] == 0:  # a channel of one cell between inlets has no freedom left
+        return _Nothing()
     return splu(
         sp.csc_matrix(matrix),
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.01,
         options={"SymmetricMode": True},
     )
+
+
+class _Nothing:
+    """Factors of the empty matrix."""
+
+    @staticmethod
+    def solve(right: Floats) -> Floats:
+        """Solution (0, ...)."""
+        return right
 
 
 class NotConvergedError(Exception):
@@ -91,18 +102,18 @@ class System:
         factors, last, step = self.stokes, np.inf, np.inf
         for _ in range(max_iterations):
             force = self.stream.curl.T @ self.residual(moving, drive, inertia)
-            change = self.stream.curl @ factors.solve(np.ascontiguousarray(-force))
+            change = np.asarray(self.stream.curl @ factors.solve(np.ascontiguousarray(-force)))
             step = float(np.abs(change).max()) / speed
             if not np.isfinite(step) or step > 1e6:
                 break
             if step > WORTH_KEEPING * last or step > 0.5:
                 factors = self.tangent(moving, inertia)[0]
-                change = self.stream.curl @ factors.solve(np.ascontiguousarray(-force))
+                change = np.asarray(self.stream.curl @ factors.solve(np.ascontiguousarray(-force)))
                 step = float(np.abs(change).max()) / speed
             moving = moving + change
             last = step
             if step <= tolerance:
-                return moving
+                return np.asarray(moving)
         raise NotConvergedError(step)
 
     def tangent(self, moving: Floats, inertia: float) -> tuple[Any, Any]:

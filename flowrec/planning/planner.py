@@ -15,6 +15,7 @@ from flowrec.planning.paper import adjacency, search_paper
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
 from flowrec.planning.space import End, Space, attach_goal, attach_start, open_space, why_apart
+from flowrec.planning.zermelo import line_is_clear
 from flowrec.robot import Robot
 
 Method = Literal["astar_time", "astar_paper", "astar_length"]
@@ -73,7 +74,7 @@ class Planner:
             shortest = self._search(space, "astar_length", start.node, goal.node, 1.0)
             assert shortest is not None, "free pixels that touch are joined by edges"
             return no_route(self.method, too_fast(field, shortest * px, speed_um_s))
-        path = _between(nodes, start, goal)
+        path = _between(space, nodes, start, goal)
         if self.method == "astar_time" and self.refine:
             even = np.ones_like(space.clearance)
             refined = relax(path, space.clearance, space.need, space.vx, space.vy, even, speed_um_s / px)
@@ -108,8 +109,13 @@ class Planner:
         return backtrack(parent, goal, space.width) if np.isfinite(cost[goal]) else None
 
 
-def _between(nodes: Points, start: End, goal: End) -> Points:
-    """The path (n, 2) px with its true ends put before and behind the nodes they are joined to."""
-    parts = [start.point[None] if start.point is not None else nodes[:0], nodes]
-    parts.append(goal.point[None] if goal.point is not None else nodes[:0])
-    return np.concatenate(parts)
+def _between(space: Space, nodes: Points, start: End, goal: End) -> Points:
+    """The path (n, 2) px with its true ends, each in the place of its node where it sees the next one."""
+    path = nodes
+    for end in (start, goal):
+        if end.point is not None:
+            beyond = path[1] if len(path) > 1 else end.point
+            sees = line_is_clear(space.clearance, *end.point, *beyond, space.edge_need)
+            path = np.concatenate([end.point[None], path[1:] if sees else path])
+        path = path[::-1]
+    return path

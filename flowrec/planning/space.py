@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import label
+from scipy.ndimage import distance_transform_edt, label
 
 from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
@@ -112,18 +112,10 @@ def why_apart(space: Space, a: int, b: int) -> str:
     widest = _bottleneck(space.clearance, a, b)
     if widest < 0.0:
         return "no channel leads from start to goal"
-    # The place is where the way closes: the pixel of just that clearance that joins the two sides.
-    beyond = label(space.clearance > widest, _EIGHT)[0]
-    rows, columns = np.nonzero(space.clearance == widest)
-    place = (int(columns[0]), int(rows[0]))
-    for column, row in zip(columns, rows, strict=True):
-        around = beyond[max(0, row - 1) : row + 2, max(0, column - 1) : column + 2]
-        if len(np.unique(around[around > 0])) > 1:
-            place = (int(column), int(row))
-            break
+    column, row = _narrowest_place(space.clearance, widest, a, b)
     px = space.um_per_px
     return (
-        f"the channel is too narrow at {place[0] * px:.0f},{place[1] * px:.0f} um: half its width there is "
+        f"the channel is too narrow at {column * px:.0f},{row * px:.0f} um: half its width there is "
         f"{widest * px:.0f} um and the robot needs {space.need * px:.0f} um"
     )
 
@@ -191,3 +183,15 @@ def _bottleneck(clearance: Raster, a: int, b: int) -> float:
         else:
             high = middle
     return float(values[low])
+
+
+def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[int, int]:
+    """The pixel (column, row) of just the bottleneck's clearance that lies most nearly between what it parts."""
+    parts = label(clearance > widest, _EIGHT)[0]
+    apart = np.zeros(clearance.shape)
+    for node in (a, b):
+        part = parts.ravel()[node]
+        side = parts == part if part else np.arange(parts.size).reshape(parts.shape) == node
+        apart += distance_transform_edt(~side)
+    row, column = divmod(int(np.argmin(np.where(clearance == widest, apart, np.inf))), clearance.shape[1])
+    return column, row

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.messages import FlowField, Route
@@ -29,7 +30,8 @@ class SurveyPlanner:
     through every junction and can neither stop nor circle.
     """
 
-    distance_um: float | None = None  # None: half of the longest way downstream
+    distance_um: float | None = None  # None: the share below of the longest way downstream
+    share: float = 0.125
     speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
     clearance_margin_um: float | None = None  # None: a quarter of the robot's radius
     middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
@@ -90,10 +92,11 @@ class SurveyPlanner:
         length, work = _along_tree(cost, parent, space)
         allowed = np.isfinite(cost) & (work > 0.0) & ~_near_openings(space, chip, self.outlet_gap_radii).ravel()
         allowed[start.node] = False
+        allowed &= _middle(space.clearance).ravel()
         if not allowed.any():
             return no_route(_METHOD, "nothing lies downstream of the start before the chip ends")
         longest_px = length[int(np.argmax(np.where(allowed, work, -np.inf)))]
-        limit_px = 0.5 * longest_px if limit_um is None else limit_um / px
+        limit_px = self.share * longest_px if limit_um is None else limit_um / px
         allowed &= length <= limit_px
         if not allowed.any():
             return no_route(_METHOD, f"a survey of {limit_px * px:.0f} um is shorter than a pixel of the chip")
@@ -129,6 +132,11 @@ def _along_tree(
         length[node] = length[before] + np.hypot(dx, dy)
         work[node] = work[before] + 0.5 * (dx * (vx[node] + vx[before]) + dy * (vy[node] + vy[before]))
     return length, work
+
+
+def _middle(clearance: Raster) -> NDArray[np.bool_]:
+    """(h, w) pixels near the middle between walls: two pixels on, no other is more than one farther from them."""
+    return clearance >= maximum_filter(clearance, 5) - 1.0
 
 
 def _near_openings(space: Space, chip: Chip, gap_radii: float) -> NDArray[np.bool_]:

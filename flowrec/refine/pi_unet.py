@@ -9,6 +9,7 @@ wrong inlet makes them wrong in proportion.
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -42,13 +43,14 @@ class PiUnet:
     observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value, noise and all
     near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as printed, the initial values stay
     iterations: int = 80
-    largest_work_mpx: float = 6.0  # iterations times pixels in millions: larger fields get fewer iterations
+    largest_work_mpx: float = 5.0  # iterations times pixels in millions: larger fields get fewer iterations
     patience: int = 25  # iterations without a better loss before it stops
     learning_rate: float = 3e-3
     observation_weight: float = 0.03  # of the mean log-likelihood against the mean squared residual
     base_channels: int = 16
     device: Literal["cpu", "cuda"] = "cpu"
-    threads: int = 2
+    # More than one only on idle cores: torch spins at its barriers, and on two shared cores two are ten times slower.
+    threads: int = 1
     seed: int = 0
 
     def fit(self, initial: FlowField, sight: Sight, chip: Chip) -> FlowField:
@@ -109,7 +111,10 @@ class PiUnet:
             loss_of = _Loss(case, used, self)
             net = UNet(self.base_channels).to(self.device)
             optimiser = torch.optim.Adam(net.parameters(), lr=self.learning_rate)
-            schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, self.learning_rate, steps, pct_start=0.1)
+            # A short start, then half a cosine down to zero.
+            schedule = torch.optim.lr_scheduler.LambdaLR(
+                optimiser, lambda i: min(1.0, (i + 1) / (0.1 * steps)) * 0.5 * (1.0 + math.cos(math.pi * i / steps))
+            )
             lowest, best, since, done = float("inf"), loss_of.start, 0, 0
             for _ in range(steps):
                 loss, fields = loss_of(net(loss_of.seen))

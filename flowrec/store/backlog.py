@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from flowrec.messages import Message
 
 News = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(NamedTuple):
     """The new messages of one tick and about what they weigh in memory."""
 
     stamp_ns: int

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from operator import attrgetter
 
 from mcap.records import ChunkIndex
@@ -13,8 +14,19 @@ from flowrec.store.source import CHUNK_LIMIT_BYTES, Record, Source
 
 _AHEAD_BYTES = 32 << 20  # decompressed before they are asked for
 _AHEAD_CHUNKS = 16
+_THREADS = 2
 
 by_time = attrgetter("log_ns")
+
+
+@contextlib.contextmanager
+def threads() -> Iterator[Executor]:
+    """The threads that decompress; who stops reading early does not wait for what was to come."""
+    executor = ThreadPoolExecutor(_THREADS, "session-reader")
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
 
 
 def lane(source: Source, chunks: Iterable[ChunkIndex], executor: Executor) -> Iterator[Record]:
@@ -32,20 +44,16 @@ def lane(source: Source, chunks: Iterable[ChunkIndex], executor: Executor) -> It
     )
     running: deque[tuple[int, Future[list[Record]]]] = deque()
     ahead_bytes = 0
-    try:
-        while waiting or running:
-            while waiting and len(running) < _AHEAD_CHUNKS and (ahead_bytes < _AHEAD_BYTES or not running):
-                bundle = waiting.popleft()
-                weight = sum(chunk.uncompressed_size for chunk in bundle)
-                running.append((weight, executor.submit(_sorted_messages, source, bundle)))
-                ahead_bytes += weight
-            weight, future = running.popleft()
-            records = future.result()
-            ahead_bytes -= weight
-            yield from records
-    finally:
-        for _, future in running:
-            future.cancel()
+    while waiting or running:
+        while waiting and len(running) < _AHEAD_CHUNKS and (ahead_bytes < _AHEAD_BYTES or not running):
+            bundle = waiting.popleft()
+            weight = sum(chunk.uncompressed_size for chunk in bundle)
+            running.append((weight, executor.submit(_sorted_messages, source, bundle)))
+            ahead_bytes += weight
+        weight, future = running.popleft()
+        records = future.result()
+        ahead_bytes -= weight
+        yield from records
 
 
 def _bundles(source: Source, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:

@@ -82,31 +82,36 @@ class McapFile:
             )
         self._append(data)
 
-    def add_chunk(self, chunk: Chunk, indexes: list[MessageIndex]) -> None:
-        """A sealed chunk, followed by its message indexes in the same write."""
-        start, body = self.size, _bytes_of(chunk)
-        parts, offsets, end = [body], {}, start + len(body)
-        for index in indexes:
-            parts.append(_bytes_of(index))
-            offsets[index.channel_id] = end
-            end += len(parts[-1])
-            self._counts[index.channel_id] += len(index.records)
-        self._append(b"".join(parts))
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=len(body),
-                chunk_start_offset=start,
-                compression=chunk.compression,
-                compressed_size=len(chunk.data),
-                message_end_time=chunk.message_end_time,
-                message_index_length=end - start - len(body),
-                message_index_offsets=offsets,
-                message_start_time=chunk.message_start_time,
-                uncompressed_size=chunk.uncompressed_size,
+    def add_chunks(self, sealed: Iterable[tuple[Chunk, list[MessageIndex]]]) -> None:
+        """Sealed chunks with their indexes, all in one write: a killed process leaves them whole or not at all."""
+        parts: list[bytes] = []
+        at = self.size
+        for chunk, indexes in sealed:
+            start = at
+            parts.append(_bytes_of(chunk))
+            at += len(parts[-1])
+            length, offsets = at - start, {}
+            for index in indexes:
+                parts.append(_bytes_of(index))
+                offsets[index.channel_id] = at
+                at += len(parts[-1])
+                self._counts[index.channel_id] += len(index.records)
+            self._chunks.append(
+                ChunkIndex(
+                    chunk_length=length,
+                    chunk_start_offset=start,
+                    compression=chunk.compression,
+                    compressed_size=len(chunk.data),
+                    message_end_time=chunk.message_end_time,
+                    message_index_length=at - start - length,
+                    message_index_offsets=offsets,
+                    message_start_time=chunk.message_start_time,
+                    uncompressed_size=chunk.uncompressed_size,
+                )
             )
-        )
-        first, last = self._span or (chunk.message_start_time, chunk.message_end_time)
-        self._span = min(first, chunk.message_start_time), max(last, chunk.message_end_time)
+            first, last = self._span or (chunk.message_start_time, chunk.message_end_time)
+            self._span = min(first, chunk.message_start_time), max(last, chunk.message_end_time)
+        self._append(b"".join(parts))
 
     def finish(self) -> None:
         """Data end, summary and footer; then the file is whole."""

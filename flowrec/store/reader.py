@@ -6,7 +6,6 @@ import heapq
 import itertools
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -19,12 +18,12 @@ from flowrec.messages import Message, Tick
 from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
 from flowrec.store.header import SessionHeader
-from flowrec.store.lane import by_time, lane
+from flowrec.store.lane import by_time, lane, threads
 from flowrec.store.source import Record
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
-_THREADS = 2  # that decompress ahead
+_KEPT_MESSAGES = 64  # of restored states
 
 
 class SessionReader:
@@ -62,6 +61,7 @@ class SessionReader:
             if channel in self._fields and count:
                 counts[self._fields[channel]] += count
         self.counts: dict[str, int] = dict(counts)
+        self._kept: dict[tuple[int, int], Message] = {}  # oldest use first
         self._frame_channels = {channel for channel, field in self._fields.items() if field == "frame"}
 
     @property
@@ -94,7 +94,11 @@ class SessionReader:
             yield tick
 
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:
-        """The tick at or before a stamp; an empty `Tick()` before the first one."""
+        """The tick at or before a stamp; an empty `Tick()` before the first one.
+
+        `tick_before(start_ns - 1)` holds the same objects as what `ticks(start_ns)` goes on from, so that a
+        message of its first tick is new if and only if it is another object.
+        """
         return self._state_at(stamp_ns, with_frames=with_frames)
 
     def messages(self, field: str) -> Iterator[Any]:
@@ -107,7 +111,7 @@ class SessionReader:
         if field not in BY_FIELD:
             raise SessionError(f"{self.path}: there is no topic {field!r}; the topics are {', '.join(BY_FIELD)}")
         channels = {channel for channel, name in self._fields.items() if name == field}
-        with ThreadPoolExecutor(_THREADS, "session-reader") as executor:
+        with threads() as executor:
             for record in lane(self._source, self._chunks_with(channels), executor):
                 if record.channel in channels:
                     yield self._message(record)
@@ -134,12 +138,21 @@ class SessionReader:
                 f" `flowrec recover {self.path}` saves what is whole"
             ) from error
 
+    def _restored(self, record: Record) -> Message:
+        # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
+        key = (record.channel, record.log_ns)
+        message = self._kept.pop(key, None) or self._message(record)
+        self._kept[key] = message
+        if len(self._kept) > _KEPT_MESSAGES:
+            del self._kept[next(iter(self._kept))]
+        return message
+
     def _records(self, start_ns: int | None, with_frames: bool) -> Iterator[Record]:
         """The messages of known topics from a time on, state and frames merged."""
         start = 0 if start_ns is None else start_ns
         state, frames = self._lanes(start)
         wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
-        with ThreadPoolExecutor(_THREADS, "session-reader") as executor:
+        with threads() as executor:
             lanes = [lane(self._source, state, executor)]
             if with_frames:
                 lanes.append(lane(self._source, frames, executor))
@@ -183,5 +196,5 @@ class SessionReader:
                     continue
                 if field_name not in latest or latest[field_name].log_ns <= record.log_ns:
                     latest[field_name] = record
-        news: dict[str, Any] = {field: self._message(record) for field, record in latest.items()}
+        news: dict[str, Any] = {field: self._restored(record) for field, record in latest.items()}
         return Tick(max((record.log_ns for record in latest.values()), default=-1), **news)

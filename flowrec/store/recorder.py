@@ -74,9 +74,9 @@ class Recorder:
             self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
         for mirror, stamp_ns, view in self._mirrors.of(entry.news):
             self._append(mirror.path, entry.stamp_ns, stamp_ns, (view,), None)
-        for group, builder in self._builders.items():
-            if builder.size >= _CHUNK_BYTES[group]:
-                self._file.add_chunk(*builder.seal())
+        full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]
+        if full:
+            self._file.add_chunks([builder.seal() for builder in full])
 
     def flush_if_due(self) -> None:
         """Write what has waited for `flush_s`; have it kept by the disk once a second."""
@@ -114,6 +114,6 @@ class Recorder:
         self._synced_s = time.monotonic()
 
     def _flush(self) -> None:
-        for builder in self._builders.values():
-            if builder.size:
-                self._file.add_chunk(*builder.seal())
+        waiting = [builder for builder in self._builders.values() if builder.size]
+        if waiting:
+            self._file.add_chunks([builder.seal() for builder in waiting])

@@ -5,7 +5,10 @@ what is logged when (log), the layout (blueprint), the file (rrd), the live view
 where the viewer is and whether there is a screen (viewer), pictures without a screen (screenshot).
 """
 
+from flowrec.view.live import LiveView
 from flowrec.view.rrd import write_rrd
 from flowrec.view.scene import Scene
+from flowrec.view.screenshot import screenshot
+from flowrec.view.viewer import open_viewer
 
-__all__ = ["Scene", "write_rrd"]
+__all__ = ["LiveView", "Scene", "open_viewer", "screenshot", "write_rrd"]

@@ -10,34 +10,39 @@ from flowrec.flow import sample
 from flowrec.messages import FlowField
 from flowrec.view.scene import Scene
 
-_SPACING_PX = 20.0  # of the camera, where the channels are wide enough for it
-_ACROSS = 3.0  # arrows abreast in a typical channel
+_ALONG = (28.0, 45.0)  # arrows along the width of the image: where channels are wide, and where they are narrow
+_ACROSS = 2.5  # arrows abreast in a typical channel, within these limits
 _LONGEST = 0.9  # the fastest arrow, in spacings: a row of longer ones reads as one line
-_FROM_WALL = 0.3  # no arrow stands nearer to a wall, in spacings
+_FROM_WALL = 0.3  # no arrow stands nearer to a wall, in spacings, unless in the middle of a narrow channel
+_PITCH = 0.2  # of the points that may carry an arrow, in spacings
 
 
 def arrow_grid(scene: Scene) -> tuple[NDArray[np.float64], float]:
-    """Points (n, 2) in um inside the fluid, and their spacing in um."""
-    chip = scene.chip
+    """Points (n, 2) in um inside the fluid, nowhere nearer than a spacing, and the spacing in um.
+
+    The middle of the channels is filled first, then what is left beside it: a narrow channel gets one row of arrows,
+    not those points of a grid that happen to hit it.
+    """
+    chip, left_right = scene.chip, scene.image_bounds()[::2]
     # A ring of solid counts the image's border as wall, so that no arrow sticks out of it.
     wall_px = cv2.distanceTransform(np.pad(chip.mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    ridge = wall_px[(wall_px >= cv2.dilate(wall_px, np.ones((5, 5), np.uint8))) & (wall_px > 1.5)]
-    width_um = 2.0 * float(np.median(ridge)) * chip.um_per_px if ridge.size else chip.um_per_px
-    spacing_um = max(
-        min(_SPACING_PX * scene.calibration.um_per_px, width_um / _ACROSS),
-        width_um / 8.0,  # a coarse camera must not fill a wide channel with hair
-        0.02 * max(chip.size_um) / 3.0,
-    )
-    h, w = chip.mask.shape
-    x, y = np.meshgrid(
-        np.arange(0.5 * spacing_um, w * chip.um_per_px, spacing_um),
-        np.arange(0.5 * spacing_um, h * chip.um_per_px, spacing_um),
-    )
-    x[1::2] += 0.5 * spacing_um  # staggered, so that the grid does not look like the channel's own pattern
-    points = np.stack([x.ravel(), y.ravel()], 1)
-    column, row = np.clip(np.rint(points / chip.um_per_px).astype(np.intp), 0, (w - 1, h - 1)).T
-    inside = wall_px[row, column] * chip.um_per_px >= _FROM_WALL * spacing_um
-    return points[inside], spacing_um
+    ridge = (wall_px >= cv2.dilate(wall_px, np.ones((5, 5), np.uint8))) & (wall_px > 1.5)
+    width_px = 2.0 * float(np.median(wall_px[ridge])) if ridge.any() else 1.0
+    image_px = (left_right[1] - left_right[0]) * scene.calibration.um_per_px / chip.um_per_px  # of the mask
+    spacing = float(np.clip(width_px / _ACROSS, image_px / _ALONG[1], image_px / _ALONG[0]))
+    allowed = ridge | (wall_px >= _FROM_WALL * spacing)
+    pitch = max(1, int(_PITCH * spacing))
+    row, column = np.nonzero(allowed & chip.mask)
+    chosen = (row % pitch == 0) & (column % pitch == 0) | ridge[row, column]
+    row, column = row[chosen], column[chosen]
+    free = np.ones_like(chip.mask, np.uint8)
+    points = []
+    for at in np.lexsort((row, column, -np.round(wall_px[row, column]))):
+        y, x = int(row[at]), int(column[at])
+        if free[y, x]:
+            points.append((x, y))
+            cv2.circle(free, (x, y), max(round(spacing) - 1, 1), 0, -1)
+    return np.array(points, np.float64).reshape(-1, 2) * chip.um_per_px, spacing * chip.um_per_px
 
 
 def flow_arrows(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Set as AbstractSet
 
+import rerun as rr
 import rerun.blueprint as rrb
 
 from flowrec.view import entities as e
@@ -57,7 +58,7 @@ def _single(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
     return rrb.Vertical(
         above,
         _phases([e.PHASE, e.SIGHT]),
-        rrb.Horizontal(
+        _plots(
             _tabs(
                 _plot("Coil currents (A)", [e.CURRENT], window_s=_COIL_WINDOW_S),
                 _plot("Field frequency (Hz)", [e.FREQUENCY]),
@@ -117,7 +118,7 @@ def _replay(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
     return rrb.Vertical(
         above,
         _phases([e.PHASE], both),
-        rrb.Horizontal(
+        _plots(
             _tabs(
                 _plot("Command: field frequency (Hz)", [e.FREQUENCY], both),
                 _plot("Coil currents, recorded (A)", [e.CURRENT], (old,), _COIL_WINDOW_S),
@@ -149,12 +150,15 @@ def _row(parts: list[rrb.View | rrb.Container | None]) -> rrb.Container | None:
     return rrb.Horizontal(*there) if there else None
 
 
-def _tabs(*parts: rrb.View | None) -> rrb.View | rrb.Container | None:
+def _plots(*parts: rrb.View | rrb.Container | None) -> rrb.Container:
+    """The row at the bottom."""
+    return rrb.Horizontal(*(part for part in parts if part is not None))
+
+
+def _tabs(*parts: rrb.View | None) -> rrb.Container | None:
     """What is there, one behind the other, the first in front."""
     there = [part for part in parts if part is not None]
-    if len(there) > 1:
-        return rrb.Tabs(*there, active_tab=0)
-    return there[0] if there else None
+    return rrb.Tabs(*there, active_tab=0) if there else None
 
 
 def _camera(scene: Scene, name: str, contents: list[str], origin: str) -> rrb.View:
@@ -178,6 +182,8 @@ def _map(scene: Scene, name: str, entity: str, scale: str, prefix: str = "") -> 
             f"+ {e.under(prefix, scale)}/**",
             *(f"+ {e.under(prefix, overlay)}" for overlay in overlays),
         ],
+        # Thin here: the fastest flow is just where the path runs.
+        overrides={e.under(prefix, e.PATH): rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(0.6))},
         background=palette.SOLID,
         visual_bounds=_bounds(ColourBar.beside(scene).bounds_with(scene)),
     )

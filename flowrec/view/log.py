@@ -35,8 +35,8 @@ from flowrec.view.scene import Scene
 
 _JPEG_QUALITY = 85
 _TRAIL_S = 4.0
-_TRAIL_STEP_PX = 1.0
-_COMMAND_PX = 60.0  # length of the arrow of the fastest command
+_TRAIL_STEP_PX = 1.0  # likewise
+_COMMAND_PX = 60.0  # length of the arrow of the fastest command, in an image of 640 pixels
 _LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 _PHASES = {
     "start": palette.GREY,
@@ -69,9 +69,8 @@ _STYLES = {
 class TickLogger:
     """Logs the ticks of one session into a recording stream, below `prefix` ('', 'recorded' or 'replayed').
 
-    `image_step` tells of which rows and columns of the camera the images consist; loggers that share `speeds` paint
-    their maps on one scale. `present` collects which of the optional parts were ever seen: truth, refined,
-    uncertainty, route.
+    Loggers that share `speeds` paint their maps on one scale. Of a preview, `image_step` says that only each
+    so-manieth row and column of the camera's image is there. `present` collects what was ever seen, for the blueprint.
     """
 
     def __init__(
@@ -81,7 +80,6 @@ class TickLogger:
         prefix: str = "",
         *,
         images: bool = True,
-        image_step: int = 1,
         speeds: maps.SpeedScale | None = None,
     ) -> None:
         self.present: set[str] = set()
@@ -90,7 +88,8 @@ class TickLogger:
         self._prefix = prefix
         self._style = _STYLES[prefix]
         self._images = images
-        self._image_step = image_step
+        self.image_step = 1
+        self._placed_step = 0
         self._speeds = maps.SpeedScale() if speeds is None else speeds
         self._painted = 0  # version of the scale the maps were painted on
         self._last = Tick()
@@ -99,7 +98,7 @@ class TickLogger:
         self._bar = maps.ColourBar.beside(scene)
         self._names: dict[str, str] = {}
         left, _, right, _ = scene.image_bounds()
-        self._label_px = (right - left) / 640.0  # about one line of text is 24 of these in the usual layout
+        self._unit_px = (right - left) / 640.0  # sizes that suit a 640 pixel image, whatever the camera
         self._robot_px = scene.length_px(scene.robot.radius)
         turn = np.linspace(0.0, 2.0 * np.pi, 33)
         self._ring = np.stack([np.cos(turn), np.sin(turn)], 1)
@@ -157,13 +156,36 @@ class TickLogger:
         self._log(e.OUTLINE, rr.LineStrips2D(strips, colors=palette.GREY, radii=rr.Radius.ui_points(0.6)), static=True)
         for entity in (e.ASSUMED, e.REFINED, e.TRUE, e.CHANGE, e.UNCERTAINTY):
             self._log(entity, maps.placed(placement), static=True)
-        if self._images:
-            self._log(e.IMAGE, maps.placed(self._scene.preview_placement(self._image_step)), static=True)
+        self._log_styles()
         self._log_series()
         self._log(e.PHASE, rr.StateConfiguration(values=list(_PHASES), colors=list(_PHASES.values())), static=True)
         self._log(
             e.SIGHT, rr.StateConfiguration(values=["seen", "lost"], colors=[palette.GREEN, palette.RED]), static=True
         )
+
+    def _log_styles(self) -> None:
+        """What never changes of the things that move; in each tick only their places are logged."""
+        style, points, above = self._style, rr.Radius.ui_points, float(self._prefix == "replayed")
+        self._log(
+            e.TRAIL,
+            rr.LineStrips2D.from_fields(colors=(*style.robot, 150), radii=points(1.0), draw_order=24.0),
+            static=True,
+        )
+        self._log(e.ROBOT, rr.LineStrips2D.from_fields(radii=points(style.width), draw_order=30.0 + above), static=True)
+        self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(radii=points(0.0), show_labels=True), static=True)
+        self._log(
+            e.REFERENCE,
+            rr.Points2D.from_fields(
+                colors=palette.YELLOW,
+                radii=points(3.5),
+                labels=[f"{style.word}reference"],
+                show_labels=False,
+                draw_order=28.0,
+            ),
+            static=True,
+        )
+        colour = style.robot if self._prefix else palette.WHITE
+        self._log(e.COMMAND, rr.Arrows2D.from_fields(colors=colour, radii=points(1.6), draw_order=29.0), static=True)
 
     def _log_series(self) -> None:
         """Names and colours of all lines. One line of each session in a plot: the session's name says which."""
@@ -206,6 +228,9 @@ class TickLogger:
     def _log_image(self, frame: Frame) -> None:
         if not self._images or frame.image.size == 0:
             return
+        if self._placed_step != self.image_step:
+            self._placed_step = self.image_step
+            self._log(e.IMAGE, maps.placed(self._scene.preview_placement(self.image_step)), static=True)
         done, jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         assert done
         self._log(e.IMAGE, rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg", draw_order=-20.0))
@@ -252,7 +277,7 @@ class TickLogger:
                 radii=rr.Radius.ui_points(1.2),
                 draw_order=25.0,
             ),
-            _label(centre + (0.0, radius), "goal", palette.GREEN),
+            _label(centre + np.array([0.0, radius]), "goal", palette.GREEN),
         )
 
     def _log_sight(self, track: Track, last: Track | None) -> None:
@@ -263,15 +288,14 @@ class TickLogger:
         centre = self._scene.to_plane(estimate.position_um)
         colour = self._style.robot if estimate.seen else palette.PALE
         ring = [centre + self._robot_px * self._ring]
-        radius = rr.Radius.ui_points(self._style.width)
-        self._log(
-            e.ROBOT,
-            rr.LineStrips2D(ring, colors=colour, radii=radius, draw_order=30.0 + (self._prefix == "replayed")),
-        )
+        self._log(e.ROBOT, rr.LineStrips2D.from_fields(strips=ring, colors=colour))
         # Recorded and replayed robots mostly coincide: their labels go to either side.
-        aside = self._robot_px + 2.0 if self._prefix != "recorded" else -self._robot_px - 24.0 * self._label_px
+        aside = self._robot_px + 2.0 * self._unit_px
+        if self._prefix == "recorded":
+            aside = -self._robot_px - 24.0 * self._unit_px
         word = f"{self._style.word}robot" + ("" if estimate.seen else " (not seen)")
-        self._log(e.ROBOT_LABEL, _label(centre + (0.0, aside), word, colour))
+        position = [centre + np.array([0.0, aside])]
+        self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=position, labels=[word], colors=colour))
         self._log_trail(estimate.stamp_ns, centre)
         flow = estimate.flow_um_s
         on_map = sample(field, estimate.position_um) if field is not None else np.full(2, np.nan)
@@ -288,47 +312,23 @@ class TickLogger:
 
     def _log_trail(self, stamp_ns: int, centre: NDArray[np.float64]) -> None:
         trail = self._trail
-        old = len(trail)
-        if not trail or math.dist(trail[-1][1], centre) >= _TRAIL_STEP_PX:
+        if not trail or math.dist(trail[-1][1], centre) >= _TRAIL_STEP_PX * self._unit_px:
             trail.append((stamp_ns, centre))
         while trail and stamp_ns - trail[0][0] > _TRAIL_S * NS_PER_S:
             trail.popleft()
-        if len(trail) != old or len(trail) > 1:
-            points = np.array([point for _, point in trail])
-            self._log(
-                e.TRAIL,
-                rr.LineStrips2D(
-                    [points], colors=(*self._style.robot, 150), radii=rr.Radius.ui_points(1.0), draw_order=24.0
-                ),
-            )
+        if len(trail) > 1:
+            self._log(e.TRAIL, rr.LineStrips2D.from_fields(strips=[np.array([point for _, point in trail])]))
 
     def _log_demand(self, demand: Demand, estimate: Estimate | None) -> None:
         # No data, not NaN, where there is no reference: the plot shows a gap either way, a statistic does not.
         if math.isfinite(demand.error_um):
             self._log(e.TRACKING_ERROR, rr.Scalars(demand.error_um))
-            self._log(
-                e.REFERENCE,
-                rr.Points2D(
-                    [self._scene.to_plane(demand.reference_um)],
-                    colors=palette.YELLOW,
-                    radii=rr.Radius.ui_points(3.5),
-                    labels=[f"{self._style.word}reference"],
-                    show_labels=False,
-                    draw_order=28.0,
-                ),
-            )
+            reference = self._scene.to_plane(demand.reference_um)
+            self._log(e.REFERENCE, rr.Points2D.from_fields(positions=[reference]))
         if estimate is not None:
-            vector = demand.velocity_um_s * (_COMMAND_PX / self._scene.robot.speed_limit_um_s)
-            self._log(
-                e.COMMAND,
-                rr.Arrows2D(
-                    origins=[self._scene.to_plane(estimate.position_um)],
-                    vectors=[vector],
-                    colors=palette.WHITE if not self._prefix else self._style.robot,
-                    radii=rr.Radius.ui_points(1.6),
-                    draw_order=29.0,
-                ),
-            )
+            vector = demand.velocity_um_s * (_COMMAND_PX * self._unit_px / self._scene.robot.speed_limit_um_s)
+            position = self._scene.to_plane(estimate.position_um)
+            self._log(e.COMMAND, rr.Arrows2D.from_fields(origins=[position], vectors=[vector]))
 
     # ---- flow
 
@@ -344,7 +344,7 @@ class TickLogger:
         ]
         for field in new:
             self._speeds.hold(maps.peak(field))
-        if self._speeds.scale is None or tick.assumed is None and tick.refined is None and tick.true_field is None:
+        if self._speeds.scale is None or (tick.field is None and tick.true_field is None):
             return
         repaint = self._painted != self._speeds.version
         if not new and not repaint:
@@ -353,14 +353,15 @@ class TickLogger:
         scale, mask = self._speeds.scale, self._scene.chip.mask
         if repaint:
             self._log_scale(e.SPEED_SCALE, scale)
-        for entity, field in ((e.ASSUMED, tick.assumed), (e.REFINED, tick.refined), (e.TRUE, tick.true_field)):
-            if field is not None and (repaint or any(field is other for other in new)):
-                self._log(entity, maps.picture(maps.speed(field, mask), scale))
-        self.present |= {
-            name
-            for name, field in (("assumed", tick.assumed), ("refined", tick.refined), ("truth", tick.true_field))
-            if field is not None
-        }
+        known = (
+            (e.ASSUMED, "assumed", tick.assumed),
+            (e.REFINED, "refined", tick.refined),
+            (e.TRUE, "truth", tick.true_field),
+        )
+        for entity, name, known_field in known:
+            if known_field is not None and (repaint or any(known_field is other for other in new)):
+                self.present.add(name)
+                self._log(entity, maps.picture(maps.speed(known_field, mask), scale))
         self._log_change(tick.refined, tick.assumed, new)
         self._log_uncertainty(tick.field, new)
         if tick.field is not None and (repaint or tick.field is not last.field):

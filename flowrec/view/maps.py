@@ -114,7 +114,5 @@ class ColourBar:
         # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
         at = [(right + 2.0 * self.width, row - 0.045 * self.height) for row in y]
         at.append((self.left + 0.5 * self.width, self.top - 0.14 * self.height))
-        numbers = rr.Points2D(
-            at, labels=labels, show_labels=True, colors=palette.WHITE, radii=rr.Radius.ui_points(0)
-        )
+        numbers = rr.Points2D(at, labels=labels, show_labels=True, colors=palette.WHITE, radii=rr.Radius.ui_points(0))
         return marks, numbers

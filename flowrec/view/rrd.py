@@ -70,7 +70,7 @@ def describe(stream: rr.RecordingStream, scene: Scene) -> None:
     """Send what people read in the properties of a recording."""
     stream.send_recording_name(scene.title)
     if scene.properties:
-        stream.send_property("session", rr.AnyValues(**scene.properties))
+        stream.send_property("session", rr.AnyValues(drop_untyped_nones=True, **scene.properties))
 
 
 def _log_all(

@@ -63,4 +63,7 @@ class Scene:
 
     def image_bounds(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom of the camera's image in the picture plane."""
-        return self.chip_bounds() if self.image_px is None else (0.0, 0.0, *map(float, self.image_px))
+        if self.image_px is None:
+            return self.chip_bounds()
+        width, height = self.image_px
+        return 0.0, 0.0, float(width), float(height)

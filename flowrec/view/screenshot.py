@@ -127,6 +127,8 @@ def _why(log: Path) -> str:
     """The viewer's last words."""
     said = log.read_text(errors="replace")
     if "render context" in said or "adapter" in said:
-        return "it has no graphics to draw with: install a driver, or `apt install mesa-vulkan-drivers` for a software one"
+        return (
+            "it has no graphics to draw with: install a driver, or `apt install mesa-vulkan-drivers` for a software one"
+        )
     lines = [line for line in said.splitlines() if line.strip()]
     return lines[-1] if lines else "it says nothing"

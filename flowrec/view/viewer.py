@@ -20,7 +20,7 @@ def executable() -> Path | None:
     if named:
         return Path(named) if Path(named).exists() else None
     try:
-        import rerun_cli
+        import rerun_cli  # type: ignore[import-untyped]
     except ImportError:
         found = shutil.which("rerun")
         return Path(found) if found else None

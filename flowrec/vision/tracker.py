@@ -8,6 +8,7 @@ until the whole image is searched again. The centre is then fitted to a fraction
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -88,7 +89,7 @@ class Tracker:
         # A border of the image is filled in, so that a robot half outside is still found.
         left, top = x0 - pad, y0 - pad
         right, bottom = x1 + pad + shrink, y1 + pad + shrink
-        cut = image[max(top, 0) : min(bottom, image.shape[0]), max(left, 0) : min(right, image.shape[1])]
+        cut: NDArray[Any] = image[max(top, 0) : min(bottom, image.shape[0]), max(left, 0) : min(right, image.shape[1])]
         cut = cv2.copyMakeBorder(
             cut,
             max(-top, 0),

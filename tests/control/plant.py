@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
+from flowrec.messages import Estimate, FlowField, Mission, Route
 from flowrec.robot import Robot
 from flowrec.units import nanoseconds
 
@@ -100,7 +100,10 @@ def _observe(state, spread, moved, dt):
     q, noise = 1e3, np.zeros((4, 4))  # random-walk flow, um2/s3
     for i in (0, 1):
         noise[i, i], noise[i, i + 2], noise[i + 2, i], noise[i + 2, i + 2] = (
-            q * dt**3 / 3 + 0.1, q * dt**2 / 2, q * dt**2 / 2, q * dt,
+            q * dt**3 / 3 + 0.1,
+            q * dt**2 / 2,
+            q * dt**2 / 2,
+            q * dt,
         )
     return step @ state + np.r_[moved, 0.0, 0.0], step @ spread @ step.T + noise
 
@@ -108,6 +111,3 @@ def _observe(state, spread, moved, dt):
 def _correct(state, spread, measured, noise_um):
     gain = spread[:, :2] @ np.linalg.inv(spread[:2, :2] + (noise_um**2 + 0.01) * np.eye(2))
     return state + gain @ (measured - state[:2]), spread - gain @ spread[:2]
-
-
-__all__ = ["CENTRE_UM", "ROBOT", "Demand", "fly", "field_of", "lemniscate", "mission", "straight", "vortex"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 
 import cv2
@@ -26,7 +27,7 @@ def _channel(points: np.ndarray, half_width: float, speed: float) -> tuple[np.nd
     y, x = np.mgrid[0:H, 0:W].astype(float)
     best = np.full((H, W), np.inf)
     velocity = np.zeros((H, W, 2))
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in itertools.pairwise(points):
         along = b - a
         t = np.clip(((x - a[0]) * along[0] + (y - a[1]) * along[1]) / (along @ along), 0, 1)
         distance = np.hypot(x - a[0] - t * along[0], y - a[1] - t * along[1])
@@ -42,7 +43,9 @@ def field(share: float, method: str, std: bool = False) -> m.FlowField:
     parts = [_channel(MIDDLE, 22, 300.0), _channel(UPPER, 15, 600 * share), _channel(LOWER, 15, 600 * (1 - share))]
     velocity = np.zeros((H, W, 2))
     for part, mask in parts:
-        velocity = np.where(mask[..., None] & (np.abs(part).sum(-1) > np.abs(velocity).sum(-1))[..., None], part, velocity)
+        velocity = np.where(
+            mask[..., None] & (np.abs(part).sum(-1) > np.abs(velocity).sum(-1))[..., None], part, velocity
+        )
     spread = np.repeat((0.02 + 0.15 * np.hypot(*np.moveaxis(velocity, -1, 0)))[..., None], 2, -1) if std else None
     return m.FlowField(
         0, 0, method, UM_PER_PX, velocity, np.zeros((H, W)), spread, np.array([200.0, 0.0, 0.0]), 1.0, 998.0, "made up"

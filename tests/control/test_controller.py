@@ -1,0 +1,167 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.chip import clearance_um
+from flowrec.control import Controller
+from flowrec.messages import Demand, Estimate, Route
+from tests.control.plant import CENTRE_UM, ROBOT, field_of, fly, lemniscate, mission, straight, vortex
+
+UNGOVERNED = {"lag_free_radii": 1e9, "lag_full_radii": 2e9}  # the paper's reference does not wait
+START = CENTRE_UM + np.array([1200.0, 600.0])
+STILL = field_of(lambda x, y: (0.0 * x, 0.0 * y))
+
+
+def wrong_vortex(x, y):
+    return tuple(1.1 * part for part in vortex(x, y))
+
+
+def seen_at(position, stamp=0, flow=(0.0, 0.0), seen=True):
+    return Estimate(stamp, np.array(position, float), np.array(flow), np.eye(4), 2.0, np.array(position), seen)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.mark.parametrize(
+    ("method", "noise_um", "told", "delay_s", "steady_um", "settled_s"),
+    [
+        ("vector", 0.0, vortex, 0.0, 2.0, 2.0),
+        ("vector", 10.0, wrong_vortex, 0.04, 10.0, 2.0),
+        ("ff_fb", 0.0, vortex, 0.0, 8.0, 6.0),
+        ("ff_fb", 10.0, wrong_vortex, 0.04, 15.0, 6.0),
+    ],
+)
+def test_the_papers_lemniscate_is_tracked(method, noise_um, told, delay_s, steady_um, settled_s):
+    route, robot = lemniscate(turns=1), replace(ROBOT, delay_s=delay_s)
+    controller = Controller(method=method, **UNGOVERNED)
+    run = fly(controller, route, vortex, 40.0, START, field_of(told), noise_um=noise_um, robot=robot, seed=1)
+    error = run.error_um(route)
+    assert rms(error[20_000:]) < steady_um
+    assert error[round(1000 * settled_s) :].max() < 50.0
+
+
+def test_without_a_map_the_observer_is_enough_and_without_both_the_error_persists():
+    route = lemniscate(turns=1)
+    observed = fly(Controller(**UNGOVERNED), route, vortex, 20.0, START, None, noise_um=10.0)
+    assert rms(observed.error_um(route)[10_000:]) < 12.0
+    # A flow map of zero, and an observer that is not listened to: the paper's "without compensation".
+    deaf = fly(Controller(map_error=0.0, **UNGOVERNED), route, vortex, 20.0, START, STILL)
+    assert rms(deaf.error_um(route)[10_000:]) > 50.0
+
+
+def test_the_reference_waits_for_a_robot_that_can_not_follow_and_never_runs_away():
+    slow = replace(ROBOT, max_speed_um_s=200.0)
+    route = straight(speed_um_s=300.0)
+    run = fly(Controller(), route, lambda x, y: (0.0, 0.0), 25.0, (500.0, 2500.0), STILL, robot=slow)
+    assert max(demand.error_um for demand in run.demands) < 3.0 * slow.radius
+    assert all(np.hypot(*demand.velocity_um_s) <= 200.0 + 1e-9 for demand in run.demands)
+    progress = [demand.progress_s for demand in run.demands]
+    assert (np.diff(progress) >= 0.0).all()
+    assert progress[-1] == route.arrival_s[-1], "it arrives all the same"
+    assert run.demands[-1].error_um < 5.0
+
+
+def test_a_robot_swept_ahead_pulls_the_reference_along_instead_of_fighting_the_flow():
+    route = straight(speed_um_s=100.0)
+    weak = replace(ROBOT, max_speed_um_s=300.0)
+    run = fly(Controller(), route, lambda x, y: (350.0, 0.0), 6.0, (500.0, 2500.0), STILL, robot=weak)
+    assert run.demands[-1].progress_s > 6.5
+
+
+def test_across_a_current_near_its_limit_the_robot_keeps_to_its_course_and_gives_up_speed():
+    route = straight(speed_um_s=300.0)
+    weak = replace(ROBOT, max_speed_um_s=250.0)
+    field = field_of(lambda x, y: (0.0 * x, 220.0 + 0.0 * x))
+    run = fly(Controller(), route, lambda x, y: (0.0, 220.0), 15.0, (500.0, 2500.0), field, robot=weak)
+    assert np.abs(run.position_um[2000:, 1] - 2500.0).max() < 25.0
+    assert run.position_um[-1, 0] > 1800.0
+    assert run.demands[200].saturated
+
+
+@pytest.mark.parametrize("phase", ["start", "refine", "plan"])
+def test_between_drives_the_robot_holds_the_place_where_the_phase_found_it(phase):
+    run = fly(Controller(), lemniscate(), vortex, 6.0, START, field_of(vortex), noise_um=10.0, mission=mission(phase))
+    assert np.hypot(*(run.position_um[1000:] - START).T).max() < 35.0
+    assert all((demand.reference_um == run.demands[0].reference_um).all() for demand in run.demands)
+
+
+def test_a_new_phase_starts_its_route_at_the_beginning_and_a_finished_mission_asks_for_nothing():
+    controller, route = Controller(), straight()
+    first = controller.control(None, mission(), route, seen_at((500, 2500), 1), STILL, ROBOT, None, 1.0)
+    assert first.progress_s == 0.0 and (first.reference_um == route.waypoints_um[0]).all()
+    later = first
+    for stamp in range(2, 20):
+        at = seen_at(later.reference_um, stamp * 33_000_000)
+        later = controller.control(later, mission(), route, at, STILL, ROBOT, None, 1.0)
+    assert later.progress_s > 0.5
+    stamp = 20 * 33_000_000
+    again = controller.control(
+        later, mission(since_ns=stamp), route, seen_at((600, 2500), stamp), STILL, ROBOT, None, 1
+    )
+    assert again.progress_s == 0.0
+    held = controller.control(later, mission("plan", stamp), route, seen_at((600, 2500), stamp), STILL, ROBOT, None, 1)
+    np.testing.assert_array_equal(held.reference_um, [600.0, 2500.0])
+    done = controller.control(
+        later, mission("done", stamp, finished=True), route, seen_at((600, 2500), stamp), STILL, ROBOT, None, 1.0
+    )
+    assert not done.velocity_um_s.any()
+
+
+def test_a_robot_that_is_not_seen_is_soon_asked_for_nothing_and_taken_up_again_where_it_is_found():
+    run = fly(Controller(), None, lambda x, y: (50.0, 0.0), 8.0, START, None, blind=(2.0, 6.0), mission=mission("plan"))
+    speed = np.array([np.hypot(*demand.velocity_um_s) for demand in run.demands])
+    time = np.array([demand.stamp_ns for demand in run.demands]) / 1e9
+    blind = (time >= 2.0) & (time < 6.0)
+    assert (np.diff(speed[blind]) <= 1e-9).all()
+    assert not speed[(time > 4.0) & (time < 6.0)].any() and np.isnan(run.demands[150].error_um)
+    assert run.demands[-1].error_um < 5.0
+    assert run.position_um[-1, 0] > START[0] + 50.0, "not driven back to where it was lost"
+    never = Controller().control(None, mission("start"), None, seen_at((1, 1), seen=False), None, ROBOT, None, 1.0)
+    assert not never.velocity_um_s.any() and np.isnan(never.error_um)
+
+
+def test_the_wall_guard_keeps_the_robot_off_the_wall_that_its_route_leads_into():
+    mask = np.zeros((101, 101), bool)
+    mask[40:61] = True  # walls at y = 1975 and 3025 um
+    clearance = clearance_um(mask, 50.0)
+    time = np.linspace(0.0, 10.0, 101)
+    crash = Route(0, 1, "", True, "", np.stack([500.0 + 200.0 * time, 2500.0 - 80.0 * time], -1), time)
+    guard, careless = Controller(), Controller(guard_radii=0.0)
+    wall_um = 1975.0
+    runs = [
+        fly(c, crash, lambda x, y: (0.0, -30.0), 12.0, (500.0, 2500.0), None, noise_um=3.0, clearance=(clearance, 50.0))
+        for c in (guard, careless)
+    ]
+    nearest = [run.position_um[:, 1].min() - wall_um for run in runs]
+    assert nearest[0] > 0.9 * ROBOT.radius and nearest[1] < 0.0
+
+
+@pytest.mark.parametrize("method", ["vector", "ff_fb"])
+def test_from_any_demand_on_the_run_goes_on_the_same_and_nothing_is_ever_nan(method):
+    controller, route, field = Controller(method=method), lemniscate(), field_of(vortex)
+    run = fly(controller, route, vortex, 4.0, START, field, noise_um=10.0)
+    for tick in (1, 17, 60, len(run.demands) - 1):
+        fields = {name: getattr(run.demands[tick - 1], name) for name in Demand.__dataclass_fields__}
+        before = Demand(**{key: np.array(v) if isinstance(v, np.ndarray) else v for key, v in fields.items()})
+        again = Controller(method=method).control(
+            before, mission(), route, run.estimates[tick], field, ROBOT, None, 1.0
+        )
+        assert again.same_as(run.demands[tick])
+    assert all(np.isfinite(demand.velocity_um_s).all() for demand in run.demands)
+
+
+@pytest.mark.parametrize("method", ["vector", "ff_fb"])
+def test_no_error_no_motion_and_no_flow_are_no_division_by_zero(method):
+    demand = Controller(method=method).control(
+        None, mission("plan"), None, seen_at((500.0, 500.0)), STILL, ROBOT, None, 1.0
+    )
+    np.testing.assert_array_equal(demand.velocity_um_s, [0.0, 0.0])
+
+
+def test_the_same_frame_twice_is_the_same_demand():
+    controller = Controller()
+    first = controller.control(None, mission(), straight(), seen_at((500, 2500), 5), STILL, ROBOT, None, 1.0)
+    assert controller.control(first, mission(), straight(), seen_at((9, 9), 5), STILL, ROBOT, None, 1.0) is first

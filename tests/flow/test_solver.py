@@ -1,0 +1,166 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.chip.chip import Chip, Opening
+from flowrec.errors import FlowError
+from flowrec.flow import FlowSolver
+from flowrec.flow import system as systems
+
+
+def relative(a, b):
+    return np.sqrt(((a - b) ** 2).sum() / (b**2).sum())
+
+
+def test_poiseuille_flow_is_parabolic_and_converges_at_second_order(straight):
+    width, speed = 6, 100.0
+    chip = straight(width, speed=speed)
+    edge = np.linspace(0.0, 1.0, width + 1)
+    profile = speed * width * np.diff(3 * edge**2 - 2 * edge**3)  # pixel averages of 6 s (1 - s)
+    slope = -12e-3 * (speed * 1e-6) / (width * 10e-6) ** 2  # Pa/m
+    errors, slopes = [], []
+    for k in (1, 2, 4):
+        field = FlowSolver(k).solve(chip)
+        errors.append(relative(field.velocity_um_s[2:-2, 12, 0], profile))
+        slopes.append(abs((field.pressure_pa[4, 15] - field.pressure_pa[4, 9]) / 60e-6 / slope - 1.0))
+        assert np.abs(field.velocity_um_s[2:-2, 12, 1]).max() < 1e-4 * speed
+    assert errors[0] < 0.03
+    assert errors[0] / errors[1] > 3.3 and errors[1] / errors[2] > 3.3
+    assert slopes[0] / slopes[1] > 3.3 and slopes[2] < 0.005
+
+
+@pytest.mark.parametrize("walls", ["pixel", "smooth"])
+@pytest.mark.parametrize("k", [1, 2])
+def test_every_cell_and_the_whole_chip_conserve_mass(crossing, walls, k):
+    chip = replace(crossing, walls=walls, density_kg_m3=5e4)
+    equations = systems.system(chip, k)
+    drive = chip.boundary_values * np.array([1.0, 1.0, 0.01, 0.01])
+    moving = equations.steady(drive, 1e-3, 40, 1e-10)
+    padded = np.append(moving, 0.0)
+    u, v = padded[equations.grid.number_u], padded[equations.grid.number_v]
+    assert np.abs(np.diff(u, axis=1) + np.diff(v, axis=0)).max() < 1e-12 * np.abs(moving).max()
+    fluxes = np.array([mouth.inward * moving[mouth.faces].sum() for mouth in equations.grid.mouths])
+    assert fluxes[:2] == pytest.approx(drive[:2] * 12 * k, rel=1e-12)
+    assert abs(fluxes.sum()) < 1e-10 * np.abs(fluxes).max()
+    assert (fluxes[2:] < 0.0).all()
+
+
+def test_stokes_flow_is_the_sum_of_its_modes(crossing):
+    solver = FlowSolver(convection=False)
+    chip = crossing.with_boundary([70.0, -20.0, 0.01, 0.03], viscosity_mpa_s=3.0)
+    modes = solver.modes(crossing.with_boundary([1.0, 2.0, 3.0, 4.0], viscosity_mpa_s=3.0))
+    field = solver.solve(chip)
+    summed = np.tensordot(chip.boundary_values, modes.velocity, 1)
+    assert relative(summed, field.velocity_um_s.astype(float)) < 1e-6
+    assert relative(np.tensordot(chip.boundary_values, modes.pressure, 1), field.pressure_pa.astype(float)) < 1e-6
+
+
+def test_linearised_modes_are_the_derivatives_of_the_solution(crossing):
+    # Re about 10: convection matters.
+    chip = crossing.with_boundary([60000.0, 20000.0, 0.0, 5.0])
+    solver = FlowSolver(tolerance=1e-12)
+    modes = solver.linearised(chip)
+    assert relative(modes.base.velocity_um_s, FlowSolver(convection=False).solve(chip).velocity_um_s) > 0.02
+    for index, step in enumerate([600.0, 200.0, 0.5, 0.5]):
+        shifted = [
+            solver.solve(chip.with_boundary(chip.boundary_values + sign * step * np.eye(4)[index])) for sign in (1, -1)
+        ]
+        slope = (shifted[0].velocity_um_s.astype(float) - shifted[1].velocity_um_s) / (2 * step)
+        assert relative(modes.velocity[index], slope) < 2e-3
+        slope = (shifted[0].pressure_pa.astype(float) - shifted[1].pressure_pa) / (2 * step)
+        assert relative(modes.pressure[index], slope) < 2e-3
+    thick, thin = (solver.solve(chip.with_boundary(chip.boundary_values, float(np.exp(s)))) for s in (0.02, -0.02))
+    slope = (thick.velocity_um_s.astype(float) - thin.velocity_um_s) / 0.04
+    assert relative(modes.viscosity_velocity, slope) < 5e-3
+    slope = (thick.pressure_pa.astype(float) - thin.pressure_pa) / 0.04
+    assert relative(modes.viscosity_pressure, slope) < 5e-3
+
+
+def test_depth_friction_gives_the_profile_of_a_shallow_channel(straight):
+    width, speed, depth = 16, 100.0, 40.0
+    field = FlowSolver(4).solve(straight(width, 32, speed, depth_um=depth))
+    y = (np.arange(width) - (width - 1) / 2) * 10.0
+    rate, half = np.sqrt(12.0) / depth, width * 5.0
+    profile = 1.0 - np.cosh(rate * y) / np.cosh(rate * half)
+    profile *= speed / (1.0 - np.tanh(rate * half) / (rate * half))
+    assert relative(field.velocity_um_s[2:-2, 16, 0], profile) < 0.01
+    # Far from the sides Hele-Shaw: dp/dx = -12 mu v / H^2.
+    slope = (field.pressure_pa[9, 20] - field.pressure_pa[9, 12]) / 80e-6
+    assert slope == pytest.approx(-12e-3 * field.velocity_um_s[9, 16, 0] * 1e-6 / (depth * 1e-6) ** 2, rel=0.01)
+
+
+def test_convection_leaves_a_developed_channel_flow_alone(straight):
+    chip = straight(8, speed=1e5)
+    with_it, without = FlowSolver().solve(chip), FlowSolver(convection=False).solve(chip)
+    # The inlet's parabola is not quite the discrete one, hence not zero.
+    assert relative(with_it.velocity_um_s, without.velocity_um_s) < 0.01
+
+
+def test_a_mirrored_chip_has_the_mirrored_flow_and_convection_tells_forth_from_back(straight):
+    mask = np.zeros((24, 36), bool)
+    mask[8:16] = True
+    mask[2:22, 14:] = True  # a sudden expansion
+    forth = Chip(
+        "step", mask, 10.0, (Opening("left", 8, 15, "inlet", 8e4), Opening("right", 2, 21, "outlet", 0.0)), 1.0, 1e3
+    )
+    upside = replace(forth, mask=mask[::-1])
+    upside = replace(
+        upside, openings=(replace(forth.openings[0]), replace(forth.openings[1]))
+    )  # the rows 8..15 and 2..21 of 24 mirror onto themselves
+    field, mirrored = FlowSolver().solve(forth), FlowSolver().solve(upside)
+    assert relative(mirrored.velocity_um_s[::-1] * [1, -1], field.velocity_um_s) < 1e-6
+    # Inertia carries the jet on: the middle is faster than in Stokes flow, and the corners turn back.
+    stokes = FlowSolver(convection=False).solve(forth)
+    assert field.velocity_um_s[12, 22, 0] > 1.1 * stokes.velocity_um_s[12, 22, 0]
+    assert field.velocity_um_s[3, 16:22, 0].min() < 0.0
+
+
+def test_a_smooth_wall_has_the_resistance_of_the_oblique_channel_it_was_drawn_from():
+    width, angle, length = 8.0, np.radians(30.0), 80
+    rows, columns = np.mgrid[: int(length * np.tan(angle)) + 24, :length].astype(float)
+    rows, columns = rows - rows.mean() + 0.27, columns - columns.mean() + 0.13
+    mask = np.abs(rows * np.cos(angle) - columns * np.sin(angle)) < width / 2
+    left, right = np.flatnonzero(mask[:, 0]), np.flatnonzero(mask[:, -1])
+    openings = (
+        Opening("left", int(left[0]), int(left[-1]), "inlet", 100.0 * width / len(left)),
+        Opening("right", int(right[0]), int(right[-1]), "outlet", 0.0),
+    )
+    along = columns * np.cos(angle) + rows * np.sin(angle)
+    core = mask & (np.abs(rows * np.cos(angle) - columns * np.sin(angle)) < 1.0) & (np.abs(along) < 20.0)
+
+    def resistance(walls, k):
+        chip = Chip("oblique", mask, 10.0, openings, 1.0, 1000.0, walls=walls)
+        pressure = FlowSolver(k).solve(chip).pressure_pa
+        return -np.polyfit(along[core] * 10e-6, pressure[core], 1)[0] * (width * 10e-6) ** 2 / (12e-3 * 100e-6)
+
+    assert resistance("smooth", 1) == pytest.approx(1.0, abs=0.05)
+    assert resistance("smooth", 2) == pytest.approx(1.0, abs=0.03)
+    assert resistance("pixel", 2) > 1.15
+
+
+def test_solid_and_ponds_stand_still(crossing):
+    field = FlowSolver(2).solve(crossing)
+    assert not field.velocity_um_s[~crossing.mask].any() and not field.pressure_pa[~crossing.mask].any()
+    assert not field.velocity_um_s[3:8, 4:9].any()
+
+
+def test_the_same_chip_gives_the_same_bytes_with_or_without_the_cache(crossing):
+    chip = crossing.with_boundary([6000.0, 2000.0, 0.0, 0.0])
+    first = FlowSolver().solve(chip)
+    FlowSolver().linearised(chip.with_boundary([1.0, 2.0, 3.0, 4.0], viscosity_mpa_s=9.0))
+    assert FlowSolver().solve(chip).same_as(first)
+    systems._kept.clear()
+    assert FlowSolver().solve(chip).same_as(first)
+
+
+def test_what_can_not_be_solved_is_said_in_one_line(crossing, straight):
+    with pytest.raises(FlowError, match=r"did not converge \(Re about .*max_iterations"):
+        FlowSolver(max_iterations=3).solve(crossing.with_boundary([5e7, 5e7, 0.0, 0.0]))
+    channel = straight()
+    with pytest.raises(FlowError, match="no outlet"):
+        FlowSolver().solve(replace(channel, openings=channel.openings[:1]))
+    with pytest.raises(FlowError, match="1, 2 or 4"):
+        FlowSolver(k=3).solve(channel)
+    with pytest.raises(FlowError, match="not one run of fluid"):
+        FlowSolver().solve(replace(channel, openings=(Opening("left", 0, 9, "inlet", 1.0), channel.openings[1])))

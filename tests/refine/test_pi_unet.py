@@ -1,0 +1,78 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from flowrec.refine import PiUnet, Refiner
+from flowrec.refine.physics import Physics
+
+
+def poiseuille(width, length):
+    """Mask, velocity and pressure of a channel in units of px, V and mu V / px; pixel averages."""
+    y = np.arange(width) + 0.5
+    profile = y * (width - y) / width**2
+    mask = np.zeros((width + 4, length))
+    mask[2:-2] = 1.0
+    velocity = np.zeros((2, *mask.shape))
+    velocity[0, 2:-2] = profile[:, None]
+    pressure = -2.0 / width**2 * np.arange(length) * mask
+    return (torch.tensor(array, dtype=torch.float32) for array in (mask[None, None], velocity[None], pressure[None, None]))
+
+
+def test_the_discrete_equations_vanish_on_poiseuille_flow():
+    fluid, velocity, pressure = poiseuille(10, 12)
+    inside = torch.zeros_like(fluid)
+    inside[..., 1:-1, 1:-1] = 1.0
+    residuals = Physics.of(fluid, inside, reynolds=3.0, friction=0.0).residuals(velocity, pressure)[0]
+    # Away from the walls the five-point Laplacian of a parabola is exact: sign and scale of every term are right.
+    assert residuals[:, 3:-3].abs().max() < 1e-6
+    # The ghost value of a wall pixel is second order in v, so its Laplacian is off by 1 / 4 of 1 / width^2.
+    assert residuals.abs().max() < 0.6 / 10**2
+    wrong = Physics.of(fluid, inside, reynolds=3.0, friction=0.0).residuals(2 * velocity, pressure)[0]
+    assert wrong[1, 5:-5].abs().max() > 1.9 / 10**2
+
+
+def test_pi_unet_lowers_the_error_of_a_wrong_solution_by_a_third(twin):
+    case = twin()
+    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", iterations=60))
+    refined = refiner.refine(case.assumed, case.observations, case.chip, case.solver)
+    assert case.error(refined) < 2.0 / 3.0 * case.error(case.assumed)
+    assert not refined.velocity_um_s[~case.chip.mask].any()
+    assert refined.method == "pi_unet"
+
+
+def test_pi_unet_keeps_an_assimilated_field_that_explains_the_observations(twin):
+    case = twin()
+    assimilated = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    refined = Refiner("pi_unet").refine(case.assumed, case.observations, case.chip, case.solver)
+    assert np.array_equal(refined.velocity_um_s, assimilated.velocity_um_s)
+    assert "start kept" in refined.note and assimilated.note in refined.note
+
+
+def test_pi_unet_corrects_what_no_boundary_value_can_explain(twin):
+    # The chip is not what its mask says: debris half closes the upper branch, so the flow there is another one.
+    case = twin(noise=0.02, every=2)
+    mask = case.chip.mask.copy()
+    mask[8:12, 30:50] = False
+    real = case.solver.solve(replace(case.chip, mask=mask))
+    points = case.observations.position_um
+    from flowrec.flow import sample  # noqa: PLC0415
+
+    case.true = real
+    case.observations = replace(case.observations, flow_um_s=sample(real, points))
+    assimilated = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    refined = Refiner("pi_unet").refine(case.assumed, case.observations, case.chip, case.solver)
+    assert case.error(refined) < 0.9 * case.error(assimilated)
+    assert (refined.std_um_s >= assimilated.std_um_s).all()
+
+
+@pytest.mark.parametrize("settings", [{"observations": "hard"}, {"near_wall": "hard"}, {"near_wall": "free"}])
+def test_the_printed_variants_run_and_give_the_same_bytes_twice(twin, settings):
+    case = twin(noise=0.0)
+    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", iterations=10, **settings))
+    threads = torch.get_num_threads()
+    first, second = (refiner.refine(case.assumed, case.observations, case.chip, case.solver) for _ in range(2))
+    assert first.same_as(second)
+    assert torch.get_num_threads() == threads
+    assert case.error(first) < case.error(case.assumed)

@@ -1,0 +1,137 @@
+import contextlib
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from flowrec.errors import SessionError
+from flowrec.messages import Event, Frame, Matrix, Message, OperatorEvent, Track, Vector, array_fields
+from flowrec.store import codec
+from flowrec.store.schemas import forms_of
+from flowrec.topics import TOPICS
+
+TYPES = sorted({topic.type for topic in TOPICS}, key=lambda kind: kind.__name__)
+TEXTS = st.text(st.characters(exclude_categories=("Cs",)), max_size=20)
+
+
+def bits_of(array):
+    """Any bit pattern, so NaNs of every kind, infinities, -0 and denormals are among them."""
+    return hnp.arrays(np.dtype(f"u{array.dtype.itemsize}"), array.shape).map(lambda bits: bits.view(array.dtype))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Maybe(Message):
+    stamp_ns: int
+    number: float | None
+    count: int | None
+    word: str | None
+    vector: Vector | None
+    matrix: Matrix | None
+
+
+@st.composite
+def messages(draw, kind):
+    dtypes = dict(array_fields(kind))
+    values = {}
+    for form in forms_of(kind):
+        if form.optional and draw(st.booleans()):
+            values[form.name] = None
+        elif form.name in dtypes:
+            dims = {"vector": (1, 1), "array": (0, 3)}[form.kind] if kind is not Frame else (2, 2)
+            shape = draw(hnp.array_shapes(min_dims=dims[0], max_dims=dims[1], min_side=0, max_side=4))
+            values[form.name] = draw(bits_of(np.empty(shape, dtypes[form.name])))
+        elif kind is Frame and form.name == "index":
+            values[form.name] = draw(st.integers(0, 2**32 - 1))
+        elif kind in (Frame, Event, OperatorEvent) and form.kind is int:
+            values[form.name] = draw(st.integers(-(10**17), 2**63 - 1))  # Timestamp: 64 bit of seconds
+        else:
+            values[form.name] = draw(
+                {
+                    int: st.integers(-(2**63), 2**63 - 1),
+                    float: st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True),
+                    bool: st.booleans(),
+                    str: TEXTS,
+                }[form.kind]
+            )
+    return kind(**values)
+
+
+@pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
+def test_every_message_comes_back_bit_for_bit(kind):
+    @settings(max_examples=40, deadline=None)
+    @given(messages(kind))
+    def round_trip(message):
+        sequence, parts = codec.encode_record(message)
+        again = codec.decode(kind, memoryview(b"".join(parts)), sequence or 0)
+        assert again.same_as(message)
+        for name in (field.name for field in dataclasses.fields(kind)):
+            mine, theirs = getattr(message, name), getattr(again, name)
+            assert type(mine) is type(theirs)
+            if isinstance(mine, float):
+                assert np.float64(mine).tobytes() == np.float64(theirs).tobytes()
+            if isinstance(mine, np.ndarray):
+                assert (mine.dtype, mine.shape) == (theirs.dtype, theirs.shape) and not theirs.flags.writeable
+
+    round_trip()
+
+
+@pytest.mark.parametrize("level", ["info", "warning", "error", "debug", "fatal", "", "odd: level", "flowrec."])
+def test_event_levels_come_back_whatever_they_are(level):
+    event = Event(5, level, "x")
+    assert codec.decode(Event, codec.encode(event)).same_as(event)
+
+
+def test_an_action_with_colons_is_not_confused_with_its_text():
+    for action, text in (("a: b", "c: d"), ("", ": "), ("operator.", "operator.x: ")):
+        event = OperatorEvent(5, action, text)
+        assert codec.decode(OperatorEvent, codec.encode(event)).same_as(event)
+
+
+def test_half_a_character_is_spelled_out_instead_of_ending_the_run():
+    assert codec.decode(Event, codec.encode(Event(1, "info", "a\ud800b"))).text == r"a\ud800b"
+
+
+def test_a_value_that_can_not_be_stored_is_told_with_type_and_stamp():
+    flat = Track(7, True, np.zeros((2, 2)), 1.0, 0, 1.0, np.zeros(4))
+    for message in (
+        flat,
+        Frame(7, -1, np.zeros((2, 2))),
+        Frame(7, 0, np.zeros(3)),
+        dataclasses.replace(flat, score=None),
+    ):
+        with pytest.raises(SessionError, match=f"a {type(message).__name__} at 7 ns can not be stored"):
+            codec.encode(message)
+
+
+def test_optional_scalars_and_arrays_keep_the_difference_between_nothing_and_zero():
+    nothing = Maybe(0, None, None, None, None, None)
+    zero = Maybe(0, 0.0, 0, "", np.zeros(0), np.zeros((0, 3)))
+    for message in (nothing, zero):
+        assert codec.decode(Maybe, codec.encode(message)).same_as(message)
+
+
+@pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
+def test_schemas_stand_on_their_own(kind):
+    schema = codec.codec_of(kind).schema
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+        pool.Add(file)  # refuses a file before what it depends on
+    assert pool.FindMessageTypeByName(schema.name).full_name == schema.name
+
+
+def test_vectors_are_packed_doubles_that_viewers_can_plot():
+    (file,) = descriptor_pb2.FileDescriptorSet.FromString(codec.codec_of(Track).schema.data).file
+    position = next(field for field in file.message_type[0].field if field.name == "position_um")
+    assert (position.type, position.label) == (position.TYPE_DOUBLE, position.LABEL_REPEATED)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from(TYPES), st.binary(max_size=60))
+def test_rubbish_is_a_session_error_or_a_message(kind, rubbish):
+    with contextlib.suppress(SessionError):
+        assert isinstance(codec.decode(kind, rubbish), kind)

@@ -1,0 +1,231 @@
+"""Writer and reader together, and what other programs make of the file."""
+
+import itertools
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+
+from flowrec.errors import SessionError
+from flowrec.messages import Frame, Tick
+from flowrec.store import SessionReader, SessionWriter
+from flowrec.store.schemas import foxglove_schema
+from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+
+TICKS = list(ticks_of(150))
+
+
+def record(path, ticks=TICKS, outcome=None, **options):
+    with SessionWriter(path, HEADER, block=True, **options) as writer:
+        for tick in ticks:
+            writer.write(tick)
+        writer.close(outcome or {"outcome": "reached"})
+    return path
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return record(tmp_path_factory.mktemp("sessions") / "session.mcap")
+
+
+def same(first: Tick, second: Tick, *, but: tuple[str, ...] = ()) -> bool:
+    for field in fields(Tick):
+        mine, theirs = getattr(first, field.name), getattr(second, field.name)
+        if field.name not in but and mine != theirs and not mine.same_as(theirs):
+            return False
+    return True
+
+
+def news(ticks, before=None):
+    """Which fields are new in each tick, by identity."""
+    before = before or Tick()
+    for tick in ticks:
+        yield {topic for topic in counts_of() if getattr(tick, topic) is not getattr(before, topic)}
+        before = tick
+
+
+def counts_of():
+    return [field.name for field in fields(Tick) if field.name != "stamp_ns"]
+
+
+def test_ticks_come_back_as_they_were_with_the_same_messages_new(path):
+    reader = SessionReader(path)
+    again = list(reader.ticks())
+    assert all(itertools.starmap(same, zip(TICKS, again, strict=True)))
+    assert list(news(again)) == list(news(TICKS))
+
+
+def test_the_session_says_what_it_is(path):
+    reader = SessionReader(path)
+    assert reader.header == HEADER
+    assert reader.outcome == {"outcome": "reached", "ticks": "150", "dropped_frames": "0"}
+    assert (reader.first_ns, reader.last_ns) == (TICKS[0].stamp_ns, TICKS[-1].stamp_ns)
+    assert reader.duration_s == pytest.approx(149 * PERIOD_NS / 1e9)
+    assert reader.counts["frame"] == 150 and reader.counts["refined"] == 3 and reader.counts["event"] == 1
+    assert [frame.index for frame in reader.messages("frame")] == list(range(150))
+    assert len(list(reader.messages("refined"))) == 3
+
+
+@pytest.mark.parametrize("number", [0, 1, 11, 12, 75, 149])
+def test_starting_late_gives_the_tail_of_all_ticks(path, number):
+    reader = SessionReader(path)
+    start_ns = TICKS[number].stamp_ns
+    tail, before = list(reader.ticks(start_ns)), reader.tick_before(start_ns - 1)
+    assert all(itertools.starmap(same, zip(TICKS[number:], tail, strict=True)))
+    # What is new in the first tick of the tail is told by the objects, too.
+    assert list(news(tail, before)) == list(news(TICKS))[number:]
+
+
+def test_the_state_between_two_ticks_is_that_of_the_earlier_one(path):
+    reader = SessionReader(path)
+    for number in (0, 10, 11, 149):
+        assert same(reader.tick_before(TICKS[number].stamp_ns + 1), TICKS[number])
+    assert same(reader.tick_before(TICKS[0].stamp_ns - 1), Tick())
+
+
+def test_poses_are_read_without_touching_a_frame(path, monkeypatch):
+    reader = SessionReader(path)
+    frames = {chunk.chunk_start_offset for chunk in reader._contents.chunks if 1 in chunk.message_index_offsets}
+    read, pread = [], reader._source.read
+    monkeypatch.setattr(type(reader._source), "read", lambda _, at, length: (read.append(at), pread(at, length))[1])
+    ticks = list(reader.ticks(with_frames=False))
+    assert all(same(a, b, but=("frame",)) and b.frame is None for a, b in zip(TICKS, ticks, strict=True))
+    assert read and frames and frames.isdisjoint(read)
+
+
+def test_a_replay_without_images_is_a_session_too(tmp_path):
+    path = record(tmp_path / "replay.mcap", [replace(tick, frame=None) for tick in TICKS])
+    assert all(same(a, b, but=("frame",)) for a, b in zip(TICKS, SessionReader(path).ticks(), strict=True))
+
+
+def test_a_session_without_ticks_can_be_read(tmp_path):
+    reader = SessionReader(record(tmp_path / "empty.mcap", []))
+    assert list(reader.ticks()) == [] and reader.counts == {} and same(reader.tick_before(5), Tick())
+
+
+def test_the_same_ticks_make_the_same_messages_however_the_thread_was_timed(tmp_path):
+    paths = [record(tmp_path / f"{flush_s}.mcap", flush_s=flush_s) for flush_s in (0.0, 10.0)]
+    contents = []
+    for path in paths:
+        with path.open("rb") as stream:
+            found = [
+                (c.topic, m.log_time, m.publish_time, m.sequence, m.data)
+                for _, c, m in make_reader(stream).iter_messages()
+            ]
+        contents.append(sorted(found, key=lambda message: message[1::-1]))
+    assert contents[0] == contents[1]
+
+
+def test_a_message_said_again_is_written_once(tmp_path):
+    first = TICKS[0]
+    copy = replace(first.assumed)
+    changed = replace(first.assumed, note="same stamp, other words")
+    ticks = [
+        first,
+        replace(first, stamp_ns=2 * 10**9, assumed=copy),
+        replace(first, stamp_ns=3 * 10**9, assumed=changed),
+    ]
+    reader = SessionReader(record(tmp_path / "s.mcap", ticks))
+    assert [field.note for field in reader.messages("assumed")] == ["made up", "same stamp, other words"]
+
+
+def test_the_official_reader_sees_every_message_in_order(path):
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        times, counts = [], Counter()
+        for schema, channel, message in reader.iter_messages():
+            assert schema.encoding == channel.message_encoding == "protobuf"
+            times.append(message.log_time)
+            counts[channel.topic] += 1
+        assert times == sorted(times)
+        assert counts["/camera/frame"] == counts["/view/robot_pose"] == 150
+        assert {record.name for record in reader.iter_metadata()} >= {"flowrec.session", "flowrec.outcome"}
+        assert {record.name for record in reader.iter_attachments()} >= {"config.toml", "chip.png", "chip.toml"}
+    with path.open("rb") as stream:  # front to back, with the checksum of all data
+        assert sum(1 for _ in NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)) == len(
+            times
+        )
+
+
+def test_other_viewers_get_pose_path_and_previews_on_one_scale(path):
+    with path.open("rb") as stream:
+        found = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic.startswith("/view/"):
+                found[channel.topic] = foxglove_schema(schema.name.removeprefix("foxglove.")).wire.FromString(
+                    message.data
+                )
+    assert found["/view/robot_pose"].pose.position.x == TICKS[-1].estimate.position_um[0]
+    assert len(found["/view/path"].poses) == 20
+    points = np.frombuffer(found["/view/path_points"].data, "<f4").reshape(-1, 3)
+    assert np.array_equal(points[:, :2], TICKS[-1].route.waypoints_um.astype("<f4"))
+    grid = np.frombuffer(found["/view/flow_refined_grid"].data, "<f4").reshape(24, 32, 2)
+    assert np.array_equal(grid, TICKS[-1].refined.velocity_um_s)
+    colours = cv2.imdecode(np.frombuffer(found["/view/flow_refined"].data, np.uint8), cv2.IMREAD_COLOR)
+    assert colours.shape == (24, 32, 3) and not colours[:3].any() and colours[3:].any()
+
+
+def test_rerun_accepts_the_bare_file(path, tmp_path):
+    beside = Path(sys.executable).with_name("rerun")
+    rerun = str(beside) if beside.exists() else shutil.which("rerun")
+    if rerun is None:
+        pytest.skip("the rerun command is not installed")
+    checked = subprocess.run([rerun, "mcap", "check", path], capture_output=True, text=True, check=False, timeout=60)
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    convert = [rerun, "mcap", "convert", path, "-o", tmp_path / "s.rrd"]
+    done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 0 and "ERROR" not in done.stderr, done.stderr
+    assert all(topic in done.stderr for topic in ("/camera/frame", "/robot/estimate", "/view/robot_pose", "/view/path"))
+
+
+def test_a_full_queue_of_a_live_run_drops_images_only(tmp_path):
+    with SessionWriter(tmp_path / "s.mcap", HEADER, queue_limit_bytes=10_000) as writer:
+        for tick in TICKS:
+            writer.write(tick)
+        writer.close({"outcome": "reached"})
+    reader = SessionReader(tmp_path / "s.mcap")
+    again = list(reader.ticks())
+    assert all(same(a, b, but=("frame",)) for a, b in zip(TICKS, again, strict=True))
+    assert 0 < writer.dropped_frames < 150
+    assert reader.counts["frame"] == 150 - writer.dropped_frames == sum("frame" in fresh for fresh in news(again))
+    assert reader.outcome["dropped_frames"] == str(writer.dropped_frames)
+
+
+def test_a_full_queue_of_a_simulation_waits(tmp_path):
+    path = record(tmp_path / "s.mcap", queue_limit_bytes=10_000)
+    assert SessionReader(path).counts["frame"] == 150
+
+
+def test_an_exception_becomes_the_outcome(tmp_path):
+    def fly():
+        with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+            writer.write(TICKS[0])
+            raise RuntimeError("the pump fell off")
+
+    with pytest.raises(RuntimeError):
+        fly()
+    outcome = SessionReader(tmp_path / "s.mcap").outcome
+    assert (outcome["outcome"], outcome["reason"]) == ("failed", "RuntimeError: the pump fell off")
+
+
+def test_a_clock_that_goes_backwards_is_refused(tmp_path):
+    with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+        writer.write(TICKS[1])
+        for tick in (TICKS[1], TICKS[0], Tick(-1)):
+            with pytest.raises(SessionError, match="stamps of a session must grow"):
+                writer.write(tick)
+
+
+def test_a_frame_that_can_not_be_stored_is_told_and_what_came_before_is_kept(tmp_path):
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER)
+    writer.write(Tick(5, frame=Frame(5, -1, np.zeros((2, 2)))))
+    with pytest.raises(SessionError, match=r"not in 32 bit; `flowrec recover .*s\.mcap\.partial`"):
+        writer.close()
+    assert not writer.path.exists() and writer.partial_path.exists()

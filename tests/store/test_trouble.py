@@ -1,0 +1,246 @@
+"""Paths that can not be written, disks that fail, runs that are killed, files that are damaged or foreign."""
+
+import errno
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import zstandard
+from google.protobuf import descriptor_pb2
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.exceptions import McapError
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+from flowrec.errors import SessionError
+from flowrec.store import SessionReader, SessionWriter, header, layout
+from flowrec.store.mcap_file import McapFile
+from tests.store.made_up import HEADER, ticks_of
+
+TICKS = list(ticks_of(30, shape=(8, 8)))
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    path = tmp_path_factory.mktemp("trouble") / "session.mcap"
+    with SessionWriter(path, HEADER) as writer:
+        for tick in TICKS:
+            writer.write(tick)
+    return path
+
+
+def names_in(directory):
+    return [path.name for path in directory.iterdir()]
+
+
+def one_line(error):
+    assert "\n" not in str(error.value), error.value
+    return str(error.value)
+
+
+def test_an_existing_session_is_refused_before_anything_is_made(tmp_path):
+    path = tmp_path / "s.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(SessionError, match=r"exists already.*--overwrite") as error:
+        SessionWriter(path, HEADER)
+    assert one_line(error).startswith(str(path))
+    assert names_in(tmp_path) == ["s.mcap"] and path.read_bytes() == b"precious"
+    SessionWriter(path, HEADER, overwrite=True).close()
+    assert SessionReader(path).outcome["outcome"] == "ended"
+
+
+def test_the_remains_of_an_unfinished_run_are_refused_as_well(tmp_path):
+    partial = tmp_path / "s.mcap.partial"
+    partial.write_bytes(b"precious")
+    with pytest.raises(SessionError, match="flowrec recover"):
+        SessionWriter(tmp_path / "s.mcap", HEADER)
+    assert partial.read_bytes() == b"precious"
+
+
+def test_a_missing_directory_is_told_in_one_line(tmp_path):
+    with pytest.raises(SessionError, match="no such directory; make it") as error:
+        SessionWriter(tmp_path / "missing" / "s.mcap", HEADER)
+    one_line(error)
+
+
+def test_a_name_taken_during_the_run_is_not_overwritten(tmp_path):
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER)
+    writer.path.write_bytes(b"precious")
+    with pytest.raises(SessionError, match=r"stays in .*s\.mcap\.partial"):
+        writer.close()
+    assert writer.path.read_bytes() == b"precious"
+    assert SessionReader(writer.partial_path).outcome["outcome"] == "ended"
+
+
+@pytest.mark.parametrize("block", [True, False])
+def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatch, block):
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER, flush_s=0.0, block=block, queue_limit_bytes=2000)
+
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(McapFile, "add_chunks", refuse)
+
+    def fly():
+        for tick in ticks_of(10_000, shape=(8, 8)):
+            writer.write(tick)
+            time.sleep(0.001)
+
+    for call in (fly, writer.close):
+        with pytest.raises(SessionError, match="the disk is full") as error:
+            call()
+        one_line(error)
+    assert not writer.path.exists() and writer.partial_path.exists()
+
+
+KILLED = """
+import sys, time
+from flowrec.store import SessionWriter
+sys.path.insert(0, sys.argv[2])
+from made_up import HEADER, ticks_of
+writer = SessionWriter(sys.argv[1], HEADER, flush_s=0.1)
+for number, tick in enumerate(ticks_of(10_000, shape=(8, 8))):
+    writer.write(tick)
+    print(number, flush=True)
+    time.sleep(0.005)
+"""
+
+
+def test_a_killed_run_loses_no_more_than_the_last_moments(tmp_path):
+    path = tmp_path / "s.mcap"
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED, path, Path(__file__).parent], stdout=subprocess.PIPE, text=True
+    ) as run:
+        said = 0
+        while said < 150:
+            said = int(run.stdout.readline())
+        run.send_signal(signal.SIGKILL)
+        run.stdout.read()
+    assert names_in(tmp_path) == ["s.mcap.partial"]
+    with pytest.raises(SessionError, match=r"was not finished.*flowrec recover"):
+        SessionReader(tmp_path / "s.mcap.partial")
+    topics, counts = {}, Counter()
+    with (tmp_path / "s.mcap.partial").open("rb") as stream:
+        try:
+            for record in StreamReader(stream, validate_crcs=True).records:
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                if isinstance(record, Message):
+                    counts[topics[record.channel_id]] += 1
+        except McapError:
+            pass  # the end, wherever it is
+    assert counts["/camera/frame"] == counts["/robot/estimate"] > 150 - 60
+
+
+def test_what_is_no_session_is_named_as_what_it_is(tmp_path, session):
+    empty, text, foreign, cut = (tmp_path / name for name in ("empty", "text", "foreign", "cut"))
+    empty.touch()
+    text.write_text("hello, world")
+    cut.write_bytes(session.read_bytes()[:-1000])
+    for library, profile in (("other", "ros2"), ("pretender", "flowrec")):
+        with foreign.with_suffix(f".{library}").open("wb") as stream:
+            writer = Writer(stream)
+            writer.start(profile=profile, library=library)
+            writer.finish()
+    expected = {
+        tmp_path / "missing.mcap": "no such file",
+        tmp_path: "is a directory, not a session",
+        empty: "is empty",
+        text: "is not an MCAP file",
+        cut: "was not finished .*flowrec recover",
+        foreign.with_suffix(".other"): "of another program .profile 'ros2', library 'other'",
+        foreign.with_suffix(".pretender"): "without the record 'flowrec.session'",
+    }
+    for path, message in expected.items():
+        with pytest.raises(SessionError, match=message) as error:
+            SessionReader(path)
+        assert one_line(error).startswith(str(path))
+
+
+def test_a_session_of_a_later_format_says_which_flowrec_it_needs(tmp_path, monkeypatch):
+    monkeypatch.setattr(header, "FORMAT_VERSION", 2)
+    monkeypatch.setattr("flowrec.__version__", "9.9.0")
+    SessionWriter(tmp_path / "s.mcap", HEADER).close()
+    monkeypatch.undo()
+    with pytest.raises(SessionError, match=r"format '2'.*install flowrec 9\.9\.0 or later"):
+        SessionReader(tmp_path / "s.mcap")
+
+
+def test_a_message_that_is_laid_out_differently_is_named(tmp_path, monkeypatch):
+    slot = layout.SLOTS["/robot/track"]
+    files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
+    files.file[0].message_type[0].field[3].name = "likeness"
+    other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
+    monkeypatch.setitem(layout.SLOTS, "/robot/track", other)
+    SessionWriter(tmp_path / "s.mcap", HEADER).close()
+    with pytest.raises(SessionError, match=r"/robot/track is laid out differently \(Track\.likeness, Track\.score\)"):
+        SessionReader(tmp_path / "s.mcap")
+
+
+def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 28))
+
+    def plant(self, sealed):
+        plain(self, [(replace(chunk, data=bomb, uncompressed_size=1000), indexes) for chunk, indexes in sealed])
+
+    plain = McapFile.add_chunks
+    monkeypatch.setattr(McapFile, "add_chunks", plant)
+    with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+        writer.write(TICKS[0])
+    began = time.process_time()
+    with pytest.raises(SessionError, match="zstd announces another size"):
+        list(SessionReader(tmp_path / "s.mcap").ticks())
+    assert time.process_time() - began < 1.0
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_anywhere_is_told_in_one_line_or_does_no_harm(session, tmp_path, data):
+    content = bytearray(session.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        # Half of the blows go to the summary, where the sizes and offsets are.
+        low = data.draw(st.sampled_from([0, max(0, len(content) - 4000)]))
+        at = data.draw(st.integers(low, len(content) - 1))
+        content[at] = data.draw(st.integers(0, 255))
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(content)
+    told, stamps = None, None
+    try:
+        with SessionReader(path) as reader:
+            _ = reader.header
+            stamps = [tick.stamp_ns for tick in reader.ticks()]
+    except SessionError as error:
+        told = str(error)
+    if told is None:
+        assert stamps == [tick.stamp_ns for tick in TICKS]
+    else:
+        assert "\n" not in told and str(path) in told
+
+
+def test_a_file_cut_off_anywhere_is_told_as_such(session, tmp_path):
+    content, path = session.read_bytes(), tmp_path / "cut.mcap"
+    for length in [*range(0, 80), *range(80, len(content), 997), len(content) - 1]:
+        path.write_bytes(content[:length])
+        with pytest.raises(SessionError):
+            SessionReader(path)
+
+
+def test_a_closed_reader_says_so(session):
+    reader = SessionReader(session)
+    reader.close()
+    with pytest.raises(SessionError, match="has been closed"):
+        next(reader.ticks())
+
+
+def test_reading_can_be_broken_off_and_begun_again(session):
+    reader = SessionReader(session)
+    first = next(iter(reader.ticks()))
+    both = zip(reader.ticks(), reader.ticks(), strict=True)
+    assert first.stamp_ns == TICKS[0].stamp_ns and all(one.stamp_ns == two.stamp_ns for one, two in both)
