@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.control.laws import ff_fb_law, saturated, shortened, vector_law
-from flowrec.control.prediction import blend, remembered, roll_forward
+from flowrec.control.prediction import FlowBelief, blend, remembered, roll_forward
 from flowrec.control.reference import governed_pace, place_on, velocity_on
 from flowrec.control.walls import guarded
 from flowrec.flow import sample
@@ -50,6 +50,7 @@ class Controller:
     lag_free_radii: float = 0.5  # the robot may be this far off before the reference slows down,
     lag_full_radii: float = 3.0  # and waits for it from here on
     map_error: float = 0.3  # share of the flow's speed that the map is thought to be wrong by
+    observer_lag_s: float = 0.3  # how far behind a changing flow the observer is thought to be
     guard_radii: float = 1.1  # clearance kept from walls, in robot radii; 0: no wall guard
     guard_per_s: float = 5.0  # how fast the room left above that may be used up
     blind_s: float = 0.5  # while the robot is not seen the demand dies away with this time constant
@@ -79,11 +80,13 @@ class Controller:
             return previous
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
-        aim = self._aim(previous, mission, route, estimate, robot, dt_s)
+        belief = blend(field, estimate, sent, self.map_error, self.observer_lag_s)
+        point = roll_forward(estimate.position_um, sent, dt_s, robot.delay_s, belief)
+        aim = self._aim(previous, mission, route, estimate, point, robot, dt_s)
         error = aim.reference_um - estimate.position_um
         demand, saturated = np.zeros(2), False
         if not mission.finished and np.isfinite(error).all():
-            demand, saturated = self._law(aim, estimate, field, robot, clearance_um, um_per_px, sent, dt_s)
+            demand, saturated = self._law(aim, estimate, field, belief, point, robot, clearance_um, um_per_px, dt_s)
             if not estimate.seen:
                 demand = self._blind(previous, demand, robot, dt_s)
         return Demand(
@@ -102,13 +105,14 @@ class Controller:
         mission: Mission,
         route: Route | None,
         estimate: Estimate,
+        point: Vector,
         robot: Robot,
         dt_s: float,
     ) -> _Aim:
-        """The reference of this frame."""
+        """The reference of this frame; `point` is where the robot will be when the demand takes effect."""
         began = previous is None or mission.since_ns > previous.stamp_ns
         if mission.finished or mission.phase not in _FOLLOWING or route is None or not route.reachable:
-            return _Aim.at_rest(self._place(previous, began, mission, estimate))
+            return _Aim.at_rest(self._place(previous, began, mission, estimate, point))
         if previous is None or began or route.stamp_ns > previous.stamp_ns:
             progress_s, pace = 0.0, 1.0
         else:
@@ -129,30 +133,34 @@ class Controller:
         )
 
     @staticmethod
-    def _place(previous: Demand | None, began: bool, mission: Mission, estimate: Estimate) -> Vector:
-        """Where to stay: where the phase, or the robot after it was lost, was found; NaN while it never was."""
+    def _place(previous: Demand | None, began: bool, mission: Mission, estimate: Estimate, point: Vector) -> Vector:
+        """Where to stay: as near as the robot can stop to where the phase found it, or it was found after a loss.
+
+        NaN while it has not been seen, or not for so long that nothing is asked of it any more.
+        """
         if previous is None or not np.isfinite(previous.reference_um).all():
-            return estimate.position_um if estimate.seen else np.full(2, np.nan)
-        if not estimate.seen and not previous.velocity_um_s.any() and not mission.finished:
+            return point if estimate.seen else np.full(2, np.nan)
+        if mission.finished:
+            return previous.reference_um
+        if not estimate.seen and not previous.velocity_um_s.any():
             return np.full(2, np.nan)
-        return estimate.position_um if began and not mission.finished else previous.reference_um
+        return point if began else previous.reference_um
 
     def _law(
         self,
         aim: _Aim,
         estimate: Estimate,
         field: FlowField | None,
+        belief: FlowBelief,
+        point: Vector,
         robot: Robot,
         clearance_um: NDArray[np.float32] | None,
         um_per_px: float,
-        sent_um_s: NDArray[np.float64],
         dt_s: float,
     ) -> tuple[Vector, bool]:
         """The demand (2,) um/s and whether the robot's limit cut it."""
         limit_um_s = robot.speed_limit_um_s
         if self.method == "vector":
-            belief = blend(field, estimate, self.map_error)
-            point = roll_forward(estimate.position_um, sent_um_s, dt_s, robot.delay_s, belief)
             flow = belief.at(point)
             wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, self.kp_per_s)
             demand, cut = saturated(wanted, flow, limit_um_s)

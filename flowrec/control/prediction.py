@@ -27,11 +27,15 @@ class FlowBelief:
         return sample(self.field, point_um) + self.residual_um_s
 
 
-def blend(field: FlowField | None, estimate: Estimate, map_error: float) -> FlowBelief:
+def blend(
+    field: FlowField | None, estimate: Estimate, sent_um_s: NDArray[np.float64], map_error: float, lag_s: float
+) -> FlowBelief:
     """The map plus a share of the observer's residual, each trusted by its variance.
 
-    The observer's comes with the estimate, so that one that has seen nothing yet does not count; the map's error is
-    taken as the share `map_error` of the speed, or as its own standard deviation where it knows a larger one.
+    The observer's comes with the estimate, so that one that has seen nothing yet does not count. As an observer of
+    a flow that it thinks constant lags by about `lag_s`, the change of the map over the way of that time is added:
+    where the robot turns from one stream into another the map knows better. The map's own error is its standard
+    deviation where it knows it, else the share `map_error` of the speed; more than twice of it is not believed.
     """
     if field is None:
         return FlowBelief(None, estimate.flow_um_s)
@@ -40,10 +44,14 @@ def blend(field: FlowField | None, estimate: Estimate, map_error: float) -> Flow
     if field.std_um_s is not None:
         h, w = field.std_um_s.shape[:2]
         column, row = np.rint(estimate.position_um / field.um_per_px).astype(int)
-        doubt = max(doubt, float(field.std_um_s[min(max(row, 0), h - 1), min(max(column, 0), w - 1)].max()))
-    variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3])
-    share = doubt**2 / (doubt**2 + max(variance, 0.0))
-    return FlowBelief(field, share * (estimate.flow_um_s - mapped))
+        doubt = max(0.3 * doubt, float(field.std_um_s[min(max(row, 0), h - 1), min(max(column, 0), w - 1)].max()))
+    moving = mapped + sent_um_s[0] if len(sent_um_s) else mapped
+    change = mapped - sample(field, estimate.position_um - lag_s * moving)
+    variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3]) + float(change @ change)
+    residual = estimate.flow_um_s - mapped
+    length = float(np.hypot(residual[0], residual[1]))
+    share = min(doubt**2 / (doubt**2 + variance), 2.0 * doubt / length if length > 0.0 else 1.0)
+    return FlowBelief(field, share * residual)
 
 
 def roll_forward(

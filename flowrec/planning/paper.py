@@ -9,6 +9,7 @@ The cost stays finite (2 |dx|) against a flow as fast as the robot, and the heur
 from __future__ import annotations
 
 import heapq
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ def paper_cost(displacement: Points, velocity: Points, speed: float) -> NDArray[
 
 
 def adjacency(nodes: Points, radius: float, clearance: NDArray[np.float64], need: float) -> NDArray[np.int64]:
-    """(m, 2) directed edges between all nodes (n, 2), px, within a radius that see each other past the walls."""
+    """(m, 2) directed edges between nodes (n, 2), px, within a radius that touch or see each other past the walls."""
     pairs = cKDTree(nodes).query_pairs(radius, output_type="ndarray")
     pairs = pairs[_clear(clearance, nodes, pairs.astype(np.int64), need)]
     return np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
@@ -58,7 +59,8 @@ def _clear(clearance: NDArray[np.float64], nodes: Points, pairs: NDArray[np.int6
     for k in range(len(pairs)):
         a = pairs[k, 0]
         b = pairs[k, 1]
-        clear[k] = line_is_clear(clearance, nodes[a, 0], nodes[a, 1], nodes[b, 0], nodes[b, 1], need)
+        x0, y0, x1, y1 = nodes[a, 0], nodes[a, 1], nodes[b, 0], nodes[b, 1]
+        clear[k] = math.hypot(x1 - x0, y1 - y0) < 1.5 or line_is_clear(clearance, x0, y0, x1, y1, need)
     return clear
 
 

@@ -32,9 +32,9 @@ class Planner:
     """
 
     method: Method = "astar_time"
-    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: a quarter of it
+    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
-    reach_px: int = 2  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
+    reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
     refine: bool = True  # astar_time's path
 
@@ -42,7 +42,7 @@ class Planner:
         """Route from start to goal, both (2,) um; stamp and request are 0.
 
         A reachable route may carry a remark in `reason`. A start too near to a wall is joined to the nearest
-        place with room; where a channel leaves no room for the margin, the margin is given up.
+        place with room; where a channel leaves no room for the margin, half of it is kept, or none.
 
         Raises
         ------
@@ -53,15 +53,19 @@ class Planner:
         """
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        wanted_um = 0.25 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
+        wanted_um = 0.5 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
         trouble = ""
-        for margin_um in dict.fromkeys((wanted_um, 0.0)):
+        for margin_um in dict.fromkeys((wanted_um, 0.5 * wanted_um, 0.0)):
             space = open_space(chip, field, robot.radius, margin_um)
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
                 route = self._through(space, field, start, goal, speed_um_s)
-                lean = f"no room for the margin of {wanted_um:.0f} um" if margin_um < wanted_um else ""
+                lean = (
+                    f"no room for the margin of {wanted_um:.0f} um, {margin_um:.0f} um kept"
+                    if margin_um < wanted_um
+                    else ""
+                )
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
         return no_route(self.method, trouble)
@@ -90,13 +94,13 @@ class Planner:
             nodes = np.column_stack([columns, rows]).astype(np.float64)
             number = {int(flat): k for k, flat in enumerate(rows * space.width + columns)}
             velocity = np.column_stack([space.vx[rows, columns], space.vy[rows, columns]])
-            edges = adjacency(nodes, self.paper_radius_px, space.clearance, space.edge_need)
+            edges = adjacency(nodes, self.paper_radius_px, space.clearance, space.need)
             chain = search_paper(nodes, velocity, edges, number[start], number[goal], speed)
             return nodes[chain] if len(chain) else None
         cost, parent = search(
             space.free,
             space.clearance,
-            space.edge_need,
+            space.need,
             space.vx,
             space.vy,
             np.ones_like(space.clearance),
@@ -115,7 +119,8 @@ def _between(space: Space, nodes: Points, start: End, goal: End) -> Points:
     for end in (start, goal):
         if end.point is not None:
             beyond = path[1] if len(path) > 1 else end.point
-            sees = line_is_clear(space.clearance, *end.point, *beyond, space.edge_need)
+            (x0, y0), (x1, y1) = end.point, beyond
+            sees = line_is_clear(space.clearance, x0, y0, x1, y1, space.need)
             path = np.concatenate([end.point[None], path[1:] if sees else path])
         path = path[::-1]
     return path

@@ -22,7 +22,8 @@ def planning_speed_um_s(share: float, robot: Robot) -> float:
     UsageError
         If that is no speed at all.
     """
-    speed_um_s = share * robot.speed_limit_um_s
+    # A float and nothing else: every other type would be compiled for anew.
+    speed_um_s = float(share * robot.speed_limit_um_s)
     if not speed_um_s > 0.0:
         raise UsageError(
             f"plan: speed_share {share:g} of the robot's {robot.speed_limit_um_s:g} um/s leaves no speed to plan with; "

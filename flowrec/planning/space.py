@@ -18,9 +18,8 @@ from flowrec.planning.zermelo import bilinear, line_is_clear
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
 
-# Between pixel centres the bilinear clearance dips below that of the centres by up to half a pixel (on the ridge of
-# an oblique channel, where the true one does not dip). With this slack free pixels that touch are always joined.
-_EDGE_SLACK_PX = 0.5
+# A mask can not tell more closely than this where a wall is; ends of a route are not refused for less.
+_SLACK_PX = 0.5
 _EIGHT = np.ones((3, 3), np.int64)
 
 
@@ -32,7 +31,7 @@ class Space:
     fluid: NDArray[np.bool_]  # (h, w)
     free: NDArray[np.bool_]  # (h, w) where the robot's centre may be: the nodes
     radius: float  # of the robot
-    need: float  # clearance of nodes
+    need: float  # clearance of nodes and of long edges
     vx: Raster  # (h, w)
     vy: Raster  # (h, w)
     um_per_px: float
@@ -41,11 +40,6 @@ class Space:
     def width(self) -> int:
         """Columns."""
         return int(self.free.shape[1])
-
-    @property
-    def edge_need(self) -> float:
-        """Clearance that every edge between nodes keeps."""
-        return max(self.need - _EDGE_SLACK_PX, 0.0)
 
     def clearance_at(self, point: Points) -> float:
         """Clearance (px) at a point (x, y) in px."""
@@ -82,16 +76,16 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float)
     # A mask without walls has infinite clearance, which bilinear weights of 0 would turn into NaN.
     far_px = float(sum(chip.mask.shape))
     clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
-    need = (radius_um + margin_um) / chip.um_per_px
+    need = float((radius_um + margin_um) / chip.um_per_px)
     return Space(
         clearance=clearance,
         fluid=np.ascontiguousarray(chip.mask),
         free=chip.mask & (clearance >= need),
-        radius=radius_um / chip.um_per_px,
+        radius=float(radius_um) / chip.um_per_px,
         need=need,
         vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
         vy=np.ascontiguousarray(field.velocity_um_s[..., 1], np.float64) / chip.um_per_px,
-        um_per_px=chip.um_per_px,
+        um_per_px=float(chip.um_per_px),
     )
 
 
@@ -137,7 +131,7 @@ def _attach(space: Space, name: str, point_um: Points, within: float) -> End:
     if node < 0:
         needs = f"the robot needs {space.need * space.um_per_px:.0f} um"
         return End(-1, None, trouble=f"{where} is {room * space.um_per_px:.0f} um from a wall and {needs}")
-    if room >= min(space.need, space.radius) - _EDGE_SLACK_PX:
+    if room >= min(space.need, space.radius) - _SLACK_PX:
         return End(node, point)
     remark = f"{where} is only {room * space.um_per_px:.0f} um from a wall: joined to the nearest place with room"
     # A start is where the robot is, so the route begins there all the same; a goal is replaced by its node.

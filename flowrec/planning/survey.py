@@ -33,7 +33,7 @@ class SurveyPlanner:
     distance_um: float | None = None  # None: the share below of the longest way downstream
     share: float = 0.125
     speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
-    clearance_margin_um: float | None = None  # None: a quarter of the robot's radius
+    clearance_margin_um: float | None = None  # None: half of the robot's radius
     middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
     outlet_gap_radii: float = 3.0  # left between the end of the route and any opening
 
@@ -52,13 +52,17 @@ class SurveyPlanner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         limit_um = distance_um if distance_um is not None else self.distance_um
         at = np.asarray(start_um, np.float64)
-        wanted_um = 0.25 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
+        wanted_um = 0.5 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
         route = no_route(_METHOD, "")
-        for margin_um in dict.fromkeys((wanted_um, 0.0)):
+        for margin_um in dict.fromkeys((wanted_um, 0.5 * wanted_um, 0.0)):
             space = open_space(chip, field, robot.radius, margin_um)
             route = self._downstream(space, field, at, chip, speed_um_s, limit_um)
             if route.reachable:
-                lean = f"no room for the margin of {wanted_um:.0f} um" if margin_um < wanted_um else ""
+                lean = (
+                    f"no room for the margin of {wanted_um:.0f} um, {margin_um:.0f} um kept"
+                    if margin_um < wanted_um
+                    else ""
+                )
                 return replace(route, reason="; ".join(remark for remark in (lean, route.reason) if remark))
         return route
 
@@ -79,7 +83,7 @@ class SurveyPlanner:
         cost, parent = search(
             space.free,
             space.clearance,
-            space.edge_need,
+            space.need,
             space.vx,
             space.vy,
             weight,
@@ -92,15 +96,17 @@ class SurveyPlanner:
         length, work = _along_tree(cost, parent, space)
         allowed = np.isfinite(cost) & (work > 0.0) & ~_near_openings(space, chip, self.outlet_gap_radii).ravel()
         allowed[start.node] = False
-        allowed &= _middle(space.clearance).ravel()
         if not allowed.any():
             return no_route(_METHOD, "nothing lies downstream of the start before the chip ends")
-        longest_px = length[int(np.argmax(np.where(allowed, work, -np.inf)))]
+        longest_px = length[_best(work, allowed)]
         limit_px = self.share * longest_px if limit_um is None else limit_um / px
         allowed &= length <= limit_px
         if not allowed.any():
-            return no_route(_METHOD, f"a survey of {limit_px * px:.0f} um is shorter than a pixel of the chip")
-        end = int(np.argmax(np.where(allowed, work, -np.inf)))
+            return no_route(
+                _METHOD, f"there is no place to survey within {limit_px * px:.0f} um downstream of the start"
+            )
+        central = allowed & _middle(space.clearance).ravel()
+        end = _best(work, central if central.any() else allowed)
         nodes = backtrack(parent, end, space.width)
         path = nodes if start.point is None else np.concatenate([start.point[None], nodes])
         smooth = relax(path, space.clearance, space.need, space.vx, space.vy, weight, speed_um_s / px)
@@ -134,9 +140,14 @@ def _along_tree(
     return length, work
 
 
+def _best(work: NDArray[np.float64], allowed: NDArray[np.bool_]) -> int:
+    """The allowed node (flat index) along the way to which the flow helps most."""
+    return int(np.argmax(np.where(allowed, work, -np.inf)))
+
+
 def _middle(clearance: Raster) -> NDArray[np.bool_]:
     """(h, w) pixels near the middle between walls: two pixels on, no other is more than one farther from them."""
-    return clearance >= maximum_filter(clearance, 5) - 1.0
+    return np.asarray(clearance >= maximum_filter(clearance, 5) - 1.0)
 
 
 def _near_openings(space: Space, chip: Chip, gap_radii: float) -> NDArray[np.bool_]:

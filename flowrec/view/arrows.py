@@ -14,14 +14,15 @@ _ALONG = (28.0, 45.0)  # arrows along the width of the image: where channels are
 _ACROSS = 2.5  # arrows abreast in a typical channel, within these limits
 _LONGEST = 0.9  # the fastest arrow, in spacings: a row of longer ones reads as one line
 _FROM_WALL = 0.3  # no arrow stands nearer to a wall, in spacings, unless in the middle of a narrow channel
+_WELL_AWAY = 0.45  # from the wall, in spacings
 _PITCH = 0.2  # of the points that may carry an arrow, in spacings
 
 
 def arrow_grid(scene: Scene) -> tuple[NDArray[np.float64], float]:
     """Points (n, 2) in um inside the fluid, nowhere nearer than a spacing, and the spacing in um.
 
-    The middle of the channels is filled first, then what is left beside it: a narrow channel gets one row of arrows,
-    not those points of a grid that happen to hit it.
+    What lies well away from the walls is filled first: a narrow channel gets a row of arrows along its middle, a wide
+    one several, and none only those points of a grid that happen to hit it.
     """
     chip, left_right = scene.chip, scene.image_bounds()[::2]
     # A ring of solid counts the image's border as wall, so that no arrow sticks out of it.
@@ -37,7 +38,7 @@ def arrow_grid(scene: Scene) -> tuple[NDArray[np.float64], float]:
     row, column = row[chosen], column[chosen]
     free = np.ones_like(chip.mask, np.uint8)
     points = []
-    for at in np.lexsort((row, column, -np.round(wall_px[row, column]))):
+    for at in np.lexsort((row, column, -np.round(np.minimum(wall_px[row, column], _WELL_AWAY * spacing)))):
         y, x = int(row[at]), int(column[at])
         if free[y, x]:
             points.append((x, y))
@@ -50,15 +51,15 @@ def flow_arrows(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Origins (n, 2) and vectors (n, 2) in the picture plane, and speeds (n,) in um/s.
 
-    Each arrow is centred on its point of the grid and points where the flow goes.
+    Each arrow is centred on its point of the grid and points where the flow goes. Its length goes as the root of the
+    speed, so that the slow branches of a network still show their direction; how fast they are, the colour says.
     """
     points_um, spacing_um = grid
     velocity = sample(field, points_um)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     peak = float(np.quantile(speed, 0.99)) if len(speed) else 0.0
     longest = _LONGEST * scene.length_px(spacing_um)
-    vectors = velocity * (longest / peak) if peak > 0.0 else np.zeros_like(velocity)
-    # A jet through a narrow spot must not paint over its neighbours.
-    length = np.hypot(vectors[:, 0], vectors[:, 1])
-    vectors = vectors * np.where(length > longest, longest / np.maximum(length, 1e-12), 1.0)[:, None]
+    # Capped: a jet through a narrow spot must not paint over its neighbours.
+    length = longest * np.sqrt(np.minimum(speed / peak, 1.0)) if peak > 0.0 else np.zeros_like(speed)
+    vectors = velocity * (length / np.maximum(speed, 1e-12))[:, None]
     return scene.to_plane(points_um) - 0.5 * vectors, vectors, speed

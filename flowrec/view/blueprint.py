@@ -178,7 +178,7 @@ def _map(scene: Scene, name: str, entity: str, scale: str, prefix: str = "") -> 
         name=name,
         origin=e.under(prefix, entity.rsplit("/", 1)[0]),
         contents=[
-            f"+ {e.under(prefix, entity)}",
+            "+ $origin/**",
             f"+ {e.under(prefix, scale)}/**",
             *(f"+ {e.under(prefix, overlay)}" for overlay in overlays),
         ],

@@ -24,6 +24,7 @@ REFINED = "flow/refined/speed"
 TRUE = "flow/truth/speed"
 CHANGE = "flow/change/map"
 UNCERTAINTY = "flow/uncertainty/map"
+NOT_YET = "not yet"  # beside a map that comes later in the session
 SPEED_SCALE = "flow/speed scale"  # colour bar and ticks, common to all maps of speed
 CHANGE_SCALE = "flow/change/scale"
 UNCERTAINTY_SCALE = "flow/uncertainty/scale"

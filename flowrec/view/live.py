@@ -31,7 +31,7 @@ Mode = Literal["spawn", "serve"]
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
-_CLOSE_S = 3.0  # for the last ticks to be shown
+_CLOSE_S = 2.5  # for the last ticks to be shown
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
 _FIELDS = tuple(field.name for field in fields(Tick))
 

@@ -110,6 +110,7 @@ class TickLogger:
         self._set_time(tick, frame_index)
         if tick.frame is not None and tick.frame is not last.frame:
             self._log_image(tick.frame)
+        self._log_not_yet(tick.refined, last)
         self._log_fields(tick, last)
         if tick.route is not None and tick.route is not last.route:
             self._log_route(tick.route)
@@ -332,6 +333,17 @@ class TickLogger:
 
     # ---- flow
 
+    def _log_not_yet(self, refined: FlowField | None, last: Tick) -> None:
+        """Say in the maps that wait for a refinement that they do."""
+        if refined is None and last.stamp_ns < 0:
+            left, top, right, bottom = self._scene.chip_bounds()
+            centre = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
+            for entity in (e.REFINED, e.CHANGE):
+                self._log(_beside(entity), _label(centre, "not refined yet", palette.PALE))
+        elif refined is not None and last.refined is None:
+            for entity in (e.REFINED, e.CHANGE):
+                self._log(_beside(entity), rr.Clear(recursive=False))
+
     def _log_fields(self, tick: Tick, last: Tick) -> None:
         new = [
             field
@@ -392,7 +404,7 @@ class TickLogger:
     def _log_arrows(self, field: FlowField) -> None:
         assert self._speeds.scale is not None
         origins, vectors, speed = flow_arrows(self._scene, field, self._grid)
-        radius = 0.07 * self._scene.length_px(self._grid[1])
+        radius = 0.08 * self._scene.length_px(self._grid[1])
         self._log(
             e.ARROWS,
             rr.Arrows2D(
@@ -423,6 +435,11 @@ class TickLogger:
 
     def _said(self, text: str) -> str:
         return f"{self._prefix}: {text}" if self._prefix else text
+
+
+def _beside(entity: str) -> str:
+    """Where a map's word about its absence is logged."""
+    return f"{entity.rsplit('/', 1)[0]}/{e.NOT_YET}"
 
 
 def _label(at: NDArray[np.float64], text: str, colour: palette.Rgb) -> rr.Points2D:

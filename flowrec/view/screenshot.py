@@ -20,6 +20,7 @@ from flowrec.view.entities import SESSION_TIME
 
 _T = TypeVar("_T")
 
+_LOG_TIME = "message_log_time"  # what Rerun calls the session clock of a bare .mcap
 _START_S = 20.0
 _LOAD_S = 60.0
 _SETTLE_S = 1.0  # images are decoded and plots laid out over some frames
@@ -45,11 +46,12 @@ def screenshot(
         state = _until(lambda: _loaded(client), _LOAD_S)
         if state is None:
             raise FlowrecError(f"{path}: the viewer shows nothing of it; `rerun rrd verify {path}` says more")
-        timeline = _session_timeline(state)
-        if timeline is not None:
-            name, end_ns = timeline
-            at = np.timedelta64(end_ns if time_s is None else nanoseconds(time_s), "ns")
-            client.set_time(name, duration=at, play_state="paused")
+        ends_ns = {line.name: line.end for recording in state.recordings for line in recording.timelines}
+        if SESSION_TIME in ends_ns:
+            at_ns = (ends_ns[SESSION_TIME] or 0) if time_s is None else nanoseconds(time_s)
+            client.set_time(SESSION_TIME, duration=np.timedelta64(at_ns, "ns"), play_state="paused")
+        elif _LOG_TIME in ends_ns and time_s is not None:
+            client.set_time(_LOG_TIME, timestamp=np.datetime64(nanoseconds(time_s), "ns"), play_state="paused")
         time.sleep(max(_SETTLE_S, began + _NOTICES_S - time.monotonic()))
         out_png.parent.mkdir(parents=True, exist_ok=True)
         out_png.write_bytes(client.take_screenshot())
@@ -101,15 +103,6 @@ def _loaded(client: ViewerClient) -> ViewerState | None:
     """What the viewer shows, once nothing is on its way any more."""
     state = client.get_state()
     return state if not state.loading and any(recording.timelines for recording in state.recordings) else None
-
-
-def _session_timeline(state: ViewerState) -> tuple[str, int] | None:
-    """Name and end in ns of the timeline that counts from the start of the session, if there is one."""
-    for recording in state.recordings:
-        for timeline in recording.timelines:
-            if timeline.name == SESSION_TIME and timeline.end is not None:
-                return timeline.name, int(timeline.end)
-    return None
 
 
 def _until(done: Callable[[], _T | None], limit_s: float) -> _T | None:

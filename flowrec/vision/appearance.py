@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,12 +15,19 @@ _REACH = 1.75  # the template ends here, in radii of the disc, beyond the rim
 _SOFT_PX = 1.0  # least blur of an edge by optics and pixels
 
 
-def profile(distance_px: NDArray[np.float64], radius_px: float) -> NDArray[np.float64]:
-    """Brightness against the background at a distance from the centre: -1 in the disc, positive on the rim."""
+def widths_px(radius_px: float) -> tuple[float, float, float]:
+    """Softness of the disc's edge, radius of the rim and its width, in pixels."""
     soft = max(_SOFT_PX, 0.12 * radius_px)
-    disc = -1.0 / (1.0 + np.exp((distance_px - radius_px) / (0.5 * soft)))
-    ring = _RIM * np.exp(-0.5 * ((distance_px - _RIM_AT * radius_px) / (0.6 * soft + 0.08 * radius_px)) ** 2)
-    return disc + ring
+    return 0.5 * soft, _RIM_AT * radius_px, 0.6 * soft + 0.08 * radius_px
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def brightness(distance: float, radius: float, soft: float, ring_at: float, ring_width: float) -> tuple[float, float]:
+    """Brightness against the background at a distance from the centre, and its derivative: -1 in the disc."""
+    edge = math.exp(min((distance - radius) / soft, 50.0))
+    off = (distance - ring_at) / ring_width
+    ring = _RIM * math.exp(-0.5 * off * off)
+    return -1.0 / (1.0 + edge) + ring, edge / (soft * (1.0 + edge) ** 2) - ring * off / ring_width
 
 
 def reach_px(radius_px: float) -> int:
@@ -31,5 +39,7 @@ def reach_px(radius_px: float) -> int:
 def template(radius_px: float) -> NDArray[np.float32]:
     """The robot centred on the middle pixel of a square of 2 reach + 1 pixels a side."""
     reach = reach_px(radius_px)
-    offsets = np.arange(-reach, reach + 1, dtype=np.float64)
-    return profile(np.hypot(*np.meshgrid(offsets, offsets)), radius_px).astype(np.float32)
+    offsets = range(-reach, reach + 1)
+    widths = widths_px(radius_px)
+    square = [[brightness(math.hypot(x, y), radius_px, *widths)[0] for x in offsets] for y in offsets]
+    return np.array(square, np.float32)

@@ -90,14 +90,9 @@ class Tracker:
         left, top = x0 - pad, y0 - pad
         right, bottom = x1 + pad + shrink, y1 + pad + shrink
         cut: NDArray[Any] = image[max(top, 0) : min(bottom, image.shape[0]), max(left, 0) : min(right, image.shape[1])]
-        cut = cv2.copyMakeBorder(
-            cut,
-            max(-top, 0),
-            max(bottom - image.shape[0], 0),
-            max(-left, 0),
-            max(right - image.shape[1], 0),
-            cv2.BORDER_REPLICATE,
-        )
+        outside = (max(-top, 0), max(bottom - image.shape[0], 0), max(-left, 0), max(right - image.shape[1], 0))
+        if any(outside):
+            cut = cv2.copyMakeBorder(cut, *outside, cv2.BORDER_REPLICATE)
         allowed = view.centres[y0:y1, x0:x1]
         if shrink > 1:
             cut = cv2.resize(cut, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)

@@ -1,6 +1,7 @@
 """Twins: a true flow, an assumed one with wrong parameters, and what a robot would have measured in between."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def twin():
         true = solver.solve(chip.with_boundary(scale * np.array(truth)))
         # Up the stem, around the island above, out to the right.
         corners = np.array([[20, 240], [240, 240], [240, 120], [555, 120], [555, 240], [760, 240]], float)
-        pieces = [np.linspace(a, b, int(np.abs(b - a).max() / 10), endpoint=False) for a, b in zip(corners, corners[1:])]
+        pieces = [np.linspace(a, b, int(np.abs(b - a).max() / 10), endpoint=False) for a, b in pairwise(corners)]
         points = np.concatenate(pieces)[::every]
         flow = sample(true, points)
         std = noise * np.sqrt((flow**2).sum(axis=1).mean())

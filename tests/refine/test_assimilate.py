@@ -47,7 +47,7 @@ def test_error_bars_cover_the_truth_and_shrink_with_observations(twin):
         case = twin(truth=truth, seed=seed)
         refined = Refiner(assimilate=settings).refine(case.assumed, case.observations, case.chip, case.solver)
         busy = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
-        scores.append(((refined.velocity_um_s - case.true.velocity_um_s) / refined.std_um_s)[busy])
+        scores.append((refined.velocity_um_s - case.true.velocity_um_s)[busy] / refined.std_um_s[busy])
         widths.append(np.median(refined.std_um_s[busy]))
     spread = np.sqrt(np.mean([np.mean(score**2) for score in scores]))
     assert 0.4 < spread < 1.6

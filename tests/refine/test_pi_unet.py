@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from flowrec.flow import sample
 from flowrec.refine import PiUnet, Refiner
 from flowrec.refine.physics import Physics
 
@@ -17,7 +18,9 @@ def poiseuille(width, length):
     velocity = np.zeros((2, *mask.shape))
     velocity[0, 2:-2] = profile[:, None]
     pressure = -2.0 / width**2 * np.arange(length) * mask
-    return (torch.tensor(array, dtype=torch.float32) for array in (mask[None, None], velocity[None], pressure[None, None]))
+    return (
+        torch.tensor(array, dtype=torch.float32) for array in (mask[None, None], velocity[None], pressure[None, None])
+    )
 
 
 def test_the_discrete_equations_vanish_on_poiseuille_flow():
@@ -35,7 +38,7 @@ def test_the_discrete_equations_vanish_on_poiseuille_flow():
 
 def test_pi_unet_lowers_the_error_of_a_wrong_solution_by_a_third(twin):
     case = twin()
-    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", iterations=60))
+    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", iterations=40))
     refined = refiner.refine(case.assumed, case.observations, case.chip, case.solver)
     assert case.error(refined) < 2.0 / 3.0 * case.error(case.assumed)
     assert not refined.velocity_um_s[~case.chip.mask].any()
@@ -57,8 +60,6 @@ def test_pi_unet_corrects_what_no_boundary_value_can_explain(twin):
     mask[8:12, 30:50] = False
     real = case.solver.solve(replace(case.chip, mask=mask))
     points = case.observations.position_um
-    from flowrec.flow import sample  # noqa: PLC0415
-
     case.true = real
     case.observations = replace(case.observations, flow_um_s=sample(real, points))
     assimilated = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)

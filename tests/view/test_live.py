@@ -1,0 +1,161 @@
+"""A live view must never make a run wait, whatever becomes of the viewer."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from flowrec.messages import Frame, Tick
+from flowrec.view import LiveView, Scene, viewer
+
+LISTENING = "0A"
+LOOPBACK = "0100007F"
+
+
+@pytest.fixture(autouse=True)
+def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+def listeners(pid: int) -> list[tuple[str, int]]:
+    """Address, as the kernel writes it, and port of each socket on which a process listens."""
+    inodes = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            target = str(link.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    rows = [
+        line.split()
+        for table in ("tcp", "tcp6")
+        if Path("/proc/net", table).exists()
+        for line in Path("/proc/net", table).read_text().splitlines()[1:]
+    ]
+    found = [row[1].split(":") for row in rows if row[3] == LISTENING and row[9] in inodes]
+    return [(address, int(port, 16)) for address, port in found]
+
+
+def until(done: Callable[[], object], limit_s: float = 15.0) -> None:
+    end = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def slowest_s(live: LiveView, ticks: list[Tick], count: int) -> float:
+    """The longest of many writes, at ten times the speed of a camera."""
+    worst = 0.0
+    for i in range(count):
+        tick = replace(ticks[i % len(ticks)], stamp_ns=i)
+        began = time.perf_counter()
+        live.write(tick)
+        worst = max(worst, time.perf_counter() - began)
+        if i % 20 == 0:
+            time.sleep(0.005)
+    return worst
+
+
+def closes_within_s(live: LiveView) -> float:
+    began = time.perf_counter()
+    live.close()
+    return time.perf_counter() - began
+
+
+@pytest.mark.parametrize("blow", [signal.SIGSTOP, signal.SIGKILL])
+def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
+    scene: Scene, ticks: list[Tick], blow: signal.Signals
+) -> None:
+    live = LiveView(scene, "serve", max_hz=50)
+    assert live.pid is not None
+    until(lambda: listeners(live.pid or 0))
+    live.write(ticks[0])
+    os.kill(live.pid, blow)
+    assert slowest_s(live, ticks, 2000) < 0.05
+    assert live.dropped > 1000
+    if blow == signal.SIGKILL:
+        assert "the run goes on without" in live.message
+    assert closes_within_s(live) < 5.0
+
+
+def test_a_live_view_listens_on_this_machine_only_and_ends_with_the_run(scene: Scene, ticks: list[Tick]) -> None:
+    with LiveView(scene, "spawn") as live:
+        pid = live.pid
+        assert pid is not None
+        until(lambda: listeners(pid))
+        for tick in ticks[:30]:
+            live.write(tick)
+        assert {address for address, _ in listeners(pid)} == {LOOPBACK}
+        assert live.url in live.message
+        assert "no screen" in live.message
+    assert live.dropped == 0
+    assert not Path(f"/proc/{pid}").exists()
+    live.write(ticks[0])  # late, and no error
+    live.close()
+
+
+def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
+    tmp_path: Path, scene: Scene, ticks: list[Tick]
+) -> None:
+    image = cv2.resize(ticks[0].frame.image, (1600, 1280))  # type: ignore[union-attr]
+    program = viewer.executable()
+    assert program is not None
+    with LiveView(scene, "serve", max_hz=20) as live:
+        until(lambda: listeners(live.pid or 0))
+        received = tmp_path / "received.rrd"
+        listener = subprocess.Popen(
+            [program, live.url, "--save", received], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        for i, tick in enumerate(ticks[:60]):
+            live.write(replace(tick, frame=Frame(tick.stamp_ns, i, image)))
+            time.sleep(0.01)
+    until(lambda: listener.poll() is not None)
+    robot, images, scale = [], [], []
+    for chunk in RrdReader(received).stream():
+        batch = chunk.to_record_batch()
+        if chunk.entity_path == "/camera/robot" and not chunk.is_static:
+            robot += batch.column("frame").to_pylist()
+        if chunk.entity_path == "/camera/image":
+            if chunk.is_static:
+                scale += batch.column("Transform3D:scale").to_pylist()
+            else:
+                images += batch.column("EncodedImage:blob").to_pylist()
+    assert robot == list(range(60))
+    assert 3 <= len(images) <= 40  # throttled
+    preview = cv2.imdecode(np.array(images[-1][0], np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert preview.shape == (427, 534)
+    assert scale[-1] == [[3.0, 3.0, 1.0]]
+
+
+def test_without_a_viewer_the_run_goes_on_and_says_so(
+    scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RERUN_CLI_PATH", str(tmp_path / "missing"))
+    with LiveView(scene) as live:
+        live.write(ticks[0])
+        assert "not installed" in live.message
+        assert live.dropped == 1
+
+
+def test_a_port_that_is_taken_is_said(scene: Scene, ticks: list[Tick]) -> None:
+    with socket.socket() as other:
+        other.bind((viewer.LOOPBACK, 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with LiveView(scene, "serve", port=port) as live:
+            until(lambda: "the run goes on without" in live.message)
+            assert f"port {port} is taken" in live.message
+            live.write(ticks[0])

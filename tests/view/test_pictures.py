@@ -1,0 +1,154 @@
+"""Maps, scales and arrows: what a person reads off them is what the field says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import rerun as rr
+
+from flowrec.chip.calibration import Calibration
+from flowrec.flow import sample
+from flowrec.messages import FlowField, Tick
+from flowrec.view import Scene, maps, palette
+from flowrec.view.arrows import arrow_grid, flow_arrows
+from flowrec.view.log import TickLogger
+from flowrec.view.palette import Scale
+
+
+class Record:
+    """Stands in for a recording stream and keeps what is logged last of each entity."""
+
+    def __init__(self) -> None:
+        self.logged: dict[str, Any] = {}
+
+    def set_time(self, *_: object, **__: object) -> None: ...
+    def disable_timeline(self, *_: object) -> None: ...
+
+    def log(self, path: str, what: Any, *_: Any, static: bool = False) -> None:
+        if not static:
+            self.logged[path] = what
+
+    def map(self, path: str) -> np.ndarray:
+        """(h, w, 3) RGB."""
+        png = np.asarray(self.logged[path].blob.as_arrow_array().to_pylist()[0], np.uint8)
+        return np.asarray(cv2.imdecode(png, cv2.IMREAD_COLOR)[..., ::-1])
+
+
+def times(field: FlowField, factor: float) -> FlowField:
+    return replace(field, velocity_um_s=field.velocity_um_s * np.float32(factor))
+
+
+def test_maps_beside_each_other_have_one_scale_also_when_a_faster_flow_comes(scene: Scene, ticks: list[Tick]) -> None:
+    assumed = ticks[0].assumed
+    assert assumed is not None
+    record, speeds = Record(), maps.SpeedScale()
+    logger = TickLogger(record, scene, speeds=speeds)  # type: ignore[arg-type]
+    logger.log(Tick(0, assumed=assumed))
+    before = record.map("/flow/assumed/speed")
+    logger.log(Tick(1, assumed=assumed, refined=times(assumed, 3.0)))
+    after, refined = record.map("/flow/assumed/speed"), record.map("/flow/refined/speed")
+    assert speeds.scale is not None
+    assert speeds.scale.high >= 3.0 * maps.peak(assumed)
+    assert not np.array_equal(before, after)  # painted again, or its colours would mean something else
+    fluid = scene.chip.mask
+    assert np.array_equal(after, speeds.scale.paint(maps.speed(assumed, fluid)))
+    assert np.array_equal(refined, speeds.scale.paint(maps.speed(times(assumed, 3.0), fluid)))
+    assert (after[~fluid] == palette.SOLID).all()
+
+
+def test_a_recorded_and_a_replayed_session_share_one_scale(scene: Scene, ticks: list[Tick]) -> None:
+    assumed = ticks[0].assumed
+    assert assumed is not None
+    record, speeds = Record(), maps.SpeedScale()
+    recorded, replayed = (
+        TickLogger(record, scene, prefix, speeds=speeds)  # type: ignore[arg-type]
+        for prefix in ("recorded", "replayed")
+    )
+    recorded.log(Tick(0, assumed=assumed))
+    replayed.log(Tick(0, assumed=times(assumed, 5.0)))
+    recorded.log(Tick(1, assumed=assumed))
+    assert speeds.scale is not None
+    assert np.array_equal(
+        record.map("/recorded/flow/assumed/speed"), speeds.scale.paint(maps.speed(assumed, scene.chip.mask))
+    )
+
+
+@pytest.mark.parametrize("largest", [3e-7, 0.9, 1.0, 7.3, 42.0, 100.0, 456.0, 1e6])
+def test_a_scale_holds_its_largest_value_on_few_round_ticks(largest: float) -> None:
+    for colours in ("speed", "change"):
+        scale = Scale.up_to(largest, colours)  # type: ignore[arg-type]
+        assert largest <= scale.high * (1 + 1e-9) < 2.6 * largest
+        assert 3 <= len(scale.ticks) <= 8
+        assert scale.ticks[-1] == pytest.approx(scale.high)
+
+
+def test_the_ticks_of_the_colour_bar_stand_where_their_colour_is(scene: Scene) -> None:
+    scale, bar = Scale.up_to(500.0, "speed"), maps.ColourBar.beside(scene)
+    image, _ = bar.strip(scale)
+    marks, numbers = bar.ticks(scale)
+    words = numbers.labels.as_arrow_array().to_pylist()  # type: ignore[union-attr]
+    assert words == ["0", "100", "200", "300", "400", "500", "µm/s"]
+    rows = image.buffer.as_arrow_array().to_pylist()[0]  # type: ignore[union-attr]
+    colours = np.array(rows, np.uint8).reshape(256, 3)
+    for strip, word in zip(marks.strips.as_arrow_array().to_pylist(), words[:-1], strict=True):  # type: ignore[union-attr]
+        row = int(np.clip((strip[0][1] - bar.top) / bar.height * 256, 0, 255))
+        assert np.abs(colours[row].astype(int) - scale.paint(float(word))).max() <= 4
+
+
+def test_arrows_stand_in_fluid_apart_and_point_where_the_flow_goes(scene: Scene, ticks: list[Tick]) -> None:
+    field = ticks[-1].refined
+    assert field is not None
+    grid = arrow_grid(scene)
+    origins, vectors, speed = flow_arrows(scene, field, grid)
+    middle_um = scene.calibration.to_um(origins + 0.5 * vectors - 0.5)
+    assert np.allclose(middle_um, grid[0])
+    velocity = sample(field, grid[0])
+    assert len(speed) > 60
+    assert (speed > 0).all()  # none in solid
+    cosine = (vectors * velocity).sum(1) / np.hypot(*vectors.T) / speed
+    assert cosine.min() > 0.999999
+    assert np.hypot(*vectors.T).max() <= scene.length_px(grid[1])  # no longer than their spacing
+    gaps = np.linalg.norm(grid[0][:, None] - grid[0], axis=-1)[~np.eye(len(speed), dtype=bool)]
+    assert gaps.min() > 0.75 * grid[1]
+    order = np.argsort(speed)
+    assert (np.diff(np.hypot(*vectors.T)[order]) >= -1e-9).all()  # faster is never shorter
+
+
+def test_the_branches_of_a_narrow_network_all_have_arrows(scene: Scene) -> None:
+    mask = np.zeros((400, 400), bool)
+    for at in (37, 151, 263, 388):
+        mask[at : at + 5] = True
+    narrow = replace(scene, chip=replace(scene.chip, mask=mask))
+    rows = arrow_grid(narrow)[0][:, 1] / narrow.chip.um_per_px
+    assert all(np.sum(np.abs(rows - at - 2) <= 2) > 15 for at in (37, 151, 263, 388))
+
+
+def test_pictures_of_any_resolution_lie_on_each_other(scene: Scene) -> None:
+    turned = replace(scene, calibration=Calibration(0.7, (30.0, -12.0)))
+    place = turned.mask_placement(4.0)
+    column_row = np.array([10.0, 20.0])  # a pixel of the mask, whose centre Rerun counts half a pixel further
+    assert np.allclose(turned.to_plane(4.0 * column_row), (column_row + 0.5) * place.scale + place.offset)
+    preview = turned.preview_placement(3)
+    assert np.allclose((column_row + 0.5) * preview.scale + preview.offset, 3 * column_row + 0.5)
+
+
+def test_a_robot_that_is_not_seen_is_grey_and_says_so(scene: Scene, ticks: list[Tick]) -> None:
+    record = Record()
+    logger = TickLogger(record, scene)  # type: ignore[arg-type]
+    words = []
+    for tick in ticks[70:78]:
+        logger.log(tick)
+        (word,) = record.logged["/camera/robot\\ label"].labels.as_arrow_array().to_pylist()
+        (colour,) = record.logged["/camera/robot"].colors.as_arrow_array().to_pylist()
+        words.append(word)
+        expected = palette.ORANGE if word == "robot" else palette.PALE
+        assert colour >> 8 == (expected[0] << 16) + (expected[1] << 8) + expected[2]
+    assert words == ["robot"] * 2 + ["robot (not seen)"] * 4 + ["robot"] * 2
+
+
+def test_the_stand_in_has_the_methods_of_a_real_stream() -> None:
+    assert all(hasattr(rr.RecordingStream, name) for name in ("set_time", "disable_timeline", "log"))

@@ -1,0 +1,147 @@
+"""What a viewer finds in an .rrd file."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+from rerun.chunk import RrdReader
+
+from flowrec.errors import SessionError
+from flowrec.messages import Tick
+from flowrec.view import Scene, write_rrd
+
+
+class File:
+    """An .rrd read back: rows and timelines by entity, and what its views ask for."""
+
+    def __init__(self, path: Path) -> None:
+        reader = RrdReader(path)
+        (self.recording,) = reader.recordings()
+        (layout,) = reader.blueprints()
+        self.rows: dict[str, int] = defaultdict(int)
+        self.times: dict[str, set[str]] = defaultdict(set)
+        self.columns: dict[str, dict[str, list[object]]] = defaultdict(lambda: defaultdict(list))
+        for chunk in reader.stream(store=self.recording):
+            self.rows[chunk.entity_path] += chunk.num_rows
+            self.times[chunk.entity_path] |= set(chunk.timeline_names)
+            batch = chunk.to_record_batch()
+            for name in batch.schema.names:
+                column = batch.column(name)
+                # A duration as a Python object is not exact to the nanosecond.
+                whole = column.cast(pa.int64()) if pa.types.is_duration(column.type) else column
+                self.columns[chunk.entity_path][name] += whole.to_pylist()
+        found: dict[str, dict[str, list[str]]] = defaultdict(dict)
+        for chunk in reader.stream(store=layout):
+            batch = chunk.to_record_batch()
+            view = chunk.entity_path.removesuffix("/ViewContents")
+            for name in batch.schema.names:
+                if name.startswith(("ViewBlueprint:", "ViewContents:query")):
+                    found[view][name.split(":")[1]] = batch.column(name).to_pylist()[-1]
+        self.views = {
+            view["display_name"][0]: [
+                term.removeprefix("+ ").replace("$origin", view["space_origin"][0])
+                for term in view["query"]
+                if not term.startswith("-")
+            ]
+            for view in found.values()
+            if "query" in view
+        }
+
+    def holds(self, query: str) -> bool:
+        """Whether there is anything below `a/**` or at `a`."""
+        if query.endswith("/**"):
+            return any(entity.startswith(query[:-2]) for entity in self.rows)
+        return self.rows.get(query, 0) > 0
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory: pytest.TempPathFactory, scene: Scene, ticks: list[Tick]) -> File:
+    path = tmp_path_factory.mktemp("single") / "session.rrd"
+    write_rrd(path, scene, ticks)
+    return File(path)
+
+
+@pytest.fixture(scope="module")
+def double(
+    tmp_path_factory: pytest.TempPathFactory, scene: Scene, ticks: list[Tick], made_up: Callable[..., Iterator[Tick]]
+) -> File:
+    path = tmp_path_factory.mktemp("double") / "session.rrd"
+    # As a replay comes: without frames, and with another flow, faster in the upper branch.
+    write_rrd(path, scene, ticks, (replace(tick, frame=None) for tick in made_up(120, seed=1, share=0.9)))
+    return File(path)
+
+
+def test_everything_that_a_view_asks_for_is_in_the_file(single: File) -> None:
+    assert {"Camera: path, robot, goal, flow", "Flow speed: assumed", "Flow speed: refined", "Events"} < set(
+        single.views
+    )
+    empty = {(name, query) for name, queries in single.views.items() for query in queries if not single.holds(query)}
+    # Nobody intervened in this run; the operator's words would stand in the same view as the events.
+    assert empty == {("Events", "/run/operator")}
+
+
+def test_everything_that_a_view_of_a_replay_asks_for_is_in_the_file(double: File) -> None:
+    assert {"Recorded: refined speed", "Replayed: refined speed", "Command: field heading (°)"} < set(double.views)
+    empty = {query for queries in double.views.values() for query in queries if not double.holds(query)}
+    assert empty == {"/recorded/run/operator", "/replayed/run/operator"}
+
+
+def test_a_view_that_would_stay_empty_is_left_out(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+    bare = [replace(tick, true_field=None, truth=None, refined=None) for tick in ticks[:5]]
+    write_rrd(tmp_path / "bare.rrd", scene, bare)
+    views = File(tmp_path / "bare.rrd").views
+    assert "Flow speed: assumed" in views
+    assert not {
+        name for name in views if "truth" in name or "efined" in name or "ncertain" in name or "Estimate" in name
+    }
+
+
+def test_the_timelines_are_session_time_to_the_nanosecond_and_frame(
+    tmp_path: Path, scene: Scene, ticks: list[Tick]
+) -> None:
+    late = 123_456_789_123_456_789  # four years, which a float does not hold to the nanosecond
+    tick = replace(ticks[7], stamp_ns=late)
+    write_rrd(tmp_path / "late.rrd", scene, [tick])
+    file = File(tmp_path / "late.rrd")
+    assert set().union(*file.times.values()) == {"session time", "frame"}
+    stamps = [stamp for stamp in file.columns["/camera/image"]["session time"] if stamp is not None]
+    assert stamps == [late]
+    assert file.columns["/camera/image"]["frame"] == [7]
+
+
+def test_a_replay_without_frames_lies_on_the_frames_of_the_recording(double: File) -> None:
+    frames = double.columns["/replayed/camera/robot"]["frame"]
+    assert [frame for frame in frames if frame is not None] == list(range(120))
+
+
+def test_what_is_not_new_is_not_logged_again(single: File) -> None:
+    static = 1  # where the map lies
+    assert single.rows["/flow/assumed/speed"] == single.rows["/flow/refined/speed"] == 1 + static
+    assert single.rows["/camera/flow\\ arrows"] == 2  # assumed, then refined
+    assert single.rows["/camera/image"] == 120 + static
+
+
+def test_title_and_properties_are_those_of_the_scene(single: File) -> None:
+    assert single.recording.application_id == "flowrec"
+    assert single.columns["/__properties"]["RecordingInfo:name"][-1] == ["a made-up mission"]
+    assert single.columns["/__properties/session"]["operator"] == [["nobody"]]
+
+
+def test_a_file_that_breaks_off_does_not_appear(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+    def breaks_off() -> Iterator[Tick]:
+        yield from ticks[:3]
+        raise SessionError("damaged")
+
+    with pytest.raises(SessionError, match="damaged"):
+        write_rrd(tmp_path / "half.rrd", scene, breaks_off())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_said_in_one_line(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+    with pytest.raises(SessionError, match=r"nowhere.*cannot be written.*--out"):
+        write_rrd(tmp_path / "nowhere" / "session.rrd", scene, ticks)
