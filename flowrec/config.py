@@ -17,6 +17,7 @@ from typing import Any, Literal, get_type_hints
 import numpy as np
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
+from scipy.ndimage import label
 
 from flowrec.chip import ChipSettings, check_point, median_width_um
 from flowrec.chip.calibration import Calibration
@@ -162,6 +163,7 @@ def resolve(config: Config, chip: Chip) -> Config:
         start=_point(chip, mission.start, "start", robot),
         goal=_point(chip, mission.goal, "goal", robot),
     )
+    _refuse_apart(chip, mission)
     return replace(resolved, mission=mission)
 
 
@@ -181,6 +183,23 @@ def _point(chip: Chip, place: tuple[float, float] | str, what: str, robot: Robot
         return opening_point_um(chip, place, 5.0 * robot.radius)
     check_point(chip, place, what, robot.radius)
     return place
+
+
+def _refuse_apart(chip: Chip, mission: Commander) -> None:
+    """Start and goal must lie in one connected channel."""
+    channels, count = label(chip.mask)
+    rows, columns = chip.mask.shape
+    ends = []
+    for x, y in (mission.start, mission.goal):
+        assert not isinstance(x, str)
+        assert not isinstance(y, str)
+        row, column = round(y / chip.um_per_px), round(x / chip.um_per_px)
+        ends.append(channels[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)])
+    if ends[0] != ends[1]:
+        raise UsageError(
+            f"mission.goal = {mission.goal}: lies in another channel than the start {mission.start}; the mask of "
+            f"{chip.name} has {count} channels that do not meet; choose a goal in the same one"
+        )
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

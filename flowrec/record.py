@@ -205,4 +205,8 @@ def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dic
 def print_summary(recorded: Recorded) -> None:
     """The table at the end of a run and what to do next."""
     table("Session", ("", "value"), list(recorded.facts.items()))
+    if recorded.exit_status:
+        say(
+            f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; see flowrec view {recorded.path}"
+        )
     say(f"next: flowrec replay {recorded.path} --refine    flowrec view {recorded.path}")

@@ -85,7 +85,11 @@ class Commander:
         if previous.phase == "start":
             if seconds(now_ns - previous.since_ns) > self.find_limit_s:
                 return self._finish(
-                    previous, now_ns, "not found", f"no robot seen in the image for {self.find_limit_s:g} s"
+                    previous,
+                    now_ns,
+                    "not found",
+                    f"no robot seen in the image for {self.find_limit_s:g} s; is it in view (camera.um_per_px), "
+                    "and of the size in robot.radius_um?",
                 )
         elif track.lost_frames > self.lost_limit_frames:
             return self._finish(previous, now_ns, "lost", f"robot not seen in {track.lost_frames} frames")
