@@ -190,9 +190,9 @@ def _refuse_apart(chip: Chip, mission: Commander) -> None:
     channels, count = label(chip.mask)
     rows, columns = chip.mask.shape
     ends = []
-    for x, y in (mission.start, mission.goal):
-        assert not isinstance(x, str)
-        assert not isinstance(y, str)
+    for place in (mission.start, mission.goal):
+        assert not isinstance(place, str)
+        x, y = place
         row, column = round(y / chip.um_per_px), round(x / chip.um_per_px)
         ends.append(channels[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)])
     if ends[0] != ends[1]:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Literal
 
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
@@ -20,6 +21,9 @@ from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sin
 from flowrec.session import length_mm, session_header
 from flowrec.status import StatusLine, say, table, warn
 from flowrec.store import SessionReader, SessionWriter
+
+
+View = Literal["spawn", "serve", "rrd", "none"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +83,8 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
     blind_um = config.robot.delay_s * config.robot.max_speed_um_s
     if blind_um > 0.5 * median_width_um(chip):
         warn(
-            f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at {config.robot.max_speed_um_s:.0f}"
-            f" um/s goes {blind_um:.0f} um, more than half a channel: expect it to be swept into walls; "
+            f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at "
+            f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be swept into walls; "
             "set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return config, chip, assemble(config, chip)
@@ -113,7 +117,7 @@ def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
 
 
 def record(
-    config: Config, out: Path | None = None, view: str = "none", realtime: bool = False, overwrite: bool = False
+    config: Config, out: Path | None = None, view: View = "none", realtime: bool = False, overwrite: bool = False
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`; `view` is spawn, serve, rrd or none."""
     config, chip, pipeline = prepare(config)
@@ -207,6 +211,7 @@ def print_summary(recorded: Recorded) -> None:
     table("Session", ("", "value"), list(recorded.facts.items()))
     if recorded.exit_status:
         say(
-            f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; see flowrec view {recorded.path}"
+            f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; "
+            f"see flowrec view {recorded.path}"
         )
     say(f"next: flowrec replay {recorded.path} --refine    flowrec view {recorded.path}")

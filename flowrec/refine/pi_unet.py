@@ -43,7 +43,7 @@ class PiUnet:
     observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value, noise and all
     near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as printed, the initial values stay
     iterations: int = 80
-    largest_work_mpx: float = 5.0  # iterations times pixels in millions: larger fields get fewer iterations
+    largest_work_mpx: float = 4.0  # iterations times pixels in millions: larger fields get fewer iterations
     patience: int = 25  # iterations without a better loss before it stops
     learning_rate: float = 3e-3
     observation_weight: float = 0.03  # of the mean log-likelihood against the mean squared residual
@@ -109,7 +109,9 @@ class PiUnet:
         steps = max(1, min(self.iterations, int(self.largest_work_mpx * 1e6 / case.pixels)))
         with _torch_state(torch, self.threads, self.seed):
             loss_of = _Loss(case, used, self)
-            net = UNet(self.base_channels).to(self.device)
+            # Channels last: a fifth faster on a CPU.
+            net = UNet(self.base_channels).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+            seen = loss_of.seen.contiguous(memory_format=torch.channels_last)
             optimiser = torch.optim.Adam(net.parameters(), lr=self.learning_rate)
             # A short start, then half a cosine down to zero.
             schedule = torch.optim.lr_scheduler.LambdaLR(
@@ -117,7 +119,7 @@ class PiUnet:
             )
             lowest, best, since, done = float("inf"), loss_of.start, 0, 0
             for _ in range(steps):
-                loss, fields = loss_of(net(loss_of.seen))
+                loss, fields = loss_of(net(seen))
                 value, since, done = float(loss.detach()), since + 1, done + 1
                 if value < lowest:
                     since = since if value > 0.995 * lowest else 0

@@ -21,7 +21,7 @@ def widths_px(radius_px: float) -> tuple[float, float, float]:
     return 0.5 * soft, _RIM_AT * radius_px, 0.6 * soft + 0.08 * radius_px
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def brightness(distance: float, radius: float, soft: float, ring_at: float, ring_width: float) -> tuple[float, float]:
     """Brightness against the background at a distance from the centre, and its derivative: -1 in the disc."""
     edge = math.exp(min((distance - radius) / soft, 50.0))

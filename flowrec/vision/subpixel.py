@@ -49,7 +49,7 @@ def fit_centre(
     return Fit((x, y), contrast, likeness) if points >= _FEWEST else None
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@numba.njit(cache=True)
 def _fit(
     image: NDArray[np.uint8],
     usable: NDArray[np.bool_],
@@ -125,5 +125,3 @@ def _fit(
         if longest < _CLOSE_PX:
             break
     return points, x, y, contrast, likeness
-
-

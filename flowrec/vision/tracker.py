@@ -44,7 +44,9 @@ class Tracker:
         locked = previous is not None and (previous.seen or 0 < previous.lost_frames <= self.reacquire_after)
         if locked and previous is not None and previous.score > 0:
             region = self._region(previous, calibration, radius_px, view)
-            fits = self._find(frame.image, view, region, radius_px, self.least_likeness, 2)
+            # Out of sight a poor likeness is rather a piece of debris that came along.
+            least = self.acquire_likeness if previous.lost_frames else self.least_likeness
+            fits = self._find(frame.image, view, region, radius_px, least, 2)
         else:
             region = view.box
             fits = self._find(frame.image, view, region, radius_px, self.acquire_likeness, self.candidates)
