@@ -22,7 +22,6 @@ from flowrec.session import length_mm, session_header
 from flowrec.status import StatusLine, say, table, warn
 from flowrec.store import SessionReader, SessionWriter
 
-
 View = Literal["spawn", "serve", "rrd", "none"]
 
 
@@ -84,8 +83,8 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
     if blind_um > 0.5 * median_width_um(chip):
         warn(
             f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at "
-            f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be swept into walls; "
-            "set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
+            f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
+            "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return config, chip, assemble(config, chip)
 

@@ -36,8 +36,8 @@ def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
     """The chip with the boundary values and the viscosity that really hold, drawn from the seed.
 
     Each inlet speed times 1 +- (a third of inlet_speed_error to all of it), the viscosity times 1 +-
-    viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across the chip; all uniform. One outlet alone keeps its
-    pressure: only differences drive a flow.
+    viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across the chip;
+    all uniform. One outlet alone keeps its pressure: only differences drive a flow.
     """
     rng = np.random.default_rng([simulated.seed, 5])
     inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
