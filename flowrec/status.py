@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +21,8 @@ from rich.text import Text
 
 from flowrec.messages import Tick
 from flowrec.units import seconds
+
+_PATIENCE_S = 2.0  # without a tick, then a person wants to know why
 
 console = Console(stderr=True, highlight=False)
 
@@ -52,13 +55,26 @@ class StatusLine:
     @contextmanager
     def shown(self) -> Iterator[StatusLine]:
         """Keep the line on the screen for the length of the context."""
-        if not console.is_terminal:
-            yield self
-            return
-        with Live(Text("starting"), console=console, refresh_per_second=8, transient=True) as live:
-            self._live = live
-            yield self
-        self._live = None
+        over = threading.Event()
+        threading.Thread(target=self._explain_waiting, args=(over,), name="status", daemon=True).start()
+        try:
+            if not console.is_terminal:
+                yield self
+                return
+            with Live(Text("starting"), console=console, refresh_per_second=8, transient=True) as live:
+                self._live = live
+                yield self
+        finally:
+            over.set()
+            self._live = None
+
+    def _explain_waiting(self, over: threading.Event) -> None:
+        """Say once why nothing moves: after an installation numba compiles each part when it is first used."""
+        began = time.perf_counter()
+        while not over.wait(0.5):
+            if time.perf_counter() - max([began, *list(self._arrivals)[-1:]]) > _PATIENCE_S:
+                say("working ... (the first run after an installation compiles its numerics, some 20 s in all)")
+                return
 
     def __call__(self, tick: Tick) -> None:
         """Take note of one tick."""
