@@ -218,6 +218,61 @@ def info(
     table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
 
 
+@app.command("ls")
+def list_directory(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Where to look.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
+    from dataclasses import asdict
+
+    from flowrec.session import list_sessions
+    from flowrec.status import say, table
+
+    rows = list_sessions(directory)
+    if as_json:
+        typer.echo(json.dumps([asdict(row) for row in rows]))
+        return
+    columns = ("name", "outcome", "duration", "size", "chip", "recorded")
+    table(
+        str(directory),
+        columns,
+        [
+            (
+                row.name,
+                row.outcome,
+                "" if row.duration_s is None else f"{row.duration_s:.1f} s",
+                f"{row.size_bytes / 1e6:.1f} MB",
+                row.chip,
+                row.recorded,
+            )
+            for row in rows
+        ],
+    )
+    for row in rows:
+        if row.duration_s is None:
+            say(f"{row.name}: {row.note}")
+
+
+@app.command()
+def recover(
+    session: Annotated[Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Session file to make; X.mcap or X_recovered.mcap by default.")
+    ] = None,
+) -> None:
+    """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
+    from flowrec.status import say
+    from flowrec.store import recover as save
+
+    done = save(session, out)
+    if not done.changed:
+        say(f"{session}: is whole; nothing to do")
+    else:
+        say(f"{done.path}: {done.ticks} ticks, {done.duration_s:.1f} s" + (f"; lost: {done.lost}" if done.lost else ""))
+    raise typer.Exit(0 if done.complete else 3)
+
+
 @app.command()
 def compare(
     first: Annotated[Path, typer.Argument(help="Session (.mcap).")],

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,13 @@ import numpy as np
 from flowrec.chip import chip_files, chip_from_files
 from flowrec.chip.chip import Chip
 from flowrec.config import Config, config_from_toml, to_toml
+from flowrec.errors import SessionError
 from flowrec.messages import Route
 from flowrec.provenance import provenance
-from flowrec.store import SessionHeader, SessionReader
+from flowrec.store import SessionHeader, SessionReader, is_growing
 from flowrec.topics import BY_FIELD
+
+SESSION_NAMES = (".mcap", ".mcap.partial")
 
 
 def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:
@@ -71,6 +76,46 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
         if key not in ("outcome", "note", "duration")
     }
     return facts, {BY_FIELD[name].path: count for name, count in reader.counts.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One session file of a directory; what is not known of it is None or empty."""
+
+    name: str
+    outcome: str  # or: recording, unfinished, unreadable
+    note: str  # why
+    size_bytes: int
+    duration_s: float | None = None
+    chip: str = ""
+    recorded: str = ""
+
+
+def list_sessions(directory: Path) -> list[Listed]:
+    """The sessions in a directory by name, with those that were not finished or can not be read.
+
+    Reads heads and indexes only. Raises SessionError when there is no such directory.
+    """
+    if not directory.is_dir():
+        raise SessionError(f"{directory}: no such directory; flowrec ls lists the sessions in one")
+    try:
+        paths = [path for path in directory.iterdir() if path.is_file() and path.name.endswith(SESSION_NAMES)]
+    except OSError as error:
+        raise SessionError(f"{directory}: can not be listed ({error.strerror}); check its permissions") from error
+    return [_listed(path) for path in sorted(paths)]
+
+
+def _listed(path: Path) -> Listed:
+    size = path.stat().st_size
+    try:
+        with SessionReader(path) as reader:
+            head = reader.header
+            outcome = reader.outcome.get("outcome", "unknown"), reader.outcome.get("note", "")
+            chip = str(tomllib.loads(head.chip_toml).get("name", ""))
+            return Listed(path.name, *outcome, size, reader.duration_s, chip, head.provenance.get("wall_time", ""))
+    except (SessionError, tomllib.TOMLDecodeError) as error:
+        what = "recording" if is_growing(path) else "unfinished" if path.suffix == ".partial" else "unreadable"
+        return Listed(path.name, what, str(error).removeprefix(f"{path}: "), size)
 
 
 def _bracketed(text: str) -> str:

@@ -138,10 +138,12 @@ def _speed_around(field: FlowField, chip: Chip) -> Floats:
 
 def _note(chip: Chip, sight: Sight, std: Floats, prior: Floats) -> str:
     """What was used, and which openings the robot could not see."""
+    # The pressure of an only outlet moves nothing: there is nothing to see.
+    alone = sum(opening.kind == "outlet" for opening in chip.openings) == 1
     unseen = [
         f"{opening.kind} {index} ({opening.side})"
         for index, opening in enumerate(chip.openings)
-        if std[index] > UNSEEN * prior[index]
+        if std[index] > UNSEEN * prior[index] and not (alone and opening.kind == "outlet")
     ]
     text = f"assimilated {sight.count} observations"
     return f"{text}; they say nothing about {', '.join(unseen)}" if unseen else text

@@ -1,5 +1,7 @@
 from flowrec.store.header import SessionHeader
+from flowrec.store.mcap_file import is_growing
 from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import Recovered, recover
 from flowrec.store.writer import SessionWriter
 
-__all__ = ["SessionHeader", "SessionReader", "SessionWriter"]
+__all__ = ["Recovered", "SessionHeader", "SessionReader", "SessionWriter", "is_growing", "recover"]

@@ -12,12 +12,17 @@ import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.codec import codec_of
 from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
-from flowrec.store.source import Source
+from flowrec.store.source import Source, Summary
 from flowrec.topics import BY_PATH
 
 
 class Contents:
     """The index of a session file.
+
+    Parameters
+    ----------
+    path : the file.
+    summary : its index where the file's own is not to be used (scan.py makes one).
 
     Attributes
     ----------
@@ -33,22 +38,22 @@ class Contents:
     SessionError : it is none, or not for this flowrec.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, summary: Summary | None = None) -> None:
         self.source = Source(path)
         try:
-            self._open()
+            self._open(summary)
         except BaseException:
             self.source.close()
             raise
 
-    def _open(self) -> None:
+    def _open(self, summary: Summary | None) -> None:
         path, header = self.source.path, self.source.header
         if header.profile != PROFILE:
             raise SessionError(
                 f"{path}: is an MCAP file of another program (profile {header.profile!r}, library {header.library!r});"
                 " flowrec reads what `flowrec record` has written"
             )
-        self._summary = self.source.read_summary()
+        self._summary = summary if summary is not None else self.source.read_summary()
         metadata = self._metadata()
         if SESSION not in metadata:
             raise SessionError(
@@ -59,7 +64,7 @@ class Contents:
         self._check_version(metadata[SESSION].get("format_version", ""))
         self.outcome = metadata.get(OUTCOME, {})
         self.chunks: list[ChunkIndex] = self._summary.chunks
-        assert self._summary.statistics is not None  # Source has seen to it
+        assert self._summary.statistics is not None  # Source or Scan has seen to it
         self.statistics: Statistics = self._summary.statistics
         self.fields = {
             channel.id: BY_PATH[channel.topic].field

@@ -6,6 +6,8 @@ Layout: https://mcap.dev/spec.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
 import zlib
 from collections.abc import Iterable
@@ -53,6 +55,9 @@ class McapFile:
         self._counts: dict[int, int] = {}
         self._span: tuple[int, int] | None = None
         self._file = path.open("wb" if truncate else "xb", buffering=0)
+        # While we live, nobody may take the growing file for the remains of a run; a few file systems know no locks.
+        with contextlib.suppress(OSError):
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def start(self, profile: str, library: str) -> None:
         """Magic and header."""
@@ -166,6 +171,18 @@ class McapFile:
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
+
+
+def is_growing(path: Path) -> bool:
+    """Whether a living process is writing this file."""
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 def _bytes_of(record: McapRecord) -> bytes:

@@ -7,6 +7,7 @@ Both flow previews use one colour scale, viridis from 0 to the highest speed of 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,11 @@ from flowrec.messages import Estimate, FlowField, Message, Route, Track
 from flowrec.store.schemas import foxglove_schema
 from flowrec.store.standard import timestamp
 
-_FLOAT32 = 7  # foxglove.PackedElementField.NumericType
+_UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
+# A ring about the robot: a single point of Rerun's default size drowns in the path.
+_MARK_POINTS, _MARK_UM = 24, 60.0
+_MARK_RGBA = (255, 64, 32, 255)
+_COLOURS = ("red", "green", "blue", "alpha")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,13 +36,15 @@ class Mirror:
 
 
 ROBOT_POSE = Mirror("/view/robot_pose", "PoseInFrame", "estimate, else track")
+# The same once more, for Rerun draws a point and does not draw a pose.
+ROBOT_POINT = Mirror("/view/robot_point", "PointCloud", "estimate, else track")
 PATH = Mirror("/view/path", "PosesInFrame", "route")
 PATH_POINTS = Mirror("/view/path_points", "PointCloud", "route")
 FLOW_ASSUMED = Mirror("/view/flow_assumed", "CompressedImage", "assumed")
 FLOW_REFINED = Mirror("/view/flow_refined", "CompressedImage", "refined")
 FLOW_REFINED_GRID = Mirror("/view/flow_refined_grid", "Grid", "refined")
 
-MIRRORS = (ROBOT_POSE, PATH, PATH_POINTS, FLOW_ASSUMED, FLOW_REFINED, FLOW_REFINED_GRID)
+MIRRORS = (ROBOT_POSE, ROBOT_POINT, PATH, PATH_POINTS, FLOW_ASSUMED, FLOW_REFINED, FLOW_REFINED_GRID)
 
 
 class Mirrors:
@@ -51,6 +58,7 @@ class Mirrors:
         robot = news.get("estimate") or news.get("track")
         if isinstance(robot, (Estimate, Track)):
             yield ROBOT_POSE, robot.stamp_ns, _pose_in_frame(robot)
+            yield ROBOT_POINT, robot.stamp_ns, _mark(robot)
         route = news.get("route")
         if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
             yield PATH, route.stamp_ns, _poses_in_frame(route)
@@ -94,6 +102,24 @@ def _pose(x_um: float, y_um: float) -> dict[str, dict[str, float]]:
 def _pose_in_frame(robot: Estimate | Track) -> bytes:
     pose = _pose(float(robot.position_um[0]), float(robot.position_um[1]))
     return _serialized(_wire("PoseInFrame")(timestamp=timestamp(robot.stamp_ns), pose=pose))
+
+
+def _mark(robot: Estimate | Track) -> bytes:
+    x_um, y_um = robot.position_um.tolist()
+    news = _wire("PointCloud")(timestamp=timestamp(robot.stamp_ns), pose=_pose(x_um, y_um))
+    return _serialized(news) + _mark_points()
+
+
+@functools.cache
+def _mark_points() -> bytes:
+    """What is the same in every tick: protobuf merges messages that follow each other."""
+    colours = [{"name": name, "offset": 12 + place, "type": _UINT8} for place, name in enumerate(_COLOURS)]
+    turn = np.arange(_MARK_POINTS) * (2.0 * np.pi / _MARK_POINTS)
+    points = np.zeros(1 + _MARK_POINTS, [("at", "<f4", 3), ("colour", "u1", 4)])  # the first one is the robot itself
+    points["at"][1:, 0], points["at"][1:, 1] = _MARK_UM * np.cos(turn), _MARK_UM * np.sin(turn)
+    points["colour"] = _MARK_RGBA
+    fields = _float_fields("x", "y", "z") + colours
+    return _serialized(_wire("PointCloud")(point_stride=points.itemsize, fields=fields, data=points.tobytes()))
 
 
 def _poses_in_frame(route: Route) -> bytes:

@@ -19,7 +19,7 @@ from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
 from flowrec.store.header import SessionHeader
 from flowrec.store.lane import by_time, lane, threads
-from flowrec.store.source import Record
+from flowrec.store.source import DamageError, Record
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
@@ -32,6 +32,7 @@ class SessionReader:
     Parameters
     ----------
     path : the session file.
+    contents : its index, where the file has none or a wrong one (recovery.py).
 
     Attributes
     ----------
@@ -46,9 +47,9 @@ class SessionReader:
     SessionError : there is no such file, or it is no session that this flowrec can read; on reading, damage.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, contents: Contents | None = None) -> None:
         self.path = Path(path)
-        self._contents = Contents(self.path)
+        self._contents = contents if contents is not None else Contents(self.path)
         self._source = self._contents.source
         self._fields = self._contents.fields
         self.outcome = self._contents.outcome
@@ -133,10 +134,7 @@ class SessionReader:
         try:
             return decode(BY_FIELD[field].type, record.payload, record.sequence)
         except SessionError as error:
-            raise SessionError(
-                f"{self.path}: {BY_FIELD[field].path} at {record.log_ns} ns: {error};"
-                f" `flowrec recover {self.path}` saves what is whole"
-            ) from error
+            raise DamageError(self.path, f"{BY_FIELD[field].path} at {record.log_ns} ns: {error}") from error
 
     def _restored(self, record: Record) -> Message:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.

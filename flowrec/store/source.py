@@ -42,7 +42,7 @@ from flowrec.store.mcap_file import MAGIC
 CHUNK_LIMIT_BYTES = 1 << 30  # of one chunk before compression
 _HEADER_LIMIT_BYTES = 1 << 16
 _RECORDS_PER_CHUNK = 1 << 20
-_RECORD_HEAD = struct.Struct("<BQ")
+RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _FOOTER_BYTES = 9 + 20
 _CRC = struct.Struct("<I")
@@ -59,6 +59,14 @@ _DAMAGE = (
     OverflowError,
     MemoryError,
 )
+
+
+class DamageError(SessionError):
+    """Bytes that make no sense; `what` says where and why, without advice."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__(f"{path}: {what}; `flowrec recover {path}` saves what is whole")
+        self.what = what
 
 
 class Record(NamedTuple):
@@ -97,7 +105,7 @@ class Source:
         try:
             self._descriptor = os.open(path, os.O_RDONLY)
         except FileNotFoundError as error:
-            raise SessionError(f"{path}: no such file; `flowrec ls` shows the sessions in a directory") from error
+            raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
         except OSError as error:
             raise SessionError(f"{path}: can not be opened ({error.strerror}); check its permissions") from error
         self.close = weakref.finalize(self, os.close, self._descriptor)
@@ -125,11 +133,9 @@ class Source:
             raise SessionError(f"{self.path}: can not be read at byte {offset} ({error.strerror})") from error
         return data
 
-    def damaged(self, offset: int, why: object) -> SessionError:
+    def damaged(self, offset: int, why: object) -> DamageError:
         """The error for bytes that make no sense."""
-        return SessionError(
-            f"{self.path}: damaged at byte {offset} ({why}); `flowrec recover {self.path}` saves what is whole"
-        )
+        return DamageError(self.path, f"damaged at byte {offset} ({why})")
 
     @contextlib.contextmanager
     def parsing(self, offset: int) -> Iterator[None]:
@@ -165,12 +171,12 @@ class Source:
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""
-        record: Metadata = self._record(index.offset, index.length, Opcode.METADATA, Metadata.read)[0]
+        record: Metadata = self.record(index.offset, index.length, Opcode.METADATA, Metadata.read)[0]
         return dict(record.metadata)
 
     def attachment(self, index: AttachmentIndex) -> bytes:
         """The content of one attachment, checksum verified."""
-        record, body = self._record(index.offset, index.length, Opcode.ATTACHMENT, Attachment.read)
+        record, body = self.record(index.offset, index.length, Opcode.ATTACHMENT, Attachment.read)
         with self.parsing(index.offset):
             (crc,) = _CRC.unpack(body[-4:])
         if crc and zlib.crc32(body[:-4]) != crc:
@@ -183,7 +189,7 @@ class Source:
     def messages(self, index: ChunkIndex) -> list[Record]:
         """All messages of one chunk, in file order; decompressed within its declared size, checksum verified."""
         offset = index.chunk_start_offset
-        chunk: Chunk = self._record(offset, index.chunk_length, Opcode.CHUNK, Chunk.read)[0]
+        chunk: Chunk = self.record(offset, index.chunk_length, Opcode.CHUNK, Chunk.read)[0]
         with self.parsing(offset):
             content = _decompressed(chunk)
             if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
@@ -206,19 +212,20 @@ class Source:
             raise SessionError(f"{self.path}: is not an MCAP file; flowrec reads what `flowrec record` has written")
         data = self.read(len(MAGIC), min(self.size - len(MAGIC), _HEADER_LIMIT_BYTES))
         with self.parsing(len(MAGIC)):
-            opcode, length = _RECORD_HEAD.unpack_from(data)
-            if opcode != Opcode.HEADER or length > len(data) - _RECORD_HEAD.size:
+            opcode, length = RECORD_HEAD.unpack_from(data)
+            if opcode != Opcode.HEADER or length > len(data) - RECORD_HEAD.size:
                 raise ValueError("no header record")
-            header: Header = Header.read(_stream(data[_RECORD_HEAD.size :][:length]))
+            header: Header = Header.read(_stream(data[RECORD_HEAD.size :][:length]))
         return header
 
-    def _record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> tuple[Any, bytes]:
+    def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> tuple[Any, bytes]:
+        """One record of that kind and size, parsed, and its body."""
         data = self.read(offset, length)
         with self.parsing(offset):
-            found, size = _RECORD_HEAD.unpack_from(data)
-            if found != opcode or size != length - _RECORD_HEAD.size:
+            found, size = RECORD_HEAD.unpack_from(data)
+            if found != opcode or size != length - RECORD_HEAD.size:
                 raise ValueError(f"no {opcode.name.lower()} of {length} bytes here")
-            body = data[_RECORD_HEAD.size :]
+            body = data[RECORD_HEAD.size :]
             return parse(_stream(body)), body
 
     def _check(self, summary: Summary, start: int) -> None:
@@ -247,8 +254,8 @@ def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and length of the body of each record."""
     at, end = 0, len(data)
     while at < end:
-        opcode, length = _RECORD_HEAD.unpack_from(data, at)
-        at += _RECORD_HEAD.size
+        opcode, length = RECORD_HEAD.unpack_from(data, at)
+        at += RECORD_HEAD.size
         if length > end - at:
             raise ValueError(f"a record of {length} bytes where {end - at} are left")
         yield opcode, at, length

@@ -200,7 +200,7 @@ class SessionWriter:
             self._recorder.finish(outcome)
             self._refuse_if_taken(finished=True)
             self.partial_path.replace(self.path)
-            _sync_directory(self.path.parent)
+            sync_directory(self.path.parent)
         except OSError as error:
             self._failure = error
 
@@ -237,7 +237,7 @@ def _nbytes(message: Message) -> int:
     return nbytes
 
 
-def _sync_directory(directory: Path) -> None:
+def sync_directory(directory: Path) -> None:
     """Have the disk keep the new name as well."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:

@@ -54,10 +54,12 @@ def test_pi_unet_keeps_an_assimilated_field_that_explains_the_observations(twin)
 
 
 def test_pi_unet_corrects_what_no_boundary_value_can_explain(twin):
-    # The chip is not what its mask says: debris half closes the upper branch, so the flow there is another one.
+    # The chip is not what its mask says: debris closes most of the upper branch, so the flow there is another one.
+    # Gains depend on the network's seed: 0.75 to 0.88 of the start's error over ten runs here, while with one pixel
+    # of debris less they were 0.81 to 1.00, too close to nothing for a test.
     case = twin(noise=0.02, every=2)
     mask = case.chip.mask.copy()
-    mask[8:12, 30:50] = False
+    mask[8:13, 30:50] = False
     real = case.solver.solve(replace(case.chip, mask=mask))
     points = case.observations.position_um
     case.true = real

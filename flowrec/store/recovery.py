@@ -1,0 +1,214 @@
+"""A whole session from one whose run was killed, or whose file is cut off or damaged."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from flowrec.errors import SessionError
+from flowrec.messages import Tick
+from flowrec.store.contents import Contents
+from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
+from flowrec.store.mcap_file import is_growing
+from flowrec.store.reader import SessionReader
+from flowrec.store.scan import Scan, scan
+from flowrec.store.source import DamageError, Source
+from flowrec.store.writer import PARTIAL_SUFFIX, SessionWriter, sync_directory
+from flowrec.topics import BY_PATH
+from flowrec.units import seconds
+
+_HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What came of a recovery.
+
+    Attributes
+    ----------
+    path : the whole session.
+    ticks, duration_s : what is in it.
+    lost_bytes : of the old file, not to be used.
+    lost : what was lost, for people; empty when nothing was.
+    changed : False where the file was whole already.
+    """
+
+    path: Path
+    ticks: int
+    duration_s: float
+    lost_bytes: int = 0
+    lost: str = ""
+    changed: bool = True
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost."""
+        return not self.lost
+
+
+def recover(path: Path, out: Path | None = None) -> Recovered:
+    """Write everything intact of a session to a new file, from the first tick to the last whole one.
+
+    A tick is whole when its inputs and what the stages made of them are there: the images of a killed run are often
+    ahead of the rest. Derived views are made anew. What is missing is told in the new session's outcome. The remains
+    `X.mcap.partial` are removed once `X.mcap` is complete; any other file stays as it is, and so does a whole one,
+    which at most gets the name that its run could not give it.
+
+    Parameters
+    ----------
+    path : the unfinished, cut or damaged file.
+    out : file to make; by default X.mcap for X.mcap.partial, else X_recovered.mcap.
+
+    Raises
+    ------
+    SessionError : nothing can be saved, the run is still going on, or `out` is taken or can not be written.
+    """
+    partial = path.name.endswith(PARTIAL_SUFFIX)
+    final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
+    target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
+    if is_growing(path):
+        raise SessionError(f"{path}: is being recorded just now; stop that run with Ctrl-C, and its file is whole")
+    with _without_circular_advice(path):
+        whole = _checked(path)
+        if whole is not None:
+            if not partial:
+                return whole
+            _refuse_if_taken(target)
+            _rename(path, target)
+            return Recovered(target, whole.ticks, whole.duration_s)
+        with contextlib.closing(Source(path)) as source:
+            found = scan(source)
+        reader = SessionReader(path, Contents(path, found.summary))
+        _require_head(path, found)
+        end_ns = _last_whole_ns(path, reader, found)
+    _refuse_if_taken(target)
+    draft = target.with_name(f"{target.stem}.recovering{target.suffix}")
+    try:
+        ticks, lost = _rewrite(reader, found, end_ns, draft)
+        done = _checked(draft)
+        if done is None:
+            raise SessionError(f"{draft}: can not be read back; is the disk sound?")
+        _refuse_if_taken(target)
+        _rename(draft, target)
+    except SessionError as error:
+        # Its own advice is about a draft that is gone.
+        raise SessionError(f"{path}: is left as it was; {str(error).split('; ')[0]}") from error
+    finally:
+        reader.close()
+        for remains in (draft, draft.with_name(draft.name + PARTIAL_SUFFIX)):
+            remains.unlink(missing_ok=True)
+    if partial and target == final:
+        path.unlink()
+    return Recovered(target, ticks, done.duration_s, sum(lost.nbytes for lost in found.lost), lost)
+
+
+def _checked(path: Path) -> Recovered | None:
+    """A file that is whole, every chunk of it; None for any other."""
+    try:
+        with SessionReader(path, contents := Contents(path)) as reader:
+            _ = reader.header
+            for chunk in contents.chunks:
+                contents.source.messages(chunk)
+            return Recovered(path, int(reader.outcome.get("ticks", 0)), reader.duration_s, changed=False)
+    except SessionError:
+        return None
+
+
+def _require_head(path: Path, found: Scan) -> None:
+    present = {metadata.name for metadata in found.summary.metadata}
+    present |= {attachment.name for attachment in found.summary.attachments}
+    missing = sorted(_HEAD - present)
+    if missing:
+        raise SessionError(
+            f"{path}: nothing can be saved: {', '.join(missing)} of its head is not whole,"
+            " without which nobody knows what was flown; remove the file"
+        )
+
+
+def _last_whole_ns(path: Path, reader: SessionReader, found: Scan) -> int:
+    """Stamp of the last tick with inputs and outputs; those of one tick are always in the same chunk."""
+    ends = [found.last_ns.get(_channel(found, topic)) for topic in ("/coils/applied", "/robot/track")]
+    if any(end is None for end in ends):
+        raise SessionError(
+            f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; remove the file"
+        )
+    return min(end for end in ends if end is not None)
+
+
+def _channel(found: Scan, topic: str) -> int:
+    return next((number for number, channel in found.summary.channels.items() if channel.topic == topic), -1)
+
+
+def _rewrite(reader: SessionReader, found: Scan, end_ns: int, draft: Path) -> tuple[int, str]:
+    """Write the ticks up to a stamp; their number and what was lost."""
+    before = Tick()
+    whole = images_missing = images_ahead = dropped = 0
+    has_images = "frame" in reader.counts
+    with SessionWriter(draft, reader.header, overwrite=True, block=True) as writer:
+        for tick in reader.ticks():
+            if tick.stamp_ns > end_ns:
+                images_ahead += 1
+                continue
+            if tick.applied is not before.applied and tick.track is not before.track:
+                whole += 1
+                images_missing += has_images and tick.frame is before.frame
+                dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
+            writer.write(tick)
+            before = tick
+        lost = "; ".join(_losses(reader, found, images_missing - dropped, images_ahead))
+        writer.close(_outcome(reader, lost, before.stamp_ns, dropped))
+    return whole, lost
+
+
+def _losses(reader: SessionReader, found: Scan, images_missing: int, images_ahead: int) -> Iterator[str]:
+    if not found.ended:
+        yield "the last moments, which were not on the disk"
+    if found.lost:
+        nbytes, first = sum(lost.nbytes for lost in found.lost), found.lost[0].offset
+        yield f"{nbytes} damaged or cut-off bytes, the first at {first}"
+    gaps = found.gaps.get(_channel(found, "/coils/applied"), [])
+    if gaps:
+        from_s = seconds(gaps[0].before_ns - reader.first_ns)
+        yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"
+    absent = sorted(set(BY_PATH) - {channel.topic for channel in found.summary.channels.values()})
+    if absent:
+        yield f"all of {', '.join(absent)}"
+    if images_missing > 0:
+        yield f"{images_missing} images"
+    if images_ahead:
+        yield f"{images_ahead} ticks of which there was only the image"
+
+
+def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Mapping[str, str]:
+    said = {key: value for key, value in reader.outcome.items() if key not in ("ticks", "dropped_frames")}
+    marks = {"recovered_from": reader.path.name, "frames_dropped": str(dropped)}
+    if not lost:
+        return {"outcome": "ended", **said, **marks}
+    if "outcome" in said:
+        marks["ended_as"] = said["outcome"]
+    until_s = seconds(end_ns - reader.first_ns)
+    return {**said, **marks, "outcome": "cut", "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
+
+
+def _refuse_if_taken(target: Path) -> None:
+    if target.exists():
+        raise SessionError(f"{target}: exists already; choose another name with --out")
+
+
+def _rename(source: Path, target: Path) -> None:
+    try:
+        source.rename(target)
+        sync_directory(target.parent)
+    except OSError as error:
+        raise SessionError(f"{target}: can not be made ({error.strerror}); choose another --out") from error
+
+
+@contextlib.contextmanager
+def _without_circular_advice(path: Path) -> Iterator[None]:
+    """The reader sends people here; here it would send them in a circle."""
+    try:
+        yield
+    except DamageError as error:
+        raise SessionError(f"{path}: nothing can be saved: {error.what}; remove the file") from error

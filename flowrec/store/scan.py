@@ -1,0 +1,207 @@
+"""The index of a file that has none, or whose index is not to be trusted: made from its records, front to back.
+
+What does not parse, or fails its checksum, is left out. After a record whose length makes no sense the next chunk is
+looked for by its shape.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+
+from flowrec.errors import SessionError
+from flowrec.store.header import OUTCOME
+from flowrec.store.mcap_file import MAGIC
+from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Source, Summary
+
+_CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the content
+_CHUNK_MARK = b"\x04\x00\x00\x00zstd"  # follows the head of every chunk that flowrec writes
+_WINDOW_BYTES = 1 << 20
+_SEQUENCES = 2**32
+
+
+class Lost(NamedTuple):
+    """Bytes of the file that are not to be used."""
+
+    offset: int
+    nbytes: int
+
+
+class Gap(NamedTuple):
+    """Messages of one channel that are missing before a time, told by their sequence numbers."""
+
+    before_ns: int
+    messages: int
+
+
+@dataclass(slots=True)
+class Scan:
+    """What was found.
+
+    Attributes
+    ----------
+    summary : index of everything intact.
+    lost : what was passed over before the end of the run; a missing or damaged index after it is no loss.
+    gaps : by channel.
+    last_ns : time of the last message, by channel.
+    ended : the outcome of the run was found, which is written after its last message.
+    """
+
+    summary: Summary = field(default_factory=Summary)
+    lost: list[Lost] = field(default_factory=list)
+    gaps: dict[int, list[Gap]] = field(default_factory=dict)
+    last_ns: dict[int, int] = field(default_factory=dict)
+    ended: bool = False
+    _counts: dict[int, int] = field(default_factory=dict)
+    _sequences: dict[int, int] = field(default_factory=dict)
+
+    def take(self, source: Source, opcode: int, offset: int, length: int) -> bool:
+        """Enter one record; False when it is damaged."""
+        try:
+            if opcode == Opcode.CHUNK:
+                self._take_chunk(source, offset, length)
+            elif opcode == Opcode.SCHEMA:
+                schema: Schema = source.record(offset, length, Opcode.SCHEMA, Schema.read)[0]
+                self.summary.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel: Channel = source.record(offset, length, Opcode.CHANNEL, Channel.read)[0]
+                self.summary.channels[channel.id] = channel
+            elif opcode == Opcode.METADATA:
+                metadata: Metadata = source.record(offset, length, Opcode.METADATA, Metadata.read)[0]
+                self.summary.metadata.append(MetadataIndex(offset=offset, length=length, name=metadata.name))
+                self.ended = self.ended or metadata.name == OUTCOME
+            elif opcode == Opcode.ATTACHMENT:
+                self._take_attachment(source, offset, length)
+        except SessionError:
+            return False
+        return True
+
+    def lose(self, offset: int, nbytes: int) -> None:
+        """Pass over some bytes."""
+        if not self.ended:
+            self.lost.append(Lost(offset, nbytes))
+
+    def close(self) -> None:
+        """Complete the summary."""
+        summary = self.summary
+        for channel in list(summary.channels.values()):
+            if channel.schema_id not in summary.schemas:
+                del summary.channels[channel.id]
+        summary.statistics = Statistics(
+            attachment_count=len(summary.attachments),
+            channel_count=len(summary.channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(summary.chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=max((chunk.message_end_time for chunk in summary.chunks), default=0),
+            message_start_time=min((chunk.message_start_time for chunk in summary.chunks), default=0),
+            metadata_count=len(summary.metadata),
+            schema_count=len(summary.schemas),
+        )
+
+    def _take_chunk(self, source: Source, offset: int, length: int) -> None:
+        index = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression="zstd",
+            compressed_size=length,
+            message_end_time=0,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=0,
+            uncompressed_size=0,
+        )
+        records = source.messages(index)
+        if not records:
+            return
+        # The times in the head of a chunk are under no checksum; those of its messages are.
+        index.message_start_time = min(record.log_ns for record in records)
+        index.message_end_time = max(record.log_ns for record in records)
+        index.message_index_offsets = {record.channel: 0 for record in records}
+        index.uncompressed_size = sum(len(record.payload) for record in records)
+        self.summary.chunks.append(index)
+        for log_ns, channel, sequence, _ in records:
+            missing = (sequence - self._sequences.get(channel, -1) - 1) % _SEQUENCES
+            if missing:
+                self.gaps.setdefault(channel, []).append(Gap(log_ns, missing))
+            self._sequences[channel] = sequence
+            self._counts[channel] = self._counts.get(channel, 0) + 1
+            self.last_ns[channel] = max(log_ns, self.last_ns.get(channel, 0))
+
+    def _take_attachment(self, source: Source, offset: int, length: int) -> None:
+        record: Attachment = source.record(offset, length, Opcode.ATTACHMENT, Attachment.read)[0]
+        index = AttachmentIndex(
+            offset=offset,
+            length=length,
+            log_time=record.log_time,
+            create_time=record.create_time,
+            data_size=len(record.data),
+            name=record.name,
+            media_type=record.media_type,
+        )
+        source.attachment(index)  # for its checksum
+        self.summary.attachments.append(index)
+
+
+def scan(source: Source) -> Scan:
+    """Read a whole file and note what is intact; one chunk is in memory at a time.
+
+    Raises
+    ------
+    SessionError : the disk does not give the bytes.
+    """
+    found = Scan()
+    at = len(MAGIC)
+    while at < source.size:
+        opcode, end = _extent(source, at)
+        if end and found.take(source, opcode, at, end - at):
+            if opcode == Opcode.FOOTER:
+                break
+            at = end
+            continue
+        # A damaged record between sound ones is passed over; else its length is not to be trusted either.
+        sound = end and (end == source.size or _extent(source, end)[1])
+        following = end if sound else _next_chunk(source, at + 1)
+        found.lose(at, following - at)
+        at = following
+    found.close()
+    return found
+
+
+def _extent(source: Source, at: int) -> tuple[int, int]:
+    """Opcode and end of the record at an offset; the end is 0 where no whole record can be."""
+    if at + RECORD_HEAD.size > source.size:
+        return 0, 0
+    opcode, length = RECORD_HEAD.unpack(source.read(at, RECORD_HEAD.size))
+    end = at + RECORD_HEAD.size + length
+    known = Opcode.HEADER <= opcode <= Opcode.DATA_END
+    return (opcode, end) if known and end <= source.size else (0, 0)
+
+
+def _next_chunk(source: Source, start: int) -> int:
+    """Offset of the next thing that has the shape of a chunk, the end of the file where there is none."""
+    head = _CHUNK_HEAD.size
+    while start < source.size:
+        window = source.read(start, min(source.size - start, _WINDOW_BYTES + head + len(_CHUNK_MARK)))
+        place = window.find(_CHUNK_MARK, head)
+        while place >= 0:
+            opcode, length, _, _, size, _ = _CHUNK_HEAD.unpack_from(window, place - head)
+            at = start + place - head
+            if opcode == Opcode.CHUNK and size <= CHUNK_LIMIT_BYTES and length <= source.size - at - RECORD_HEAD.size:
+                return at
+            place = window.find(_CHUNK_MARK, place + 1)
+        start += _WINDOW_BYTES
+    return source.size

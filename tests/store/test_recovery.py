@@ -1,0 +1,244 @@
+"""What is saved of killed, cut and damaged sessions, and what is said of the rest."""
+
+import signal
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from flowrec import replay as verb
+from flowrec.compare import compare_sessions
+from flowrec.errors import SessionError
+from flowrec.replay import Change
+from flowrec.store import SessionReader, SessionWriter, is_growing, recover
+from flowrec.store.layout import SLOTS
+from flowrec.store.recorder import Recorder
+from flowrec.store.scan import scan
+from flowrec.store.source import Source
+from tests.store.made_up import HEADER, ticks_of
+from tests.store.test_trouble import KILLED, names_in
+
+TICKS = list(ticks_of(40, shape=(8, 8)))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """A made-up session of many chunks: three ticks a flush."""
+    path = tmp_path_factory.mktemp("recovery") / "small.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recorder, "flush_if_due", flush_every(3))
+        with SessionWriter(path, HEADER, block=True) as writer:
+            for tick in TICKS:
+                writer.write(tick)
+            writer.close({"outcome": "reached", "note": "there"})
+    return path
+
+
+def flush_every(ticks):
+    """Chunks that do not depend on the clock."""
+
+    def flush_if_due(self):
+        self.calls = getattr(self, "calls", 0) + 1
+        if self.calls % ticks == 0:
+            self._flush()
+
+    return flush_if_due
+
+
+def chunks_of(path):
+    """Start, end and channels of each chunk."""
+    source = Source(path)
+    found = scan(source).summary.chunks
+    return [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length, set(c.message_index_offsets)) for c in found]
+
+
+def cut(path, length, to):
+    to.write_bytes(path.read_bytes()[:length])
+    return to
+
+
+def same_ticks(one, other):
+    return len(one) == len(other) and all(
+        mine is theirs is None or mine == theirs or mine.same_as(theirs)
+        for a, b in zip(one, other, strict=True)
+        for mine, theirs in ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    )
+
+
+def test_a_real_recording_cut_anywhere_is_replayed_exactly_after_recovery(session, tmp_path):
+    size = session.stat().st_size
+    for number, share in enumerate((0.15, 0.62, 0.97)):
+        path = cut(session, int(share * size), tmp_path / f"cut{number}.mcap.partial")
+        done = recover(path)
+        assert done.path == tmp_path / f"cut{number}.mcap" and not path.exists()
+        assert not done.complete and done.lost_bytes > 0
+        reader = SessionReader(done.path)
+        assert reader.outcome["outcome"] == "cut" and "lost:" in reader.outcome["note"]
+        assert reader.header == SessionReader(session).header
+        assert reader.outcome["ticks"] == str(done.ticks)
+        replayed = verb.replay(done.path, Change(), verify=True)
+        same, lines = verb.verdict(replayed)
+        assert same, lines
+        assert replayed.report.ticks == done.ticks > 0
+
+
+def test_a_recovered_session_begins_exactly_as_the_original(small, tmp_path):
+    length = chunks_of(small)[-7][1]
+    done = recover(cut(small, length, tmp_path / "s.mcap"))
+    assert done.path == tmp_path / "s_recovered.mcap"
+    assert sorted(names_in(tmp_path)) == ["s.mcap", "s_recovered.mcap"]
+    saved = list(SessionReader(done.path).ticks())
+    assert 0 < len(saved) < len(TICKS)
+    assert same_ticks(saved, TICKS[: len(saved)])
+    assert SessionReader(done.path).header == HEADER
+
+
+def test_images_ahead_of_the_rest_are_trimmed(small, tmp_path):
+    frames = SLOTS["/camera/frame"].channel
+    ends = [end for _, end, channels in chunks_of(small) if channels == {frames}]
+    done = recover(cut(small, ends[5], tmp_path / "s.mcap.partial"))
+    assert done.ticks == 15 and "3 ticks of which there was only the image" in done.lost
+    last = list(SessionReader(done.path).ticks())[-1]
+    assert last.frame.stamp_ns == last.applied.stamp_ns == last.track.stamp_ns == last.stamp_ns
+
+
+def test_only_the_index_missing_is_no_loss(small, tmp_path):
+    done = recover(cut(small, small.stat().st_size - 100, tmp_path / "s.mcap.partial"))
+    assert done.complete and done.changed and done.lost_bytes == 0
+    reader = SessionReader(done.path)
+    assert (reader.outcome["outcome"], reader.outcome["note"]) == ("reached", "there")
+    assert compare_sessions(reader, SessionReader(small)).identical
+
+
+def test_a_whole_session_is_left_alone(small, tmp_path):
+    before = small.read_bytes()
+    done = recover(small, tmp_path / "never.mcap")
+    assert done.path == small and done.complete and not done.changed
+    assert small.read_bytes() == before and not names_in(tmp_path)
+
+
+def test_a_whole_session_that_got_no_name_gets_it(small, tmp_path):
+    done = recover(cut(small, small.stat().st_size, tmp_path / "s.mcap.partial"))
+    assert done.complete and done.ticks == len(TICKS)
+    assert names_in(tmp_path) == ["s.mcap"] and done.path.read_bytes() == small.read_bytes()
+
+
+def test_a_damaged_chunk_costs_no_more_than_itself(small, tmp_path):
+    state, frames = SLOTS["/robot/track"].channel, SLOTS["/camera/frame"].channel
+    chunks = chunks_of(small)
+    for name, wanted, said in (("frames", frames, "3 images"), ("state", state, "3 ticks on the way")):
+        start, end, _ = [chunk for chunk in chunks if wanted in chunk[2]][4]
+        content = bytearray(small.read_bytes())
+        content[(start + end) // 2] ^= 0xFF
+        path = tmp_path / f"{name}.mcap"
+        path.write_bytes(content)
+        done = recover(path)
+        assert said in done.lost and not done.complete
+        reader = SessionReader(done.path)
+        assert reader.outcome["outcome"] == "cut" and reader.outcome["ended_as"] == "reached"
+        assert len(list(reader.ticks())) == len(TICKS)
+        assert done.ticks == len(TICKS) - (3 if name == "state" else 0)
+
+
+def test_after_a_length_that_makes_no_sense_the_next_chunk_is_found(small, tmp_path):
+    start = chunks_of(small)[6][0]
+    content = bytearray(small.read_bytes())
+    content[start + 1 : start + 9] = b"\xff" * 8
+    path = tmp_path / "s.mcap"
+    path.write_bytes(content)
+    assert recover(path).ticks >= len(TICKS) - 3
+
+
+def test_zeros_of_a_lost_page_at_the_end_are_passed_over(small, tmp_path):
+    end = chunks_of(small)[-1][1]
+    path = tmp_path / "s.mcap.partial"
+    path.write_bytes(small.read_bytes()[:end] + bytes(5000))
+    done = recover(path)
+    assert done.ticks == len(TICKS) and done.lost_bytes == 5000
+
+
+def test_a_taken_name_is_refused_and_nothing_is_changed(small, tmp_path):
+    path = cut(small, chunks_of(small)[-4][1], tmp_path / "s.mcap.partial")
+    (tmp_path / "s.mcap").write_bytes(b"precious")
+    before = path.read_bytes()
+    with pytest.raises(SessionError, match=r"s\.mcap: exists already; choose another name with --out") as error:
+        recover(path)
+    assert "\n" not in str(error.value)
+    assert (tmp_path / "s.mcap").read_bytes() == b"precious" and path.read_bytes() == before
+    other = recover(path, tmp_path / "other.mcap")
+    assert other.path.exists() and path.read_bytes() == before
+    with pytest.raises(SessionError, match="exists already"):
+        recover(path, other.path)
+
+
+def test_what_can_not_be_saved_is_told_in_one_line_without_sending_in_circles(small, tmp_path):
+    first = chunks_of(small)[0][0]
+    for length in (0, 5, 20, 60, 600, first - 1, first, first + 30):
+        path = cut(small, length, tmp_path / "s.mcap.partial")
+        with pytest.raises(SessionError) as error:
+            recover(path)
+        said = str(error.value)
+        assert said.startswith(str(path)) and "\n" not in said and "flowrec recover" not in said
+        assert names_in(tmp_path) == ["s.mcap.partial"]
+    for path in (tmp_path / "missing.mcap", tmp_path):
+        with pytest.raises(SessionError):
+            recover(path)
+
+
+def test_a_full_disk_leaves_the_remains_as_they_were(small, tmp_path, monkeypatch):
+    path = cut(small, chunks_of(small)[-4][1], tmp_path / "s.mcap.partial")
+
+    def refuse(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("flowrec.store.mcap_file.McapFile.add_chunks", refuse)
+    with pytest.raises(SessionError, match=r"left as it was.*disk is full") as error:
+        recover(path)
+    assert "flowrec recover" not in str(error.value)
+    assert names_in(tmp_path) == ["s.mcap.partial"]
+
+
+def test_a_running_recording_is_not_taken_for_remains_and_a_killed_one_is_saved(tmp_path):
+    path = tmp_path / "s.mcap"
+    partial = tmp_path / "s.mcap.partial"
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED, path, Path(__file__).parent], stdout=subprocess.PIPE, text=True
+    ) as run:
+        said = 0
+        while said < 150:
+            said = int(run.stdout.readline())
+        assert is_growing(partial)
+        with pytest.raises(SessionError, match="is being recorded just now"):
+            recover(partial)
+        run.send_signal(signal.SIGKILL)
+        run.stdout.read()
+    done = recover(partial)
+    assert 150 - 60 < done.ticks and "the last moments" in done.lost
+    assert names_in(tmp_path) == ["s.mcap"]
+    ticks = list(SessionReader(path).ticks())
+    assert same_ticks(ticks, list(ticks_of(len(ticks), shape=(8, 8))))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_anywhere_leaves_a_readable_session_or_one_line(small, tmp_path, data):
+    content = bytearray(small.read_bytes())
+    del content[data.draw(st.integers(len(content) // 2, len(content))) :]
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    path.write_bytes(content)
+    out.unlink(missing_ok=True)
+    try:
+        done = recover(path, out)
+    except SessionError as error:
+        assert "\n" not in str(error) and str(path) in str(error) and "flowrec recover" not in str(error)
+        assert not out.exists()
+    else:
+        whole = {tick.stamp_ns: tick for tick in TICKS}
+        with SessionReader(done.path) as reader:
+            assert {tick.stamp_ns for tick in reader.ticks()} <= set(whole)
