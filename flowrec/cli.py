@@ -244,7 +244,7 @@ def list_directory(
                 "" if row.duration_s is None else f"{row.duration_s:.1f} s",
                 f"{row.size_bytes / 1e6:.1f} MB",
                 row.chip,
-                row.recorded,
+                row.recorded[:16].replace("T", " "),
             )
             for row in rows
         ],

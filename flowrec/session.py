@@ -58,7 +58,7 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
     said = reader.header.provenance
     width_um, height_um = chip.size_um
     facts = {
-        "outcome": reader.outcome.get("outcome", "unknown") + _bracketed(reader.outcome.get("note", "")),
+        "outcome": reader.outcome.get("outcome", "unknown") + _bracketed(reader.outcome.get("note") or reader.outcome.get("reason", "")),
         "duration": f"{reader.duration_s:.1f} s",
         "size": f"{path.stat().st_size / 1e6:.1f} MB",
         "chip": f"{chip.name}, {width_um / 1000:.2f} x {height_um / 1000:.2f} mm, {len(chip.openings)} openings",
@@ -110,7 +110,7 @@ def _listed(path: Path) -> Listed:
     try:
         with SessionReader(path) as reader:
             head = reader.header
-            outcome = reader.outcome.get("outcome", "unknown"), reader.outcome.get("note", "")
+            outcome = reader.outcome.get("outcome", "unknown"), reader.outcome.get("note") or reader.outcome.get("reason", "")
             chip = str(tomllib.loads(head.chip_toml).get("name", ""))
             return Listed(path.name, *outcome, size, reader.duration_s, chip, head.provenance.get("wall_time", ""))
     except (SessionError, tomllib.TOMLDecodeError) as error:

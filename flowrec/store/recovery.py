@@ -19,6 +19,7 @@ from flowrec.store.writer import PARTIAL_SUFFIX, SessionWriter, sync_directory
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
+_QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
 _HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
 
 
@@ -111,7 +112,7 @@ def _checked(path: Path) -> Recovered | None:
             _ = reader.header
             for chunk in contents.chunks:
                 contents.source.messages(chunk)
-            return Recovered(path, int(reader.outcome.get("ticks", 0)), reader.duration_s, changed=False)
+            return Recovered(path, reader.counts.get("track", 0), reader.duration_s, changed=False)
     except SessionError:
         return None
 
@@ -145,8 +146,9 @@ def _rewrite(reader: SessionReader, found: Scan, end_ns: int, draft: Path) -> tu
     """Write the ticks up to a stamp; their number and what was lost."""
     before = Tick()
     whole = images_missing = images_ahead = dropped = 0
-    has_images = "frame" in reader.counts
-    with SessionWriter(draft, reader.header, overwrite=True, block=True) as writer:
+    # Only replays are written without images.
+    has_images = "frame" in reader.counts or not reader.header.parent
+    with SessionWriter(draft, reader.header, overwrite=True, block=True, queue_limit_bytes=_QUEUE_BYTES) as writer:
         for tick in reader.ticks():
             if tick.stamp_ns > end_ns:
                 images_ahead += 1

@@ -217,7 +217,7 @@ def test_a_running_recording_is_not_taken_for_remains_and_a_killed_one_is_saved(
         run.send_signal(signal.SIGKILL)
         run.stdout.read()
     done = recover(partial)
-    assert 150 - 60 < done.ticks and "the last moments" in done.lost
+    assert done.ticks > 150 - 60 and "the last moments" in done.lost
     assert names_in(tmp_path) == ["s.mcap"]
     ticks = list(SessionReader(path).ticks())
     assert same_ticks(ticks, list(ticks_of(len(ticks), shape=(8, 8))))
@@ -233,12 +233,14 @@ def test_damage_anywhere_leaves_a_readable_session_or_one_line(small, tmp_path, 
     path, out = tmp_path / "damaged.mcap", tmp_path / "out.mcap"
     path.write_bytes(content)
     out.unlink(missing_ok=True)
+    told = ""
     try:
         done = recover(path, out)
     except SessionError as error:
-        assert "\n" not in str(error) and str(path) in str(error) and "flowrec recover" not in str(error)
+        told = str(error)
+    if told:
+        assert "\n" not in told and str(path) in told and "flowrec recover" not in told
         assert not out.exists()
     else:
-        whole = {tick.stamp_ns: tick for tick in TICKS}
         with SessionReader(done.path) as reader:
-            assert {tick.stamp_ns for tick in reader.ticks()} <= set(whole)
+            assert {tick.stamp_ns for tick in reader.ticks()} <= {tick.stamp_ns for tick in TICKS}
