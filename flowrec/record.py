@@ -173,9 +173,8 @@ def record(
         facts["frames dropped"] = str(writer.dropped_frames)
         if math.isfinite(witness.rms_um):
             facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
-        outcome = {"outcome": report.outcome, "note": report.note} | {
-            key.replace(" ", "_"): value for key, value in facts.items()
-        }
+        outcome = {key.replace(" ", "_"): value for key, value in facts.items()}
+        outcome |= {"outcome": report.outcome, "note": report.note}
         writer.close(outcome)
     facts["file"] = f"{path} ({path.stat().st_size / 1e6:.1f} MB)"
     if view == "rrd":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -17,6 +18,9 @@ from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Ti
 from flowrec.pipeline import Inputs, Pipeline, step
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
+
+
+_SWITCH_S = 1e-4
 
 
 class Rig(Protocol):
@@ -222,6 +226,10 @@ def run(
         mark = now
 
     with ExitStack() as stack:
+        # Reader and writer threads need the interpreter for moments only; at the default of 5 ms each of their turns
+        # may cost a tick as much.
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_SWITCH_S)
         stack.callback(worker.close)
         stack.enter_context(rig)
         for arrived in rig.inputs():

@@ -58,7 +58,7 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
     said = reader.header.provenance
     width_um, height_um = chip.size_um
     facts = {
-        "outcome": reader.outcome.get("outcome", "unknown") + _bracketed(reader.outcome.get("note") or reader.outcome.get("reason", "")),
+        "outcome": reader.outcome.get("outcome", "unknown") + _bracketed(_why(reader.outcome)),
         "duration": f"{reader.duration_s:.1f} s",
         "size": f"{path.stat().st_size / 1e6:.1f} MB",
         "chip": f"{chip.name}, {width_um / 1000:.2f} x {height_um / 1000:.2f} mm, {len(chip.openings)} openings",
@@ -110,7 +110,7 @@ def _listed(path: Path) -> Listed:
     try:
         with SessionReader(path) as reader:
             head = reader.header
-            outcome = reader.outcome.get("outcome", "unknown"), reader.outcome.get("note") or reader.outcome.get("reason", "")
+            outcome = reader.outcome.get("outcome", "unknown"), _why(reader.outcome)
             chip = str(tomllib.loads(head.chip_toml).get("name", ""))
             return Listed(path.name, *outcome, size, reader.duration_s, chip, head.provenance.get("wall_time", ""))
     except (SessionError, tomllib.TOMLDecodeError) as error:
@@ -120,3 +120,8 @@ def _listed(path: Path) -> Listed:
 
 def _bracketed(text: str) -> str:
     return f" ({text})" if text else ""
+
+
+def _why(outcome: Mapping[str, str]) -> str:
+    """The note of a run that ended by itself, the reason of one that failed."""
+    return outcome.get("note") or outcome.get("reason", "")

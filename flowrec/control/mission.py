@@ -28,6 +28,8 @@ class Commander:
     goal_tolerance_um: float | None = None  # None: the robot's radius
     survey_limit_s: float = 120.0
     navigate_limit_s: float = 300.0
+    patience: float = 3.0  # no route is followed for longer than this many times its planned time, and 5 s
+    orders_limit: int = 20  # solved, refined and planned so often and still blown off: it is no use
     find_limit_s: float = 3.0  # to see the robot for the first time
     lost_limit_frames: int = 90  # in a row without seeing it before the run gives up
     replan_error_um: float | None = None  # None: six radii; blown this far off the route, plan anew
@@ -130,7 +132,7 @@ class Commander:
             return self._next_after("survey", previous, now_ns, estimate, "")
         if previous.phase == "survey":
             assert route is not None
-            late = seconds(now_ns - previous.since_ns) > self.survey_limit_s
+            late = seconds(now_ns - previous.since_ns) > self._limit_s(self.survey_limit_s, route)
             if late or self._at_end(estimate, route, demand, robot):
                 note = "survey cut short by its time limit" if late else ""
                 return self._next_after("survey", previous, now_ns, estimate, note)
@@ -142,18 +144,35 @@ class Commander:
             if not answer.reachable:
                 return self._finish(previous, now_ns, "unreachable", answer.reason)
             return self._next_after("plan", previous, now_ns, estimate, answer.reason)
-        return self._navigate(previous, now_ns, track, estimate, demand, robot)
+        assert route is not None
+        return self._navigate(previous, now_ns, track, estimate, route, demand, robot)
+
+    def _limit_s(self, limit_s: float, route: Route) -> float:
+        """How long a route may be followed: a robot that is stuck will not get there by waiting."""
+        return min(limit_s, self.patience * float(route.arrival_s[-1]) + 5.0)
 
     def _navigate(
-        self, previous: Mission, now_ns: int, track: Track, estimate: Estimate, demand: Demand | None, robot: Robot
+        self,
+        previous: Mission,
+        now_ns: int,
+        track: Track,
+        estimate: Estimate,
+        route: Route,
+        demand: Demand | None,
+        robot: Robot,
     ) -> Mission:
         tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else robot.radius
         if track.seen and math.dist(estimate.position_um, previous.goal_um) <= tolerance_um:
             return self._finish(previous, now_ns, "reached", "")
-        if seconds(now_ns - previous.since_ns) > self.navigate_limit_s:
-            return self._finish(previous, now_ns, "timeout", f"goal not reached in {self.navigate_limit_s:g} s")
+        limit_s = self._limit_s(self.navigate_limit_s, route)
+        if seconds(now_ns - previous.since_ns) > limit_s:
+            note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
+            return self._finish(previous, now_ns, "timeout", note)
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * robot.radius
         if track.seen and demand is not None and demand.error_um > limit_um:
+            if previous.request >= self.orders_limit:
+                note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
+                return self._finish(previous, now_ns, "gave up", note)
             note = f"blown {demand.error_um:.0f} um off the route: planning anew"
             return self._order(previous, now_ns, "plan", "route", estimate, note)
         return previous

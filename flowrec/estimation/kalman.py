@@ -8,6 +8,7 @@ has mean 2 when R and q are right.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -44,10 +45,8 @@ class Kalman:
         scale = (robot.max_speed_um_s / 600.0) ** 3 / (robot.radius / 50.0)
         q = self.flow_noise_um2_s3 if self.flow_noise_um2_s3 is not None else 1e4 * scale
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
-        # The filter lives for one step: all it knows is in the messages, so a replay can start anywhere.
-        kalman = KalmanFilter(dim_x=4, dim_z=2, dim_u=2)
-        kalman.H = _H
-        kalman.R = np.eye(2) * sigma_um**2
+        # State and covariance are set anew for every step: all that the filter knows is in the messages.
+        kalman = _filter(sigma_um)
         if previous is None:
             flow_um_s = 0.5 * robot.max_speed_um_s
             kalman.x = np.array([*track.position_um, 0.0, 0.0])
@@ -79,12 +78,23 @@ class Kalman:
         )
 
 
+@lru_cache(maxsize=8)
+def _filter(sigma_um: float) -> KalmanFilter:
+    """A filter for positions with this noise; making one costs as much as using it."""
+    kalman = KalmanFilter(dim_x=4, dim_z=2, dim_u=2)
+    kalman.H = _H
+    kalman.R = np.eye(2) * sigma_um**2
+    return kalman
+
+
+@lru_cache(maxsize=16)
 def _transition(dt: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     matrix = np.eye(4)
     matrix[0, 2] = matrix[1, 3] = dt
     return matrix
 
 
+@lru_cache(maxsize=16)
 def _noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """Process noise of a random-walk velocity over dt, with a random walk of the position on top."""
     noise = np.zeros((4, 4))

@@ -1,45 +1,46 @@
-"""What the robot looks like in bright field: a dark disc, a bright rim, both softened by defocus."""
+"""What the robot looks like in bright field: a dark disc within a bright rim, both softened by defocus."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
 
-import numba
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-_RIM = 0.35  # brightness of the rim, as a share of the disc's darkness
-_RIM_AT = 1.22  # its radius, in radii of the disc
-_REACH = 1.75  # the template ends here, in radii of the disc, beyond the rim
-_SOFT_PX = 1.0  # least blur of an edge by optics and pixels
+RIM_SHARE = 0.35  # brightness of the rim as a share of the disc's darkness, where nothing better is known
+_STEEP = 2.2
+_RIM_AT, _RIM_WIDTH = 2.0, 1.1  # in edge widths outside the outline
 
 
-def widths_px(radius_px: float) -> tuple[float, float, float]:
-    """Softness of the disc's edge, radius of the rim and its width, in pixels."""
-    soft = max(_SOFT_PX, 0.12 * radius_px)
-    return 0.5 * soft, _RIM_AT * radius_px, 0.6 * soft + 0.08 * radius_px
+@njit(cache=True)
+def profile(s: float) -> tuple[float, float, float, float]:
+    """Disc (1 inside, 0 outside) and rim at s edge widths outside the outline, and their derivatives by s."""
+    disc = 1.0 / (1.0 + math.exp(min(max(_STEEP * s, -40.0), 40.0)))
+    off = (s - _RIM_AT) / _RIM_WIDTH
+    rim = math.exp(-off * off)
+    return disc, rim, -_STEEP * disc * (1.0 - disc), -2.0 * off / _RIM_WIDTH * rim
 
 
-@numba.njit(cache=True)
-def brightness(distance: float, radius: float, soft: float, ring_at: float, ring_width: float) -> tuple[float, float]:
-    """Brightness against the background at a distance from the centre, and its derivative: -1 in the disc."""
-    edge = math.exp(min((distance - radius) / soft, 50.0))
-    off = (distance - ring_at) / ring_width
-    ring = _RIM * math.exp(-0.5 * off * off)
-    return -1.0 / (1.0 + edge) + ring, edge / (soft * (1.0 + edge) ** 2) - ring * off / ring_width
-
-
-def reach_px(radius_px: float) -> int:
-    """Half the side of the template: the square is 2 reach + 1 pixels wide."""
-    return math.ceil(_REACH * radius_px) + 1
+def edge_px(radius_px: float) -> float:
+    """Softness of the outline to begin with: the optics' and a share of the size, camera px."""
+    return math.hypot(0.9, 0.06 * radius_px)
 
 
 @lru_cache(maxsize=16)
-def template(radius_px: float) -> NDArray[np.float32]:
-    """The robot centred on the middle pixel of a square of 2 reach + 1 pixels a side."""
-    reach = reach_px(radius_px)
-    offsets = range(-reach, reach + 1)
-    widths = widths_px(radius_px)
-    square = [[brightness(math.hypot(x, y), radius_px, *widths)[0] for x in offsets] for y in offsets]
-    return np.array(square, np.float32)
+def template(radius_px: float, step: int) -> NDArray[np.float32]:
+    """The robot (n, n), n odd, in an image shrunk by `step`: disc -1, rim bright, background 0, mean 0."""
+    radius, edge = radius_px / step, edge_px(radius_px) / step + 0.3 * (step > 1)
+    half = math.ceil(1.15 * radius + 2.5 * edge)
+    fine = 4
+    axis = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
+    shape = np.empty((len(axis), len(axis)))
+    for row, y in enumerate(axis.tolist()):
+        for column, x in enumerate(axis.tolist()):
+            disc, rim, _, _ = profile((math.hypot(x, y) - radius) / edge)
+            shape[row, column] = RIM_SHARE * rim - disc
+    binned = shape.reshape(2 * half + 1, fine, 2 * half + 1, fine).mean(axis=(1, 3))
+    pattern = np.ascontiguousarray(binned - binned.mean(), np.float32)
+    pattern.flags.writeable = False
+    return pattern

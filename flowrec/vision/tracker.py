@@ -1,142 +1,180 @@
 """Frame to Track: where is the robot?
 
-Acquisition searches the whole channel with a matched filter and takes the darkest good likeness: debris is paler and
-smaller. Once locked, only a region around the last position is searched; it grows while the robot is out of sight,
-until the whole image is searched again. The centre is then fitted to a fraction of a pixel.
+Two ways to look, chosen from the previous message alone: near the last position, or, after it has been missing for a
+while, in the whole channel. Either way places that correlate with the robot's appearance are candidates, and each
+gets a disc fitted to sub-pixel precision. Near the last position the likest disc of the right size is the robot; in
+the whole channel the darkest of those, for debris is paler.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
-from flowrec.messages import Frame, Track
+from flowrec.messages import Frame, Image, Track
 from flowrec.robot import Robot
-from flowrec.vision.appearance import reach_px, template
-from flowrec.vision.fluid import FluidView, fluid_view
-from flowrec.vision.subpixel import Fit, fit_centre
+from flowrec.units import seconds
+from flowrec.vision.appearance import edge_px, template
+from flowrec.vision.disc import fit_disc
+from flowrec.vision.likeness import likeness
+from flowrec.vision.walls import Box, Walls, walls_in_view
 
-_COARSE_RADIUS_PX = 5.0  # a larger robot is first looked for in a smaller image
+_COARSE_RADIUS_PX = 2.5  # candidates are looked for at about this radius
+_FINE_RADIUS_PX = 6.0  # and measured at about this one, or as they are when smaller
+_LEAST_MATCH = 0.35  # correlation below which a place is not measured
+_SIZE_PX = 0.5  # blur hides so much of the radius of any disc
+_SURE = 0.92  # a score that needs no comparison
+
+
+@dataclass(frozen=True, slots=True)
+class _Disc:
+    """A robot, perhaps, in camera pixels and grey levels."""
+
+    x: float
+    y: float
+    radius_px: float
+    darkness: float
+    likeness: float
+    score: float  # likeness times agreement of size
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Where to look for discs, and how much like the robot they have to be. Lengths in camera pixels."""
+
+    box: Box  # of possible centres
+    centre: tuple[float, float]
+    reach: float  # from the centre; inf: anywhere
+    nominal_px: float
+    expected_px: float
+    margin_px: float
+    least_score: float
+    least_likeness: float
 
 
 @dataclass(frozen=True, slots=True)
 class Tracker:
-    """Finds the robot; its memory is the previous Track."""
+    """Finds the robot; its memory is the previous Track. Lengths that belong to the robot are in its radii."""
 
-    least_likeness: float = 0.45  # of filter and fit, 0 to 1, to be taken for the robot while locked
-    acquire_likeness: float = 0.6  # the same without knowing where to look
-    least_contrast: float = 12.0  # grey levels
-    search_radii: float = 2.5  # the region reaches so many radii around the last position ...
+    least_score: float = 0.55  # likeness times agreement of size, 0 to 1, to be taken for the robot while locked
+    acquire_score: float = 0.65  # the same when it was not seen just before: there is more to be mistaken
+    acquire_likeness: float = 0.82  # and the likeness alone: touching pieces of debris have its size, not its shape
+    least_contrast: float = 6.0  # darkness of the robot in grey levels
+    size_tolerance: float = 0.25  # one sigma of ln(seen radius / expected radius)
+    search_radii: float = 2.0  # how far from the last position to look, besides what v_max allows ...
     search_px: float = 8.0  # ... and at least so many pixels
-    reacquire_after: int = 10  # frames without the robot, then the whole image is searched
-    candidates: int = 6  # best likenesses that are fitted and compared when acquiring
+    reach_speed: float = 3.0  # farthest drift since the last frame, in v_max dt: its own speed and the flow's
+    reacquire_after: int = 10  # frames without the robot, then the whole channel is searched
+    wall_margin_um: float = 18.0  # this near to a wall its own image spoils that of the robot
+    candidates: int = 6  # measured at most per image
 
     def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
         """The robot in this frame; `seen` False keeps the last position (the image's centre before the first)."""
-        radius_px = robot.radius / calibration.um_per_px
-        view = fluid_view(chip, calibration, frame.image.shape, radius_px)
-        locked = previous is not None and (previous.seen or 0 < previous.lost_frames <= self.reacquire_after)
-        if locked and previous is not None and previous.score > 0:
-            region = self._region(previous, calibration, radius_px, view)
-            # Out of sight a poor likeness is rather a piece of debris that came along.
-            least = self.acquire_likeness if previous.lost_frames else self.least_likeness
-            fits = self._find(frame.image, view, region, radius_px, least, 2)
-        else:
-            region = view.box
-            fits = self._find(frame.image, view, region, radius_px, self.acquire_likeness, self.candidates)
-        roi = np.array(region, np.float64)
-        if not fits:
-            return self._unseen(previous, frame, calibration, radius_px, roi)
-        best = max(fits, key=lambda fit: fit.contrast * fit.likeness)
+        height, width = frame.image.shape
+        walls = walls_in_view(chip, calibration, (height, width))
+        search = self._plan(previous, frame, walls, calibration, robot)
+        found = self._search(frame.image, walls, search)
+        roi = np.array(search.box, np.float64)
+        if found is None:
+            middle = calibration.to_um(((width - 1) / 2, (height - 1) / 2))
+            return Track(
+                stamp_ns=frame.stamp_ns,
+                seen=False,
+                position_um=middle if previous is None else previous.position_um,
+                score=0.0 if previous is None else previous.score,
+                lost_frames=1 if previous is None else previous.lost_frames + 1,
+                radius_px=search.expected_px,
+                roi_px=roi,
+            )
+        # The radius follows slowly: focus drifts, single frames mislead.
+        radius_px = search.expected_px + 0.05 * (found.radius_px - search.expected_px)
         return Track(
             stamp_ns=frame.stamp_ns,
             seen=True,
-            position_um=calibration.to_um(best.centre_px),
-            score=min(max(best.likeness, 0.0), 1.0),
+            position_um=calibration.to_um((found.x, found.y)),
+            score=found.score,
             lost_frames=0,
-            radius_px=radius_px,
+            radius_px=min(max(radius_px, 0.75 * search.nominal_px), 1.35 * search.nominal_px),
             roi_px=roi,
         )
 
-    def _region(
-        self, previous: Track, calibration: Calibration, radius_px: float, view: FluidView
-    ) -> tuple[int, int, int, int]:
-        """Where to search: x0, y0, x1, y1 of possible centres around the last position."""
-        x, y = calibration.to_px(previous.position_um)
-        margin = max(self.search_radii * radius_px, self.search_px) * (1 + previous.lost_frames)
-        x0, y0, x1, y1 = view.box
-        left, top = max(x0, int(x - margin)), max(y0, int(y - margin))
-        return left, top, max(left + 1, min(x1, int(x + margin) + 2)), max(top + 1, min(y1, int(y + margin) + 2))
+    def _plan(
+        self, previous: Track | None, frame: Frame, walls: Walls, calibration: Calibration, robot: Robot
+    ) -> _Search:
+        """Where to look, from the previous message."""
+        nominal = robot.radius / calibration.um_per_px
+        margin = min(max(self.wall_margin_um / calibration.um_per_px, 1.0), 0.5 * nominal)
+        # A score of 0 says that it was never seen.
+        if previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after:
+            expected = nominal if previous is None else previous.radius_px
+            return _Search(
+                walls.box, (0.0, 0.0), math.inf, nominal, expected, margin, self.acquire_score, self.acquire_likeness
+            )
+        x, y = calibration.to_px(previous.position_um).tolist()
+        dt = seconds(frame.stamp_ns - previous.stamp_ns) / (1 + previous.lost_frames)
+        drift = self.reach_speed * robot.speed_limit_um_s * dt / calibration.um_per_px
+        reach = max(self.search_radii * previous.radius_px + drift, self.search_px) * (1 + previous.lost_frames)
+        x0, y0, x1, y1 = walls.box
+        left, top = max(math.floor(x - reach), x0), max(math.floor(y - reach), y0)
+        box = (left, top, min(math.ceil(x + reach) + 1, x1), min(math.ceil(y + reach) + 1, y1))
+        # Out of sight a poor likeness is rather a piece of debris that came along.
+        least = (self.acquire_score, self.acquire_likeness) if previous.lost_frames else (self.least_score, 0.0)
+        return _Search(box, (x, y), reach, nominal, previous.radius_px, margin, *least)
 
-    def _find(
-        self,
-        image: NDArray[np.uint8],
-        view: FluidView,
-        region: tuple[int, int, int, int],
-        radius_px: float,
-        least_likeness: float,
-        candidates: int,
-    ) -> list[Fit]:
-        """Fits of the best likenesses with centres in the region."""
-        shrink = max(1, int(radius_px / _COARSE_RADIUS_PX))
-        x0, y0, x1, y1 = region
-        reach = reach_px(radius_px / shrink)
-        pad = reach * shrink
-        # A border of the image is filled in, so that a robot half outside is still found.
-        left, top = x0 - pad, y0 - pad
-        right, bottom = x1 + pad + shrink, y1 + pad + shrink
-        cut: NDArray[Any] = image[max(top, 0) : min(bottom, image.shape[0]), max(left, 0) : min(right, image.shape[1])]
-        outside = (max(-top, 0), max(bottom - image.shape[0], 0), max(-left, 0), max(right - image.shape[1], 0))
-        if any(outside):
-            cut = cv2.copyMakeBorder(cut, *outside, cv2.BORDER_REPLICATE)
-        allowed = view.centres[y0:y1, x0:x1]
-        if shrink > 1:
-            cut = cv2.resize(cut, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA)
-        likeness = cv2.matchTemplate(
-            cut.astype(np.float32), template(round(radius_px / shrink, 3)), cv2.TM_CCOEFF_NORMED
+    def _search(self, image: Image, walls: Walls, search: _Search) -> _Disc | None:
+        """The best disc in reach."""
+        x0, y0, x1, y1 = search.box
+        if x1 <= x0 or y1 <= y0:
+            return None
+        nominal = search.nominal_px
+        step = max(1, int(nominal / _COARSE_RADIUS_PX))
+        match = likeness(
+            image, walls.distance_px, search.box, step, search.margin_px, 0.7 * nominal, template(nominal, step)
         )
-        rows = min(likeness.shape[0], -(-allowed.shape[0] // shrink))
-        columns = min(likeness.shape[1], -(-allowed.shape[1] // shrink))
-        likeness = np.where(allowed[::shrink, ::shrink][:rows, :columns], likeness[:rows, :columns], -1.0)
-        fits: list[Fit] = []
-        for _ in range(candidates):
-            _, peak, _, (column, row) = cv2.minMaxLoc(likeness)
-            if peak < 0.8 * least_likeness:
+        rows, columns = match.shape
+        offset = 0.5 * (step - 1)
+        near = math.isfinite(search.reach)
+        if near:
+            dx = x0 + offset - search.centre[0] + step * np.arange(columns, dtype=np.float32)
+            dy = y0 + offset - search.centre[1] + step * np.arange(rows, dtype=np.float32)
+            away = ((dx * dx)[None] + (dy * dy)[:, None]) / np.float32(search.reach**2)
+            match = np.where(away <= 1.0, match - np.float32(0.1) * away, np.float32(-1.0))
+        best, best_worth = None, 0.0
+        hide = max(1, round(nominal / step))
+        for _ in range(self.candidates):
+            row, column = divmod(int(match.argmax()), columns)
+            if match[row, column] < _LEAST_MATCH:
                 break
-            start = (x0 + column * shrink + 0.5 * (shrink - 1), y0 + row * shrink + 0.5 * (shrink - 1))
-            fit = fit_centre(image, view.open, start, radius_px)
-            if (
-                fit is not None
-                and fit.contrast >= self.least_contrast
-                and fit.likeness >= least_likeness
-                and max(abs(fit.centre_px[0] - start[0]), abs(fit.centre_px[1] - start[1])) <= 1.0 + shrink
-            ):
-                fits.append(fit)
-            cv2.circle(likeness, (column, row), max(2, round(radius_px / shrink)), -1.0, -1)
-        return fits
+            match[max(row - hide, 0) : row + hide + 1, max(column - hide, 0) : column + hide + 1] = -1.0
+            found = self._measure(image, walls, x0 + offset + step * column, y0 + offset + step * row, search)
+            if found is None or found.score < search.least_score or found.likeness < search.least_likeness:
+                continue
+            worth = found.score * found.darkness
+            if near:
+                distance2 = (found.x - search.centre[0]) ** 2 + (found.y - search.centre[1]) ** 2
+                worth = found.score - 0.1 * distance2 / search.reach**2
+            if worth > best_worth:
+                best, best_worth = found, worth
+            if near and found.score > _SURE:
+                break
+        return best
 
-    @staticmethod
-    def _unseen(
-        previous: Track | None,
-        frame: Frame,
-        calibration: Calibration,
-        radius_px: float,
-        roi: NDArray[np.float64],
-    ) -> Track:
-        rows, columns = frame.image.shape
-        centre = calibration.to_um(((columns - 1) / 2, (rows - 1) / 2))
-        return Track(
-            stamp_ns=frame.stamp_ns,
-            seen=False,
-            position_um=centre if previous is None else previous.position_um,
-            score=0.0 if previous is None else previous.score,
-            lost_frames=1 if previous is None else previous.lost_frames + 1,
-            radius_px=radius_px,
-            roi_px=roi,
+    def _measure(self, image: Image, walls: Walls, x: float, y: float, search: _Search) -> _Disc | None:
+        """Fit a disc near a candidate; None when there is none of the robot's kind."""
+        expected = search.expected_px
+        step = max(1, int(search.nominal_px / _FINE_RADIUS_PX))
+        fx, fy, radius_px, darkness, alike = fit_disc(
+            image, walls.distance_px, search.margin_px, x, y, expected, edge_px(expected), step
         )
+        if darkness < self.least_contrast or math.hypot(fx - x, fy - y) > max(1.2 * expected, 2.0):
+            return None
+        height, width = image.shape
+        row, column = min(max(round(fy), 0), height - 1), min(max(round(fx), 0), width - 1)
+        if walls.distance_px[row, column] < 0.6 * search.nominal_px:
+            return None
+        size = math.log(radius_px / expected) / math.hypot(self.size_tolerance, _SIZE_PX / expected)
+        return _Disc(fx, fy, radius_px, darkness, alike, alike * math.exp(-0.5 * size * size))

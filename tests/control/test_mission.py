@@ -1,0 +1,150 @@
+"""The commander: order of phases, waiting for work, and every way to end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from flowrec.control.mission import Commander
+from flowrec.messages import Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
+from flowrec.robot import Robot
+
+ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0)
+GOAL = (1000.0, 500.0)
+
+
+def field(request: int) -> FlowField:
+    return FlowField(0, request, "fvm", 20.0, np.zeros((4, 4, 2)), np.zeros((4, 4)), None, [1.0], 1.0, 1000.0, "")
+
+
+def route(request: int, reachable: bool = True) -> Route:
+    points = [[0.0, 500.0], GOAL] if reachable else np.zeros((0, 2))
+    return Route(
+        0, request, "astar_time", reachable, "" if reachable else "too narrow", points, [0.0, 4.0][: len(points)]
+    )
+
+
+class World:
+    """Feeds a commander, second by second, with a robot at a place and results as they are handed over."""
+
+    def __init__(self, **settings) -> None:  # type: ignore[no-untyped-def]
+        self.commander = Commander(start=(0.0, 500.0), goal=GOAL, **settings)
+        self.mission: Mission | None = None
+        self.time_s = 0.0
+        self.results: dict[str, object] = {"assumed": None, "refined": None, "route": None}
+
+    def tick(self, at=(0.0, 500.0), seen=True, error_um=0.0, operator="", lost=0, **results) -> Mission:  # type: ignore[no-untyped-def]
+        self.results |= results
+        stamp = round(self.time_s * 1e9)
+        track = Track(stamp, seen, at, 0.9, lost, 5.0, np.zeros(4))
+        estimate = Estimate(stamp, at, np.zeros(2), np.eye(4), math.nan, at, seen)
+        demand = Demand(stamp, np.zeros(2), at, 0.0, error_um, False, np.zeros((0, 2)))
+        event = OperatorEvent(stamp, operator, "") if operator else None
+        self.mission = self.commander.decide(
+            self.mission,
+            track,
+            estimate,
+            *self.results.values(),
+            event,
+            demand,
+            ROBOT,  # type: ignore[arg-type]
+        )
+        self.time_s += 1.0
+        return self.mission
+
+
+def test_a_whole_mission_goes_through_its_phases_and_waits_for_each_result() -> None:
+    world = World()
+    assert (world.tick().phase, world.tick().wanted) == ("start", "solve")
+    assert world.tick(assumed=field(1)).wanted == "survey_route"
+    assert world.tick().request == 2
+    assert world.tick(route=route(2)).phase == "survey"
+    assert world.tick(at=GOAL).wanted == "refine"
+    assert world.tick(refined=field(3)).wanted == "route"
+    assert world.tick(route=route(3)).phase == "plan"  # an answer to another order is none
+    assert world.tick(route=route(4)).phase == "navigate"
+    assert world.tick(at=(500.0, 500.0)).phase == "navigate"
+    done = world.tick(at=GOAL)
+    assert done.finished
+    assert done.outcome == "reached"
+    assert world.tick() is done
+
+
+def test_the_previous_message_itself_is_returned_while_nothing_changes() -> None:
+    world = World()
+    first = world.tick()
+    assert world.tick() is first
+
+
+def test_an_unreachable_goal_ends_the_run_before_anything_is_risked() -> None:
+    world = World(phases=("navigate",))
+    world.tick()
+    assert world.tick(assumed=field(1)).wanted == "route"
+    done = world.tick(route=route(2, reachable=False))
+    assert (done.outcome, done.note) == ("unreachable", "too narrow")
+
+
+def test_a_field_of_an_earlier_session_needs_no_solving() -> None:
+    world = World(phases=("navigate",))
+    assert world.tick(assumed=field(0)).wanted == ""
+    assert world.tick().wanted == "route"
+
+
+def test_the_operator_stops_everything() -> None:
+    world = World()
+    world.tick()
+    assert world.tick(operator="mark").outcome == ""
+    assert world.tick(operator="stop").outcome == "stopped"
+
+
+def test_a_robot_never_seen_is_not_found_and_one_lost_for_long_is_lost() -> None:
+    world = World()
+    outcomes = [world.tick(seen=False).outcome for _ in range(6)]
+    assert outcomes[-1] == "not found"
+    world = World(phases=("navigate",))
+    world.tick(assumed=field(0))
+    world.tick()
+    world.tick(route=route(1))
+    assert world.tick(seen=False, lost=10).outcome == ""
+    assert world.tick(seen=False, lost=91).outcome == "lost"
+
+
+def test_nothing_is_begun_with_a_robot_out_of_sight() -> None:
+    world = World(phases=("navigate",))
+    world.tick(assumed=field(0))
+    world.tick()
+    assert world.tick(seen=False, lost=1, route=route(1)).phase == "plan"
+    assert world.tick().phase == "navigate"
+
+
+def test_blown_off_its_route_the_robot_plans_anew_from_where_it_is_until_it_is_no_use() -> None:
+    world = World(phases=("navigate",), orders_limit=4)
+    world.tick(assumed=field(0))
+    world.tick()
+    for request in (1, 2, 3):
+        assert world.tick(route=route(request)).phase == "navigate"
+        ordered = world.tick(at=(300.0, 800.0), error_um=400.0)
+        assert ordered.wanted == "route"
+        np.testing.assert_array_equal(ordered.start_um, [300.0, 800.0])
+    world.tick(route=route(4))
+    assert world.tick(error_um=400.0).outcome == "gave up"
+
+
+def test_a_robot_that_is_stuck_does_not_wait_for_ever() -> None:
+    world = World(phases=("navigate",), patience=2.0)
+    world.tick(assumed=field(0))
+    world.tick()
+    world.tick(route=route(1))
+    outcomes = [world.tick().outcome for _ in range(15)]
+    assert outcomes[-1] == "timeout"
+    assert outcomes.index("timeout") == 13  # 2 x 4 s and 5 s
+
+
+def test_a_mission_message_is_new_whenever_it_is_another_object() -> None:
+    world = World()
+    first = world.tick()
+    second = world.tick(assumed=field(1))
+    assert second.stamp_ns > first.stamp_ns
+    assert replace(second, stamp_ns=first.stamp_ns).request == 2
