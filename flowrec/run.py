@@ -19,7 +19,6 @@ from flowrec.pipeline import Inputs, Pipeline, step
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
 
-
 _SWITCH_S = 1e-4
 
 
