@@ -119,6 +119,7 @@ def replay(
     """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
     from flowrec import replay as verb
     from flowrec.status import say, table
+    from flowrec.whatif import before_and_after
 
     change = verb.Change(refine, plan, observer, controller, tuple(sets or ()))
     if verify and refly:
@@ -133,11 +134,11 @@ def replay(
             for line in lines:
                 typer.echo(line)
         raise typer.Exit(0 if same else 3)
-    rows = verb.before_and_after(done)
+    rows = before_and_after(done)
     if refly:
-        rows += verb.refly(
-            done, target.with_name(f"{target.stem}_refly.mcap") if target is not None else None, overwrite
-        )
+        from flowrec.refly import refly as fly_both
+
+        rows += fly_both(done, target.with_name(f"{target.stem}_refly.mcap") if target is not None else None, overwrite)
     if as_json:
         typer.echo(
             json.dumps(

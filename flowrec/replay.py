@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -15,20 +14,16 @@ from flowrec.chip.chip import Chip
 from flowrec.compare import Comparison
 from flowrec.config import Config, with_sets
 from flowrec.errors import SessionError, UsageError
-from flowrec.flow import sample
-from flowrec.flow.metrics import relative_rmse
-from flowrec.messages import Demand, FlowField, Observations, Route, Tick
+from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.planning import travel_time
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.rigs.simulated import SimulatedRig
-from flowrec.run import LockstepWorker, Preloaded, RunReport, Sink, StopSwitch, run
-from flowrec.session import file_sha256, length_mm, open_session, session_header
-from flowrec.status import progress, say
+from flowrec.run import LockstepWorker, RunReport, Sink, StopSwitch, run
+from flowrec.session import file_sha256, open_session, session_header
+from flowrec.status import progress
 from flowrec.store import SessionReader, SessionWriter
 from flowrec.topics import BY_FIELD
 from flowrec.units import nanoseconds, seconds
-from flowrec.work import FILLS, no_observations, work
+from flowrec.work import FILLS, work
 
 # Which results of the worker a changed section makes stale.
 STALE: dict[str, frozenset[str]] = {
@@ -317,7 +312,7 @@ def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick
             wanted="route",
             request=number + 1,
             requested_ns=stamp_ns,
-            start_um=_planned_from(recorded, last),
+            start_um=planned_from(recorded, last),
         )
         route = work(pipeline, replace(tick, mission=order))
         assert isinstance(route, Route)
@@ -325,144 +320,12 @@ def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick
     return tick if tick.refined is not last.refined or tick.route is not last.route else last
 
 
-def _planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
+def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
     """Where the recorded route began, else where the robot is."""
     if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
         return np.array(recorded.route.waypoints_um[0], np.float64)
     assert last.estimate is not None
     return last.estimate.position_um
-
-
-def residual_um_s(flow: FlowField, observations: Observations) -> float:
-    """Root mean square of observed minus mapped flow, um/s, both components together."""
-    miss = observations.flow_um_s - sample(flow, observations.position_um)
-    return float(np.sqrt((miss**2).sum(axis=1).mean())) if len(miss) else math.nan
-
-
-def before_and_after(done: Replayed) -> list[tuple[str, str, str]]:
-    """Rows of quantity, recorded, replayed: what the change is worth."""
-    was, now = done.recorded, done.replayed
-    rows: list[tuple[str, str, str]] = []
-
-    def flow_error(flow: FlowField | None) -> str:
-        if flow is None or done.true_field is None:
-            return "-"
-        return f"{100 * relative_rmse(flow, done.true_field, done.chip.mask).v:.1f} %"
-
-    observations = now.observations or was.observations or no_observations(0)
-    rows.append(("map", _map_name(was), _map_name(now)))
-    if done.true_field is not None:
-        rows.append(("flow error, assumed", flow_error(was.assumed), flow_error(now.assumed)))
-        rows.append(("flow error, refined", flow_error(was.refined), flow_error(now.refined)))
-    if len(observations.position_um) and was.field is not None and now.field is not None:
-        rows.append(
-            (
-                f"residual of {len(observations.position_um)} observations",
-                f"{residual_um_s(was.field, observations):.1f} um/s",
-                f"{residual_um_s(now.field, observations):.1f} um/s",
-            )
-        )
-    if was.route is not None or now.route is not None:
-        rows.append(("planner", _planner(was.route), _planner(now.route)))
-        rows.append(("path length", _length(was.route), _length(now.route)))
-        if now.field is not None:
-            limit = done.config.plan.speed_share * done.config.robot.speed_limit_um_s
-            rows.append(
-                (
-                    f"travel time on the {now.field.method} map",
-                    _time_on(was.route, now.field, limit),
-                    _time_on(now.route, now.field, limit),
-                )
-            )
-    commands = done.commands
-    since = f", first at {seconds(commands.first_ns):.2f} s" if commands.first_ns is not None else ""
-    rows.append(
-        (
-            "commands that differ",
-            "-",
-            f"{commands.changed} of {commands.compared} ticks (rms {commands.rms_um_s:.0f} um/s{since})",
-        )
-    )
-    return rows
-
-
-def _map_name(tick: Tick) -> str:
-    return tick.field.method if tick.field is not None else "none"
-
-
-def _planner(route: Route | None) -> str:
-    return "none" if route is None else route.method if route.reachable else f"{route.method}: unreachable"
-
-
-def _length(route: Route | None) -> str:
-    return f"{length_mm(route):.2f} mm" if route is not None and route.reachable else "-"
-
-
-def _time_on(route: Route | None, flow: FlowField, limit_um_s: float) -> str:
-    if route is None or not route.reachable:
-        return "-"
-    arrival_s, feasible = travel_time(flow, route.waypoints_um, limit_um_s)
-    return f"{arrival_s[-1]:.1f} s" if feasible else "can not be followed"
-
-
-def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tuple[str, str, str]]:
-    """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
-
-    Both start where the recorded route began and use the same seed; rows of quantity, recorded, replayed.
-    """
-    flow = done.replayed.field
-    if flow is None or done.recorded.mission is None or done.recorded.route is None:
-        raise UsageError(
-            "--refly: the session has no map or no route to fly; replay it with --refine --plan astar_time"
-        )
-    source_config = open_session(done.source)[1]
-    start = tuple(float(value) for value in _planned_from(done.recorded, done.replayed))
-    flights = {
-        "recorded": (source_config, done.recorded, None),
-        "replayed": (done.config, done.replayed, out),
-    }
-    reports: dict[str, RunReport] = {}
-    for name, (config, tick, target) in flights.items():
-        assert len(start) == 2
-        mission = replace(config.mission, phases=("plan", "navigate"), start=start, replan_error_um=None)
-        flown = replace(config, mission=mission)
-        pipeline = assemble(flown, done.chip)
-        rig = SimulatedRig(
-            done.chip, flown.robot, pipeline.calibration, flown.camera, flown.simulated, start, true_field=flow
-        )
-        known: Mapping[str, FlowField] = {
-            key: value for key in ("assumed", "refined") if (value := getattr(tick, key)) is not None
-        }
-        worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
-        sinks: list[Sink] = []
-        with ExitStack() as stack:
-            if target is not None:
-                parent = {"file": done.source.name, "sha256": file_sha256(done.source)}
-                header = session_header(flown, done.chip, parent)
-                writer = stack.enter_context(SessionWriter(target, header, block=True, overwrite=overwrite))
-                sinks.append(writer)
-            say(f"reflying as {name} ...")
-            reports[name] = report = run(pipeline, rig, worker, sinks)
-            if target is not None:
-                writer.close({"outcome": report.outcome, "note": f"refly of {done.source.name}"})
-    was, now = reports["recorded"], reports["replayed"]
-    return [
-        ("reflown: outcome", was.outcome, now.outcome),
-        ("reflown: navigation", _navigation_s(was), _navigation_s(now)),
-        ("reflown: wall contacts", str(was.contacts), str(now.contacts)),
-    ]
-
-
-def _navigation_s(report: RunReport) -> str:
-    """Time from the adopted route to the end."""
-    mission, route = report.last.mission, report.last.route
-    if mission is None or route is None or not mission.finished:
-        return "-"
-    return (
-        f"{seconds(mission.since_ns - route.stamp_ns):.1f} s (planned {route.arrival_s[-1]:.1f} s)"
-        if len(route.arrival_s)
-        else "-"
-    )
 
 
 def verdict(done: Replayed) -> tuple[bool, list[str]]:

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flowrec import replay as verb
 from flowrec.config import load_config
 from flowrec.record import GOOD_ENDS, Recorded, record
+from flowrec.refly import refly
 from flowrec.store import SessionReader
 from tests.conftest import SMALL
 
@@ -49,15 +51,18 @@ def test_upstream_it_takes_the_long_slow_branch_and_arrives(upstream: Recorded) 
     assert np.all(rows < ISLAND_ROW_UM)
 
 
-def test_the_paper_planner_goes_upstream_the_same_way_but_slower(upstream: Recorded) -> None:
-    from flowrec import replay as verb
-
+def test_the_paper_planner_goes_upstream_the_same_way_but_slower(upstream: Recorded, tmp_path: Path) -> None:
     done = verb.replay(upstream.path, verb.Change(plan="astar_paper"))
     assert done.replayed.route is not None
     assert done.recorded.route is not None
     assert done.replayed.route.method == "astar_paper"
     assert done.replayed.route.waypoints_um[:, 1].min() < ISLAND_ROW_UM - 500.0
     assert done.replayed.route.arrival_s[-1] > done.recorded.route.arrival_s[-1]
+    flown = {row[0]: row[1:] for row in refly(done, tmp_path / "flown.mcap")}
+    assert flown["reflown: outcome"] == ("reached", "reached")
+    ours_s, paper_s = (float(text.split()[0]) for text in flown["reflown: navigation"])
+    assert paper_s > ours_s
+    assert SessionReader(tmp_path / "flown.mcap").outcome["outcome"] == "reached"
 
 
 def test_a_robot_slower_than_the_flow_says_that_it_can_not_go_back(tmp_path: Path) -> None:

@@ -1,0 +1,79 @@
+"""`flowrec replay --refly`: close the loop that a replay leaves open, in a simulator whose flow is the replay's map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from flowrec.errors import UsageError
+from flowrec.messages import FlowField
+from flowrec.pipeline import assemble
+from flowrec.replay import Replayed, planned_from
+from flowrec.rigs.simulated import SimulatedRig
+from flowrec.run import LockstepWorker, Preloaded, RunReport, Sink, run
+from flowrec.session import file_sha256, open_session, session_header
+from flowrec.status import say
+from flowrec.store import SessionWriter
+from flowrec.units import seconds
+
+
+def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tuple[str, str, str]]:
+    """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
+
+    Both start where the recorded route began and use the same seed; rows of quantity, recorded, replayed.
+    """
+    flow = done.replayed.field
+    if flow is None or done.recorded.mission is None or done.recorded.route is None:
+        raise UsageError(
+            "--refly: the session has no map or no route to fly; replay it with --refine --plan astar_time"
+        )
+    source_config = open_session(done.source)[1]
+    start = tuple(float(value) for value in planned_from(done.recorded, done.replayed))
+    flights = {
+        "recorded": (source_config, done.recorded, None),
+        "replayed": (done.config, done.replayed, out),
+    }
+    reports: dict[str, RunReport] = {}
+    for name, (config, tick, target) in flights.items():
+        assert len(start) == 2
+        mission = replace(config.mission, phases=("plan", "navigate"), start=start, replan_error_um=None)
+        flown = replace(config, mission=mission)
+        pipeline = assemble(flown, done.chip)
+        rig = SimulatedRig(
+            done.chip, flown.robot, pipeline.calibration, flown.camera, flown.simulated, start, true_field=flow
+        )
+        known: Mapping[str, FlowField] = {
+            key: value for key in ("assumed", "refined") if (value := getattr(tick, key)) is not None
+        }
+        worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
+        sinks: list[Sink] = []
+        with ExitStack() as stack:
+            if target is not None:
+                parent = {"file": done.source.name, "sha256": file_sha256(done.source)}
+                header = session_header(flown, done.chip, parent)
+                writer = stack.enter_context(SessionWriter(target, header, block=True, overwrite=overwrite))
+                sinks.append(writer)
+            say(f"reflying as {name} ...")
+            reports[name] = report = run(pipeline, rig, worker, sinks)
+            if target is not None:
+                writer.close({"outcome": report.outcome, "note": f"refly of {done.source.name}"})
+    was, now = reports["recorded"], reports["replayed"]
+    return [
+        ("reflown: outcome", was.outcome, now.outcome),
+        ("reflown: navigation", _navigation_s(was), _navigation_s(now)),
+        ("reflown: wall contacts", str(was.contacts), str(now.contacts)),
+    ]
+
+
+def _navigation_s(report: RunReport) -> str:
+    """Time from the adopted route to the end."""
+    mission, route = report.last.mission, report.last.route
+    if mission is None or route is None or not mission.finished:
+        return "-"
+    return (
+        f"{seconds(mission.since_ns - route.stamp_ns):.1f} s (planned {route.arrival_s[-1]:.1f} s)"
+        if len(route.arrival_s)
+        else "-"
+    )
