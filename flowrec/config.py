@@ -30,7 +30,7 @@ from flowrec.estimation import Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
-from flowrec.robot import Robot
+from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.settings import CameraSettings, Simulated
 from flowrec.vision import Tracker
 
@@ -132,7 +132,8 @@ def resolve(config: Config, chip: Chip) -> Config:
     """Fill in what was left to fit the chip, place the camera, and turn named places into points.
 
     A robot that nobody described is made to suit the chip: radius 50 um, or a fifth of the median channel width
-    where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow.
+    where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; 40 ms from command to motion, or as long as
+    it takes at v_max through a fifth of a channel.
     """
     camera, robot = config.camera, config.robot
     width_um, height_um = chip.size_um
@@ -150,6 +151,11 @@ def resolve(config: Config, chip: Chip) -> Config:
     assert robot.max_speed_um_s is not None
     if robot.max_speed_um_s <= 0:
         raise UsageError(f"robot.max_speed_um_s = {robot.max_speed_um_s:g}: the robot must move; give a positive speed")
+    assert robot.max_speed_um_s is not None
+    if robot.delay_s is None:
+        crossing_s = 0.2 * median_width_um(chip) / robot.max_speed_um_s
+        robot = replace(robot, delay_s=round(min(USUAL_DELAY_S, crossing_s), 5))
+    assert robot.max_speed_um_s is not None
     if robot.step_out_hz is None:
         robot = replace(robot, step_out_hz=1.2 * robot.max_speed_um_s / robot.um_per_rev)
     assert robot.max_speed_um_s is not None

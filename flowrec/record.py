@@ -79,10 +79,10 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
                 f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
                 f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
             )
-    blind_um = config.robot.delay_s * config.robot.max_speed_um_s
+    blind_um = config.robot.delay * config.robot.max_speed_um_s
     if blind_um > 0.5 * median_width_um(chip):
         warn(
-            f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at "
+            f"in the {1e3 * config.robot.delay:.0f} ms from command to motion a robot at "
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )

@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass
 
 
+USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
+
+
 @dataclass(frozen=True, slots=True)
 class Robot:
     """Kinematics xdot = u (cos phi, sin phi) + v(x) with u = k f (the paper's eq. kinematic).
@@ -18,13 +21,18 @@ class Robot:
     max_speed_um_s: float | None = None  # v_max, relative to the fluid
     step_out_hz: float | None = None  # above it the robot no longer follows the field
     step_out_margin: float = 0.9  # share of the step-out frequency that is ever commanded
-    delay_s: float = 0.04  # from command to motion
+    delay_s: float | None = None  # from command to motion; 0.04 where the channel leaves time for it
 
     @property
     def radius(self) -> float:
         """Radius in um of a resolved robot."""
         assert self.radius_um is not None, "robot.radius_um is resolved with the chip"
         return self.radius_um
+
+    @property
+    def delay(self) -> float:
+        """From command to motion, s."""
+        return USUAL_DELAY_S if self.delay_s is None else self.delay_s
 
     @property
     def speed_limit_um_s(self) -> float:

@@ -20,6 +20,8 @@ from flowrec.units import seconds
 
 Vector = NDArray[np.float64]
 _FOLLOWING = ("survey", "navigate")
+_USUAL_RADII_PER_S = 12.0
+_LARGEST_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +44,9 @@ class Controller:
 
     vector: u = sat(xd_dot - v(x+) + Kp (xd - x+)); x+ is the estimate rolled forward over the demands still on
     their way to the coils. ff_fb: the paper's feedforward-feedback law, made sound.
+
+    Rates and times are meant for a robot that swims up to 12 of its radii in a second. For one that is faster, in
+    smaller or swifter vessels, they are that much quicker, as far as the frame rate allows.
     """
 
     method: Literal["vector", "ff_fb"] = "vector"
@@ -80,8 +85,8 @@ class Controller:
             return previous
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
-        belief = blend(field, estimate, sent, self.map_error, self.observer_lag_s)
-        point = roll_forward(estimate.position_um, sent, dt_s, robot.delay_s, belief)
+        belief = blend(field, estimate, sent, self.map_error, self.observer_lag_s / _hurry(robot))
+        point = roll_forward(estimate.position_um, sent, dt_s, robot.delay, belief)
         aim = self._aim(previous, mission, route, estimate, point, robot, dt_s)
         error = aim.reference_um - estimate.position_um
         demand, saturated = np.zeros(2), False
@@ -96,7 +101,7 @@ class Controller:
             progress_s=aim.progress_s,
             error_um=math.hypot(error[0], error[1]),
             saturated=saturated,
-            sent_um_s=remembered(sent, demand, dt_s, robot.delay_s),
+            sent_um_s=remembered(sent, demand, dt_s, robot.delay),
         )
 
     def _aim(
@@ -124,7 +129,7 @@ class Controller:
                 self.lag_full_radii * robot.radius,
             )
             progress_s = min(previous.progress_s + pace * dt_s, float(route.arrival_s[-1]))
-        then_s = progress_s + pace * robot.delay_s
+        then_s = progress_s + pace * robot.delay
         return _Aim(
             reference_um=place_on(route, progress_s),
             reference_then_um=place_on(route, then_s),
@@ -162,7 +167,7 @@ class Controller:
         limit_um_s = robot.speed_limit_um_s
         if self.method == "vector":
             flow = belief.at(point)
-            wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, self.kp_per_s)
+            wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, _quicker(self.kp_per_s, robot, dt_s))
             demand, cut = saturated(wanted, flow, limit_um_s)
         else:
             point = estimate.position_um
@@ -172,7 +177,7 @@ class Controller:
         if clearance_um is None or self.guard_radii <= 0.0:
             return demand, cut
         keep_um = self.guard_radii * robot.radius
-        demand = guarded(demand, flow, point, clearance_um, um_per_px, keep_um, self.guard_per_s)
+        demand = guarded(demand, flow, point, clearance_um, um_per_px, keep_um, _quicker(self.guard_per_s, robot, dt_s))
         demand, cut_again = shortened(demand, limit_um_s)
         return demand, cut or cut_again
 
@@ -183,3 +188,14 @@ class Controller:
         if left_um_s < 0.02 * robot.speed_limit_um_s:
             return np.zeros(2)
         return shortened(demand_um_s, left_um_s)[0]
+
+
+def _hurry(robot: Robot) -> float:
+    """How many times quicker than the robot that the settings are meant for."""
+    assert robot.max_speed_um_s is not None
+    return max(1.0, robot.max_speed_um_s / robot.radius / _USUAL_RADII_PER_S)
+
+
+def _quicker(per_s: float, robot: Robot, dt_s: float) -> float:
+    """A rate for this robot; what is held for a whole frame must not undo more than a third of an error in one."""
+    return max(per_s, min(per_s * _hurry(robot), _LARGEST_SHARE / dt_s)) if dt_s > 0.0 else per_s

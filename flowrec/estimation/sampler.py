@@ -22,7 +22,7 @@ class Sampler:
     """
 
     spacing_radii: float = 0.8  # least way between two observations, in radii of the robot
-    interval_s: float = 0.1  # and least time
+    memories: float = 2.0  # and least time, in memories of the filter
     settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
     floor_um_s: float = 2.0  # no observation claims a smaller sigma
     capacity: int = 2000  # the oldest go first
@@ -44,7 +44,7 @@ class Sampler:
         position = estimate.position_um - lag_s * (estimate.position_um - before.position_um) / dt
         if previous is not None and len(previous.position_um):
             way = math.dist(position, previous.position_um[-1])
-            soon = estimate.stamp_ns < previous.stamp_ns + nanoseconds(self.interval_s)
+            soon = estimate.stamp_ns < previous.stamp_ns + nanoseconds(self.memories * lag_s)
             if soon or way < self.spacing_radii * robot.radius:
                 return previous
             wait_s = seconds(estimate.stamp_ns - previous.stamp_ns)

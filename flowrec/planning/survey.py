@@ -31,7 +31,7 @@ class SurveyPlanner:
     """
 
     distance_um: float | None = None  # None: the share below of the longest way downstream
-    share: float = 0.125
+    share: float | None = None  # None: an eighth; half where several inlets or outlets are to be told apart
     speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
     clearance_margin_um: float | None = None  # None: half of the robot's radius
     middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
@@ -99,7 +99,7 @@ class SurveyPlanner:
         if not allowed.any():
             return no_route(_METHOD, "nothing lies downstream of the start before the chip ends")
         longest_px = length[_best(work, allowed)]
-        limit_px = self.share * longest_px if limit_um is None else limit_um / px
+        limit_px = self._share(chip) * longest_px if limit_um is None else limit_um / px
         allowed &= length <= limit_px
         if not allowed.any():
             return no_route(
@@ -115,6 +115,11 @@ class SurveyPlanner:
             if route.reachable:
                 break
         return route
+
+    def _share(self, chip: Chip) -> float:
+        if self.share is not None:
+            return self.share
+        return 0.125 if len(chip.openings) <= 2 else 0.5
 
     def _weight(self, space: Space) -> Raster:
         """(h, w) >= 1: what time costs, most next to the walls, least in the middle of the channel."""

@@ -95,7 +95,7 @@ class SimulatedRig:
         self._frames = math.inf if duration_s is None else max(1.0, math.floor(duration_s * self._rate_hz) + 1)
         self._realtime = realtime
         self._field = true_field
-        self._delay_ns = nanoseconds(robot.delay_s if simulated.delay_s is None else simulated.delay_s)
+        self._delay_ns = nanoseconds(robot.delay if simulated.delay_s is None else simulated.delay_s)
         self._now_ns = 0
         # What the coils do now, and what is on its way to them: (stamp of its effect, command).
         self._acting: Currents | None = None
