@@ -132,8 +132,8 @@ def resolve(config: Config, chip: Chip) -> Config:
     """Fill in what was left to fit the chip, place the camera, and turn named places into points.
 
     A robot that nobody described is made to suit the chip: radius 50 um, or a fifth of the median channel width
-    where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; 40 ms from command to motion, or as long as
-    it takes at v_max through a fifth of a channel.
+    where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow;
+    40 ms from command to motion, or as long as it takes at v_max through a fifth of a channel.
     """
     camera, robot = config.camera, config.robot
     width_um, height_um = chip.size_um

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
 

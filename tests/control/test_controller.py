@@ -18,6 +18,10 @@ def wrong_vortex(x, y):
     return tuple(1.1 * part for part in vortex(x, y))
 
 
+# So swift a robot as the plant's is driven with quicker gains; this one with those that are written down.
+UNHURRIED = replace(ROBOT, max_speed_um_s=600.0)
+
+
 def seen_at(position, stamp=0, flow=(0.0, 0.0), seen=True):
     return Estimate(stamp, np.array(position, float), np.array(flow), np.eye(4), 2.0, np.array(position), seen)
 
@@ -49,7 +53,7 @@ def test_without_a_map_the_observer_is_enough_and_without_both_the_error_persist
     observed = fly(Controller(**UNGOVERNED), route, vortex, 20.0, START, None, noise_um=10.0)
     assert rms(observed.error_um(route)[10_000:]) < 12.0
     # A flow map of zero, and an observer that is not listened to: the paper's "without compensation".
-    deaf = fly(Controller(map_error=0.0, **UNGOVERNED), route, vortex, 20.0, START, STILL)
+    deaf = fly(Controller(map_error=0.0, **UNGOVERNED), route, vortex, 20.0, START, STILL, robot=UNHURRIED)
     assert rms(deaf.error_um(route)[10_000:]) > 50.0
 
 
@@ -104,23 +108,27 @@ def test_where_the_robot_turns_into_another_stream_the_map_is_believed_over_an_o
 
 def test_a_new_phase_starts_its_route_at_the_beginning_and_a_finished_mission_asks_for_nothing():
     controller, route = Controller(), straight()
-    first = controller.control(None, mission(), route, seen_at((500, 2500), 1), STILL, ROBOT, None, 1.0)
+    first = controller.control(None, mission(), route, seen_at((500, 2500), 1), STILL, UNHURRIED, None, 1.0)
     assert first.progress_s == 0.0 and (first.reference_um == route.waypoints_um[0]).all()
     later = first
     for stamp in range(2, 20):
         at = seen_at(later.reference_um, stamp * 33_000_000)
-        later = controller.control(later, mission(), route, at, STILL, ROBOT, None, 1.0)
+        later = controller.control(later, mission(), route, at, STILL, UNHURRIED, None, 1.0)
     assert later.progress_s > 0.5
     stamp = 20 * 33_000_000
     again = controller.control(
-        later, mission(since_ns=stamp), route, seen_at((600, 2500), stamp), STILL, ROBOT, None, 1
+        later, mission(since_ns=stamp), route, seen_at((600, 2500), stamp), STILL, UNHURRIED, None, 1
     )
     assert again.progress_s == 0.0
-    held = controller.control(later, mission("plan", stamp), route, seen_at((600, 2500), stamp), STILL, ROBOT, None, 1)
+    held = controller.control(
+        later, mission("plan", stamp), route, seen_at((600, 2500), stamp), STILL, UNHURRIED, None, 1
+    )
     overshoot_um = held.reference_um - [600.0, 2500.0]
-    assert 0.0 < overshoot_um[0] < ROBOT.delay_s * 340.0, "it can not stop before the last demands have been used up"
+    assert 0.0 < overshoot_um[0] < UNHURRIED.delay_s * 340.0, (
+        "it can not stop before the last demands have been used up"
+    )
     done = controller.control(
-        later, mission("done", stamp, finished=True), route, seen_at((600, 2500), stamp), STILL, ROBOT, None, 1.0
+        later, mission("done", stamp, finished=True), route, seen_at((600, 2500), stamp), STILL, UNHURRIED, None, 1.0
     )
     assert not done.velocity_um_s.any()
 
@@ -180,3 +188,15 @@ def test_the_same_frame_twice_is_the_same_demand():
     controller = Controller()
     first = controller.control(None, mission(), straight(), seen_at((500, 2500), 5), STILL, ROBOT, None, 1.0)
     assert controller.control(first, mission(), straight(), seen_at((9, 9), 5), STILL, ROBOT, None, 1.0) is first
+
+
+def test_a_swifter_robot_is_driven_with_quicker_gains_as_far_as_the_frames_allow():
+    def pull_per_s(robot, dt_ns):
+        first = Controller().control(None, mission("plan"), None, seen_at((500, 2500), 1), STILL, robot, None, 1.0)
+        off = seen_at((490, 2500), 1 + dt_ns)
+        demand = Controller().control(first, mission("plan"), None, off, STILL, robot, None, 1.0)
+        return demand.velocity_um_s[0] / 10.0
+
+    assert pull_per_s(UNHURRIED, 10_000_000) == pytest.approx(3.0)
+    assert pull_per_s(replace(UNHURRIED, max_speed_um_s=2400.0), 10_000_000) == pytest.approx(12.0)
+    assert pull_per_s(replace(UNHURRIED, max_speed_um_s=24000.0), 10_000_000) == pytest.approx(30.0)
