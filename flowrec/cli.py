@@ -145,15 +145,16 @@ def replay(
                 {
                     "session": str(session),
                     "out": str(target),
-                    "wall_s": done.wall_s,
-                    "duration_s": done.duration_s,
+                    "wall_s": done.report.wall_s,
+                    "duration_s": done.report.duration_s,
                     "rows": [{"quantity": a, "recorded": b, "replayed": c} for a, b, c in rows],
                 }
             )
         )
     else:
         table(f"Replay of {session.name}", ("", "recorded", "replayed"), rows)
-        say(f"{done.report.ticks} ticks ({done.duration_s:.1f} s) replayed in {done.wall_s:.1f} s -> {target}")
+        report = done.report
+        say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {target}")
         if done.replayed.field is not None and done.replayed.field.note:
             say(f"{done.replayed.field.method}: {done.replayed.field.note}")
     if view == "rrd" and target is not None:

@@ -96,11 +96,7 @@ def load_config(path: Path | None = None, sets: Iterable[str] = ()) -> Config:
     tree: dict[str, Any] = {}
     if path is not None:
         tree = _read_toml(path)
-    for text in sets:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
-        _put(tree, key.strip().split("."), _value(value.strip()))
+    _apply_sets(tree, sets)
     return _config_from(tree, str(path) if path is not None else "--set")
 
 
@@ -120,11 +116,7 @@ def to_toml(config: Config) -> str:
 def with_sets(config: Config, sets: Iterable[str]) -> Config:
     """The configuration with some `key=value` changed."""
     tree = _without_none(asdict(config))
-    for text in sets:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
-        _put(tree, key.strip().split("."), _value(value.strip()))
+    _apply_sets(tree, sets)
     return _config_from(tree, "--set")
 
 
@@ -136,13 +128,13 @@ def resolve(config: Config, chip: Chip) -> Config:
     40 ms from command to motion, or as long as it takes at v_max through a fifth of a channel.
     """
     camera, robot = config.camera, config.robot
+    channel_um = median_width_um(chip)
     width_um, height_um = chip.size_um
     if camera.um_per_px is None:
         fit = max(width_um / camera.width_px, height_um / camera.height_px)
         camera = replace(camera, um_per_px=fit)
     assert camera.um_per_px is not None
     if robot.radius_um is None:
-        channel_um = median_width_um(chip)
         radius = min(max(min(50.0, 0.2 * channel_um), 3.0 * camera.um_per_px), 0.25 * channel_um)
         robot = replace(robot, radius_um=round(radius, 2))
     if robot.max_speed_um_s is None:
@@ -153,7 +145,7 @@ def resolve(config: Config, chip: Chip) -> Config:
         raise UsageError(f"robot.max_speed_um_s = {robot.max_speed_um_s:g}: the robot must move; give a positive speed")
     assert robot.max_speed_um_s is not None
     if robot.delay_s is None:
-        crossing_s = 0.2 * median_width_um(chip) / robot.max_speed_um_s
+        crossing_s = 0.2 * channel_um / robot.max_speed_um_s
         robot = replace(robot, delay_s=round(min(USUAL_DELAY_S, crossing_s), 5))
     assert robot.max_speed_um_s is not None
     if robot.step_out_hz is None:
@@ -225,6 +217,15 @@ def _value(text: str) -> Any:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
+
+
+def _apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> None:
+    """Put each `key=value` into the tree."""
+    for text in sets:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
+        _put(tree, key.strip().split("."), _value(value.strip()))
 
 
 def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:

@@ -18,9 +18,9 @@ from flowrec.messages import Demand, FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
-from flowrec.session import length_mm, session_header
+from flowrec.session import length_mm, session_writer
 from flowrec.status import StatusLine, say, table, warn
-from flowrec.store import SessionReader, SessionWriter
+from flowrec.store import SessionReader
 
 View = Literal["spawn", "serve", "rrd", "none"]
 
@@ -122,7 +122,6 @@ def record(
     config, chip, pipeline = prepare(config)
     path = out if out is not None else default_path(config)
     fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
-    header = session_header(config, chip)
     rig = SimulatedRig(
         chip,
         config.robot,
@@ -139,16 +138,7 @@ def record(
     stop = StopSwitch()
     witness = Witness()
     with ExitStack() as stack:
-        writer = stack.enter_context(
-            SessionWriter(
-                path,
-                header,
-                flush_s=config.recording.flush_s,
-                queue_limit_bytes=int(config.recording.queue_mb * 1e6),
-                block=not realtime,
-                overwrite=overwrite,
-            )
-        )
+        writer = stack.enter_context(session_writer(path, config, chip, live=realtime, overwrite=overwrite))
         sinks: list[Sink] = [writer, witness]
         if view in ("spawn", "serve"):
             # Late: importing Rerun takes a second, and most runs do without.

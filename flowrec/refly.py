@@ -13,9 +13,8 @@ from flowrec.pipeline import assemble
 from flowrec.replay import Replayed, planned_from
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, RunReport, Sink, run
-from flowrec.session import file_sha256, open_session, session_header
+from flowrec.session import open_session, session_writer
 from flowrec.status import say
-from flowrec.store import SessionWriter
 from flowrec.units import seconds
 
 
@@ -51,9 +50,9 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
         sinks: list[Sink] = []
         with ExitStack() as stack:
             if target is not None:
-                parent = {"file": done.source.name, "sha256": file_sha256(done.source)}
-                header = session_header(flown, done.chip, parent)
-                writer = stack.enter_context(SessionWriter(target, header, block=True, overwrite=overwrite))
+                writer = stack.enter_context(
+                    session_writer(target, flown, done.chip, parent=done.source, overwrite=overwrite)
+                )
                 sinks.append(writer)
             say(f"reflying as {name} ...")
             reports[name] = report = run(pipeline, rig, worker, sinks)

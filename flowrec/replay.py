@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, StopSwitch, run
-from flowrec.session import file_sha256, open_session, session_header
+from flowrec.session import open_session, session_writer
 from flowrec.status import progress
 from flowrec.store import SessionReader, SessionWriter
 from flowrec.topics import BY_FIELD
@@ -71,6 +71,32 @@ class Change:
 
 
 @dataclass(slots=True)
+class CommandDifference:
+    """A sink's tally of how far the replayed demand is from the recorded one."""
+
+    compared: int = 0
+    changed: int = 0
+    first_ns: int | None = None
+    _square: float = 0.0
+
+    def add(self, was: Demand | None, now: Demand | None) -> None:
+        """Compare one pair of demands."""
+        if was is None or now is None:
+            return
+        self.compared += 1
+        difference = math.dist(was.velocity_um_s, now.velocity_um_s)
+        self._square += difference**2
+        if difference > 1.0:  # um/s: below that nobody would see it
+            self.changed += 1
+            self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
+
+    @property
+    def rms_um_s(self) -> float:
+        """Root mean square difference of the demanded velocity."""
+        return math.sqrt(self._square / self.compared) if self.compared else 0.0
+
+
+@dataclass(slots=True)
 class Replayed:
     """What a replay found."""
 
@@ -82,40 +108,9 @@ class Replayed:
     replayed: Tick
     true_field: FlowField | None
     comparison: Comparison
-    out: Path | None = None
-    wall_s: float = 0.0
-    duration_s: float = 0.0
-    frames_missing: int = 0
-    commands: CommandDifference = field(default_factory=lambda: CommandDifference())
-    worker_results: list[str] = field(default_factory=list)
-
-
-@dataclass(slots=True)
-class CommandDifference:
-    """A sink's tally of how far the replayed demand is from the recorded one."""
-
-    compared: int = 0
-    changed: int = 0
-    first_ns: int | None = None
-    _square: float = 0.0
-    largest_um_s: float = 0.0
-
-    def add(self, was: Demand | None, now: Demand | None) -> None:
-        """Compare one pair of demands."""
-        if was is None or now is None:
-            return
-        self.compared += 1
-        difference = math.dist(was.velocity_um_s, now.velocity_um_s)
-        self._square += difference**2
-        self.largest_um_s = max(self.largest_um_s, difference)
-        if difference > 1.0:  # um/s: below that nobody would see it
-            self.changed += 1
-            self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
-
-    @property
-    def rms_um_s(self) -> float:
-        """Root mean square difference of the demanded velocity."""
-        return math.sqrt(self._square / self.compared) if self.compared else 0.0
+    frames_missing: int
+    commands: CommandDifference
+    worker_check: WorkerCheck | None  # of --verify
 
 
 def stale_results(recorded: Config, changed: Config) -> frozenset[str]:
@@ -179,21 +174,13 @@ def replay(
         sinks: list[Sink] = []
         writer = None
         if out is not None:
-            parent = {"file": path.name, "sha256": file_sha256(path)}
-            writer = stack.enter_context(
-                SessionWriter(
-                    out,
-                    session_header(config, chip, parent),
-                    flush_s=config.recording.flush_s,
-                    queue_limit_bytes=int(config.recording.queue_mb * 1e6),
-                    block=True,
-                    overwrite=overwrite,
-                )
-            )
+            writer = stack.enter_context(session_writer(out, config, chip, parent=path, overwrite=overwrite))
             sinks.append(writer if frames else WithoutFrames(writer))
         done = stack.enter_context(progress(f"replaying {path.name}", max(seconds(reader.last_ns - first_ns), 1e-3)))
         with stop.armed():
             report = run(pipeline, rig, worker, sinks, start=start, stop=stop, on_tick=on_tick, end_when_finished=False)
+        if report.ticks == 0:
+            raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
         last = report.last
         if stale and not stop.reason:
             last = _closing_work(pipeline, config, report.last, rig.recorded, stale)
@@ -201,8 +188,6 @@ def replay(
                 sinks[0].write(last)
         if writer is not None:
             writer.close({"outcome": "replayed", "note": f"replay of {path.name}", "ticks": str(report.ticks)})
-    if report.ticks == 0:
-        raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
     return Replayed(
         source=path,
         config=config,
@@ -212,12 +197,9 @@ def replay(
         replayed=last,
         true_field=truth[-1] if truth else None,
         comparison=comparison,
-        out=out,
-        wall_s=report.wall_s,
-        duration_s=report.duration_s,
         frames_missing=rig.frames_missing,
         commands=commands,
-        worker_results=checker.results if checker is not None else [],
+        worker_check=checker,
     )
 
 
@@ -339,8 +321,10 @@ def verdict(done: Replayed) -> tuple[bool, list[str]]:
             + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
             + (f", {count.different} DIFFERENT" if count.different else "")
         )
-    lines.extend(done.worker_results)
-    same = comparison.same and not any("DIFFERENT" in line for line in done.worker_results)
+    same = comparison.same
+    if done.worker_check is not None:
+        lines.extend(done.worker_check.results)
+        same = same and done.worker_check.same
     if done.frames_missing:
         lines.append(f"{done.frames_missing} frames were dropped by the recording; their recorded tracks stood in")
     if comparison.first is not None:

@@ -16,10 +16,34 @@ from flowrec.config import Config, config_from_toml, to_toml
 from flowrec.errors import SessionError
 from flowrec.messages import Route
 from flowrec.provenance import provenance
-from flowrec.store import SessionHeader, SessionReader, is_growing
+from flowrec.store import SessionHeader, SessionReader, SessionWriter, is_growing
 from flowrec.topics import BY_FIELD
 
 SESSION_NAMES = (".mcap", ".mcap.partial")
+
+
+def session_writer(
+    path: Path,
+    config: Config,
+    chip: Chip,
+    *,
+    parent: Path | None = None,
+    live: bool = False,
+    overwrite: bool = False,
+) -> SessionWriter:
+    """A new session file with its head written. `parent` is the session that it replays, named by content.
+
+    A `live` run drops images rather than wait for the disk.
+    """
+    named = {"file": parent.name, "sha256": file_sha256(parent)} if parent is not None else None
+    return SessionWriter(
+        path,
+        session_header(config, chip, named),
+        flush_s=config.recording.flush_s,
+        queue_limit_bytes=int(config.recording.queue_mb * 1e6),
+        block=not live,
+        overwrite=overwrite,
+    )
 
 
 def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:

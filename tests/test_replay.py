@@ -39,7 +39,8 @@ def test_a_replay_is_identical_tick_by_tick_and_its_worker_results_can_be_made_a
     same, lines = verb.verdict(done)
     assert same, lines
     assert done.comparison.identical, str(done.comparison.first)
-    assert len(done.worker_results) >= 4  # solved, surveyed, refined, planned
+    assert done.worker_check is not None
+    assert len(done.worker_check.results) >= 4  # solved, surveyed, refined, planned
 
 
 @pytest.mark.parametrize("share", [0.01, 0.23, 0.5, 0.77, 0.95])

@@ -14,7 +14,16 @@ from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.paper import adjacency, search_paper
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
-from flowrec.planning.space import End, Space, attach_goal, attach_start, open_space, why_apart
+from flowrec.planning.space import (
+    End,
+    Space,
+    attach_goal,
+    attach_start,
+    margin_remark,
+    margins_um,
+    open_space,
+    why_apart,
+)
 from flowrec.planning.zermelo import line_is_clear
 from flowrec.robot import Robot
 
@@ -53,19 +62,15 @@ class Planner:
         """
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        wanted_um = 0.5 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
+        margins = margins_um(self.clearance_margin_um, robot)
         trouble = ""
-        for margin_um in dict.fromkeys((wanted_um, 0.5 * wanted_um, 0.0)):
+        for margin_um in margins:
             space = open_space(chip, field, robot.radius, margin_um)
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
                 route = self._through(space, field, start, goal, speed_um_s)
-                lean = (
-                    f"no room for the margin of {wanted_um:.0f} um, {margin_um:.0f} um kept"
-                    if margin_um < wanted_um
-                    else ""
-                )
+                lean = margin_remark(margin_um, margins)
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
         return no_route(self.method, trouble)

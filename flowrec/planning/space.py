@@ -14,6 +14,7 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError, UsageError
 from flowrec.messages import FlowField
 from flowrec.planning.zermelo import bilinear, line_is_clear
+from flowrec.robot import Robot
 
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
@@ -189,3 +190,16 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
         apart += distance_transform_edt(~side)
     row, column = divmod(int(np.argmin(np.where(clearance == widest, apart, np.inf))), clearance.shape[1])
     return column, row
+
+
+def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
+    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: half the radius), half, none."""
+    first = 0.5 * robot.radius if wanted_um is None else wanted_um
+    return tuple(dict.fromkeys((first, 0.5 * first, 0.0)))
+
+
+def margin_remark(margin_um: float, tried_um: tuple[float, ...]) -> str:
+    """What to say of a margin that had to be given up; '' for the one that was wanted."""
+    if margin_um >= tried_um[0]:
+        return ""
+    return f"no room for the margin of {tried_um[0]:.0f} um, {margin_um:.0f} um kept"

@@ -13,7 +13,7 @@ from flowrec.messages import FlowField, Route
 from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route
-from flowrec.planning.space import Space, attach_start, open_space
+from flowrec.planning.space import Space, attach_start, margin_remark, margins_um, open_space
 from flowrec.robot import Robot
 
 _METHOD = "survey"
@@ -52,17 +52,13 @@ class SurveyPlanner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         limit_um = distance_um if distance_um is not None else self.distance_um
         at = np.asarray(start_um, np.float64)
-        wanted_um = 0.5 * robot.radius if self.clearance_margin_um is None else self.clearance_margin_um
+        margins = margins_um(self.clearance_margin_um, robot)
         route = no_route(_METHOD, "")
-        for margin_um in dict.fromkeys((wanted_um, 0.5 * wanted_um, 0.0)):
+        for margin_um in margins:
             space = open_space(chip, field, robot.radius, margin_um)
             route = self._downstream(space, field, at, chip, speed_um_s, limit_um)
             if route.reachable:
-                lean = (
-                    f"no room for the margin of {wanted_um:.0f} um, {margin_um:.0f} um kept"
-                    if margin_um < wanted_um
-                    else ""
-                )
+                lean = margin_remark(margin_um, margins)
                 return replace(route, reason="; ".join(remark for remark in (lean, route.reason) if remark))
         return route
 
