@@ -312,6 +312,32 @@ def bench_loop(
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
+@bench.command("flow")
+def bench_flow(
+    cases: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz); made up when left out.")
+    ] = None,
+    methods: Annotated[str | None, typer.Option(metavar="A,B", help="Which methods; all when left out.")] = None,
+    noise: Annotated[Literal["00", "02", "05", "10"], typer.Option(help="Noise of the observations in %.")] = "05",
+    share: Annotated[Literal["05", "10", "20"], typer.Option(help="Share of the skeleton that is seen in %.")] = "10",
+    k: Annotated[int, typer.Option("-k", help="Subcells of the solver per pixel side: 1, 2 or 4.")] = 2,
+    outliers: Annotated[float, typer.Option(help="Share of the observations that are nonsense.")] = 0.0,
+    mask: Annotated[
+        Literal["right", "grown", "shrunk", "shifted"], typer.Option(help="Believed walls, one pixel off.")
+    ] = "right",
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep every field in this folder.")] = None,
+) -> None:
+    """The paper's Table I: error of the flow before and after each refinement."""
+    from flowrec.bench.flow import Trouble, measure, show
+
+    chosen = methods.split(",") if methods is not None else None
+    figures = measure(cases, chosen, noise, share, k, Trouble(outliers, mask), fields)
+    show(figures)
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
 def _point(text: str) -> str:
     """`1200,800` as a TOML pair; a name stays a name."""
     parts = text.split(",")

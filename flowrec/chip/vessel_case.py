@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip, Opening, Side
 from flowrec.chip.files import check_chip
 from flowrec.errors import ChipError
+from flowrec.messages import Observations
 
+# Noise levels and shares of the skeleton that cases hold, by the names in their keys.
+NOISES = {"00": 0.0, "02": 0.02, "05": 0.05, "10": 0.1}
+SHARES = {"05": 0.05, "10": 0.1, "20": 0.2}
 KEYS = ("mask", "px", "rho_assumed", "mu_assumed", "op_side", "op_a", "op_b", "op_type", "op_u_assumed", "op_p_assumed")
 # Row 0 is their south (y grows with the row), and our top (y points down): the same array, no flip.
 _SIDES: dict[str, Side] = {"W": "left", "E": "right", "S": "top", "N": "bottom"}
@@ -24,16 +28,7 @@ _SIDES: dict[str, Side] = {"W": "left", "E": "right", "S": "top", "N": "bottom"}
 
 def read_vessel_case(path: Path) -> Chip:
     """The chip of a vessel case, with pixel walls, on which its reference is defined. SI to um, mPa s."""
-    try:
-        with np.load(path, allow_pickle=False) as case:
-            missing = [key for key in KEYS if key not in case.files]
-            if missing:
-                raise ChipError(f"{path}: no {', '.join(missing)}; a vessel case has {', '.join(KEYS)}")
-            known: dict[str, NDArray[Any]] = {key: case[key] for key in KEYS}
-    except FileNotFoundError as error:
-        raise ChipError(f"{path}: no such vessel case; give the path of an .npz file") from error
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise ChipError(f"{path}: not a readable .npz vessel case ({error})") from error
+    known = _read(path, KEYS)
     mask = np.ascontiguousarray(known["mask"], np.bool_)
     if mask.ndim != 2:
         raise ChipError(f"{path}: mask has {mask.ndim} dimensions; it must be an image (h, w)")
@@ -58,3 +53,39 @@ def read_vessel_case(path: Path) -> Chip:
     )
     check_chip(chip, str(path))
     return chip
+
+
+def read_observations(path: Path, noise: str, share: str) -> Observations:
+    """What a robot felt on its way through a vessel case: `noise` is a key of NOISES, `share` one of SHARES.
+
+    The standard deviation is that of one component.
+    """
+    known = _read(path, ("px", "route_ij", f"obs_idx_{share}", f"route_v_n{noise}", "route_v_sigma"))
+    seen = known[f"obs_idx_{share}"].astype(np.intp)
+    sigma_um_s = float(known["route_v_sigma"][list(NOISES).index(noise)]) * 1e6
+    return Observations(
+        0,
+        known["route_ij"][seen][:, ::-1] * float(known["px"]) * 1e6,
+        known[f"route_v_n{noise}"][seen] * 1e6,
+        np.full(len(seen), sigma_um_s),
+    )
+
+
+def read_true_velocity(path: Path) -> NDArray[np.float64]:
+    """The true velocity (h, w, 2) in um/s, for scoring alone."""
+    known = _read(path, ("vx", "vy"))
+    return np.stack([known["vx"], known["vy"]], axis=-1) * 1e6
+
+
+def _read(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Some arrays of a case, and no others."""
+    try:
+        with np.load(path, allow_pickle=False) as case:
+            missing = [key for key in keys if key not in case.files]
+            if missing:
+                raise ChipError(f"{path}: no {', '.join(missing)}; a vessel case has {', '.join(keys)}")
+            return {key: case[key] for key in keys}
+    except FileNotFoundError as error:
+        raise ChipError(f"{path}: no such vessel case; give the path of an .npz file") from error
+    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        raise ChipError(f"{path}: not a readable .npz vessel case ({error})") from error

@@ -172,6 +172,12 @@ def system(chip: Chip, k: int) -> System:
     return made
 
 
+def forget() -> None:
+    """Drop the kept geometries, as in a process that has just started."""
+    with _lock:
+        _kept.clear()
+
+
 def _assemble(chip: Chip, k: int, friction: float) -> System:
     grid = grids.build(chip, k)
     momentum = momenta.assemble(grid)

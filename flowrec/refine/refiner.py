@@ -18,7 +18,7 @@ from flowrec.refine.sight import sight
 class Refiner:
     """Which method refines, and the settings of each."""
 
-    method: Literal["assimilate", "pi_unet"] = "assimilate"
+    method: Literal["assimilate", "pi_unet", "fvm"] = "assimilate"  # fvm: no refinement
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)
 
@@ -37,6 +37,8 @@ class Refiner:
                 f"the assumed field has {assumed.velocity_um_s.shape[:2]} pixels and the mask of chip '{chip.name}' "
                 f"{chip.mask.shape}: solve the flow again for this chip"
             )
+        if self.method == "fvm":
+            return replace(assumed, note="not refined: method fvm")
         seen = sight(observations, chip.mask, chip.um_per_px)
         if seen.count == 0:
             why = "none of the observations lies in the fluid" if len(observations.std_um_s) else "no observations"

@@ -1,0 +1,262 @@
+"""`flowrec bench flow`: the paper's Table I. How far each refinement brings an assumed flow towards the true one.
+
+A case is read without its truth; the truth is read when the results are there to be scored. Each method runs in a
+process of its own, so that its peak memory is its own.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import platform
+import resource
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from flowrec.bench.vessels import make_up
+from flowrec.chip.chip import Chip
+from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
+from flowrec.errors import UsageError
+from flowrec.flow import FlowSolver
+from flowrec.flow.metrics import relative_rmse
+from flowrec.flow.system import forget
+from flowrec.messages import FlowField, Observations
+from flowrec.refine import PiUnet, Refiner
+from flowrec.status import progress, table
+
+MADE_UP = 10  # cases, where none are given
+
+# Name in the table: the refiner that does it. `pi_unet` alone is the paper's, from the solver's prediction.
+METHODS = {
+    "fvm": Refiner("fvm"),
+    "assimilate": Refiner("assimilate"),
+    "pi_unet": Refiner("pi_unet", pi_unet=PiUnet(start="fvm")),
+    "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """What is wrong with a case besides its parameters."""
+
+    outliers: float = 0.0  # share of the observations that are replaced by nonsense of the flow's size
+    mask: str = "right"  # grown, shrunk: walls one pixel off everywhere; shifted: one pixel to the right
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One case by one method. Errors are relative RMSE over the true mask's fluid pixels."""
+
+    case: str
+    method: str
+    rmse_vx: float
+    rmse_vy: float
+    rmse_v: float
+    seconds: float  # from nothing: the initial solve and the refinement
+    seconds_update: float  # the same case again with other observations, all caches filled
+    within_2_std: float | None  # share of the components that lie within two of the stated standard deviations
+    stated_rmse_v: float | None  # what the error bars expect rmse_v to be
+    peak_mb: float  # of the method's process up to then, above what it needs before it starts
+    note: str
+
+
+def measure(
+    folder: Path | None = None,
+    methods: Sequence[str] | None = None,
+    noise: str = "05",
+    share: str = "10",
+    k: int = 2,
+    trouble: Trouble = Trouble(),
+    fields: Path | None = None,
+) -> dict[str, Any]:
+    """Rows per case and method, and their summary; `fields` keeps every field as CASE.METHOD.npz.
+
+    Without a folder of cases some are made up.
+    """
+    methods = tuple(METHODS) if methods is None else methods
+    unknown = [name for name in methods if name not in METHODS]
+    if unknown:
+        raise UsageError(f"bench flow: no method {', '.join(map(repr, unknown))}; there are {', '.join(METHODS)}")
+    if fields is not None:
+        fields.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    with ExitStack() as stack:
+        if folder is None:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            make_up(folder, MADE_UP)
+        cases = sorted(folder.glob("*.npz"))
+        if not cases:
+            raise UsageError(f"{folder}: no vessel case (*.npz) in it")
+        done = stack.enter_context(progress("refining", len(cases) * len(methods)))
+        for method in methods:
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _start) as worker:
+                for case in cases:
+                    rows.append(worker.submit(_one, case, method, noise, share, k, trouble, fields).result())
+                    done(len(rows))
+    return {
+        "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
+        "noise": noise,
+        "share": share,
+        "k": k,
+        "trouble": asdict(trouble),
+        "rows": [asdict(row) for row in rows],
+        "summary": {method: _summary([row for row in rows if row.method == method]) for method in methods},
+    }
+
+
+def _summary(rows: list[Row]) -> dict[str, float | None]:
+    """Mean, std and median over cases; `mean` and `std` are those of rmse_v."""
+    made: dict[str, float | None] = {}
+    for name in ("rmse_vx", "rmse_vy", "rmse_v"):
+        values = [getattr(row, name) for row in rows]
+        made |= {f"{name}_mean": float(np.mean(values)), f"{name}_std": float(np.std(values))}
+    covered = [row.within_2_std for row in rows if row.within_2_std is not None]
+    return made | {
+        "mean": made["rmse_v_mean"],
+        "std": made["rmse_v_std"],
+        "worst": max(row.rmse_v for row in rows),
+        "median_seconds": float(np.median([row.seconds for row in rows])),
+        "median_seconds_update": float(np.median([row.seconds_update for row in rows])),
+        "peak_mb": max(row.peak_mb for row in rows),
+        "within_2_std": float(np.mean(covered)) if covered else None,
+    }
+
+
+_floor_mb = 0.0
+
+
+def _start() -> None:
+    """Pay for imports before anything is measured."""
+    global _floor_mb  # noqa: PLW0603 - one number per worker process
+    import torch
+
+    torch.set_num_threads(1)
+    _floor_mb = _peak_mb()
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Trouble, fields: Path | None) -> Row:
+    """Refine one case, then look at its truth."""
+    chip = read_vessel_case(case)
+    observations = read_observations(case, noise, share)
+    seed = int.from_bytes(case.stem.encode()[-4:], "little")
+    observations = with_outliers(observations, trouble.outliers, seed)
+    believed = with_wrong_mask(chip, trouble.mask)
+    solver, refiner = FlowSolver(k), METHODS[method]
+    forget()
+    began = time.perf_counter()
+    assumed = solver.solve(believed)
+    field = refiner.refine(assumed, observations, believed, solver)
+    seconds = time.perf_counter() - began
+    again = replace(observations, flow_um_s=observations.flow_um_s * 1.01)
+    began = time.perf_counter()
+    if method in ("fvm", "assimilate"):  # the others begin anew with every observation
+        refiner.refine(assumed, again, believed, solver)
+        seconds_update = time.perf_counter() - began
+    else:
+        seconds_update = seconds
+    return _scored(case, method, chip, field, (seconds, seconds_update), fields)
+
+
+def _scored(
+    case: Path, method: str, chip: Chip, field: FlowField, seconds: tuple[float, float], fields: Path | None
+) -> Row:
+    """The only place that reads a truth."""
+    true = read_true_velocity(case)
+    truth = replace(field, velocity_um_s=true.astype(np.float32))
+    error = relative_rmse(field, truth, chip.mask)
+    covered = stated = None
+    if field.std_um_s is not None:
+        miss = np.abs(field.velocity_um_s - true)[chip.mask]
+        covered = float((miss <= 2.0 * field.std_um_s[chip.mask]).mean())
+        stated = float(
+            np.sqrt((field.std_um_s[chip.mask].astype(np.float64) ** 2).sum() / (true[chip.mask] ** 2).sum())
+        )
+    if fields is not None:
+        np.savez_compressed(
+            fields / f"{case.stem}.{method.replace(':', '_from_')}.npz",
+            velocity_um_s=field.velocity_um_s,
+            mask=chip.mask,
+        )
+    return Row(
+        case.stem, method, error.vx, error.vy, error.v, *seconds, covered, stated, _peak_mb() - _floor_mb, field.note
+    )
+
+
+def with_outliers(observations: Observations, share: float, seed: int) -> Observations:
+    """Some observations replaced by draws of three times the flow's root mean square, their stated std unchanged."""
+    rng = np.random.default_rng([seed, 17])
+    count = round(share * len(observations.std_um_s))
+    wrong = rng.choice(len(observations.std_um_s), count, replace=False)
+    flow = observations.flow_um_s.copy()
+    size = 3.0 * np.sqrt((flow**2).sum(axis=1).mean())
+    flow[wrong] = size * rng.standard_normal((count, 2))
+    return replace(observations, flow_um_s=flow)
+
+
+def with_wrong_mask(chip: Chip, how: str) -> Chip:
+    """The chip as somebody would have it who drew its walls one pixel off; openings stay where fluid is."""
+    if how == "right":
+        return chip
+    if how == "grown":
+        mask = binary_dilation(chip.mask)
+    elif how == "shrunk":
+        mask = binary_erosion(chip.mask, border_value=1)
+    elif how == "shifted":
+        mask = np.concatenate([chip.mask[:, :1], chip.mask[:, :-1]], axis=1)
+    else:
+        raise UsageError(f"bench flow: no wrong mask {how!r}; there are right, grown, shrunk, shifted")
+    openings = []
+    for opening in chip.openings:
+        line: NDArray[np.bool_] = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}[
+            opening.side
+        ]
+        middle = (opening.first + opening.last + (how == "shifted" and opening.side in ("top", "bottom"))) // 2
+        first = last = middle
+        while first > 0 and line[first - 1]:
+            first -= 1
+        while last + 1 < len(line) and line[last + 1]:
+            last += 1
+        openings.append(replace(opening, first=first, last=last))
+    return replace(chip, mask=mask, openings=tuple(openings))
+
+
+def show(figures: dict[str, Any]) -> None:
+    """Print Table I."""
+    rows = []
+    for method, line in figures["summary"].items():
+        covered = line["within_2_std"]
+        rows.append(
+            (
+                method,
+                *(
+                    f"{line[f'{name}_mean']:.3f} ± {line[f'{name}_std']:.3f}"
+                    for name in ("rmse_vx", "rmse_vy", "rmse_v")
+                ),
+                f"{line['worst']:.3f}",
+                "" if covered is None else f"{100 * covered:.0f} %",
+                f"{line['median_seconds']:.2f}",
+                f"{line['median_seconds_update']:.3f}",
+                f"{line['peak_mb']:.0f}",
+            )
+        )
+    count = len({row["case"] for row in figures["rows"]})
+    columns = ("method", "vx", "vy", "v", "worst v", "within 2 std", "s", "s update", "MB")
+    table(
+        f"Relative RMSE over {count} cases, noise {figures['noise']} %, {figures['share']} % of the skeleton seen",
+        columns,
+        rows,
+    )
