@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.draw import draw_channel, smooth_curve
-from flowrec.chip.openings import find_openings
+from flowrec.chip.openings import border, find_openings
 from flowrec.chip.vessel_case import NOISES, SHARES
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
@@ -188,13 +188,11 @@ def _without_grazed(mask: Mask, openings: list[Opening]) -> Mask:
     """Close the border where no opening is: a grazed channel is a wall there."""
     kept = np.zeros_like(mask)
     for o in openings:
-        along = slice(o.first, o.last + 1)
-        at = {"left": (along, 0), "right": (along, -1), "top": (0, along), "bottom": (-1, along)}[o.side]
-        kept[at] = True
+        border(kept, o.side)[o.first : o.last + 1] = True  # a view
     closed = mask.copy()
-    border = np.ones_like(mask)
-    border[1:-1, 1:-1] = False
-    closed &= kept | ~border
+    edge = np.ones_like(mask)
+    edge[1:-1, 1:-1] = False
+    closed &= kept | ~edge
     return _largest(closed)
 
 
