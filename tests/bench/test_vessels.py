@@ -25,7 +25,7 @@ def test_a_skeleton_is_thin_and_as_connected_as_its_mask():
         assert label(skeleton, EIGHT)[1] == label(mask, EIGHT)[1]
         # Nowhere a square of four pixels, but for a few knots.
         squares = skeleton[1:, 1:] & skeleton[:-1, 1:] & skeleton[1:, :-1] & skeleton[:-1, :-1]
-        assert 0 < skeleton.sum() and squares.sum() < 0.03 * skeleton.sum()
+        assert skeleton.sum() > 0 and squares.sum() < 0.03 * skeleton.sum()
 
 
 def test_a_made_up_case_is_read_like_any_other_and_its_truth_obeys_its_true_parameters(case):
