@@ -1,46 +1,134 @@
-"""Where the wall lies: from fluid pixels to fluid subcells and to the distance of points from the outline."""
+"""Where the wall lies on the grid: a level whose sign tells fluid from solid, from a mask or from a formula."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, map_coordinates
-from scipy.special import ndtri
 
 from flowrec.chip.chip import Walls
+from flowrec.flow.contour import curves
 
-# A blurred straight edge is a Gaussian integral, so the blur can be undone into a distance. One pixel is the
-# smallest blur that no longer shows the steps of an oblique edge; a channel of three pixels keeps its width.
-BLUR_PX = 1.0
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+PIECES = 2  # straight pieces from one gate of the contour to the next
+REACH_PX = 0.7  # the outline is never farther from the edges of the pixels than this
+LEAST_PX = 0.1  # least distance between the outline and pixel centres, and middles between equal neighbours
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outline:
-    """The fluid on a grid of k x k subcells a pixel."""
+    """The wall on a grid of h x w subcells.
 
-    fluid: NDArray[np.bool_]  # (h k, w k)
-    # (h k + 2, w k + 2) distance to the wall at subcell centres, positive in fluid, in subcells, with one ring
-    # around the image; None where the wall is the edge of the subcells themselves.
-    distance: NDArray[np.float64] | None
+    `level` is sampled at the subcells' corners, at the middles of their sides and at their centres, (2 h + 1,
+    2 w + 1): positive in fluid, zero on the wall, and near it the distance to it (in any unit, as only its zeros
+    along straight lines between samples are used).
+    """
+
+    level: Floats
+    stepped: bool  # whether the wall has the corners of pixels
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of subcells."""
+        return (self.level.shape[0] - 1) // 2, (self.level.shape[1] - 1) // 2
+
+
+def analytic(distance: Callable[[Floats, Floats], Floats], shape: tuple[int, int], k: int) -> Outline:
+    """Outline of a formula, to measure the solver apart from the reading of masks.
+
+    Parameters
+    ----------
+    distance
+        Signed distance to the wall, positive in fluid, of points x, y in pixels; (0, 0) is the centre of the first.
+    shape
+        Rows and columns of pixels, each cut into k x k subcells.
+    """
+    rows, columns = (np.arange(2 * size * k + 1) / (2.0 * k) - 0.5 for size in shape)
+    x, y = np.meshgrid(columns, rows)
+    return Outline(np.asarray(distance(x, y), np.float64), stepped=False)
+
+
+def staircase(mask: NDArray[np.bool_], k: int) -> Outline:
+    """The edges of the pixels themselves."""
+    fluid = np.repeat(np.repeat(mask, 2 * k, axis=0), 2 * k, axis=1)
+    h, w = fluid.shape
+    # Samples lie between quarters of subcells: in fluid where all four are, on the wall where some are.
+    rows, columns = (np.clip(np.arange(size + 1), 0, size) for size in (h, w))
+    before, after = np.maximum(rows - 1, 0), np.minimum(rows, h - 1)
+    left, right = np.maximum(columns - 1, 0), np.minimum(columns, w - 1)
+    corners = [fluid[np.ix_(r, c)] for r in (before, after) for c in (left, right)]
+    inside = corners[0] & corners[1] & corners[2] & corners[3]
+    outside = ~(corners[0] | corners[1] | corners[2] | corners[3])
+    return Outline(np.where(inside, 0.5, np.where(outside, -0.5, 0.0)), stepped=True)
 
 
 def outline(mask: NDArray[np.bool_], k: int, walls: Walls) -> Outline:
-    """Cut each pixel into k x k subcells; `smooth` takes the walls from an outline between the pixels.
+    """The walls of a mask: `pixel`, the edges of its pixels; `smooth`, the smoothest outline that it allows."""
+    return staircase(mask, k) if walls == "pixel" else smooth(mask, k)
 
-    The outline is the half level of the blurred mask. With k = 1 the cells stay the mask's pixels and the
-    outline only tells how far the wall really is.
-    """
-    staircase = np.repeat(np.repeat(mask, k, axis=0), k, axis=1)
-    if walls == "pixel":
-        return Outline(staircase, None)
-    margin = 4
-    share = gaussian_filter(np.pad(mask.astype(np.float64), margin, mode="edge"), BLUR_PX, truncate=4.0)
-    level = BLUR_PX * ndtri(np.clip(share, 1e-4, 1.0 - 1e-4))
-    rows, columns = (
-        (np.arange(-1, size * k + 1) + 0.5) / k - 0.5 + margin for size in mask.shape
-    )  # subcell centres in the padded image
-    distance = k * map_coordinates(level, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest")
-    fluid = staircase if k == 1 else distance[1:-1, 1:-1] > 0.0
-    return Outline(fluid, distance)
+
+def smooth(mask: NDArray[np.bool_], k: int) -> Outline:
+    """Signed distance, in half subcells, to the outline between the pixels (contour)."""
+    unit = 2 * k
+    shape = (mask.shape[0] * unit + 1, mask.shape[1] * unit + 1)
+    begin, end = ((points + 0.5) * unit for points in curves(mask, PIECES))
+    reach = 2.0 + REACH_PX * unit
+    nearest = np.full(shape[0] * shape[1], reach)
+    sided = np.zeros(shape[0] * shape[1])
+    width = int(np.ceil(np.abs(end - begin).max(initial=0.0) + 2.0 * reach)) + 1
+    window = np.stack(np.meshgrid(np.arange(width), np.arange(width)), axis=-1).reshape(-1, 2)
+    parts = []
+    chunk = 2_000_000 // len(window) + 1
+    for first in range(0, len(begin), chunk):
+        a, b = begin[first : first + chunk], end[first : first + chunk]
+        corner = np.floor(np.minimum(a, b) - reach).astype(np.int64) + 1
+        parts.append(_seen(a, b, corner, window, shape, reach))
+    for sample, distance, _ in parts:
+        np.minimum.at(nearest, sample, distance)
+    for sample, distance, side in parts:
+        # Beside a joint of two pieces both are nearest, and the sum of their normals tells the side.
+        closest = distance <= nearest[sample] + 1e-9
+        sided += np.bincount(sample[closest], side[closest], len(sided))
+    rows, columns = (np.minimum(np.arange(size) // unit, size // unit - 1) for size in shape)
+    painted = mask[np.ix_(rows, columns)]
+    sign = np.where(sided.reshape(shape) == 0.0, np.where(painted, 1.0, -1.0), np.sign(sided.reshape(shape)))
+    return Outline(_kept(sign * nearest.reshape(shape), mask, k), stepped=False)
+
+
+def _seen(
+    a: Floats, b: Floats, corner: Ints, window: Ints, shape: tuple[int, int], reach: float
+) -> tuple[Ints, Floats, Floats]:
+    """Samples (numbers), distances and signed sides of all samples within reach of pieces a to b (n, 2)."""
+    run = b - a
+    length = np.maximum(np.hypot(run[:, 0], run[:, 1]), 1e-12)
+    x, y = (corner[:, None, axis] + window[None, :, axis] for axis in (0, 1))
+    dx, dy = x - a[:, None, 0], y - a[:, None, 1]
+    ux, uy = run[:, 0:1] / length[:, None], run[:, 1:2] / length[:, None]
+    along = dx * ux + dy * uy
+    side = dy * ux - dx * uy  # the fluid is on the right, with y pointing down
+    over = along - np.clip(along, 0.0, length[:, None])
+    distance = np.sqrt(side * side + over * over)
+    there = (distance < reach) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
+    return (y * shape[1] + x)[there], distance[there], side[there]
+
+
+def _kept(level: Floats, mask: NDArray[np.bool_], k: int) -> Floats:
+    """The level with the mask's own topology: pixels keep their side, and neighbours stay connected or apart."""
+    least = LEAST_PX * 2 * k
+    solid = ~mask
+    for samples, wet, dry in (
+        (level[k :: 2 * k, k :: 2 * k], mask, solid),
+        (level[k :: 2 * k, 2 * k : -1 : 2 * k], mask[:, 1:] & mask[:, :-1], solid[:, 1:] & solid[:, :-1]),
+        (level[2 * k : -1 : 2 * k, k :: 2 * k], mask[1:] & mask[:-1], solid[1:] & solid[:-1]),
+    ):
+        samples[wet] = np.maximum(samples[wet], least)
+        samples[dry] = np.minimum(samples[dry], -least)
+    falling = solid[1:, 1:] & solid[:-1, :-1]
+    rising = solid[1:, :-1] & solid[:-1, 1:]
+    joint = level[2 * k : -1 : 2 * k, 2 * k : -1 : 2 * k]
+    joint[falling | rising] = np.minimum(joint[falling | rising], 0.0)
+    return level

@@ -1,0 +1,212 @@
+"""The smoothest outline that a mask allows.
+
+A mask is a sample: all it tells is that a wall passes between two neighbouring pixel centres, one in fluid and one in
+solid. Each such pair is a gate, and the outline goes from gate to gate. Among all curves through the gates that is
+taken whose curvature changes least and which keeps nearest to the middles of the gates,
+
+    min  int l^6 (d kappa / ds)^2 + d^2 ds   over the places of the crossings, |place| <= half a pixel,
+
+kappa being the curvature, d the distance from the middle of the gate. Straight walls and circles cost nothing, so an
+oblique wall comes out straight however long its steps, and neither channels nor islands shrink.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+from scipy.sparse.csgraph import connected_components
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+STIFFNESS_PX = 4.0  # l: wobbles shorter than about 2 pi l are taken for steps of the mask
+LARGEST_PX = 0.49  # crossings stay this near to the middles of their gates, so that no pixel changes sides
+ITERATIONS = 6
+SMOOTHING = 4
+SLACK_PX = 0.05
+BEYOND_PX = 2.0
+REACH = 2
+SOFTER = 8.0
+SHORTEST_PX = 0.3
+WRAP = 16  # closed curves are continued around by this many gates
+PENALTY = 1e7  # on crossings outside their gates; far above l^6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gates:
+    """Pairs of neighbouring pixels on both sides of a wall, in order along the walls with the fluid on the right."""
+
+    middle: Floats  # (n, 2) x, y in pixels; (0, 0) is the centre of the first pixel
+    inward: Floats  # (n, 2) unit vector from solid to fluid
+    wall: Ints  # (n,) number of the wall, ascending
+    closed: NDArray[np.bool_]  # (walls,) whether it returns to its first gate; else it ends at the image's border
+
+
+def gates(mask: NDArray[np.bool_]) -> Gates:
+    """Gates of a mask. Fluid pixels that touch at corners only are not connected."""
+    h, w = mask.shape
+    edges = []  # (row, column) of the edge's begin on the pixels' corners, and its direction (right, down, left, up)
+    r, c = np.nonzero(~mask[:-1] & mask[1:])
+    edges.append((r + 1, c, np.zeros_like(r)))
+    r, c = np.nonzero(mask[:, :-1] & ~mask[:, 1:])
+    edges.append((r, c + 1, np.ones_like(r)))
+    r, c = np.nonzero(mask[:-1] & ~mask[1:])
+    edges.append((r + 1, c + 1, np.full_like(r, 2)))
+    r, c = np.nonzero(~mask[:, :-1] & mask[:, 1:])
+    edges.append((r + 1, c + 1, np.full_like(r, 3)))
+    row, column, way = (np.concatenate(part) for part in zip(*edges, strict=True))
+    step = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # x, y of the directions
+    n = len(row)
+    leaving = np.full(((h + 1) * (w + 1), 4), -1, np.int64)
+    leaving[row * (w + 1) + column, way] = np.arange(n)
+    end = (row + step[way, 1]) * (w + 1) + column + step[way, 0]
+    # Where four edges meet, turning right stays with the same fluid pixel.
+    right, ahead, left = (leaving[end, (way + turn) % 4] for turn in (1, 0, 3))
+    after = np.where(right >= 0, right, np.where(ahead >= 0, ahead, left))
+    order, wall, closed = _ordered(after)
+    begin = np.stack([column, row], axis=1) - 0.5
+    inward = step[(way + 1) % 4].astype(np.float64)
+    return Gates((begin + 0.5 * step[way])[order] - 0.0, inward[order], wall, closed)
+
+
+def _ordered(after: Ints) -> tuple[Ints, Ints, NDArray[np.bool_]]:
+    """Order of edges along their walls, the wall of each, and which walls are closed."""
+    n = len(after)
+    if n == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
+    edge = np.arange(n)
+    linked = after >= 0
+    count, wall = connected_components(
+        sp.coo_array((np.ones(linked.sum(), bool), (edge[linked], after[linked])), shape=(n, n)), directed=False
+    )
+    closed = np.ones(count, bool)
+    closed[wall[~linked]] = False
+    # A closed wall is cut before its first edge.
+    _, first = np.unique(wall, return_index=True)
+    follow = np.where(linked, after, edge)
+    cut = closed[wall] & (follow == first[wall])
+    follow[cut] = edge[cut]
+    # Steps to the end of the wall, by doubling.
+    left, jump = (follow != edge).astype(np.int64), follow
+    while (jump[jump] != jump).any():
+        left = left + left[jump]
+        jump = jump[jump]
+    order = np.lexsort((-left, wall))
+    return order, wall[order].astype(np.int64), closed
+
+
+def curves(mask: NDArray[np.bool_], pieces: int) -> tuple[Floats, Floats]:
+    """Straight pieces of the outline: begins and ends (n, 2), x, y in pixels, with the fluid on their right.
+
+    Each stretch from one gate to the next is cut into `pieces`; walls that end at the image's border go straight on.
+    """
+    crossed = gates(mask)
+    point = smoothest(crossed)
+    n = len(point)
+    if n == 0:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    size = np.bincount(crossed.wall)
+    first = np.cumsum(size) - size
+    last = first + size - 1
+    edge = np.arange(n)
+    before, after = edge - 1, edge + 1
+    closed = crossed.closed
+    before[first], after[last] = np.where(closed, last, first), np.where(closed, first, last)
+    # Tangents of the circle through three neighbours, for a cubic between two.
+    back, ahead = point - point[before], point[after] - point
+    sb, sa = (np.hypot(d[:, 0], d[:, 1])[:, None] for d in (back, ahead))
+    tangent = (back / np.maximum(sb, 1e-9) ** 2 + ahead / np.maximum(sa, 1e-9) ** 2) / (
+        1.0 / np.maximum(sb, 1e-9) + 1.0 / np.maximum(sa, 1e-9)
+    )
+    lone = (sb[:, 0] < 1e-9) | (sa[:, 0] < 1e-9)
+    tangent[lone] = (back / np.maximum(sb, 1e-9) + ahead / np.maximum(sa, 1e-9))[lone]
+    on = edge != after
+    a, b = point[on], point[after[on]]
+    chord = sa[on]
+    u = np.linspace(0.0, 1.0, pieces + 1)[:, None, None]
+    swing = u * (1.0 - u) * chord * ((1.0 - u) * tangent[on] - u * tangent[after[on]])
+    knots = a + (u * u * (3.0 - 2.0 * u)) * (b - a) + swing
+    begins, ends = [knots[:-1].reshape(-1, 2)], [knots[1:].reshape(-1, 2)]
+    open_ = ~closed
+    begins += [point[first[open_]] - BEYOND_PX * tangent[first[open_]], point[last[open_]]]
+    ends += [point[first[open_]], point[last[open_]] + BEYOND_PX * tangent[last[open_]]]
+    return np.concatenate(begins), np.concatenate(ends)
+
+
+def smoothest(crossed: Gates) -> Floats:
+    """Points (n, 2) of the outline, one beside each gate: x, y in pixels."""
+    n = len(crossed.wall)
+    if n == 0:
+        return np.zeros((0, 2))
+    size = np.bincount(crossed.wall)
+    start = np.cumsum(size) - size
+    wrap = np.where(crossed.closed, WRAP, 0)
+    long = size + 2 * wrap
+    offset = np.cumsum(long) - long
+    wall = np.repeat(np.arange(len(size)), long)
+    k = np.arange(long.sum()) - offset[wall] - wrap[wall]
+    source = start[wall] + k % size[wall]
+    own = (k >= 0) & (k < size[wall])
+    relaxed = _relax(crossed.middle[source], crossed.inward[source], wall)
+    result = np.empty((n, 2))
+    result[source[own]] = relaxed[own]
+    return result
+
+
+def _relax(middle: Floats, inward: Floats, wall: Ints) -> Floats:
+    n = len(wall)
+    same = wall[:-1] == wall[1:]
+    whole = wall[:-3] == wall[3:]  # four gates in a row on one wall
+    at = middle
+    stiffness = np.full(max(n - 3, 0), STIFFNESS_PX**6)
+    for _ in range(ITERATIONS):
+        run = np.diff(at, axis=0) * same[:, None]
+        tangent = run
+        for _ in range(SMOOTHING):
+            smooth = 2.0 * tangent
+            smooth[1:] += tangent[:-1]
+            smooth[:-1] += tangent[1:]
+            tangent = smooth * same[:, None]
+        tangent /= np.maximum(np.hypot(tangent[:, 0], tangent[:, 1]), 1e-9)[:, None]
+        length = np.maximum((run * tangent).sum(axis=1), SHORTEST_PX)
+        node = np.zeros((n, 2))
+        node[:-1] += tangent
+        node[1:] += tangent
+        node /= np.maximum(np.hypot(node[:, 0], node[:, 1]), 1e-9)[:, None]
+        normals = np.stack([-node[:, 1], node[:, 0]], axis=1)
+        t = tangent[1:-1]
+        normal = np.stack([-t[:, 1], t[:, 0]], axis=1)
+        s1, s2, s3 = length[:-2], length[1:-1], length[2:]
+        knots = np.stack([np.zeros_like(s1), s1, s1 + s2, s1 + s2 + s3], axis=1)
+        coefficient = np.stack(
+            [6.0 / np.prod([knots[:, m] - knots[:, o] for o in range(4) if o != m], axis=0) for m in range(4)], axis=1
+        )
+        coefficient *= (np.sqrt(stiffness * s2) * whole)[:, None]
+        target = sum(coefficient[:, m] * (middle[m : n - 3 + m] * normal).sum(axis=1) for m in range(4))
+        jacobian = np.stack(
+            [coefficient[:, m] * (normals[m : n - 3 + m] * normal).sum(axis=1) for m in range(4)], axis=1
+        )
+        span = np.zeros(n)
+        span[:-1] += 0.5 * length * same
+        span[1:] += 0.5 * length * same
+        bands = np.zeros((4, n))
+        bands[0] = np.maximum(span, 0.1)
+        right = np.zeros(n)
+        for m in range(4):
+            right[m : n - 3 + m] -= jacobian[:, m] * target
+            for o in range(m, 4):
+                bands[o - m, m : n - 3 + m] += jacobian[:, m] * jacobian[:, o]
+        offset = solveh_banded(bands, right, lower=True)
+        at = middle + offset[:, None] * normals
+        lean = np.abs((inward * normals).sum(axis=1))
+        outside = np.abs(offset) > 0.5 * lean + SLACK_PX
+        if STAT is not None: STAT.append((offset, outside))
+        # Where the curve misses its gates the wall really bends: less stiff there.
+        miss = np.convolve(outside, np.ones(2 * REACH + 1), "same") > 0
+        stiffness = np.where((miss[1:-2] | miss[2:-1]), stiffness / SOFTER, stiffness)
+    return at
+STAT=None
