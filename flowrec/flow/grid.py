@@ -118,7 +118,7 @@ def build(chip: Chip, k: int, drawn: Outline | None = None) -> Grid:
     open_u[:, :-1] &= ~apart
     open_v[1:] &= ~apart
     open_v[:-1] &= ~apart
-    spans = [_span(chip, open_u, open_v, k, index) for index in range(len(chip.openings))]
+    spans = [_span(chip, level, open_u, open_v, k, index) for index in range(len(chip.openings))]
     kind_u, kind_v = np.zeros((h, w + 1), np.int8), np.zeros((h + 1, w), np.int8)
     kind_u[:, 1:-1] = np.where(open_u[:, 1:-1], OPEN, WALL)
     kind_v[1:-1] = np.where(open_v[1:-1], OPEN, WALL)
@@ -204,27 +204,30 @@ def _numbered(where: NDArray[np.bool_], start: int) -> tuple[Ints, int]:
 
 
 def _span(
-    chip: Chip, open_u: NDArray[np.bool_], open_v: NDArray[np.bool_], k: int, index: int
+    chip: Chip, level: Floats, open_u: NDArray[np.bool_], open_v: NDArray[np.bool_], k: int, index: int
 ) -> tuple[Ints, Ints]:
-    """Rows and columns of the border faces of opening `index`."""
+    """Rows and columns of the border faces of opening `index`: the run of open ones with most of its pixels."""
     opening = chip.openings[index]
-    drawn, line = {
-        "left": (chip.mask[:, 0], open_u[:, 0]),
-        "right": (chip.mask[:, -1], open_u[:, -1]),
-        "top": (chip.mask[0], open_v[0]),
-        "bottom": (chip.mask[-1], open_v[-1]),
+    drawn, line, corner = {
+        "left": (chip.mask[:, 0], open_u[:, 0], level[::2, 0]),
+        "right": (chip.mask[:, -1], open_u[:, -1], level[::2, -1]),
+        "top": (chip.mask[0], open_v[0], level[0, ::2]),
+        "bottom": (chip.mask[-1], open_v[-1], level[-1, ::2]),
     }[opening.side]
-    # A smooth outline may lie up to a pixel outside the pixels that the opening names.
-    slack = k if chip.walls == "smooth" else 0
-    low, high = max(opening.first * k - slack, 0), min((opening.last + 1) * k + slack, len(line))
-    along = low + np.flatnonzero(line[low:high])
     named = drawn[max(opening.first, 0) : opening.last + 1]
-    broken = len(along) == 0 or along[-1] - along[0] + 1 != len(along)
-    if broken or len(named) != opening.width_px or not named.all():
+    # Faces that hang together, numbered by the run they are in.
+    run = np.cumsum(~(line & np.append(False, line[:-1] & (corner[1:-1] > 0.0))))
+    core = run[max(opening.first, 0) * k : (opening.last + 1) * k]
+    core = core[line[max(opening.first, 0) * k : (opening.last + 1) * k]]
+    if len(core) == 0 or len(named) != opening.width_px or not named.all():
         raise FlowError(
             f"opening {index} ({opening.side} {opening.first}..{opening.last}) of chip '{chip.name}' is not one run "
             f"of fluid (k={k}, walls={chip.walls}): correct its pixels, or try walls='pixel'"
         )
+    along = np.flatnonzero(line & (run == np.bincount(core).argmax()))
+    # Fluid that lies beyond the named pixels by more than an outline can stays shut.
+    slack = k if chip.walls == "smooth" else 0
+    along = along[(along >= opening.first * k - slack) & (along < (opening.last + 1) * k + slack)]
     still = np.zeros_like(along)
     return {
         "left": (along, still),

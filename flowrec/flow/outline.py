@@ -118,17 +118,22 @@ def _seen(
 
 def _kept(level: Floats, mask: NDArray[np.bool_], k: int) -> Floats:
     """The level with the mask's own topology: pixels keep their side, and neighbours stay connected or apart."""
-    least = LEAST_PX * 2 * k
-    solid = ~mask
-    for samples, wet, dry in (
-        (level[k :: 2 * k, k :: 2 * k], mask, solid),
-        (level[k :: 2 * k, 2 * k : -1 : 2 * k], mask[:, 1:] & mask[:, :-1], solid[:, 1:] & solid[:, :-1]),
-        (level[2 * k : -1 : 2 * k, k :: 2 * k], mask[1:] & mask[:-1], solid[1:] & solid[:-1]),
+    unit = 2 * k
+    for lines, pixels in (
+        (level[k::unit], mask),  # through the centres of the pixels of each row
+        (level[:, k::unit].T, mask.T),
+        (level[:: level.shape[0] - 1], mask[:: max(mask.shape[0] - 1, 1)]),  # along the border
+        (level[:, :: level.shape[1] - 1].T, mask[:, :: max(mask.shape[1] - 1, 1)].T),
     ):
-        samples[wet] = np.maximum(samples[wet], least)
-        samples[dry] = np.minimum(samples[dry], -least)
-    falling = solid[1:, 1:] & solid[:-1, :-1]
-    rising = solid[1:, :-1] & solid[:-1, 1:]
-    joint = level[2 * k : -1 : 2 * k, 2 * k : -1 : 2 * k]
-    joint[falling | rising] = np.minimum(joint[falling | rising], 0.0)
+        sample = np.arange(lines.shape[1])
+        before = np.clip((sample - k) // unit, 0, pixels.shape[1] - 1)
+        after = np.clip(-((k - sample) // unit), 0, pixels.shape[1] - 1)
+        least = LEAST_PX * unit
+        wet, dry = pixels[:, before] & pixels[:, after], ~(pixels[:, before] | pixels[:, after])
+        lines[wet] = np.maximum(lines[wet], least)
+        lines[dry] = np.minimum(lines[dry], -least)
+    solid = ~mask
+    crossed = (solid[1:, 1:] & solid[:-1, :-1]) | (solid[1:, :-1] & solid[:-1, 1:])
+    joint = level[unit:-1:unit, unit:-1:unit]
+    joint[crossed] = np.minimum(joint[crossed], 0.0)
     return level
