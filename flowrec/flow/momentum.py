@@ -43,6 +43,8 @@ class Momentum:
     carried: Any  # (6 faces, faces) velocity at those sides
     gradient: Any  # G (faces, cells)
     outlet: Floats  # P (faces, openings)
+    # (faces, 4) viscous drag of the image's left, right, top and bottom border per unit of its speed along x or y
+    sliding: Floats
 
     def convection(self, moving: Floats) -> Floats:
         """N(w) (faces,): the momentum that leaves each control volume."""
@@ -83,11 +85,12 @@ def assemble(grid: Grid) -> Momentum:
     # The balance of v is that of u with rows and columns exchanged.
     own = (grid.kind_u, grid.number_u, grid.ends_u)
     cross = (grid.kind_v, grid.number_v, grid.ends_v)
-    _component(into, n, share, own, cross, grid.number_p, grid.level, grid.stepped)
+    sliding = np.zeros((n, 4))
+    _component(into, sliding[:, 2:], share, own, cross, grid.number_p, grid.level, grid.stepped)
     own, cross = (
         (kind.T, number.T, (ends[0].T, ends[1].T)) for kind, number, ends in (cross, own)
     )
-    _component(into, n, share, own, cross, grid.number_p.T, grid.level.T, grid.stepped)
+    _component(into, sliding[:, :2], share, own, cross, grid.number_p.T, grid.level.T, grid.stepped)
     outlet = np.zeros((n, len(grid.mouths)))
     for index, mouth in enumerate(grid.mouths):
         if mouth.kind == "outlet":
@@ -101,6 +104,7 @@ def assemble(grid: Grid) -> Momentum:
         carried.matrix((6 * n, n)) @ per_flux,
         gradient.matrix((n, grid.cells)),
         outlet,
+        sliding,
     )
 
 
@@ -109,7 +113,7 @@ Faces = tuple[NDArray[np.int8], Ints, tuple[Floats, Floats]]
 
 def _component(
     into: tuple[_Triplets, _Triplets, _Triplets, _Triplets],
-    n: int,
+    sliding: Floats,
     share: Floats,
     own: Faces,
     cross: Faces,
@@ -121,7 +125,7 @@ def _component(
     viscous, flux, carried, gradient = into
     kind, number, (low, high) = own
     cross_kind, cross_number, _ = cross
-    w = cells.shape[1]
+    n, w = len(share), cells.shape[1]
     table = lines(kind, number, own[2], level, cross_kind, stepped)
     j, i = np.nonzero((kind != WALL) & (kind != INLET))
     me = number[j, i]
@@ -138,6 +142,7 @@ def _component(
 
     # Across the flow: u_yy = 2 a2 of the parabola on the grid line.
     spread(viscous, me, row, -2.0 * half_volume[:, None] * table.weights[row, 2])
+    sliding[me] = 2.0 * half_volume[:, None] * table.border[row, 2]
     # Along the flow, at the height t of the middle of the fluid part.
     t = 0.5 * (low + high)[j, i] - 0.5
     here = _level(level, j, i, t)
