@@ -65,9 +65,13 @@ class _Triplets:
         self.parts: list[tuple[Ints, Ints, Floats]] = []
 
     def add(self, rows: Ints, columns: Ints, values: Floats | float) -> None:
-        """Add values where both row and column are numbered."""
+        """Add values where both row and column are numbered; rows broadcast against columns."""
         there = (rows >= 0) & (columns >= 0)
-        self.parts.append((rows[there], columns[there], np.broadcast_to(values, rows.shape)[there].astype(np.float64)))
+        if there.all():
+            part = (np.broadcast_to(rows, there.shape).ravel(), columns.ravel())
+        else:
+            part = (np.broadcast_to(rows, there.shape)[there], columns[there])
+        self.parts.append((*part, np.broadcast_to(values, there.shape)[there].astype(np.float64)))
 
     def matrix(self, shape: tuple[int, int]) -> Any:
         """Sum duplicates into CSR."""
@@ -96,16 +100,21 @@ def assemble(grid: Grid) -> Momentum:
         if mouth.kind == "outlet":
             outlet[mouth.faces, index] = mouth.inward
             volume[mouth.faces] = 0.5
-    per_flux = sp.diags_array(1.0 / share)
     return Momentum(
-        viscous.matrix((n, n)) @ per_flux,
+        _per_flux(viscous.matrix((n, n)), share),
         volume / share,
         flux.matrix((6 * n, n)),
-        carried.matrix((6 * n, n)) @ per_flux,
+        _per_flux(carried.matrix((6 * n, n)), share),
         gradient.matrix((n, grid.cells)),
         outlet,
         sliding,
     )
+
+
+def _per_flux(per_velocity: Any, share: Floats) -> Any:
+    """A matrix that acts on velocities, made to act on fluxes."""
+    per_velocity.data /= share[per_velocity.indices]
+    return per_velocity
 
 
 Faces = tuple[NDArray[np.int8], Ints, tuple[Floats, Floats]]
@@ -132,16 +141,12 @@ def _component(
     row = table.place[j, i]
     half_volume = np.where((i == 0) | (i == w), 0.5, 1.0)
 
-    def spread(into: _Triplets, rows: Ints, lines_: Ints, weights: Floats) -> None:
-        for c in range(3):
-            into.add(rows, table.columns[lines_, c], weights[:, c])
-
     def at(array: NDArray[Any], rows: Ints, columns: Ints, outside: int) -> NDArray[Any]:
         inside = (rows >= 0) & (rows < array.shape[0]) & (columns >= 0) & (columns < array.shape[1])
         return np.where(inside, array[np.where(inside, rows, 0), np.where(inside, columns, 0)], outside)
 
     # Across the flow: u_yy = 2 a2 of the parabola on the grid line.
-    spread(viscous, me, row, -2.0 * half_volume[:, None] * table.weights[row, 2])
+    viscous.add(me[:, None], table.columns[row], -2.0 * half_volume[:, None] * table.weights[row, 2])
     sliding[me] = 2.0 * half_volume[:, None] * table.border[row, 2]
     # Along the flow, at the height t of the middle of the fluid part.
     t = 0.5 * (low + high)[j, i] - 0.5
@@ -158,17 +163,19 @@ def _component(
         distance = np.where(there > 0.0, 1.0, here / np.maximum(here - there, 1e-12))
         reach.append(np.where(open_, 1.0, np.clip(distance, NEAREST, 1.0)))
         simple &= ~inside | (open_ & whole[j, beyond]) | (~open_ & (reach[-1] == 1.0))
-    # Where nothing is cut, means over whole faces do for points.
-    mean = np.zeros((len(table.columns), 3))
-    mean[:, 1] = 1.0
-    middle = np.where(simple[:, None], mean[row], table.value(row, t))
-    for step, side in ((1, 0), (-1, 1)):
-        total = reach[0] + reach[1]
-        factor = np.where(inner[0] & inner[1], 2.0 / total, 1.0) / reach[side] * inner[side]
-        spread(viscous, me, row, factor[:, None] * middle)
-        seen = line[side] >= 0
-        weights = np.where(simple[seen, None], mean[line[side][seen]], table.value(line[side][seen], t[seen]))
-        spread(viscous, me[seen], line[side][seen], -factor[seen, None] * weights)
+    total = np.where(inner[0] & inner[1], 0.5 * (reach[0] + reach[1]), 1.0)
+    cut = ~simple
+    own_middle = table.value(row[cut], t[cut])
+    for side, step in enumerate((1, -1)):
+        factor = inner[side] / (total * reach[side])
+        seen = simple & (line[side] >= 0)
+        # Where nothing is cut, means over whole faces do for points.
+        viscous.add(me[simple], me[simple], factor[simple])
+        viscous.add(me[seen], table.columns[line[side][seen], 1], -factor[seen])
+        viscous.add(me[cut, None], table.columns[row[cut]], factor[cut, None] * own_middle)
+        seen = cut & (line[side] >= 0)
+        there = table.value(line[side][seen], t[seen])
+        viscous.add(me[seen, None], table.columns[line[side][seen]], -factor[seen, None] * there)
         cell = at(cells, j, i if step > 0 else i - 1, -1)
         gradient.add(me, cell, -float(step))
 

@@ -16,6 +16,7 @@ Ints = NDArray[np.int64]
 
 PIECES = 2  # straight pieces from one gate of the contour to the next
 REACH_PX = 0.7  # the outline is never farther from the edges of the pixels than this
+LEAST_REACH = 2.2  # in half subcells: a whole one, and a little, between a face and the wall beside it
 LEAST_PX = 0.1  # least distance between the outline and pixel centres, and middles between equal neighbours
 
 
@@ -76,7 +77,7 @@ def smooth(mask: NDArray[np.bool_], k: int) -> Outline:
     unit = 2 * k
     shape = (mask.shape[0] * unit + 1, mask.shape[1] * unit + 1)
     begin, end = ((points + 0.5) * unit for points in curves(mask, PIECES))
-    reach = 2.0 + REACH_PX * unit
+    reach = max(LEAST_REACH, REACH_PX * unit)
     nearest = np.full(shape[0] * shape[1], reach)
     sided = np.zeros(shape[0] * shape[1])
     width = int(np.ceil(np.abs(end - begin).max(initial=0.0) + 2.0 * reach)) + 1
@@ -104,16 +105,20 @@ def _seen(
 ) -> tuple[Ints, Floats, Floats]:
     """Samples (numbers), distances and signed sides of all samples within reach of pieces a to b (n, 2)."""
     run = b - a
-    length = np.maximum(np.hypot(run[:, 0], run[:, 1]), 1e-12)
-    x, y = (corner[:, None, axis] + window[None, :, axis] for axis in (0, 1))
-    dx, dy = x - a[:, None, 0], y - a[:, None, 1]
-    ux, uy = run[:, 0:1] / length[:, None], run[:, 1:2] / length[:, None]
-    along = dx * ux + dy * uy
-    side = dy * ux - dx * uy  # the fluid is on the right, with y pointing down
-    over = along - np.clip(along, 0.0, length[:, None])
-    distance = np.sqrt(side * side + over * over)
-    there = (distance < reach) & (x >= 0) & (y >= 0) & (x < shape[1]) & (y < shape[0])
-    return (y * shape[1] + x)[there], distance[there], side[there]
+    length = np.maximum(np.hypot(run[:, 0], run[:, 1]), 1e-12)[:, None]
+    u = run / length
+    start = corner - a
+    # Along and across the piece, for its own corner and then over the window.
+    along = (start * u).sum(axis=1)[:, None] + u @ window.T
+    side = (start[:, 1] * u[:, 0] - start[:, 0] * u[:, 1])[:, None]  # the fluid is on the right, y points down
+    side = side + np.stack([-u[:, 1], u[:, 0]], axis=1) @ window.T
+    over = along - np.clip(along, 0.0, length)
+    squared = side * side + over * over
+    piece, place = np.nonzero(squared < reach * reach)
+    at = corner[piece] + window[place]
+    inside = (at[:, 0] >= 0) & (at[:, 1] >= 0) & (at[:, 0] < shape[1]) & (at[:, 1] < shape[0])
+    piece, place, at = piece[inside], place[inside], at[inside]
+    return at[:, 1] * shape[1] + at[:, 0], np.sqrt(squared[piece, place]), side[piece, place]
 
 
 def _kept(level: Floats, mask: NDArray[np.bool_], k: int) -> Floats:
