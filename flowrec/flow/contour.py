@@ -29,6 +29,7 @@ ITERATIONS = 6
 SMOOTHING = 4
 SLACK_PX = 0.05
 BEYOND_PX = 2.0
+LARGEST_SHIFT_PX = 0.25
 REACH = 2
 SOFTER = 8.0
 SHORTEST_PX = 0.3
@@ -105,36 +106,55 @@ def curves(mask: NDArray[np.bool_], pieces: int) -> tuple[Floats, Floats]:
     Each stretch from one gate to the next is cut into `pieces`; walls that end at the image's border go straight on.
     """
     crossed = gates(mask)
-    point = smoothest(crossed)
-    n = len(point)
+    n = len(crossed.wall)
     if n == 0:
         return np.zeros((0, 2)), np.zeros((0, 2))
+    point = smoothest(crossed)
     size = np.bincount(crossed.wall)
     first = np.cumsum(size) - size
     last = first + size - 1
-    edge = np.arange(n)
-    before, after = edge - 1, edge + 1
+    before, after = np.arange(n) - 1, np.arange(n) + 1
     closed = crossed.closed
     before[first], after[last] = np.where(closed, last, first), np.where(closed, first, last)
-    # Tangents of the circle through three neighbours, for a cubic between two.
-    back, ahead = point - point[before], point[after] - point
-    sb, sa = (np.hypot(d[:, 0], d[:, 1])[:, None] for d in (back, ahead))
-    tangent = (back / np.maximum(sb, 1e-9) ** 2 + ahead / np.maximum(sa, 1e-9) ** 2) / (
-        1.0 / np.maximum(sb, 1e-9) + 1.0 / np.maximum(sa, 1e-9)
-    )
-    lone = (sb[:, 0] < 1e-9) | (sa[:, 0] < 1e-9)
-    tangent[lone] = (back / np.maximum(sb, 1e-9) + ahead / np.maximum(sa, 1e-9))[lone]
-    on = edge != after
-    a, b = point[on], point[after[on]]
-    chord = sa[on]
-    u = np.linspace(0.0, 1.0, pieces + 1)[:, None, None]
-    swing = u * (1.0 - u) * chord * ((1.0 - u) * tangent[on] - u * tangent[after[on]])
-    knots = a + (u * u * (3.0 - 2.0 * u)) * (b - a) + swing
-    begins, ends = [knots[:-1].reshape(-1, 2)], [knots[1:].reshape(-1, 2)]
+    knots, tangent = _cubic(point, before, after, pieces)
+    # What a closed wall encloses is known: its pixels. It matters where there are few.
+    along = crossed.inward[:, [1, 0]] * [1.0, -1.0]
+    wanted = _enclosed(crossed.middle, crossed.middle + along, crossed.wall)
+    found = sum(_enclosed(a, b, crossed.wall) for a, b in zip(knots[:-1], knots[1:], strict=True))
+    around = np.bincount(crossed.wall, np.hypot(*(point[after] - point).T))
+    # Both areas count positive where the fluid is inside.
+    shift = np.where(closed, np.clip((wanted - found) / np.maximum(around, 1e-9), -LARGEST_SHIFT_PX, LARGEST_SHIFT_PX), 0.0)
+    outward = tangent[:, [1, 0]] * [1.0, -1.0]
+    point = point + shift[crossed.wall, None] * outward
+    knots, tangent = _cubic(point, before, after, pieces)
+    on = after != np.arange(n)
+    begins, ends = [knots[:-1, on].reshape(-1, 2)], [knots[1:, on].reshape(-1, 2)]
     open_ = ~closed
     begins += [point[first[open_]] - BEYOND_PX * tangent[first[open_]], point[last[open_]]]
     ends += [point[first[open_]], point[last[open_]] + BEYOND_PX * tangent[last[open_]]]
     return np.concatenate(begins), np.concatenate(ends)
+
+
+def _enclosed(a: Floats, b: Floats, wall: Ints) -> Floats:
+    """Areas (walls,) under the pieces a to b (n, 2)."""
+    return np.asarray(0.5 * np.bincount(wall, a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
+
+
+def _cubic(point: Floats, before: Ints, after: Ints, pieces: int) -> tuple[Floats, Floats]:
+    """Knots (pieces + 1, n, 2) of the curve from each point to the next, and its unit tangents (n, 2) there.
+
+    The tangent is that of the circle through a point and its neighbours, and the curve the cubic between two.
+    """
+    back, ahead = point - point[before], point[after] - point
+    sb, sa = (np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)[:, None] for d in (back, ahead))
+    tangent = back / sb * sa + ahead / sa * sb
+    lone = (sb[:, 0] < 1e-8) | (sa[:, 0] < 1e-8)
+    tangent[lone] = (back / sb + ahead / sa)[lone]
+    tangent /= np.maximum(np.hypot(tangent[:, 0], tangent[:, 1]), 1e-9)[:, None]
+    u = np.linspace(0.0, 1.0, pieces + 1)[:, None, None]
+    swing = u * (1.0 - u) * sa * ((1.0 - u) * tangent - u * tangent[after])
+    straight = u * u * (3.0 - 2.0 * u) * ahead
+    return np.asarray(point + straight + swing), tangent
 
 
 def smoothest(crossed: Gates) -> Floats:
