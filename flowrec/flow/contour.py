@@ -1,17 +1,20 @@
 """The smoothest outline that a mask allows.
 
 A mask is a sample: all it tells is that a wall passes between two neighbouring pixel centres, one in fluid and one in
-solid. Each such pair is a gate, and the outline goes from gate to gate. Among all curves through the gates that is
-taken whose curvature changes least and which keeps nearest to the middles of the gates,
+solid. Each such pair is a gate, and the outline has one point near each. Among all curves that is taken whose
+curvature changes least and which keeps nearest to the middles of the gates,
 
-    min  int l^6 (d kappa / ds)^2 + d^2 ds   over the places of the crossings, |place| <= half a pixel,
+    min  int l^6 (d kappa / ds)^2 + d^2 ds,   kappa = curvature, d = distance from the middles,
 
-kappa being the curvature, d the distance from the middle of the gate. Straight walls and circles cost nothing, so an
-oblique wall comes out straight however long its steps, and neither channels nor islands shrink.
+with a length l that is made smaller, step by step, where the curve would leave the gates: there the wall bends.
+Straight walls and circles cost nothing, so an oblique wall comes out straight however long its steps, and neither
+channels nor islands shrink. What the gates leave open nobody can know: at a slope of p / q pixels the place of a
+straight wall is known to 1 / (2 sqrt(p^2 + q^2)) pixels, which is 0.35 at 45 degrees.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,18 +26,16 @@ from scipy.sparse.csgraph import connected_components
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STIFFNESS_PX = 4.0  # l: wobbles shorter than about 2 pi l are taken for steps of the mask
-LARGEST_PX = 0.49  # crossings stay this near to the middles of their gates, so that no pixel changes sides
+STIFFNESS_PX = 4.0  # l of a wall that keeps to its gates: wobbles shorter than about 2 pi l are steps of the mask
+SOFTENING = 8.0  # of l^6, around gates that are missed
+SOFTENED = 2  # gates to either side of a missed one
+SLACK_PX = 0.05  # a gate is missed by more than that
 ITERATIONS = 6
-SMOOTHING = 4
-SLACK_PX = 0.05
-BEYOND_PX = 2.0
-LARGEST_SHIFT_PX = 0.25
-REACH = 2
-SOFTER = 8.0
-SHORTEST_PX = 0.3
-WRAP = 16  # closed curves are continued around by this many gates
-PENALTY = 1e7  # on crossings outside their gates; far above l^6
+BLUR = 4  # passes of 1 2 1 over the directions of the last approximation
+SHORTEST_PX = 0.3  # least distance of two points along the wall
+WRAP = 16  # closed walls are continued around by this many gates
+BEYOND_PX = 2.0  # walls go straight on beyond the image's border
+LARGEST_SHIFT_PX = 0.25  # of a closed wall, towards the area of its pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +72,7 @@ def gates(mask: NDArray[np.bool_]) -> Gates:
     order, wall, closed = _ordered(after)
     begin = np.stack([column, row], axis=1) - 0.5
     inward = step[(way + 1) % 4].astype(np.float64)
-    return Gates((begin + 0.5 * step[way])[order] - 0.0, inward[order], wall, closed)
+    return Gates((begin + 0.5 * step[way])[order], inward[order], wall, closed)
 
 
 def _ordered(after: Ints) -> tuple[Ints, Ints, NDArray[np.bool_]]:
@@ -120,10 +121,12 @@ def curves(mask: NDArray[np.bool_], pieces: int) -> tuple[Floats, Floats]:
     # What a closed wall encloses is known: its pixels. It matters where there are few.
     along = crossed.inward[:, [1, 0]] * [1.0, -1.0]
     wanted = _enclosed(crossed.middle, crossed.middle + along, crossed.wall)
-    found = sum(_enclosed(a, b, crossed.wall) for a, b in zip(knots[:-1], knots[1:], strict=True))
+    found = sum(_enclosed(a, b, crossed.wall) for a, b in itertools.pairwise(knots))
     around = np.bincount(crossed.wall, np.hypot(*(point[after] - point).T))
     # Both areas count positive where the fluid is inside.
-    shift = np.where(closed, np.clip((wanted - found) / np.maximum(around, 1e-9), -LARGEST_SHIFT_PX, LARGEST_SHIFT_PX), 0.0)
+    shift = np.where(
+        closed, np.clip((wanted - found) / np.maximum(around, 1e-9), -LARGEST_SHIFT_PX, LARGEST_SHIFT_PX), 0.0
+    )
     outward = tangent[:, [1, 0]] * [1.0, -1.0]
     point = point + shift[crossed.wall, None] * outward
     knots, tangent = _cubic(point, before, after, pieces)
@@ -178,55 +181,65 @@ def smoothest(crossed: Gates) -> Floats:
 
 
 def _relax(middle: Floats, inward: Floats, wall: Ints) -> Floats:
+    """Points (n, 2) beside the middles of gates on open walls.
+
+    Each point is its middle moved along the normal of the wall. d kappa / ds is the third divided difference over
+    four points in the direction of the normal; normals and distances are those of the last approximation, so that
+    every step is a banded least-squares problem.
+    """
     n = len(wall)
+    if n < 4:
+        return middle
     same = wall[:-1] == wall[1:]
     whole = wall[:-3] == wall[3:]  # four gates in a row on one wall
-    at = middle
-    stiffness = np.full(max(n - 3, 0), STIFFNESS_PX**6)
+    point = middle
+    weight = np.full(n - 3, STIFFNESS_PX**6)
     for _ in range(ITERATIONS):
-        run = np.diff(at, axis=0) * same[:, None]
+        run = np.diff(point, axis=0) * same[:, None]
         tangent = run
-        for _ in range(SMOOTHING):
+        for _ in range(BLUR):
             smooth = 2.0 * tangent
             smooth[1:] += tangent[:-1]
             smooth[:-1] += tangent[1:]
             tangent = smooth * same[:, None]
-        tangent /= np.maximum(np.hypot(tangent[:, 0], tangent[:, 1]), 1e-9)[:, None]
+        tangent = _unit(tangent)
         length = np.maximum((run * tangent).sum(axis=1), SHORTEST_PX)
-        node = np.zeros((n, 2))
-        node[:-1] += tangent
-        node[1:] += tangent
-        node /= np.maximum(np.hypot(node[:, 0], node[:, 1]), 1e-9)[:, None]
-        normals = np.stack([-node[:, 1], node[:, 0]], axis=1)
-        t = tangent[1:-1]
-        normal = np.stack([-t[:, 1], t[:, 0]], axis=1)
-        s1, s2, s3 = length[:-2], length[1:-1], length[2:]
-        knots = np.stack([np.zeros_like(s1), s1, s1 + s2, s1 + s2 + s3], axis=1)
-        coefficient = np.stack(
-            [6.0 / np.prod([knots[:, m] - knots[:, o] for o in range(4) if o != m], axis=0) for m in range(4)], axis=1
-        )
-        coefficient *= (np.sqrt(stiffness * s2) * whole)[:, None]
-        target = sum(coefficient[:, m] * (middle[m : n - 3 + m] * normal).sum(axis=1) for m in range(4))
-        jacobian = np.stack(
-            [coefficient[:, m] * (normals[m : n - 3 + m] * normal).sum(axis=1) for m in range(4)], axis=1
-        )
-        span = np.zeros(n)
-        span[:-1] += 0.5 * length * same
-        span[1:] += 0.5 * length * same
-        bands = np.zeros((4, n))
-        bands[0] = np.maximum(span, 0.1)
-        right = np.zeros(n)
+        normal = _across(tangent[1:-1])
+        both = np.zeros((n, 2))
+        both[:-1] += tangent
+        both[1:] += tangent
+        normals = _across(_unit(both))
+        knots = np.zeros((n - 3, 4))
+        knots[:, 1:] = np.cumsum([length[:-2], length[1:-1], length[2:]], axis=0).T
+        # Row i: jacobian @ offsets + target, offsets along the normals of points i to i + 3.
+        jacobian, target = np.empty_like(knots), np.zeros(len(knots))
+        scale = 6.0 * np.sqrt(weight * length[1:-1]) * whole
+        for m in range(4):
+            here = slice(m, n - 3 + m)
+            divided = scale / np.prod([knots[:, m] - knots[:, o] for o in range(4) if o != m], axis=0)
+            jacobian[:, m] = divided * (normals[here] * normal).sum(axis=1)
+            target += divided * (middle[here] * normal).sum(axis=1)
+        bands, right = np.zeros((4, n)), np.zeros(n)
+        bands[0, :-1] += 0.5 * length * same
+        bands[0, 1:] += 0.5 * length * same
+        bands[0] = np.maximum(bands[0], 0.1)
         for m in range(4):
             right[m : n - 3 + m] -= jacobian[:, m] * target
             for o in range(m, 4):
                 bands[o - m, m : n - 3 + m] += jacobian[:, m] * jacobian[:, o]
         offset = solveh_banded(bands, right, lower=True)
-        at = middle + offset[:, None] * normals
-        lean = np.abs((inward * normals).sum(axis=1))
-        outside = np.abs(offset) > 0.5 * lean + SLACK_PX
-        if STAT is not None: STAT.append((offset, outside))
-        # Where the curve misses its gates the wall really bends: less stiff there.
-        miss = np.convolve(outside, np.ones(2 * REACH + 1), "same") > 0
-        stiffness = np.where((miss[1:-2] | miss[2:-1]), stiffness / SOFTER, stiffness)
-    return at
-STAT=None
+        point = middle + offset[:, None] * normals
+        missed = np.abs(offset) > 0.5 * np.abs((inward * normals).sum(axis=1)) + SLACK_PX
+        near = np.convolve(missed, np.ones(2 * SOFTENED + 1), "same") > 0.0
+        weight = np.where(near[1:-2] | near[2:-1], weight / SOFTENING, weight)
+    return point
+
+
+def _unit(vector: Floats) -> Floats:
+    """Vectors (n, 2) of length 1, or 0 where they vanish."""
+    return np.asarray(vector / np.maximum(np.hypot(vector[:, 0], vector[:, 1]), 1e-9)[:, None])
+
+
+def _across(vector: Floats) -> Floats:
+    """Vectors (n, 2) turned by a right angle."""
+    return np.stack([-vector[:, 1], vector[:, 0]], axis=1)

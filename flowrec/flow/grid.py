@@ -187,7 +187,7 @@ def _ends(level: Floats) -> tuple[Floats, Floats]:
 
 
 def _parted(level: Floats) -> NDArray[np.bool_]:
-    """Cells (h, w) with solid in the middle and fluid on more than one side of it: nothing may pass from one to another."""
+    """Cells (h, w) with solid in the middle and separate fluid beside it: nothing may pass through."""
     corner, upright, flat = level[::2, ::2] > 0.0, level[1::2, ::2] > 0.0, level[::2, 1::2] > 0.0
     ring = [corner[:-1, :-1], flat[:-1], corner[:-1, 1:], upright[:, 1:], corner[1:, 1:], flat[1:], corner[1:, :-1]]
     ring.append(upright[:, :-1])
@@ -248,7 +248,12 @@ def _fed(kind_u: NDArray[np.int8], kind_v: NDArray[np.int8]) -> NDArray[np.bool_
         sp.coo_array((np.ones(len(one), bool), (one, two)), shape=(h * w, h * w)), directed=False
     )
     labels = labels.reshape(h, w)
-    sides = [(kind_u[:, 0], labels[:, 0]), (kind_u[:, -1], labels[:, -1]), (kind_v[0], labels[0]), (kind_v[-1], labels[-1])]
+    sides = [
+        (kind_u[:, 0], labels[:, 0]),
+        (kind_u[:, -1], labels[:, -1]),
+        (kind_v[0], labels[0]),
+        (kind_v[-1], labels[-1]),
+    ]
     fed = np.concatenate([line[kinds != WALL] for kinds, line in sides])
     if len(fed) == 0:
         fed = labels.ravel()[np.concatenate([one, two])]

@@ -91,9 +91,7 @@ def assemble(grid: Grid) -> Momentum:
     cross = (grid.kind_v, grid.number_v, grid.ends_v)
     sliding = np.zeros((n, 4))
     _component(into, sliding[:, 2:], share, own, cross, grid.number_p, grid.level, grid.stepped)
-    own, cross = (
-        (kind.T, number.T, (ends[0].T, ends[1].T)) for kind, number, ends in (cross, own)
-    )
+    own, cross = ((kind.T, number.T, (ends[0].T, ends[1].T)) for kind, number, ends in (cross, own))
     _component(into, sliding[:, :2], share, own, cross, grid.number_p.T, grid.level.T, grid.stepped)
     outlet = np.zeros((n, len(grid.mouths)))
     for index, mouth in enumerate(grid.mouths):

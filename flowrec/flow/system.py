@@ -194,5 +194,5 @@ def assembled(chip: Chip, k: int, drawn: Outline | None = None) -> System:
 
 
 def _friction(chip: Chip, k: int) -> float:
-    """f = 12 h^2 / H^2 of a shallow chip."""
+    """The factor 12 h^2 / H^2 of a shallow chip, else 0."""
     return 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / k / chip.depth_um) ** 2

@@ -111,9 +111,7 @@ def test_a_bend_between_circles_converges_at_second_order():
         np.polyfit(turn[core], solved(chip, k, analytic(distance, mask.shape, k))[2][core], 1)[0] for k in (1, 2, 4)
     ]
     # Stokes flow along circles: u = G / (2 mu) (r ln r + B r + C / r) for a pressure that grows by G per radian.
-    b, c = np.linalg.solve(
-        [[inner, 1 / inner], [outer, 1 / outer]], [-inner * np.log(inner), -outer * np.log(outer)]
-    )
+    b, c = np.linalg.solve([[inner, 1 / inner], [outer, 1 / outer]], [-inner * np.log(inner), -outer * np.log(outer)])
     r = np.linspace(inner, outer, 20001)
     flux = -np.trapezoid(0.5 * (r * np.log(r) + b * r + c / r), r)
     exact = SPEED * 1e-6 * len(ends[0]) * 1e-3 / (flux * UM_PER_PX * 1e-6)
@@ -124,7 +122,7 @@ def test_a_bend_between_circles_converges_at_second_order():
 
 
 def nasty(seed, size=36):
-    """Blobs, necks of one pixel, corners that touch, ponds and islands, with openings wherever they reach the border."""
+    """Blobs, necks of one pixel, corners that touch, ponds and islands, and openings all around."""
     rng = np.random.default_rng(seed)
     field = gaussian_filter(rng.normal(size=(size, size)), rng.choice([0.5, 0.9, 1.6]))
     mask = field > np.quantile(field, 0.4)
