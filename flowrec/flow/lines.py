@@ -64,14 +64,39 @@ def lines(
     stepped
         As in Outline.
     """
-    h, w = kind.shape[0], kind.shape[1] - 1
-    j, i = np.nonzero(kind != WALL)
-    n = len(j)
+    faces = kind != WALL
+    j, i = np.nonzero(faces)
     place = np.full(kind.shape, -1, np.int64)
-    place[j, i] = np.arange(n)
-    columns = np.full((n, 3), -1, np.int64)
-    columns[:, 1] = number[j, i]
+    place[j, i] = np.arange(len(j))
+    # In the open a face and both neighbours are whole, and all such faces share one parabola.
+    whole = faces & (ends[1] - ends[0] > 1.0 - 1e-12)
+    linked = level[2:-1:2, ::2] > 0.0
+    plain = np.zeros(kind.shape, bool)
+    plain[1:-1] = whole[:-2] & whole[1:-1] & whole[2:] & linked[:-1] & linked[1:]
+    around = np.pad(number, ((1, 1), (0, 0)), constant_values=-1)
+    columns = np.stack([around[j + step, i] for step in range(3)], axis=1)
+    weights = np.broadcast_to(np.linalg.inv(_OPEN), (len(j), 3, 3)).copy()
+    border = np.zeros((len(j), 3, 2))
+    special = np.flatnonzero(~plain[j, i])
+    joined, weights[special], border[special] = _special(kind, ends, level, cross, stepped, j[special], i[special])
+    columns[special] = np.where(joined, columns[special], -1)
+    return Lines(place, columns, weights, border)
+
+
+def _special(
+    kind: NDArray[np.int8],
+    ends: tuple[Floats, Floats],
+    level: Floats,
+    cross: NDArray[np.int8],
+    stepped: bool,
+    j: Ints,
+    i: Ints,
+) -> tuple[NDArray[np.bool_], Floats, Floats]:
+    """Whether each column is there (n, 3), weights and border of faces (j, i) that walls may cut; else as `lines`."""
+    h, w = kind.shape[0], kind.shape[1] - 1
     low, high = ends
+    n = len(j)
+    joined = np.ones((n, 3), bool)
     moments = np.empty((n, 3, 3))
     moments[:, 1] = _mean(low[j, i], high[j, i])
     walls, bordered = np.empty((n, 2)), np.zeros((n, 2), bool)
@@ -79,35 +104,33 @@ def lines(
         inside = (j + step >= 0) & (j + step < h)
         beyond = np.clip(j + step, 0, h - 1)
         wet = inside & (level[2 * j + 1 + step, 2 * i] > 0.0)
-        joined = wet & (kind[beyond, i] != WALL)
-        columns[joined, 2 * side] = number[beyond, i][joined]
+        next_ = wet & (kind[beyond, i] != WALL)
+        joined[:, 2 * side] = next_
         a, b = low[beyond, i], high[beyond, i]
         # The wall is at the end of the fluid part, or hides in the nearly shut face behind it.
-        hidden = np.where(wet & ~joined, np.maximum(b - a, 0.0), 0.0)
+        hidden = np.where(wet & ~next_, np.maximum(b - a, 0.0), 0.0)
         walls[:, side] = (low if step < 0 else high)[j, i] + step * hidden
         # Nothing changes across an outlet.
         rim = cross[0 if step < 0 else h]
         free = ~inside & ((rim[np.maximum(i - 1, 0)] == OUTLET) | (rim[np.minimum(i, w - 1)] == OUTLET))
         bordered[:, side] = ~inside & ~free
         there = np.where(free[:, None], _slope(walls[:, side]), _point(walls[:, side]))
-        moments[:, 2 * side] = np.where(joined[:, None], _mean(a + step, b + step), there)
-    alone = (columns[:, 0] < 0) & (columns[:, 2] < 0) & (walls[:, 1] - walls[:, 0] < NARROWEST)
+        moments[:, 2 * side] = np.where(next_[:, None], _mean(a + step, b + step), there)
+    alone = ~joined[:, 0] & ~joined[:, 2] & (walls[:, 1] - walls[:, 0] < NARROWEST)
     moments[alone, 0], moments[alone, 2] = _point(walls[alone, 0] - NARROWEST), _point(walls[alone, 1] + NARROWEST)
-    inverse = np.broadcast_to(np.linalg.inv(_OPEN), moments.shape).copy()
-    special = (np.abs(moments - _OPEN) > 1e-12).any(axis=(1, 2))
-    inverse[special] = np.linalg.inv(moments[special])
+    inverse = np.linalg.inv(moments)
     if stepped:
         for side, step in enumerate((-1, 1)):
             # Beside a convex corner of pixels half of the edge is wall, and through the other half shows the shut
             # face behind it, where nothing moves.
             edge = cross[np.clip(j + (step > 0), 0, h)] == OPEN
-            inner = (columns[:, 2 * side] < 0) & (i > 0) & (i < w)
+            inner = ~joined[:, 2 * side] & (i > 0) & (i < w)
             half = inner & (edge[np.arange(n), np.maximum(i - 1, 0)] != edge[np.arange(n), np.minimum(i, w - 1)])
             through = moments[half]
             through[:, 2 * side] = _mean(low[j, i][half] + step, high[j, i][half] + step)
             inverse[half] = 0.5 * (inverse[half] + np.linalg.inv(through))
-    weights = np.where((columns >= 0)[:, None, :], inverse, 0.0)
-    return Lines(place, columns, weights, np.where(bordered[:, None, :], inverse[:, :, [0, 2]], 0.0))
+    border = np.where(bordered[:, None, :], inverse[:, :, [0, 2]], 0.0)
+    return joined, np.where(joined[:, None, :], inverse, 0.0), border
 
 
 def _mean(low: Floats, high: Floats) -> Floats:

@@ -17,6 +17,7 @@ Ints = NDArray[np.int64]
 PIECES = 2  # straight pieces from one gate of the contour to the next
 REACH_PX = 0.7  # the outline is never farther from the edges of the pixels than this
 LEAST_REACH = 2.2  # in half subcells: a whole one, and a little, between a face and the wall beside it
+CHUNK = 200_000  # pairs of a piece and a sample at a time, so that they stay in the cache
 LEAST_PX = 0.1  # least distance between the outline and pixel centres, and middles between equal neighbours
 
 
@@ -78,32 +79,35 @@ def smooth(mask: NDArray[np.bool_], k: int) -> Outline:
     shape = (mask.shape[0] * unit + 1, mask.shape[1] * unit + 1)
     begin, end = ((points + 0.5) * unit for points in curves(mask, PIECES))
     reach = max(LEAST_REACH, REACH_PX * unit)
-    nearest = np.full(shape[0] * shape[1], reach)
-    sided = np.zeros(shape[0] * shape[1])
     width = int(np.ceil(np.abs(end - begin).max(initial=0.0) + 2.0 * reach)) + 1
     window = np.stack(np.meshgrid(np.arange(width), np.arange(width)), axis=-1).reshape(-1, 2)
-    parts = []
-    chunk = 2_000_000 // len(window) + 1
-    for first in range(0, len(begin), chunk):
-        a, b = begin[first : first + chunk], end[first : first + chunk]
-        corner = np.floor(np.minimum(a, b) - reach).astype(np.int64) + 1
-        parts.append(_seen(a, b, corner, window, shape, reach))
-    for sample, distance, _ in parts:
+    chunk = CHUNK // len(window) + 1
+    parts = [
+        _seen(begin[first : first + chunk], end[first : first + chunk], window, shape, reach)
+        for first in range(0, len(begin), chunk)
+    ]
+    # Beyond reach a pixel's own side is enough.
+    whole = np.where(mask, reach, -reach)
+    level = np.pad(np.repeat(np.repeat(whole, unit, axis=0), unit, axis=1), ((0, 1), (0, 1)), mode="edge")
+    if parts:
+        sample, distance, side = (np.concatenate(part) for part in zip(*parts, strict=True))
+        nearest, sided = np.full(level.size, reach), np.zeros(level.size)
         np.minimum.at(nearest, sample, distance)
-    for sample, distance, side in parts:
         # Beside a joint of two pieces both are nearest, and the sum of their normals tells the side.
         closest = distance <= nearest[sample] + 1e-9
-        sided += np.bincount(sample[closest], side[closest], len(sided))
-    rows, columns = (np.minimum(np.arange(size) // unit, size // unit - 1) for size in shape)
-    painted = mask[np.ix_(rows, columns)]
-    sign = np.where(sided.reshape(shape) == 0.0, np.where(painted, 1.0, -1.0), np.sign(sided.reshape(shape)))
-    return Outline(_kept(sign * nearest.reshape(shape), mask, k), stepped=False)
+        sample = sample[closest]
+        np.add.at(sided, sample, side[closest])
+        flat = level.ravel()
+        flat[sample] = np.copysign(nearest[sample], np.where(sided[sample] == 0.0, flat[sample], sided[sample]))
+    _keep(level, mask, k)
+    return Outline(level, stepped=False)
 
 
 def _seen(
-    a: Floats, b: Floats, corner: Ints, window: Ints, shape: tuple[int, int], reach: float
+    a: Floats, b: Floats, window: Ints, shape: tuple[int, int], reach: float
 ) -> tuple[Ints, Floats, Floats]:
     """Samples (numbers), distances and signed sides of all samples within reach of pieces a to b (n, 2)."""
+    corner = np.floor(np.minimum(a, b) - reach).astype(np.int64) + 1
     run = b - a
     length = np.maximum(np.hypot(run[:, 0], run[:, 1]), 1e-12)[:, None]
     u = run / length
@@ -121,8 +125,8 @@ def _seen(
     return at[:, 1] * shape[1] + at[:, 0], np.sqrt(squared[piece, place]), side[piece, place]
 
 
-def _kept(level: Floats, mask: NDArray[np.bool_], k: int) -> Floats:
-    """The level with the mask's own topology: pixels keep their side, and neighbours stay connected or apart."""
+def _keep(level: Floats, mask: NDArray[np.bool_], k: int) -> None:
+    """Give the level the mask's own topology: pixels keep their side, and neighbours stay connected or apart."""
     unit = 2 * k
     for lines, pixels in (
         (level[k::unit], mask),  # through the centres of the pixels of each row
@@ -130,15 +134,17 @@ def _kept(level: Floats, mask: NDArray[np.bool_], k: int) -> Floats:
         (level[:: level.shape[0] - 1], mask[:: max(mask.shape[0] - 1, 1)]),  # along the border
         (level[:, :: level.shape[1] - 1].T, mask[:, :: max(mask.shape[1] - 1, 1)].T),
     ):
-        sample = np.arange(lines.shape[1])
-        before = np.clip((sample - k) // unit, 0, pixels.shape[1] - 1)
-        after = np.clip(-((k - sample) // unit), 0, pixels.shape[1] - 1)
-        least = LEAST_PX * unit
-        wet, dry = pixels[:, before] & pixels[:, after], ~(pixels[:, before] | pixels[:, after])
-        lines[wet] = np.maximum(lines[wet], least)
-        lines[dry] = np.minimum(lines[dry], -least)
+        _hold(lines[:, k::unit], pixels, ~pixels, k)
+        wet, dry = pixels[:, 1:] & pixels[:, :-1], ~(pixels[:, 1:] | pixels[:, :-1])
+        for between in range(k + 1, k + unit):
+            _hold(lines[:, between : -k - 1 : unit], wet, dry, k)
     solid = ~mask
     crossed = (solid[1:, 1:] & solid[:-1, :-1]) | (solid[1:, :-1] & solid[:-1, 1:])
     joint = level[unit:-1:unit, unit:-1:unit]
-    joint[crossed] = np.minimum(joint[crossed], 0.0)
-    return level
+    np.minimum(joint, 0.0, out=joint, where=crossed)
+
+
+def _hold(samples: Floats, wet: NDArray[np.bool_], dry: NDArray[np.bool_], k: int) -> None:
+    """Keep samples on their side."""
+    np.maximum(samples, LEAST_PX * 2 * k, out=samples, where=wet)
+    np.minimum(samples, -LEAST_PX * 2 * k, out=samples, where=dry)
