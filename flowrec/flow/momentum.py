@@ -139,9 +139,10 @@ def _component(
     row = table.place[j, i]
     half_volume = np.where((i == 0) | (i == w), 0.5, 1.0)
 
-    def at(array: NDArray[Any], rows: Ints, columns: Ints, outside: int) -> NDArray[Any]:
-        inside = (rows >= 0) & (rows < array.shape[0]) & (columns >= 0) & (columns < array.shape[1])
-        return np.where(inside, array[np.where(inside, rows, 0), np.where(inside, columns, 0)], outside)
+    # With a rim of nothing all around, so that neighbours can be asked for anywhere.
+    numbers, cross_kinds, cross_numbers, around = (
+        np.pad(array.astype(np.int64), 1, constant_values=-1) for array in (number, cross_kind, cross_number, cells)
+    )
 
     # Across the flow: u_yy = 2 a2 of the parabola on the grid line.
     viscous.add(me[:, None], table.columns[row], -2.0 * half_volume[:, None] * table.weights[row, 2])
@@ -174,13 +175,12 @@ def _component(
         seen = cut & (line[side] >= 0)
         there = table.value(line[side][seen], t[seen])
         viscous.add(me[seen, None], table.columns[line[side][seen]], -factor[seen, None] * there)
-        cell = at(cells, j, i if step > 0 else i - 1, -1)
-        gradient.add(me, cell, -float(step))
+        gradient.add(me, around[j + 1, i + (step > 0)], -float(step))
 
     scale = 1.0 / np.maximum(share[me], LEAST_VOLUME)
     for side, step in enumerate((1, -1)):
         # The side lies in the middle of a cell, or on an outlet's border, where nothing changes.
-        neighbour = at(number, j, i + step, -1)
+        neighbour = numbers[j + 1, i + 1 + step]
         rows = side * n + me
         half = np.where(inner[side], 0.5, 1.0)
         for part in (flux, carried):
@@ -188,11 +188,10 @@ def _component(
             part.add(rows, me, weight)
             part.add(rows, neighbour, weight)
     for above, step in enumerate((1, -1)):
-        beyond_row = j + (step > 0)
-        neighbour = at(number, j + step, i, -1)
-        for side, column in enumerate((i - 1, i)):
-            beyond = at(cross_kind, beyond_row, column, -1)
-            passing = at(cross_number, beyond_row, column, -1)
+        neighbour = numbers[j + 1 + step, i + 1]
+        for side in range(2):
+            place = (j + 1 + (step > 0), i + side)
+            beyond, passing = cross_kinds[place], cross_numbers[place]
             opened = beyond == OPEN
             rows = (2 + 2 * above + side) * n + me
             flux.add(rows, passing, 0.5 * step * scale)

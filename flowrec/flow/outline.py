@@ -103,9 +103,7 @@ def smooth(mask: NDArray[np.bool_], k: int) -> Outline:
     return Outline(level, stepped=False)
 
 
-def _seen(
-    a: Floats, b: Floats, window: Ints, shape: tuple[int, int], reach: float
-) -> tuple[Ints, Floats, Floats]:
+def _seen(a: Floats, b: Floats, window: Ints, shape: tuple[int, int], reach: float) -> tuple[Ints, Floats, Floats]:
     """Samples (numbers), distances and signed sides of all samples within reach of pieces a to b (n, 2)."""
     corner = np.floor(np.minimum(a, b) - reach).astype(np.int64) + 1
     run = b - a
