@@ -79,10 +79,32 @@ class _Triplets:
         return sp.csr_array(sp.coo_array((values, (rows, columns)), shape=shape))
 
 
+class _Sides:
+    """A sparse matrix (6 faces, faces) of at most two entries a row: the six sides of each control volume."""
+
+    def __init__(self, faces: int) -> None:
+        self.columns = np.zeros((6, faces, 2), np.int64)
+        self.values = np.zeros((6, faces, 2))
+
+    def put(self, side: int, rows: Ints, entry: int, columns: Ints, values: Floats | float) -> None:
+        """Set entry 0 or 1 of some rows of a side where the column is numbered."""
+        self.columns[side, rows, entry] = np.maximum(columns, 0)
+        self.values[side, rows, entry] = values * (columns >= 0)
+
+    def matrix(self) -> Any:
+        """CSR."""
+        faces = self.columns.shape[1]
+        ends = np.arange(0, 12 * faces + 1, 2)
+        matrix = sp.csr_array((self.values.ravel(), self.columns.ravel(), ends), shape=(6 * faces, faces))
+        matrix.eliminate_zeros()
+        return matrix
+
+
 def assemble(grid: Grid) -> Momentum:
     """All operators of a grid."""
     n = grid.faces
-    viscous, flux, carried, gradient = _Triplets(), _Triplets(), _Triplets(), _Triplets()
+    viscous, gradient = _Triplets(), _Triplets()
+    flux, carried = _Sides(n), _Sides(n)
     volume = np.ones(n)
     share = grid.share
     into = (viscous, flux, carried, gradient)
@@ -101,8 +123,8 @@ def assemble(grid: Grid) -> Momentum:
     return Momentum(
         _per_flux(viscous.matrix((n, n)), share),
         volume / share,
-        flux.matrix((6 * n, n)),
-        _per_flux(carried.matrix((6 * n, n)), share),
+        flux.matrix(),
+        _per_flux(carried.matrix(), share),
         gradient.matrix((n, grid.cells)),
         outlet,
         sliding,
@@ -119,7 +141,7 @@ Faces = tuple[NDArray[np.int8], Ints, tuple[Floats, Floats]]
 
 
 def _component(
-    into: tuple[_Triplets, _Triplets, _Triplets, _Triplets],
+    into: tuple[_Triplets, _Sides, _Sides, _Triplets],
     sliding: Floats,
     share: Floats,
     own: Faces,
@@ -132,7 +154,7 @@ def _component(
     viscous, flux, carried, gradient = into
     kind, number, (low, high) = own
     cross_kind, cross_number, _ = cross
-    n, w = len(share), cells.shape[1]
+    w = cells.shape[1]
     table = lines(kind, number, own[2], level, cross_kind, stepped)
     j, i = np.nonzero((kind != WALL) & (kind != INLET))
     me = number[j, i]
@@ -181,22 +203,19 @@ def _component(
     for side, step in enumerate((1, -1)):
         # The side lies in the middle of a cell, or on an outlet's border, where nothing changes.
         neighbour = numbers[j + 1, i + 1 + step]
-        rows = side * n + me
         half = np.where(inner[side], 0.5, 1.0)
-        for part in (flux, carried):
-            weight = half * step * scale if part is flux else half
-            part.add(rows, me, weight)
-            part.add(rows, neighbour, weight)
+        for entry, column in enumerate((me, neighbour)):
+            flux.put(side, me, entry, column, half * step * scale)
+            carried.put(side, me, entry, column, half)
     for above, step in enumerate((1, -1)):
         neighbour = numbers[j + 1 + step, i + 1]
-        for side in range(2):
-            place = (j + 1 + (step > 0), i + side)
-            beyond, passing = cross_kinds[place], cross_numbers[place]
-            opened = beyond == OPEN
-            rows = (2 + 2 * above + side) * n + me
-            flux.add(rows, passing, 0.5 * step * scale)
-            carried.add(rows, me, np.where(opened, 0.5, 1.0 * (beyond == OUTLET)))
-            carried.add(np.where(opened, rows, -1), neighbour, 0.5)
+        for behind in range(2):
+            side = 2 + 2 * above + behind
+            place = (j + 1 + (step > 0), i + behind)
+            opened = cross_kinds[place] == OPEN
+            flux.put(side, me, 0, cross_numbers[place], 0.5 * step * scale)
+            carried.put(side, me, 0, me, np.where(opened, 0.5, 1.0 * (cross_kinds[place] == OUTLET)))
+            carried.put(side, me, 1, neighbour, 0.5 * opened)
 
 
 def _level(level: Floats, j: Ints, i: Ints, t: Floats) -> Floats:
