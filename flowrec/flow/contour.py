@@ -26,14 +26,14 @@ from scipy.sparse.csgraph import connected_components
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STIFFNESS_PX = 4.0  # l of a wall that keeps to its gates: wobbles shorter than about 2 pi l are steps of the mask
-SOFTENING = 8.0  # of l^6, around gates that are missed
+STIFFNESS_PX = 8.0  # l of a wall that keeps to its gates: wobbles shorter than about 2 pi l are steps of the mask
+SOFTENING = 16.0  # of l^6, around gates that are missed
 SOFTENED = 2  # gates to either side of a missed one
 SLACK_PX = 0.05  # a gate is missed by more than that
-ITERATIONS = 6
+ITERATIONS = 8
 BLUR = 4  # passes of 1 2 1 over the directions of the last approximation
 SHORTEST_PX = 0.3  # least distance of two points along the wall
-WRAP = 16  # closed walls are continued around by this many gates
+WRAP = 32  # closed walls are continued around by this many gates
 BEYOND_PX = 2.0  # walls go straight on beyond the image's border
 LARGEST_SHIFT_PX = 0.25  # of a closed wall, towards the area of its pixels
 
