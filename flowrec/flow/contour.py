@@ -31,6 +31,8 @@ SOFTENING = 16.0  # of l^6, around gates that are missed
 SOFTENED = 2  # gates to either side of a missed one
 SLACK_PX = 0.05  # a gate is missed by more than that
 ITERATIONS = 8
+FARTHEST_PX = 0.6  # from the middle of a gate; half a pixel is its end
+GATES_PER_STIFFNESS = 8  # at least, of a closed wall
 BLUR = 4  # passes of 1 2 1 over the directions of the last approximation
 SHORTEST_PX = 0.3  # least distance of two points along the wall
 WRAP = 32  # closed walls are continued around by this many gates
@@ -174,14 +176,16 @@ def smoothest(crossed: Gates) -> Floats:
     k = np.arange(long.sum()) - offset[wall] - wrap[wall]
     source = start[wall] + k % size[wall]
     own = (k >= 0) & (k < size[wall])
-    relaxed = _relax(crossed.middle[source], crossed.inward[source], wall)
+    # A closed wall of few gates bends at each of them.
+    stiffness = np.where(crossed.closed, np.minimum(STIFFNESS_PX, size / GATES_PER_STIFFNESS), STIFFNESS_PX)
+    relaxed = _relax(crossed.middle[source], crossed.inward[source], wall, stiffness[wall])
     result = np.empty((n, 2))
     result[source[own]] = relaxed[own]
     return result
 
 
-def _relax(middle: Floats, inward: Floats, wall: Ints) -> Floats:
-    """Points (n, 2) beside the middles of gates on open walls.
+def _relax(middle: Floats, inward: Floats, wall: Ints, stiffness: Floats) -> Floats:
+    """Points (n, 2) beside the middles of gates on open walls, for a stiffness l (n,) to begin with.
 
     Each point is its middle moved along the normal of the wall. d kappa / ds is the third divided difference over
     four points in the direction of the normal; normals and distances are those of the last approximation, so that
@@ -193,7 +197,7 @@ def _relax(middle: Floats, inward: Floats, wall: Ints) -> Floats:
     same = wall[:-1] == wall[1:]
     whole = wall[:-3] == wall[3:]  # four gates in a row on one wall
     point = middle
-    weight = np.full(n - 3, STIFFNESS_PX**6)
+    weight = stiffness[1:-2] ** 6
     for _ in range(ITERATIONS):
         run = np.diff(point, axis=0) * same[:, None]
         tangent = run
@@ -227,7 +231,7 @@ def _relax(middle: Floats, inward: Floats, wall: Ints) -> Floats:
             right[m : n - 3 + m] -= jacobian[:, m] * target
             for o in range(m, 4):
                 bands[o - m, m : n - 3 + m] += jacobian[:, m] * jacobian[:, o]
-        offset = solveh_banded(bands, right, lower=True)
+        offset = np.clip(solveh_banded(bands, right, lower=True), -FARTHEST_PX, FARTHEST_PX)
         point = middle + offset[:, None] * normals
         missed = np.abs(offset) > 0.5 * np.abs((inward * normals).sum(axis=1)) + SLACK_PX
         near = np.convolve(missed, np.ones(2 * SOFTENED + 1), "same") > 0.0
