@@ -1,7 +1,8 @@
 """Chip and boundary values to a flow field: grid, equations, solver, sampling.
 
-Secrets: where the wall lies (outline), numbering of faces (grid), the balance of a face (momentum), conservation of
-mass (stream), factorisation and Newton's method (system), units and messages (solver), interpolation (sampling).
+Secrets: what a mask tells of its walls (contour), where they lie on the grid (outline), numbering of faces (grid), the
+flow between walls along one grid line (lines), the balance of a face (momentum), conservation of mass (stream),
+factorisation and Newton's method (system), units and messages (solver), interpolation (sampling).
 """
 
 from flowrec.flow.modes import FlowModes

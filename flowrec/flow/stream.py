@@ -48,9 +48,10 @@ def assemble(grid: Grid) -> Stream:
     openings, faces = len(grid.mouths), grid.faces
     # The gauge is the wall that most faces touch: it would be the densest row of the system.
     ends = np.concatenate([root[tail], root[head]])
-    gauge = int(np.argmax(np.bincount(ends)))
+    count = np.bincount(ends)
+    gauge = int(np.argmax(count))
     unknown = np.full(len(root), -1, np.int64)
-    used = np.unique(ends)
+    used = np.flatnonzero(count)
     used = used[used != gauge]
     unknown[used] = np.arange(len(used))
     rows = np.arange(faces)

@@ -21,6 +21,7 @@ from flowrec.flow import momentum as momenta
 from flowrec.flow import stream as streams
 from flowrec.flow.grid import INLET, Floats, Grid
 from flowrec.flow.momentum import Momentum
+from flowrec.flow.outline import Outline
 from flowrec.flow.stream import Stream
 
 KEPT = 4  # geometries in memory; a session needs one or two
@@ -78,14 +79,17 @@ class System:
         force = self.stream.curl.T @ (self.momentum.outlet @ drives - operator @ given)
         return np.asarray(self.stream.curl @ factors.solve(np.ascontiguousarray(force)) + given)
 
-    def residual(self, moving: Floats, drive: Floats, inertia: float) -> Floats:
-        """(faces,) what the pressure inside has to balance; m/s."""
-        return np.asarray(
-            self.resisting @ moving + inertia * self.momentum.convection(moving) - self.momentum.outlet @ drive
-        )
+    def residual(self, moving: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
+        """(faces,) what the pressure inside has to balance; m/s. `push` as in `steady`."""
+        given = self.momentum.outlet @ drive + push
+        return np.asarray(self.resisting @ moving + inertia * self.momentum.convection(moving) - given)
 
-    def steady(self, drive: Floats, inertia: float, max_iterations: int, tolerance: float) -> Floats:
+    def steady(
+        self, drive: Floats, inertia: float, max_iterations: int, tolerance: float, push: Floats | None = None
+    ) -> Floats:
         """Navier-Stokes face velocities (faces,) for inertia = rho h / mu in s/m.
+
+        `push` (faces,) is a further force in m/s, as of moving walls: momentum.sliding @ speeds (4,).
 
         Newton's method whose factors are renewed only when they stop paying: at the Reynolds numbers of a chip the
         Stokes factors mostly do.
@@ -96,12 +100,16 @@ class System:
             If the step is not below `tolerance` of the fastest velocity after `max_iterations`.
         """
         moving = self.linear(drive[:, None])[:, 0]
+        if push is None:
+            push = np.zeros(len(moving))
+        else:
+            moving = moving + self.stream.curl @ self.stokes.solve(np.ascontiguousarray(self.stream.curl.T @ push))
         speed = float(np.abs(moving).max())
         if inertia == 0.0 or speed == 0.0:
             return moving
         factors, last, step = self.stokes, np.inf, np.inf
         for _ in range(max_iterations):
-            force = self.stream.curl.T @ self.residual(moving, drive, inertia)
+            force = self.stream.curl.T @ self.residual(moving, drive, inertia, push)
             change = np.asarray(self.stream.curl @ factors.solve(np.ascontiguousarray(-force)))
             step = float(np.abs(change).max()) / speed
             if not np.isfinite(step) or step > 1e6:
@@ -146,7 +154,11 @@ class System:
             free = np.ones(self.grid.faces)
             free[numbers[kinds == INLET]] = 0.0
             gradient = sp.diags_array(free) @ self.momentum.gradient
-            self._poisson[:] = [gradient.T.tocsr(), factorise(gradient.T @ gradient)]
+            laplacian = gradient.T @ gradient
+            if not any(mouth.kind == "outlet" for mouth in self.grid.mouths):
+                # In a closed box the level of the pressure is free: the first cell's is 0.
+                laplacian = laplacian + sp.coo_array(([1.0], ([0], [0])), shape=laplacian.shape)
+            self._poisson[:] = [gradient.T.tocsr(), factorise(laplacian)]
         transposed, factors = self._poisson
         return np.asarray(factors.solve(np.ascontiguousarray(transposed @ load)))
 
@@ -157,14 +169,14 @@ _lock = threading.Lock()
 
 def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel; a few geometries are kept."""
-    friction = 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / k / chip.depth_um) ** 2
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
-    key = (chip.mask.shape, np.packbits(chip.mask).tobytes(), openings, chip.walls, k, friction)
+    mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
+    key = (*mask, openings, chip.walls, k, _friction(chip, k))
     with _lock:
         if key in _kept:
             _kept.move_to_end(key)
             return _kept[key]
-    made = _assemble(chip, k, friction)
+    made = assembled(chip, k)
     with _lock:
         _kept[key] = made
         while len(_kept) > KEPT:
@@ -178,9 +190,15 @@ def forget() -> None:
         _kept.clear()
 
 
-def _assemble(chip: Chip, k: int, friction: float) -> System:
-    grid = grids.build(chip, k)
+def assembled(chip: Chip, k: int, drawn: Outline | None = None) -> System:
+    """The same, not kept; with the walls of an outline in place of the mask's, where one is given."""
+    grid = grids.build(chip, k, drawn)
     momentum = momenta.assemble(grid)
     stream = streams.assemble(grid)
-    resisting = sp.csr_array(momentum.viscous + sp.diags_array(friction * momentum.volume))
+    resisting = sp.csr_array(momentum.viscous + sp.diags_array(_friction(chip, k) * momentum.volume))
     return System(grid, momentum, stream, resisting, factorise(stream.curl.T @ resisting @ stream.curl))
+
+
+def _friction(chip: Chip, k: int) -> float:
+    """The factor 12 h^2 / H^2 of a shallow chip, else 0."""
+    return 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / k / chip.depth_um) ** 2
