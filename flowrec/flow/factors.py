@@ -1,6 +1,6 @@
 """LU factors of a matrix on a grid: which engine factorises it, and nested dissection for the large ones.
 
-Small systems go to SuperLU (minimum degree). Large ones to our own multifrontal elimination: the unknowns are cut
+Most systems go to SuperLU (minimum degree). Large wide ones to our own multifrontal elimination: the unknowns are cut
 in two at the middle of the longer side of the box they lie in, again and again; the few that touch both halves come
 last (A. George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10 (1973) 345-363). Each
 part is then one dense matrix for LAPACK and BLAS (I. Duff and J. Reid, ACM TOMS 9 (1983) 302-325). Values need not
@@ -22,7 +22,10 @@ from scipy.sparse.linalg import splu
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LARGE = 20000  # unknowns from which the multifrontal engine is faster
+# The multifrontal engine pays on many unknowns that fill much of the box they lie in: cuts across a network of
+# channels are so short that SuperLU's minimum degree is as quick with half the memory.
+LARGE = 100_000
+FILLED = 0.3
 LEAF = 96  # unknowns that are no longer cut: dense work on so few costs less than the calls it would save
 # A wall that many faces touch is a long row; it goes between the halves, not its many neighbours.
 WIDE = 100
@@ -48,7 +51,7 @@ def factorise(matrix: Any, places: Floats) -> Factors:
     """
     if matrix.shape[0] == 0:  # a channel of one cell between inlets has no freedom left
         return _Nothing()
-    if matrix.shape[0] < LARGE:
+    if not _is_wide(places):
         factors: Factors = splu(
             sp.csc_matrix(matrix),
             permc_spec="MMD_AT_PLUS_A",
@@ -57,6 +60,11 @@ def factorise(matrix: Any, places: Floats) -> Factors:
         )
         return factors
     return _Fronts(sp.csc_array(matrix), np.ascontiguousarray(places, np.float64))
+
+
+def _is_wide(places: Floats) -> bool:
+    """Whether there are many unknowns in a wide place."""
+    return len(places) >= LARGE and len(places) >= FILLED * float(np.prod(np.ptp(places, axis=0) + 1.0))
 
 
 class _Nothing:

@@ -168,7 +168,10 @@ class System:
             free = np.ones(self.grid.faces)
             free[numbers[kinds == INLET]] = 0.0
             gradient = sp.diags_array(free) @ self.momentum.gradient
-            self._poisson[:] = [gradient.T.tocsr(), factorise(gradient.T @ gradient, np.argwhere(self.grid.number_p >= 0))]
+            self._poisson[:] = [
+                gradient.T.tocsr(),
+                factorise(gradient.T @ gradient, np.argwhere(self.grid.number_p >= 0)),
+            ]
         transposed, factors = self._poisson
         return np.asarray(factors.solve(np.ascontiguousarray(transposed @ load)))
 
@@ -211,8 +214,6 @@ def compose(grid: Grid, momentum: Momentum, stream: Stream, friction: float) -> 
 
 def _places(grid: Grid, stream: Stream) -> Floats:
     """(unknowns, 2) row and column of each value of the stream function: the mean of the faces that it moves."""
-    faces = np.concatenate(
-        [np.argwhere(grid.number_u >= 0) + [0.5, 0.0], np.argwhere(grid.number_v >= 0) + [0.0, 0.5]]
-    )
+    faces = np.concatenate([np.argwhere(grid.number_u >= 0) + [0.5, 0.0], np.argwhere(grid.number_v >= 0) + [0.0, 0.5]])
     touched = (stream.curl != 0).astype(np.float64).T
     return np.asarray((touched @ faces) / np.maximum(touched.sum(axis=1), 1.0)[:, None])
