@@ -121,7 +121,7 @@ class _Fronts:
 
     def solve(self, right: Floats) -> Floats:
         """Solution of A x = right, (n,) or (n, m)."""
-        x = right[self._order]
+        x: Floats = right[self._order]
         for a, b, boundary, lu, pivots, f21, _ in self._fronts:
             y, _ = lapack.dgetrs(lu, pivots, x[a:b])
             x[a:b] = y.reshape(x[a:b].shape)

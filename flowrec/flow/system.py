@@ -214,6 +214,7 @@ def compose(grid: Grid, momentum: Momentum, stream: Stream, friction: float) -> 
 
 def _places(grid: Grid, stream: Stream) -> Floats:
     """(unknowns, 2) row and column of each value of the stream function: the mean of the faces that it moves."""
-    faces = np.concatenate([np.argwhere(grid.number_u >= 0) + [0.5, 0.0], np.argwhere(grid.number_v >= 0) + [0.0, 0.5]])
+    upright, level = np.argwhere(grid.number_u >= 0), np.argwhere(grid.number_v >= 0)
+    faces = np.concatenate([np.add(upright, (0.5, 0.0)), np.add(level, (0.0, 0.5))])
     touched = (stream.curl != 0).astype(np.float64).T
     return np.asarray((touched @ faces) / np.maximum(touched.sum(axis=1), 1.0)[:, None])
