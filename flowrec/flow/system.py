@@ -170,7 +170,7 @@ class System:
             gradient = sp.diags_array(free) @ self.momentum.gradient
             self._poisson[:] = [
                 gradient.T.tocsr(),
-                factorise(gradient.T @ gradient, np.argwhere(self.grid.number_p >= 0)),
+                factorise(gradient.T @ gradient, np.argwhere(self.grid.number_p >= 0).astype(np.float64)),
             ]
         transposed, factors = self._poisson
         return np.asarray(factors.solve(np.ascontiguousarray(transposed @ load)))
