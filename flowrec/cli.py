@@ -338,6 +338,20 @@ def bench_flow(
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
+@bench.command("solver")
+def bench_solver(
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small cases only, a few seconds.")] = False,
+) -> None:
+    """The flow solver beside exact and published solutions, its speed and its memory."""
+    from flowrec.bench.solver import measure, show
+
+    figures = measure(quick)
+    show(figures)
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
 def _point(text: str) -> str:
     """`1200,800` as a TOML pair; a name stays a name."""
     parts = text.split(",")

@@ -62,8 +62,7 @@ class FlowSolver:
     def _equations(self, chip: Chip) -> tuple[System, _Scales]:
         if self.k not in (1, 2, 4):
             raise FlowError(f"solver.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
-        if not any(opening.kind == "outlet" for opening in chip.openings):
-            raise FlowError(f"chip '{chip.name}' has no outlet: make one of its openings an outlet")
+        _check(chip)
         return system(chip, self.k), _Scales.of(chip, self.k, self.convection)
 
     def _steady(self, chip: Chip, equations: System, scales: _Scales) -> Floats:
@@ -96,6 +95,28 @@ class FlowSolver:
             density_kg_m3=chip.density_kg_m3,
             note="",
         )
+
+
+def _check(chip: Chip) -> None:
+    """Raise FlowError for numbers and openings that can not carry a flow."""
+    where = f"chip '{chip.name}'"
+    for key in ("um_per_px", "viscosity_mpa_s", "depth_um"):
+        value = getattr(chip, key)
+        if value is not None and not (np.isfinite(value) and value > 0):
+            raise FlowError(f"{where}: {key} = {value:g}; it must be more than zero")
+    if not (np.isfinite(chip.density_kg_m3) and chip.density_kg_m3 >= 0):
+        raise FlowError(f"{where}: density_kg_m3 = {chip.density_kg_m3:g}; it must not be negative")
+    for index, opening in enumerate(chip.openings):
+        what = f"opening {index} ({opening.side} {opening.first}..{opening.last})"
+        if not np.isfinite(opening.value):
+            raise FlowError(
+                f"{where}: {what} has the value {opening.value:g}; give a speed in um/s or a pressure in Pa"
+            )
+        for other in chip.openings[:index]:
+            if other.side == opening.side and other.first <= opening.last and opening.first <= other.last:
+                raise FlowError(f"{where}: {what} overlaps another on the same side; remove one")
+    if not any(opening.kind == "outlet" for opening in chip.openings):
+        raise FlowError(f"{where} has no outlet: make one of its openings an outlet")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from flowrec.chip.chip import Chip
 from flowrec.flow import grid as grids
 from flowrec.flow import momentum as momenta
 from flowrec.flow import stream as streams
+from flowrec.flow.factors import Factors, factorise
 from flowrec.flow.grid import INLET, Floats, Grid
 from flowrec.flow.momentum import Momentum
 from flowrec.flow.outline import Outline
@@ -29,26 +29,11 @@ KEPT = 4  # geometries in memory; a session needs one or two
 # A frozen factorisation is used as long as each step leaves at most this share of the last one.
 WORTH_KEEPING = 0.3
 
-
-def factorise(matrix: Any) -> Any:
-    """LU factors of a matrix of symmetric pattern and dominant diagonal blocks."""
-    if matrix.shape[0] == 0:  # a channel of one cell between inlets has no freedom left
-        return _Nothing()
-    return splu(
-        sp.csc_matrix(matrix),
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.01,
-        options={"SymmetricMode": True},
-    )
-
-
-class _Nothing:
-    """Factors of the empty matrix."""
-
-    @staticmethod
-    def solve(right: Floats) -> Floats:
-        """Solution (0, ...)."""
-        return right
+# When Newton's method has gone astray, and how continuation in inertia goes on.
+RUNAWAY = 20.0  # step over the speed of the flow it started from
+PATIENCE = 2  # steps that may be longer than the one before
+NEARBY = 1e-3  # relative step that will do on the way
+SMALLEST_STRIDE = 1e-3  # of the inertia
 
 
 class NotConvergedError(Exception):
@@ -67,7 +52,7 @@ class System:
     momentum: Momentum
     stream: Stream
     resisting: Any  # A + f V (faces, faces)
-    stokes: Any  # factors of C' (A + f V) C
+    stokes: Factors  # factors of C' (A + f V) C
     _poisson: list[Any] = field(default_factory=list)  # factors for the pressure, once they are needed
 
     def linear(self, drives: Floats) -> Floats:
@@ -89,42 +74,70 @@ class System:
     ) -> Floats:
         """Navier-Stokes face velocities (faces,) for inertia = rho h / mu in s/m.
 
-        `push` (faces,) is a further force in m/s, as of moving walls: momentum.sliding @ speeds (4,).
-
-        Newton's method whose factors are renewed only when they stop paying: at the Reynolds numbers of a chip the
-        Stokes factors mostly do.
+        Newton's method from Stokes flow, then, where that fails, along flows of growing inertia. `push` (faces,) is a
+        further force on the right, in m/s: a wall that moves, for one.
 
         Raises
         ------
         NotConvergedError
-            If the step is not below `tolerance` of the fastest velocity after `max_iterations`.
+            If the step is not below `tolerance` of the fastest velocity after `max_iterations`, continuation included.
         """
-        moving = self.linear(drive[:, None])[:, 0]
-        if push is None:
-            push = np.zeros(len(moving))
-        else:
-            moving = moving + self.stream.curl @ self.stokes.solve(np.ascontiguousarray(self.stream.curl.T @ push))
-        speed = float(np.abs(moving).max())
-        if inertia == 0.0 or speed == 0.0:
+        force = self.momentum.outlet @ drive + (0.0 if push is None else push)
+        moving = self._stokes(drive, force)
+        if inertia == 0.0 or not moving.any():
             return moving
-        factors, last, step = self.stokes, np.inf, np.inf
-        for _ in range(max_iterations):
-            force = self.stream.curl.T @ self.residual(moving, drive, inertia, push)
-            change = np.asarray(self.stream.curl @ factors.solve(np.ascontiguousarray(-force)))
+        left = max_iterations
+        reached, stride = 0.0, inertia
+        while True:
+            goal = min(reached + stride, inertia)
+            # Far from the goal a thousandth will do: the flow is only where the next one starts from.
+            near = tolerance if goal == inertia else max(tolerance, NEARBY)
+            result, used, step = self._newton(moving, force, goal, left, near)
+            left -= used
+            if result is not None:
+                if goal == inertia:
+                    return result
+                moving, reached, stride = result, goal, 2.0 * stride
+            else:
+                stride = 0.25 * (goal - reached)
+            if left <= 0 or stride < SMALLEST_STRIDE * inertia:
+                raise NotConvergedError(step)
+
+    def _stokes(self, drive: Floats, force: Floats) -> Floats:
+        """Stokes flow (faces,) of drives (openings,) and forces (faces,)."""
+        given = self.stream.inflow @ drive
+        right = self.stream.curl.T @ (force - self.resisting @ given)
+        return np.asarray(self.stream.curl @ self.stokes.solve(right) + given)
+
+    def _newton(
+        self, moving: Floats, force: Floats, inertia: float, max_iterations: int, tolerance: float
+    ) -> tuple[Floats | None, int, float]:
+        """Flow or None where it runs away or is slow, iterations and last relative step.
+
+        The factors are renewed only when they stop paying: at the Reynolds numbers of a chip those of Stokes flow
+        mostly do.
+        """
+        speed = float(np.abs(moving).max())
+        factors, last, step, grew = self.stokes, np.inf, np.inf, 0
+        for number in range(1, max_iterations + 1):
+            load = self.resisting @ moving + inertia * self.momentum.convection(moving) - force
+            right = -(self.stream.curl.T @ load)
+            change = np.asarray(self.stream.curl @ factors.solve(right))
             step = float(np.abs(change).max()) / speed
-            if not np.isfinite(step) or step > 1e6:
-                break
-            if step > WORTH_KEEPING * last or step > 0.5:
+            if not np.isfinite(step) or step > WORTH_KEEPING * last or step > 0.5:
                 factors = self.tangent(moving, inertia)[0]
-                change = np.asarray(self.stream.curl @ factors.solve(np.ascontiguousarray(-force)))
+                change = np.asarray(self.stream.curl @ factors.solve(right))
                 step = float(np.abs(change).max()) / speed
+            grew += step > last
+            if not np.isfinite(step) or step > RUNAWAY or grew > PATIENCE:
+                return None, number, step
             moving = moving + change
             last = step
             if step <= tolerance:
-                return np.asarray(moving)
-        raise NotConvergedError(step)
+                return np.asarray(moving), number, step
+        return None, max_iterations, step
 
-    def tangent(self, moving: Floats, inertia: float) -> tuple[Any, Any]:
+    def tangent(self, moving: Floats, inertia: float) -> tuple[Factors, Any]:
         """Factors and operator (faces, faces) of the equations linearised around a flow."""
         if inertia == 0.0:
             return self.stokes, self.resisting

@@ -161,3 +161,46 @@ def test_what_can_not_be_solved_is_said_in_one_line(crossing, straight):
         FlowSolver(k=3).solve(channel)
     with pytest.raises(FlowError, match="not one run of fluid"):
         FlowSolver().solve(replace(channel, openings=(Opening("left", 0, 9, "inlet", 1.0), channel.openings[1])))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viscosity_mpa_s": 0.0}, "viscosity_mpa_s = 0; it must be more than zero"),
+        ({"viscosity_mpa_s": -1.0}, "viscosity_mpa_s = -1"),
+        ({"viscosity_mpa_s": np.nan}, "viscosity_mpa_s = nan"),
+        ({"density_kg_m3": np.nan}, "density_kg_m3 = nan"),
+        ({"um_per_px": 0.0}, "um_per_px = 0"),
+        ({"depth_um": -5.0}, "depth_um = -5"),
+        ({"openings": (Opening("left", 2, 9, "inlet", np.inf), Opening("right", 2, 9, "outlet", 0.0))}, "value inf"),
+        ({"openings": (Opening("left", 2, 6, "inlet", 1.0), Opening("left", 5, 9, "outlet", 0.0))}, "overlaps"),
+        ({"openings": (Opening("left", 9, 2, "inlet", 1.0), Opening("right", 2, 9, "outlet", 0.0))}, "not one run"),
+    ],
+)
+def test_impossible_numbers_and_openings_are_refused_in_one_line(straight, change, message):
+    with pytest.raises(FlowError, match=message) as refused:
+        FlowSolver().solve(replace(straight(), **change))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("k", [1, 2])
+@pytest.mark.parametrize("kinds", [("inlet", "outlet", "outlet"), ("inlet", "inlet", "outlet"), ("outlet",) * 3])
+def test_openings_that_meet_in_a_corner_conserve_mass_and_so_do_channels_without_walls(k, kinds):
+    spans = (("left", 0, 5), ("top", 0, 6), ("right", 0, 11))
+    values = [100.0 if kind == "inlet" else 0.1 * index for index, kind in enumerate(kinds)]
+    openings = tuple(Opening(*span, kind, value) for span, kind, value in zip(spans, kinds, values, strict=True))
+    chip = Chip("corner", np.ones((12, 20), bool), 10.0, openings, 1.0, 1000.0, walls="pixel")
+    field = FlowSolver(k).solve(chip)
+    assert np.isfinite(field.velocity_um_s).all() and np.isfinite(field.pressure_pa).all()
+    equations = systems.system(chip, k)
+    moving = equations.linear(chip.boundary_values[:, None])[:, 0]
+    fluxes = [mouth.inward * moving[mouth.faces].sum() for mouth in equations.grid.mouths]
+    assert abs(sum(fluxes)) < 1e-9 * np.abs(fluxes).max()
+    assert [flux > 0 for flux, kind in zip(fluxes, kinds, strict=True) if kind == "inlet"] == [True] * kinds.count(
+        "inlet"
+    )
+
+
+def test_a_channel_of_one_pixel_carries_what_flows_in(straight):
+    field = FlowSolver(2).solve(straight(1))
+    assert field.velocity_um_s[2, 3:-3, 0] == pytest.approx(100.0, rel=1e-6)

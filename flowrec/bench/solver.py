@@ -1,0 +1,113 @@
+"""`flowrec bench solver`: the flow solver beside exact and published solutions, its speed and its memory."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import scipy
+
+from flowrec.bench.cavity import cavity_case
+from flowrec.bench.channel import bend_case, oblique_case, straight_case
+from flowrec.bench.cylinder import cylinder_case
+from flowrec.bench.speed import speed_case
+from flowrec.status import table
+
+_TITLES = {
+    "channel": "Plane Poiseuille flow along the pixels",
+    "oblique": "Plane Poiseuille flow at an angle to the pixels, drawn as a mask",
+    "bend": "Flow around a bend between two circles",
+    "cavity": "Lid-driven cavity against Ghia, Ghia and Shin (units of the lid's speed)",
+    "cylinder": "Cylinder in a channel, Re 20 (Schaefer-Turek 2D-1)",
+    "speed": "Speed and memory",
+}
+
+
+def measure(quick: bool = False) -> dict[str, Any]:
+    """All figures; `quick` leaves out what takes more than a second."""
+    rows: list[dict[str, Any]] = []
+
+    def add(case: str, found: Iterable[dict[str, Any]]) -> None:
+        rows.extend({"case": case, **row} for row in found)
+
+    widths, cuts = ((4, 8), (1, 2)) if quick else ((4, 8, 16), (1, 2, 4))
+    angles = (15.0, 30.0) if quick else (5.0, 12.0, 20.0, 30.0, 37.0, 45.0)
+    add("channel", (straight_case(width, k) for width in widths for k in cuts))
+    oblique = ((width, k, walls) for walls in ("smooth", "pixel") for width in (4, 8) for k in cuts)
+    add("oblique", (oblique_case(width, k, walls, angles) for width, k, walls in oblique))  # type: ignore[arg-type]
+    add("bend", (bend_case(k) for k in cuts))
+    numbers, sizes = ((100,), (16, 32)) if quick else ((100, 400, 1000), (32, 64, 128))
+    add("cavity", (cavity_case(cells, reynolds) for reynolds in numbers for cells in sizes))
+    shapes = ((10, 1),) if quick else ((10, 1), (10, 2), (20, 1), (20, 2))
+    add("cylinder", (cylinder_case(px, k, "smooth") for px, k in shapes))
+    jobs = [("vessels", 128, 1)]
+    if not quick:
+        jobs += [("vessels", 128, 2), ("vessels", 128, 4), ("vessels", 512, 1), ("vessels", 1024, 1)]
+        jobs += [("posts", 512, 1), ("posts", 1024, 1)]
+    add("speed", (speed_case(pattern, side, k) for pattern, side, k in jobs))  # type: ignore[arg-type]
+    return {
+        "machine": {
+            "cores": os.cpu_count(),
+            "threads": os.environ.get("OMP_NUM_THREADS", "default"),
+            "platform": platform.platform(),
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+            "scipy": scipy.__version__,
+        },
+        "rows": rows,
+        "summary": _summary(rows),
+    }
+
+
+def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Observed orders of convergence, and the extremes."""
+
+    def of(case: str) -> list[dict[str, Any]]:
+        return [row for row in rows if row["case"] == case]
+
+    def order(coarse: float, fine: float) -> float:
+        return float(np.log2(abs(coarse) / abs(fine)))
+
+    bends = [row["resistance_error_percent"] for row in of("bend")]
+    summary: dict[str, Any] = {
+        "channel_largest_error_percent": max(abs(row["resistance_error_percent"]) for row in of("channel")),
+        "bend_order": order(bends[0], bends[-1]) / (len(bends) - 1),
+        "cylinder_finest_drag_error_percent": of("cylinder")[-1]["drag_error_percent"],
+        "mass_lost_in_a_cell": max(row["mass_lost_in_a_cell"] for row in of("speed")),
+    }
+    for walls in ("smooth", "pixel"):
+        errors = [row["mean_resistance_error_percent"] for row in of("oblique") if row["walls"] == walls]
+        summary[f"oblique_{walls}_mean_error_percent"] = float(np.mean(errors))
+    for reynolds in sorted({row["reynolds"] for row in of("cavity")}):
+        found = [row for row in of("cavity") if row["reynolds"] == reynolds]
+        summary[f"cavity_re_{reynolds}_finest_u_largest"] = found[-1]["u_largest"]
+        if len(found) > 2:
+            # Against itself: the table is no more accurate than a few thousandths.
+            grids = np.array([row["u_at_quarters"] for row in found[-3:]])
+            coarse, fine = np.linalg.norm(np.diff(grids, axis=0), axis=1)
+            summary[f"cavity_re_{reynolds}_order"] = order(float(coarse), float(fine))
+    return summary
+
+
+def show(figures: dict[str, Any]) -> None:
+    """Print the figures as tables."""
+    for case, title in _TITLES.items():
+        rows = [
+            {key: value for key, value in row.items() if key != "case"}
+            for row in figures["rows"]
+            if row["case"] == case
+        ]
+        names = tuple(name.replace("_", " ") for name in rows[0])
+        table(title, names, [tuple(_text(value) for value in row.values()) for row in rows])
+    table(
+        "Summary", ("", "value"), [(key.replace("_", " "), _text(value)) for key, value in figures["summary"].items()]
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(_text(one) for one in value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
