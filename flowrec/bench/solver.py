@@ -16,13 +16,60 @@ from flowrec.bench.cylinder import cylinder_case
 from flowrec.bench.speed import speed_case
 from flowrec.status import table
 
-_TITLES = {
-    "channel": "Plane Poiseuille flow along the pixels",
-    "oblique": "Plane Poiseuille flow at an angle to the pixels, drawn as a mask",
-    "bend": "Flow around a bend between two circles",
-    "cavity": "Lid-driven cavity against Ghia, Ghia and Shin (units of the lid's speed)",
-    "cylinder": "Cylinder in a channel, Re 20 (Schaefer-Turek 2D-1)",
-    "speed": "Speed and memory",
+# Title, and what is printed of a row under which head; the JSON has all of it.
+_TABLES: dict[str, tuple[str, dict[str, str]]] = {
+    "channel": (
+        "Plane Poiseuille flow along the pixels",
+        {"width_px": "px", "k": "k", "profile_error_percent": "profile %", "resistance_error_percent": "resistance %"},
+    ),
+    "oblique": (
+        "Plane Poiseuille flow at an angle to the pixels, drawn as a mask",
+        {
+            "walls": "walls",
+            "width_px": "px",
+            "k": "k",
+            "mean_resistance_error_percent": "resistance %, mean",
+            "largest_resistance_error_percent": "largest",
+        },
+    ),
+    "bend": (
+        "Flow around a bend between two circles",
+        {"width_px": "px", "k": "k", "resistance_error_percent": "resistance %"},
+    ),
+    "cavity": (
+        "Lid-driven cavity: off the table of Ghia, Ghia and Shin, speed of the lid = 1",
+        {
+            "reynolds": "Re",
+            "cells": "cells",
+            "u_largest": "u largest",
+            "u_rms": "u rms",
+            "v_largest": "v largest",
+            "v_rms": "v rms",
+        },
+    ),
+    "cylinder": (
+        "Cylinder in a channel, Re 20 (Schaefer-Turek 2D-1), drawn as a mask",
+        {
+            "px_per_diameter": "px",
+            "k": "k",
+            "unknowns": "unknowns",
+            "drag_error_percent": "drag %",
+            "lift_error_percent": "lift %",
+            "pressure_difference_pa_error_percent": "pressure %",
+        },
+    ),
+    "speed": (
+        "Speed and memory",
+        {
+            "pattern": "mask",
+            "side_px": "px",
+            "k": "k",
+            "unknowns": "unknowns",
+            "cold_s": "cold s",
+            "warm_s": "warm s",
+            "peak_memory_mb": "MB",
+        },
+    ),
 }
 
 
@@ -94,20 +141,13 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def show(figures: dict[str, Any]) -> None:
     """Print the figures as tables."""
-    for case, title in _TITLES.items():
-        rows = [
-            {key: value for key, value in row.items() if key != "case"}
-            for row in figures["rows"]
-            if row["case"] == case
-        ]
-        names = tuple(name.replace("_", " ") for name in rows[0])
-        table(title, names, [tuple(_text(value) for value in row.values()) for row in rows])
+    for case, (title, columns) in _TABLES.items():
+        rows = [row for row in figures["rows"] if row["case"] == case]
+        table(title, tuple(columns.values()), [tuple(_text(row[key]) for key in columns) for row in rows])
     table(
         "Summary", ("", "value"), [(key.replace("_", " "), _text(value)) for key, value in figures["summary"].items()]
     )
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return " ".join(_text(one) for one in value)
     return f"{value:.3g}" if isinstance(value, float) else str(value)
