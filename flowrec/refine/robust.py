@@ -1,0 +1,119 @@
+"""The most probable parameters of a linear model from observations some of which are nonsense.
+
+Each observation is either right, with Gaussian noise of its stated variance, or an outlier from a wide Gaussian
+(a mixture; Box and Tiao 1968). The weights are the probabilities of being right. A descent from any start can lock on
+a wrong subset, so there are three starts (from everything at once, and from all noise widened by what the prior leaves
+open, narrowed step by step: graduated non-convexity, Blake and Zisserman 1987; and from the prior itself), and the most
+probable end is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+WIDE = 3.0  # std of an outlier in units of the observations' typical size
+SHARE, SHARES_WORTH = 0.05, 20.0  # of outliers beforehand, and how many observations that belief is worth
+ANNEALED = (1.0, 0.3, 0.1, 0.03, 0.01, 0.0)  # of the prior's predictive variance, added to the noise
+MEDIAN = 2.0 * np.log(2.0)  # of chi squared with two degrees of freedom
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Gaussian approximation of the posterior around its most probable point, in prior standard deviations."""
+
+    mean: Floats  # (parameters,)
+    covariance: Floats  # (parameters, parameters)
+    trust: Floats  # (n,) probability that an observation is right
+    noise_factor: float  # at least 1: how many times larger than stated the noise is
+    energy: float  # minus ln of prior times likelihood, but for a constant
+
+    def moved(self, design: Floats, misfit: Floats, variance: Floats) -> Fit:
+        """The same for other misfits, with the same trust in each observation."""
+        mean, covariance = _gaussian(design, misfit, self.trust / (self.noise_factor**2 * variance))
+        return Fit(mean, covariance, self.trust, self.noise_factor, self.energy)
+
+
+def fit(design: Floats, misfit: Floats, variance: Floats, max_iterations: int = 60) -> Fit:
+    """Parameters z ~ N(0, 1) for misfit = z design + noise.
+
+    Parameters
+    ----------
+    design : (parameters, n, 2)
+    misfit : (n, 2) what was observed beyond the prior mean
+    variance : (n,) of each component's noise
+    """
+    found = _best(design, misfit, variance, max_iterations)
+    factor = 1.0
+    for _ in range(3):
+        # The median of the misfits does not know of outliers; one standard deviation of itself is let pass.
+        left = misfit - np.tensordot(found.mean, design, axes=1)
+        count = len(variance)
+        free = max(count - 0.5 * float((1.0 - np.diag(found.covariance)).sum()), 0.25 * count)
+        seen = float(np.median((left**2).sum(axis=1) / variance)) / MEDIAN * count / free
+        new = float(np.sqrt(max(1.0, seen / (1.0 + 1.44 / np.sqrt(count)))))
+        if new <= 1.02 * factor:
+            break
+        factor = new
+        found = _best(design, misfit, factor**2 * variance, max_iterations)
+    return Fit(found.mean, found.covariance, found.trust, factor, found.energy)
+
+
+def _best(design: Floats, misfit: Floats, variance: Floats, max_iterations: int) -> Fit:
+    count = len(variance)
+    wide = WIDE**2 * float(np.median((misfit**2).sum(axis=1) + (design**2).sum(axis=(0, 2)))) + 4.0 * variance.max()
+    open_ = 0.5 * (design**2).sum(axis=(0, 2))
+    ends = []
+    for start in ("everything", "annealed", "prior"):
+        if start == "annealed":
+            mean = np.zeros(len(design))
+            for share in ANNEALED:
+                widened = variance + share * open_
+                trust = _trust(misfit - np.tensordot(mean, design, axes=1), widened, wide + widened, SHARE)
+                mean, _ = _gaussian(design, misfit, trust / widened)
+        elif start == "everything":
+            mean, _ = _gaussian(design, misfit, 1.0 / variance)
+        else:
+            mean = np.zeros(len(design))
+        share = SHARE
+        for _ in range(max_iterations):
+            left = misfit - np.tensordot(mean, design, axes=1)
+            trust = _trust(left, variance, wide + variance, share)
+            share = (SHARE * SHARES_WORTH + float((1.0 - trust).sum())) / (SHARES_WORTH + count)
+            new, covariance = _gaussian(design, misfit, trust / variance)
+            settled = float(np.abs(new - mean).max()) < 1e-4
+            mean = new
+            if settled:
+                break
+        energy = _energy(misfit - np.tensordot(mean, design, axes=1), variance, wide + variance, mean)
+        ends.append(Fit(mean, covariance, trust, 1.0, energy))
+        if start == "annealed" and float(np.abs(ends[0].mean - mean).max()) < 1e-2:
+            break  # both agree: there is nothing to lock on
+    return min(ends, key=lambda end: end.energy)
+
+
+def _gaussian(design: Floats, misfit: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Mean and covariance for weights (n,)."""
+    flat = design.reshape(len(design), -1)
+    weighted = flat * np.repeat(weight, 2)
+    covariance = np.linalg.inv(np.eye(len(design)) + weighted @ flat.T)
+    return covariance @ (weighted @ misfit.ravel()), covariance
+
+
+def _trust(left: Floats, variance: Floats, wide: Floats, share: float) -> Floats:
+    """(n,) probability of being right."""
+    square = (left**2).sum(axis=1)
+    odds = share / (1.0 - share) * variance / wide * np.exp(np.minimum(0.5 * square * (1 / variance - 1 / wide), 700.0))
+    return np.asarray(1.0 / (1.0 + odds))
+
+
+def _energy(left: Floats, variance: Floats, wide: Floats, mean: Floats) -> float:
+    """Minus ln posterior of the mixture, but for a constant."""
+    square = (left**2).sum(axis=1)
+    right = np.log(1.0 - SHARE) - 0.5 * square / variance - np.log(variance)
+    wrong = np.log(SHARE) - 0.5 * square / wide - np.log(wide)
+    return float(0.5 * (mean**2).sum() - np.logaddexp(right, wrong).sum())
