@@ -9,7 +9,7 @@ from typing import Any
 
 from flowrec.chip.chip import Chip
 
-KEPT = 8  # of all kinds: a session has one chip and one fluid
+KEPT = 48  # of all kinds: one chip and one fluid, and the walls that it may have instead
 
 _kept: OrderedDict[Hashable, Any] = OrderedDict()
 _lock = threading.Lock()

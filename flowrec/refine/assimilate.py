@@ -7,22 +7,28 @@ the full equations with frozen factors. The curvature gives the posterior covari
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
+from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.kept import chip_key, kept
-from flowrec.flow.response import FlowResponse, fluid_image
+from flowrec.flow.response import FlowResponse, State, fluid_image
 from flowrec.messages import FlowField
+from flowrec.refine.mask_doubt import other_walls
 from flowrec.refine.model_error import ModelError
 from flowrec.refine.prior import Prior, Widths
-from flowrec.refine.robust import fit
+from flowrec.refine.robust import Fit, fit
 from flowrec.refine.sight import Floats, Sight
 from flowrec.refine.statement import statement
 
+SURPRISED = 0.7  # standard deviations of chi squared above which the walls are doubted
+GAIN = 4.0  # in ln probability before other walls than the chip's are believed
+MOST_PX = 30_000  # fluid pixels of a chip whose walls are doubted: each variant is a geometry of its own
 CROWD_PX = 4  # observations in a square of this size share the model's error
 
 
@@ -38,6 +44,7 @@ class Assimilate:
     depth_std_share: float = 0.0  # of the chip's depth, where it has one
     inlet_shape_std: float = 0.0  # skew and flatness of the inlets' profiles, of the inlet speed
     model: ModelError = ModelError()
+    doubt_walls: bool = True  # try walls a pixel off where the observations contradict the chip's
     max_steps: int = 8  # of the full equations with frozen factors
     tolerance: float = 2e-3  # last such step over the fastest speed
 
@@ -49,7 +56,28 @@ class Assimilate:
         FlowError
             If the flow of the fitted parameters can not be computed.
         """
-        ready = self._ready(assumed, chip, solver)
+        best = self._explain(sight, chip, solver)
+        words = ""
+        if self.doubt_walls and best.surprise > SURPRISED and np.count_nonzero(chip.mask) <= MOST_PX:
+            words, other = self._better_walls(sight, chip, replace(solver, k=1))
+            if words:
+                best = self._explain(sight, other, solver)
+        return self._field(best, words, assumed, sight, chip)
+
+    def _better_walls(self, sight: Sight, chip: Chip, solver: FlowSolver) -> tuple[str, Chip]:
+        """The mask that the observations call far more probable than the chip's, and what is wrong with that."""
+        own = self._explain(sight, chip, solver).evidence
+        gains = []
+        for words, other in other_walls(chip):
+            # A mask that carries no flow is none.
+            with suppress(FlowError):
+                gains.append((self._explain(sight, other, solver).evidence - own, words, other))
+        gain, words, other = max(gains, key=lambda entry: entry[0], default=(0.0, "", chip))
+        return (words, other) if gain > GAIN else ("", chip)
+
+    def _explain(self, sight: Sight, chip: Chip, solver: FlowSolver) -> _Explained:
+        """The most probable flow of a chip; what is observed in its solid is predicted to stand still."""
+        ready = self._ready(chip, solver)
         response, prior = ready.response, ready.prior
         seen = _Seen.of_mask(sight, chip.mask)
         design = seen.of(ready.columns)
@@ -68,30 +96,47 @@ class Assimilate:
             bent = True
         if bent:
             found = fit(design, misfit - seen.of(beyond), variance)
+        left = misfit - seen.of(beyond) - np.tensordot(found.mean, design, axes=1)
+        return _Explained(chip, ready, found, state, beyond, (left**2).sum(axis=1) / variance)
+
+    def _field(self, best: _Explained, words: str, assumed: FlowField, sight: Sight, chip: Chip) -> FlowField:
+        ready, found = best.ready, best.found
+        response, prior = ready.response, ready.prior
         offset = prior.offset(found.mean)
-        velocity = ready.base + np.tensordot(found.mean, ready.columns, axes=1) + beyond
+        velocity = ready.base + np.tensordot(found.mean, ready.columns, axes=1) + best.beyond
         spread = np.linalg.cholesky(found.covariance)
         std = np.sqrt((np.tensordot(spread.T, ready.columns, axes=1) ** 2).sum(axis=0) + ready.left_std**2)
-        fitted = prior.chip(chip, found.mean)
+        fitted = prior.chip(best.chip, found.mean)
+        pressure = response.pressure(offset, best.state) * fitted.viscosity_mpa_s / chip.viscosity_mpa_s
+        velocity_um_s, std_um_s, pressure_pa = (
+            np.where(
+                chip.mask.reshape(chip.mask.shape + (1,) * (values.ndim - 1)),
+                fluid_image(best.chip.mask, values.astype(np.float32)),
+                np.float32(0.0),
+            )
+            for values in (velocity, std, pressure)
+        )
+        # The speed through the opening as the chip has it carries the same fluid.
+        widths = [
+            (other.width_px / opening.width_px if opening.kind == "inlet" else 1.0)
+            for other, opening in zip(best.chip.openings, chip.openings, strict=True)
+        ]
         return FlowField(
             stamp_ns=assumed.stamp_ns,
             request=assumed.request,
             method="assimilate",
             um_per_px=chip.um_per_px,
-            velocity_um_s=fluid_image(chip.mask, velocity.astype(np.float32)),
-            pressure_pa=fluid_image(
-                chip.mask, (response.pressure(offset, state) * fitted.viscosity_mpa_s / chip.viscosity_mpa_s).astype(np.float32)
-            ),
-            std_um_s=fluid_image(chip.mask, std.astype(np.float32)),
-            boundary_values=fitted.boundary_values,
+            velocity_um_s=velocity_um_s,
+            pressure_pa=pressure_pa,
+            std_um_s=std_um_s,
+            boundary_values=fitted.boundary_values * widths,
             viscosity_mpa_s=fitted.viscosity_mpa_s,
             density_kg_m3=fitted.density_kg_m3,
-            note=statement(chip, sight, found, prior),
+            note=statement(chip, sight, found, prior, words),
         )
 
-    def _ready(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> _Ready:
+    def _ready(self, chip: Chip, solver: FlowSolver) -> _Ready:
         """All that does not depend on the observations; kept."""
-        drop = float(np.ptp(assumed.pressure_pa[chip.mask]))
 
         def make() -> _Ready:
             widths = Widths(
@@ -104,7 +149,8 @@ class Assimilate:
                 self.inlet_shape_std,
             )
             response = solver.response(chip, self.depth_std_share > 0.0, self.inlet_shape_std > 0.0)
-            prior = Prior.of(widths, chip, drop)
+            pressure = response.pressure(np.zeros(response.modes.shape[0]), response.start())
+            prior = Prior.of(widths, chip, float(np.ptp(pressure)))
             grid = self.model.of(chip, solver, response)
             modes = response.modes.copy()
             modes[: len(grid.modes)] += grid.share * grid.modes
@@ -115,7 +161,7 @@ class Assimilate:
             left = np.maximum(grid.left_std, 1e-3 * grid.left_std.max() + 1e-9)
             return _Ready(response, prior, columns, base, np.repeat(left[:, None], 2, axis=1))
 
-        made: _Ready = kept((self, solver, chip_key(chip), drop), make)
+        made: _Ready = kept((self, solver, chip_key(chip)), make)
         return made
 
 
@@ -128,6 +174,29 @@ class _Ready:
     columns: Floats  # (beliefs + 1, n, 2)
     base: Floats  # (n, 2)
     left_std: Floats  # (n, 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Explained:
+    """A chip's most probable flow."""
+
+    chip: Chip
+    ready: _Ready
+    found: Fit
+    state: State
+    beyond: Floats  # (n, 2) um/s what inertia adds to the linear model
+    chi_squared: Floats  # (m,) of each observation, with two degrees of freedom
+
+    @property
+    def surprise(self) -> float:
+        """By how many of its standard deviations chi squared of the observations is too large."""
+        free = max(2.0 * len(self.chi_squared) - float((1.0 - np.diag(self.found.covariance)).sum()), 1.0)
+        return (float(self.chi_squared.sum()) - free) / float(np.sqrt(2.0 * free))
+
+    @property
+    def evidence(self) -> float:
+        """ln of the probability of the observations (Laplace), but for a constant."""
+        return 0.5 * float(np.linalg.slogdet(self.found.covariance)[1]) - self.found.energy
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from flowrec.refine.sight import Sight
 UNSEEN = 0.9
 
 
-def statement(chip: Chip, sight: Sight, found: Fit, prior: Prior) -> str:
+def statement(chip: Chip, sight: Sight, found: Fit, prior: Prior, walls: str) -> str:
     alone = sum(opening.kind == "outlet" for opening in chip.openings) == 1
     std = np.sqrt(np.diag(found.covariance))
     unseen = [
@@ -21,4 +21,6 @@ def statement(chip: Chip, sight: Sight, found: Fit, prior: Prior) -> str:
         if std[index] > UNSEEN and not (alone and opening.kind == "outlet")
     ]
     text = f"assimilated {sight.count} observations"
+    if walls:
+        text = f"{text}; the mask seems wrong: {walls}"
     return f"{text}; they say nothing about {', '.join(unseen)}" if unseen else text
