@@ -27,9 +27,8 @@ from flowrec.bench.vessels import make_up
 from flowrec.chip.chip import Chip
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import UsageError
-from flowrec.flow import FlowSolver
+from flowrec.flow import FlowSolver, kept, system
 from flowrec.flow.metrics import relative_rmse
-from flowrec.flow.system import forget
 from flowrec.messages import FlowField, Observations
 from flowrec.refine import PiUnet, Refiner
 from flowrec.status import progress, table
@@ -156,7 +155,8 @@ def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Troub
     observations = with_outliers(observations, trouble.outliers, seed)
     believed = with_wrong_mask(chip, trouble.mask)
     solver, refiner = FlowSolver(k), METHODS[method]
-    forget()
+    system.forget()
+    kept.forget()
     began = time.perf_counter()
     assumed = solver.solve(believed)
     field = refiner.refine(assumed, observations, believed, solver)

@@ -28,6 +28,7 @@ from flowrec.refine.statement import statement
 
 SURPRISED = 0.7  # standard deviations of chi squared above which the walls are doubted
 GAIN = 4.0  # in ln probability before other walls than the chip's are believed
+WIDE = 3.0  # std of an outlier's components, in units of the observations' typical component
 MOST_PX = 30_000  # fluid pixels of a chip whose walls are doubted: each variant is a geometry of its own
 CROWD_PX = 4  # observations in a square of this size share the model's error
 
@@ -64,6 +65,15 @@ class Assimilate:
                 best = self._explain(sight, other, solver)
         return self._field(best, words, assumed, sight, chip)
 
+    def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
+        """The assumed field with the standard deviation of the prior; without one where there is no prior."""
+        try:
+            ready = self._ready(chip, solver)
+        except FlowError:
+            return assumed
+        std = np.sqrt((ready.columns**2).sum(axis=0) + ready.left_std**2)
+        return replace(assumed, std_um_s=fluid_image(chip.mask, std.astype(np.float32)))
+
     def _better_walls(self, sight: Sight, chip: Chip, solver: FlowSolver) -> tuple[str, Chip]:
         """The mask that the observations call far more probable than the chip's, and what is wrong with that."""
         own = self._explain(sight, chip, solver).evidence
@@ -84,7 +94,9 @@ class Assimilate:
         misfit = sight.flow_um_s - seen.of(ready.base)
         variance = _variance(sight, seen.of(ready.left_std)[:, 0])
         state, beyond = response.start(), np.zeros_like(ready.base)
-        found = fit(design, misfit, variance)
+        # The same for all walls, or their probabilities could not be compared.
+        wide = WIDE**2 * 0.5 * float(np.median((sight.flow_um_s**2).sum(axis=1))) + float(sight.std_um_s.max()) ** 2 + 1e-9
+        found = fit(design, misfit, variance, wide)
         bent = False
         for _ in range(self.max_steps):
             state = response.approach(prior.offset(found.mean), state)
@@ -95,7 +107,7 @@ class Assimilate:
             found = found.moved(design, misfit - seen.of(beyond), variance)
             bent = True
         if bent:
-            found = fit(design, misfit - seen.of(beyond), variance)
+            found = fit(design, misfit - seen.of(beyond), variance, wide)
         left = misfit - seen.of(beyond) - np.tensordot(found.mean, design, axes=1)
         return _Explained(chip, ready, found, state, beyond, (left**2).sum(axis=1) / variance)
 

@@ -9,16 +9,16 @@ probable end is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-WIDE = 3.0  # std of an outlier in units of the observations' typical size
 SHARE, SHARES_WORTH = 0.05, 20.0  # of outliers beforehand, and how many observations that belief is worth
 ANNEALED = (1.0, 0.3, 0.1, 0.03, 0.01, 0.0)  # of the prior's predictive variance, added to the noise
+ODDS = 2.0  # ln of the odds that a stated noise is right
 MEDIAN = 2.0 * np.log(2.0)  # of chi squared with two degrees of freedom
 
 
@@ -38,7 +38,7 @@ class Fit:
         return Fit(mean, covariance, self.trust, self.noise_factor, self.energy)
 
 
-def fit(design: Floats, misfit: Floats, variance: Floats, max_iterations: int = 60) -> Fit:
+def fit(design: Floats, misfit: Floats, variance: Floats, wide: float, max_iterations: int = 60) -> Fit:
     """Parameters z ~ N(0, 1) for misfit = z design + noise.
 
     Parameters
@@ -46,26 +46,36 @@ def fit(design: Floats, misfit: Floats, variance: Floats, max_iterations: int = 
     design : (parameters, n, 2)
     misfit : (n, 2) what was observed beyond the prior mean
     variance : (n,) of each component's noise
+    wide : variance of an outlier's components
     """
-    found = _best(design, misfit, variance, max_iterations)
-    factor = 1.0
-    for _ in range(3):
-        # The median of the misfits does not know of outliers; one standard deviation of itself is let pass.
-        left = misfit - np.tensordot(found.mean, design, axes=1)
-        count = len(variance)
-        free = max(count - 0.5 * float((1.0 - np.diag(found.covariance)).sum()), 0.25 * count)
-        seen = float(np.median((left**2).sum(axis=1) / variance)) / MEDIAN * count / free
-        new = float(np.sqrt(max(1.0, seen / (1.0 + 1.44 / np.sqrt(count)))))
-        if new <= 1.02 * factor:
-            break
-        factor = new
-        found = _best(design, misfit, factor**2 * variance, max_iterations)
-    return Fit(found.mean, found.covariance, found.trust, factor, found.energy)
+    best = _best(design, misfit, variance, wide, max_iterations)
+    # The median does not know of outliers if they are few; the quantile that leaves out those now distrusted does not
+    # know of them if they are many. The more probable wins, and the stated noise by itself has the odds.
+    for quantile in (0.5, 0.5 * float(best.trust.mean())):
+        found = best
+        for _ in range(3):
+            factor = _noise_factor(design, misfit, variance, found, quantile)
+            if factor <= 1.02 * found.noise_factor:
+                break
+            found = replace(
+                _best(design, misfit, factor**2 * variance, wide, max_iterations), noise_factor=factor
+            )
+        if found.energy + ODDS * (found.noise_factor > 1.0) < best.energy + ODDS * (best.noise_factor > 1.0):
+            best = found
+    return best
 
 
-def _best(design: Floats, misfit: Floats, variance: Floats, max_iterations: int) -> Fit:
+def _noise_factor(design: Floats, misfit: Floats, variance: Floats, found: Fit, quantile: float) -> float:
+    """From one quantile of the misfits; one standard deviation of itself is let pass."""
+    left = misfit - np.tensordot(found.mean, design, axes=1)
     count = len(variance)
-    wide = WIDE**2 * float(np.median((misfit**2).sum(axis=1) + (design**2).sum(axis=(0, 2)))) + 4.0 * variance.max()
+    free = max(count - 0.5 * float((1.0 - np.diag(found.covariance)).sum()), 0.25 * count)
+    seen = float(np.quantile((left**2).sum(axis=1) / variance, quantile)) / MEDIAN * count / free
+    return float(np.sqrt(max(1.0, seen / (1.0 + 1.44 / np.sqrt(count)))))
+
+
+def _best(design: Floats, misfit: Floats, variance: Floats, wide: float, max_iterations: int) -> Fit:
+    count = len(variance)
     open_ = 0.5 * (design**2).sum(axis=(0, 2))
     ends = []
     for start in ("everything", "annealed", "prior"):
