@@ -81,7 +81,7 @@ class FlowResponse:
 
     @property
     def _has_friction(self) -> bool:
-        return (self.change.shape[1] - self.openings - 1) % 2 == 1
+        return bool((self.change.shape[1] - self.openings - 1) % 2 == 1)
 
     def predicted(self, offset: Floats) -> Floats:
         """Face velocities (faces,) to first order, m/s."""
@@ -168,9 +168,7 @@ def _cell_averages(grid: Grid) -> Any:
     there = (pixel >= 0) & (grid.number_p >= 0)
     count = np.bincount(pixel[there], minlength=int(number.max()) + 1)
     return sp.csr_array(
-        sp.coo_array(
-            (1.0 / count[pixel[there]], (pixel[there], grid.number_p[there])), shape=(len(count), grid.cells)
-        )
+        sp.coo_array((1.0 / count[pixel[there]], (pixel[there], grid.number_p[there])), shape=(len(count), grid.cells))
     )
 
 

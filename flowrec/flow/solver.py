@@ -73,9 +73,7 @@ class FlowSolver:
             thickness = 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / self.k / chip.depth_um) ** 2
             moving = self._steady(chip, equations, scales)
             drive, per_unit = scales.drive(chip), scales.drive_per_unit
-            return respond(
-                equations, drive, per_unit, scales.inertia, thickness, scales.pressure, moving, extras
-            )
+            return respond(equations, drive, per_unit, scales.inertia, thickness, scales.pressure, moving, extras)
 
         made: FlowResponse = kept((self, chip_key(chip), extras), make)
         return made

@@ -1,14 +1,14 @@
 """Assimilation: the boundary values that explain the observations best, and how sure that makes the field.
 
 The parameters are the boundary values and the fluid's viscosity and density, with a Gaussian prior around the assumed
-ones. Without inertia the field is linear in inlet speeds and p_out / mu; what inertia adds is followed by a few steps of
-the full equations with frozen factors. The curvature gives the posterior covariance (science.md, section 2).
+ones. Without inertia the field is linear in inlet speeds and p_out / mu; what inertia adds is followed by a few steps
+of the full equations with frozen factors. The curvature gives the posterior covariance (science.md, section 2).
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from flowrec.refine.statement import statement
 
 SURPRISED = 0.7  # standard deviations of chi squared above which the walls are doubted
 GAIN = 4.0  # in ln probability before other walls than the chip's are believed
-WIDE = 3.0  # std of an outlier's components, in units of the observations' typical component
+WIDE = 3.0  # size of an outlier's components, in units of the observations' typical component
 MOST_PX = 30_000  # fluid pixels of a chip whose walls are doubted: each variant is a geometry of its own
 CROWD_PX = 4  # observations in a square of this size share the model's error
 
@@ -44,7 +44,7 @@ class Assimilate:
     density_std_share: float = 0.10  # of the assumed density
     depth_std_share: float = 0.0  # of the chip's depth, where it has one
     inlet_shape_std: float = 0.0  # skew and flatness of the inlets' profiles, of the inlet speed
-    model: ModelError = ModelError()
+    model: ModelError = field(default_factory=ModelError)
     doubt_walls: bool = True  # try walls a pixel off where the observations contradict the chip's
     max_steps: int = 8  # of the full equations with frozen factors
     tolerance: float = 2e-3  # last such step over the fastest speed
@@ -62,7 +62,9 @@ class Assimilate:
         if self.doubt_walls and best.surprise > SURPRISED and np.count_nonzero(chip.mask) <= MOST_PX:
             words, other = self._better_walls(sight, chip, replace(solver, k=1))
             if words:
-                best = self._explain(sight, other, solver)
+                moved = self._explain(sight, other, solver)
+                # The coarse grid proposes, the fine one decides.
+                best, words = (moved, words) if moved.evidence > best.evidence + GAIN else (best, "")
         return self._field(best, words, assumed, sight, chip)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
@@ -95,7 +97,9 @@ class Assimilate:
         variance = _variance(sight, seen.of(ready.left_std)[:, 0])
         state, beyond = response.start(), np.zeros_like(ready.base)
         # The same for all walls, or their probabilities could not be compared.
-        wide = WIDE**2 * 0.5 * float(np.median((sight.flow_um_s**2).sum(axis=1))) + float(sight.std_um_s.max()) ** 2 + 1e-9
+        wide = (
+            WIDE**2 * 0.5 * float(np.median((sight.flow_um_s**2).sum(axis=1))) + float(sight.std_um_s.max()) ** 2 + 1e-9
+        )
         found = fit(design, misfit, variance, wide)
         bent = False
         for _ in range(self.max_steps):
@@ -167,7 +171,7 @@ class Assimilate:
             modes = response.modes.copy()
             modes[: len(grid.modes)] += grid.share * grid.modes
             # Parameters in prior standard deviations, and last how far the grid is off.
-            columns = np.concatenate([np.tensordot(prior.spread, modes, axes=1), grid.std * grid.base[None]])
+            columns = np.concatenate([np.tensordot(prior.spread, modes, axes=1), grid.share_std * grid.base[None]])
             base = response.base + grid.share * grid.base
             # Nothing is known better than to rounding, also where an observation has a std of 0.
             left = np.maximum(grid.left_std, 1e-3 * grid.left_std.max() + 1e-9)
@@ -207,7 +211,7 @@ class _Explained:
 
     @property
     def evidence(self) -> float:
-        """ln of the probability of the observations (Laplace), but for a constant."""
+        """The ln of the probability of the observations (Laplace), but for a constant."""
         return 0.5 * float(np.linalg.slogdet(self.found.covariance)[1]) - self.found.energy
 
 
@@ -220,6 +224,7 @@ class _Seen:
 
     @classmethod
     def of_mask(cls, sight: Sight, mask: NDArray[np.bool_]) -> _Seen:
+        """On the fluid of a mask; solid is seen to stand still."""
         number = np.full(mask.shape, -1, np.intp)
         number[mask] = np.arange(np.count_nonzero(mask))
         index = number[sight.rows, sight.columns]
@@ -227,7 +232,7 @@ class _Seen:
 
     def of(self, values: Floats) -> Floats:
         """(..., n, 2) as observed: (..., m, 2)."""
-        return np.einsum("...mkc,mk->...mc", values[..., self.index, :], self.weights)
+        return np.asarray(np.einsum("...mkc,mk->...mc", values[..., self.index, :], self.weights))
 
 
 def _variance(sight: Sight, left_std: Floats) -> Floats:

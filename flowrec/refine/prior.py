@@ -70,9 +70,16 @@ class Prior:
             depth[count + 1] = 2.0 * widths.depth_share  # friction goes as 1 / depth^2
             rows.append(depth)
         if shapes:
-            rows += [*np.eye(shapes, parameters, parameters - shapes) * np.repeat(widths.shape_share * speed[inlet], 2)[:, None]]
+            rows += [
+                *np.eye(shapes, parameters, parameters - shapes)
+                * np.repeat(widths.shape_share * speed[inlet], 2)[:, None]
+            ]
         if widths.pump_share > 0.0:
-            rows.append(np.where(np.arange(parameters) < count, 1.0, 0.0) * np.pad(np.where(inlet, values, 0.0), (0, parameters - count)) * widths.pump_share)
+            rows.append(
+                np.where(np.arange(parameters) < count, 1.0, 0.0)
+                * np.pad(np.where(inlet, values, 0.0), (0, parameters - count))
+                * widths.pump_share
+            )
         return cls(np.stack(rows), widths.viscosity_share, widths.density_share)
 
     def offset(self, z: Floats) -> Floats:

@@ -1,10 +1,10 @@
 """The most probable parameters of a linear model from observations some of which are nonsense.
 
-Each observation is either right, with Gaussian noise of its stated variance, or an outlier from a wide Gaussian
-(a mixture; Box and Tiao 1968). The weights are the probabilities of being right. A descent from any start can lock on
-a wrong subset, so there are three starts (from everything at once, and from all noise widened by what the prior leaves
-open, narrowed step by step: graduated non-convexity, Blake and Zisserman 1987; and from the prior itself), and the most
-probable end is taken.
+Each observation is either right, with Gaussian noise of its stated variance, or an outlier from a wide distribution
+(a mixture; Box and Tiao, 1968): Student's with two degrees of freedom, so that how far off an outlier is hardly
+matters. The weights are the probabilities of being right. A descent from one start can lock on a wrong subset, so
+there are three (all observations at once; all noise widened by what the prior leaves open and narrowed step by step:
+graduated non-convexity, Blake and Zisserman, 1987; and the prior itself), and the most probable end is taken.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def fit(design: Floats, misfit: Floats, variance: Floats, wide: float, max_itera
     design : (parameters, n, 2)
     misfit : (n, 2) what was observed beyond the prior mean
     variance : (n,) of each component's noise
-    wide : variance of an outlier's components
+    wide : squared scale of an outlier's components
     """
     best = _best(design, misfit, variance, wide, max_iterations)
     # The median does not know of outliers if they are few; the quantile that leaves out those now distrusted does not
@@ -57,9 +57,7 @@ def fit(design: Floats, misfit: Floats, variance: Floats, wide: float, max_itera
             factor = _noise_factor(design, misfit, variance, found, quantile)
             if factor <= 1.02 * found.noise_factor:
                 break
-            found = replace(
-                _best(design, misfit, factor**2 * variance, wide, max_iterations), noise_factor=factor
-            )
+            found = replace(_best(design, misfit, factor**2 * variance, wide, max_iterations), noise_factor=factor)
         if found.energy + ODDS * (found.noise_factor > 1.0) < best.energy + ODDS * (best.noise_factor > 1.0):
             best = found
     return best
@@ -83,7 +81,7 @@ def _best(design: Floats, misfit: Floats, variance: Floats, wide: float, max_ite
             mean = np.zeros(len(design))
             for share in ANNEALED:
                 widened = variance + share * open_
-                trust = _trust(misfit - np.tensordot(mean, design, axes=1), widened, wide + widened, SHARE)
+                trust = _trust(misfit - np.tensordot(mean, design, axes=1), widened, wide, SHARE)
                 mean, _ = _gaussian(design, misfit, trust / widened)
         elif start == "everything":
             mean, _ = _gaussian(design, misfit, 1.0 / variance)
@@ -92,14 +90,14 @@ def _best(design: Floats, misfit: Floats, variance: Floats, wide: float, max_ite
         share = SHARE
         for _ in range(max_iterations):
             left = misfit - np.tensordot(mean, design, axes=1)
-            trust = _trust(left, variance, wide + variance, share)
+            trust = _trust(left, variance, wide, share)
             share = (SHARE * SHARES_WORTH + float((1.0 - trust).sum())) / (SHARES_WORTH + count)
             new, covariance = _gaussian(design, misfit, trust / variance)
             settled = float(np.abs(new - mean).max()) < 1e-4
             mean = new
             if settled:
                 break
-        energy = _energy(misfit - np.tensordot(mean, design, axes=1), variance, wide + variance, mean)
+        energy = _energy(misfit - np.tensordot(mean, design, axes=1), variance, wide, mean)
         ends.append(Fit(mean, covariance, trust, 1.0, energy))
         if start == "annealed" and float(np.abs(ends[0].mean - mean).max()) < 1e-2:
             break  # both agree: there is nothing to lock on
@@ -110,20 +108,24 @@ def _gaussian(design: Floats, misfit: Floats, weight: Floats) -> tuple[Floats, F
     """Mean and covariance for weights (n,)."""
     flat = design.reshape(len(design), -1)
     weighted = flat * np.repeat(weight, 2)
-    covariance = np.linalg.inv(np.eye(len(design)) + weighted @ flat.T)
+    covariance = np.asarray(np.linalg.inv(np.eye(len(design)) + weighted @ flat.T), np.float64)
     return covariance @ (weighted @ misfit.ravel()), covariance
 
 
-def _trust(left: Floats, variance: Floats, wide: Floats, share: float) -> Floats:
+def _trust(left: Floats, variance: Floats, wide: float, share: float) -> Floats:
     """(n,) probability of being right."""
     square = (left**2).sum(axis=1)
-    odds = share / (1.0 - share) * variance / wide * np.exp(np.minimum(0.5 * square * (1 / variance - 1 / wide), 700.0))
-    return np.asarray(1.0 / (1.0 + odds))
+    wrong = np.log(share / (1.0 - share)) + _wrong(square, wide) + 0.5 * square / variance + np.log(variance)
+    return np.asarray(1.0 / (1.0 + np.exp(np.minimum(wrong, 700.0))))
 
 
-def _energy(left: Floats, variance: Floats, wide: Floats, mean: Floats) -> float:
+def _wrong(square: Floats, wide: float) -> Floats:
+    """The ln density of an outlier at the squared distance; as of a right one, without 1 / (2 pi)."""
+    return np.asarray(-2.0 * np.log1p(0.5 * square / wide) - np.log(wide))
+
+
+def _energy(left: Floats, variance: Floats, wide: float, mean: Floats) -> float:
     """Minus ln posterior of the mixture, but for a constant."""
     square = (left**2).sum(axis=1)
     right = np.log(1.0 - SHARE) - 0.5 * square / variance - np.log(variance)
-    wrong = np.log(SHARE) - 0.5 * square / wide - np.log(wide)
-    return float(0.5 * (mean**2).sum() - np.logaddexp(right, wrong).sum())
+    return float(0.5 * (mean**2).sum() - np.logaddexp(right, np.log(SHARE) + _wrong(square, wide)).sum())
