@@ -30,6 +30,7 @@ SURPRISED = 0.7  # standard deviations of chi squared above which the walls are 
 GAIN = 4.0  # in ln probability before other walls than the chip's are believed
 WIDE = 3.0  # size of an outlier's components, in units of the observations' typical component
 MOST_PX = 30_000  # fluid pixels of a chip whose walls are doubted: each variant is a geometry of its own
+SHARPEST = 1e-3  # of the observations' typical speed: no observation is known better
 CROWD_PX = 4  # observations in a square of this size share the model's error
 
 
@@ -64,7 +65,7 @@ class Assimilate:
             if words:
                 moved = self._explain(sight, other, solver)
                 # The coarse grid proposes, the fine one decides.
-                best, words = (moved, words) if moved.evidence > best.evidence + GAIN else (best, "")
+                best, words = (moved, words) if moved.adequate and moved.evidence > best.evidence + GAIN else (best, "")
         return self._field(best, words, assumed, sight, chip)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
@@ -210,6 +211,16 @@ class _Explained:
         return (float(self.chi_squared.sum()) - free) / float(np.sqrt(2.0 * free))
 
     @property
+    def adequate(self) -> bool:
+        """Whether it explains most observations, with parameters that somebody could have believed."""
+        openings = len(self.chip.openings)
+        return (
+            self.found.noise_factor < 1.5
+            and float(self.found.trust.mean()) > 0.6
+            and float(np.abs(self.found.mean[:openings]).max()) < 3.0
+        )
+
+    @property
     def evidence(self) -> float:
         """The ln of the probability of the observations (Laplace), but for a constant."""
         return 0.5 * float(np.linalg.slogdet(self.found.covariance)[1]) - self.found.energy
@@ -249,4 +260,6 @@ def _variance(sight: Sight, left_std: Floats) -> Floats:
     )
     same = np.concatenate([sight.rows[:, :1], sight.columns[:, :1], sight.weights, sight.flow_um_s], axis=1)
     _, twin, times = np.unique(same, axis=0, return_inverse=True, return_counts=True)
-    return np.asarray(times[twin.ravel()] * sight.std_um_s**2 + crowd[cell.ravel()] * left_std**2)
+    # A std of 0 in solid would be a contradiction that no noise explains.
+    least = (SHARPEST**2) * float(np.median((sight.flow_um_s**2).sum(axis=1))) + 1e-12
+    return np.asarray(times[twin.ravel()] * sight.std_um_s**2 + crowd[cell.ravel()] * left_std**2 + least)

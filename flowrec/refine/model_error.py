@@ -30,7 +30,7 @@ class ModelError:
 
     share: float = 0.40  # of D that is added: 0.41 over 36 crops of real and drawn vessels, 0.29 to 0.50
     share_std: float = 0.06  # one standard deviation of it from chip to chip: 0.04 there
-    left_share: float = 0.20  # of D around a pixel: one standard deviation of what is left there
+    left_share: float = 0.14  # of D around a pixel: one standard deviation of what is left there; 0.12 there
     speed_share: float = 0.003  # of the speed around a pixel: the same, where both grids agree by chance
     coarse_share: float = 0.03  # of the speed around a pixel: all of it, where there is no coarser grid (k = 1)
 

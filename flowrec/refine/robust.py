@@ -19,6 +19,7 @@ Floats = NDArray[np.float64]
 SHARE, SHARES_WORTH = 0.05, 20.0  # of outliers beforehand, and how many observations that belief is worth
 ANNEALED = (1.0, 0.3, 0.1, 0.03, 0.01, 0.0)  # of the prior's predictive variance, added to the noise
 ODDS = 2.0  # ln of the odds that a stated noise is right
+LEAST_FOR_ALIKENESS = 8  # observations
 MEDIAN = 2.0 * np.log(2.0)  # of chi squared with two degrees of freedom
 
 
@@ -30,12 +31,14 @@ class Fit:
     covariance: Floats  # (parameters, parameters)
     trust: Floats  # (n,) probability that an observation is right
     noise_factor: float  # at least 1: how many times larger than stated the noise is
+    copies: float  # at least 1: how many observations in a row say the same wrong thing
     energy: float  # minus ln of prior times likelihood, but for a constant
 
     def moved(self, design: Floats, misfit: Floats, variance: Floats) -> Fit:
         """The same for other misfits, with the same trust in each observation."""
-        mean, covariance = _gaussian(design, misfit, self.trust / (self.noise_factor**2 * variance))
-        return Fit(mean, covariance, self.trust, self.noise_factor, self.energy)
+        weight = self.trust / (self.copies * self.noise_factor**2 * variance)
+        mean, covariance = _gaussian(design, misfit, weight)
+        return replace(self, mean=mean, covariance=covariance)
 
 
 def fit(design: Floats, misfit: Floats, variance: Floats, wide: float, max_iterations: int = 60) -> Fit:
@@ -60,7 +63,24 @@ def fit(design: Floats, misfit: Floats, variance: Floats, wide: float, max_itera
             found = replace(_best(design, misfit, factor**2 * variance, wide, max_iterations), noise_factor=factor)
         if found.energy + ODDS * (found.noise_factor > 1.0) < best.energy + ODDS * (best.noise_factor > 1.0):
             best = found
+    # What the model can not explain is alike in neighbours: they are fewer than they look.
+    alike = _alikeness(misfit - np.tensordot(best.mean, design, axes=1), best.trust, variance)
+    if alike > 0.0:
+        few = (1.0 + alike) / (1.0 - alike)
+        mean, covariance = _gaussian(design, misfit, best.trust / (few * best.noise_factor**2 * variance))
+        best = replace(best, mean=mean, covariance=covariance, copies=few)
     return best
+
+
+def _alikeness(left: Floats, trust: Floats, variance: Floats) -> float:
+    """Correlation of what is left of each observation with that of the next, beyond what chance does; at most 0.95."""
+    scaled = left * np.sqrt(trust / variance)[:, None]
+    count = len(scaled)
+    square = float((scaled**2).sum())
+    if count < LEAST_FOR_ALIKENESS or square == 0.0:
+        return 0.0
+    found = float((scaled[1:] * scaled[:-1]).sum()) / square
+    return min(max(found - 2.0 / np.sqrt(2.0 * count), 0.0), 0.95)
 
 
 def _noise_factor(design: Floats, misfit: Floats, variance: Floats, found: Fit, quantile: float) -> float:
@@ -98,7 +118,7 @@ def _best(design: Floats, misfit: Floats, variance: Floats, wide: float, max_ite
             if settled:
                 break
         energy = _energy(misfit - np.tensordot(mean, design, axes=1), variance, wide, mean)
-        ends.append(Fit(mean, covariance, trust, 1.0, energy))
+        ends.append(Fit(mean, covariance, trust, 1.0, 1.0, energy))
         if start == "annealed" and float(np.abs(ends[0].mean - mean).max()) < 1e-2:
             break  # both agree: there is nothing to lock on
     return min(ends, key=lambda end: end.energy)

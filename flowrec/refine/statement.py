@@ -14,6 +14,7 @@ WEAK = 0.6  # share above which it is asked whether it is seen together with oth
 SEEN_TOGETHER = 0.4  # share below which they are seen together
 FAR = 3.0  # prior standard deviations from what was assumed
 DISTRUSTED = 0.5  # probability of being right below which an observation counts as an outlier
+ALIKE = 3.0  # observations in a row that say the same wrong thing
 NOISIER = 1.3  # times the stated noise
 
 
@@ -29,6 +30,8 @@ def statement(chip: Chip, sight: Sight, found: Fit, prior: Prior, walls: str) ->
         parts.append(f"the mask seems wrong: {walls}")
     if found.noise_factor > NOISIER:
         parts.append(f"they scatter {found.noise_factor:.1f} times more than their std says, error bars widened")
+    if found.copies > ALIKE:
+        parts.append("neighbours miss alike: something here is not in the model")
     far = [
         f"{_name(chip, index)} ({abs(found.mean[index]):.0f} prior std off)"
         for index in range(len(chip.openings))
