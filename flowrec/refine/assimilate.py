@@ -26,7 +26,7 @@ from flowrec.refine.robust import Fit, fit
 from flowrec.refine.sight import Floats, Sight
 from flowrec.refine.statement import statement
 
-SURPRISED = 0.7  # standard deviations of chi squared above which the walls are doubted
+SURPRISED = 1.5  # standard deviations of chi squared above which the walls are doubted
 GAIN = 4.0  # in ln probability before other walls than the chip's are believed
 WIDE = 3.0  # size of an outlier's components, in units of the observations' typical component
 MOST_PX = 30_000  # fluid pixels of a chip whose walls are doubted: each variant is a geometry of its own

@@ -80,7 +80,7 @@ def _alikeness(left: Floats, trust: Floats, variance: Floats) -> float:
     if count < LEAST_FOR_ALIKENESS or square == 0.0:
         return 0.0
     found = float((scaled[1:] * scaled[:-1]).sum()) / square
-    return min(max(found - 2.0 / np.sqrt(2.0 * count), 0.0), 0.95)
+    return float(min(max(found - 2.0 / np.sqrt(2.0 * count), 0.0), 0.95))
 
 
 def _noise_factor(design: Floats, misfit: Floats, variance: Floats, found: Fit, quantile: float) -> float:
@@ -113,7 +113,7 @@ def _best(design: Floats, misfit: Floats, variance: Floats, wide: float, max_ite
             trust = _trust(left, variance, wide, share)
             share = (SHARE * SHARES_WORTH + float((1.0 - trust).sum())) / (SHARES_WORTH + count)
             new, covariance = _gaussian(design, misfit, trust / variance)
-            settled = float(np.abs(new - mean).max()) < 1e-4
+            settled = float(np.abs(new - mean).max()) < 1e-3
             mean = new
             if settled:
                 break
