@@ -325,6 +325,9 @@ def bench_flow(
     mask: Annotated[
         Literal["right", "grown", "shrunk", "shifted"], typer.Option(help="Believed walls, one pixel off.")
     ] = "right",
+    observations: Annotated[
+        Literal["raw", "trimmed"], typer.Option(help="trimmed: treated as in the paper before they are used.")
+    ] = "raw",
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
     fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep every field in this folder.")] = None,
 ) -> None:
@@ -332,7 +335,7 @@ def bench_flow(
     from flowrec.bench.flow import Trouble, measure, show
 
     chosen = methods.split(",") if methods is not None else None
-    figures = measure(cases, chosen, noise, share, k, Trouble(outliers, mask), fields)
+    figures = measure(cases, chosen, noise, share, k, Trouble(outliers, mask, observations), fields)
     show(figures)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
@@ -350,6 +353,17 @@ def bench_solver(
     show(figures)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+@bench.command("grid")
+def bench_grid(
+    cases: Annotated[Path, typer.Argument(metavar="DIR", help="Vessel cases (*.npz) with a truth on a fine grid.")],
+    k: Annotated[int, typer.Option("-k", help="Subcells of the solver per pixel side: 2 or 4.")] = 2,
+) -> None:
+    """Fit the settings of refine.assimilate.model anew, for when the solver has changed."""
+    from flowrec.bench.grid_error import measure, show
+
+    show(measure(cases, k))
 
 
 def _point(text: str) -> str:

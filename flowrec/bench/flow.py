@@ -27,9 +27,9 @@ from flowrec.bench.vessels import make_up
 from flowrec.chip.chip import Chip
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import UsageError
-from flowrec.flow import FlowSolver
+from flowrec.estimation import Trimmed
+from flowrec.flow import FlowSolver, kept, system
 from flowrec.flow.metrics import relative_rmse
-from flowrec.flow.system import forget
 from flowrec.messages import FlowField, Observations
 from flowrec.refine import PiUnet, Refiner
 from flowrec.status import progress, table
@@ -51,6 +51,7 @@ class Trouble:
 
     outliers: float = 0.0  # share of the observations that are replaced by nonsense of the flow's size
     mask: str = "right"  # grown, shrunk: walls one pixel off everywhere; shifted: one pixel to the right
+    observations: str = "raw"  # trimmed: treated as in the paper before they are used
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +155,12 @@ def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Troub
     observations = read_observations(case, noise, share)
     seed = int.from_bytes(case.stem.encode()[-4:], "little")
     observations = with_outliers(observations, trouble.outliers, seed)
+    if trouble.observations == "trimmed":
+        observations = Trimmed().treat(observations)
     believed = with_wrong_mask(chip, trouble.mask)
     solver, refiner = FlowSolver(k), METHODS[method]
-    forget()
+    system.forget()
+    kept.forget()
     began = time.perf_counter()
     assumed = solver.solve(believed)
     field = refiner.refine(assumed, observations, believed, solver)

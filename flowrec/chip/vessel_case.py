@@ -71,6 +71,16 @@ def read_observations(path: Path, noise: str, share: str) -> Observations:
     )
 
 
+def read_true_chip(path: Path, believed: Chip) -> Chip:
+    """The chip with the true parameters, for measuring the solver alone."""
+    known = _read(path, ("mu", "rho", "op_u_true", "op_p_true"))
+    values = [
+        float(speed) * 1e6 if opening.kind == "inlet" else float(pressure)
+        for opening, speed, pressure in zip(believed.openings, known["op_u_true"], known["op_p_true"], strict=True)
+    ]
+    return believed.with_boundary(values, float(known["mu"]) * 1e3, float(known["rho"]))
+
+
 def read_true_velocity(path: Path) -> NDArray[np.float64]:
     """The true velocity (h, w, 2) in um/s, for scoring alone."""
     known = _read(path, ("vx", "vy"))

@@ -4,5 +4,7 @@ from flowrec.estimation.kalman import Kalman
 from flowrec.estimation.luenberger import Luenberger
 from flowrec.estimation.observer import Observer
 from flowrec.estimation.sampler import Sampler
+from flowrec.estimation.smoother import Smoothed, observe, smooth
+from flowrec.estimation.trimmed import Trimmed
 
-__all__ = ["Kalman", "Luenberger", "Observer", "Sampler"]
+__all__ = ["Kalman", "Luenberger", "Observer", "Sampler", "Smoothed", "Trimmed", "observe", "smooth"]

@@ -39,15 +39,20 @@ class Kalman:
     gate_nis: float = 25.0  # a measurement less likely than this is not used at once ...
     gate_growth: float = 4.0  # ... but the position's variance is multiplied, so that a real jump is soon believed
 
-    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
-        """One predict and, where the robot was seen, one update."""
+    def flow_noise(self, robot: Robot) -> float:
+        """Spectral density q of the flow's random walk, um2/s3."""
         assert robot.max_speed_um_s is not None
         scale = (robot.max_speed_um_s / 600.0) ** 3 / (robot.radius / 50.0)
-        q = self.flow_noise_um2_s3 if self.flow_noise_um2_s3 is not None else 1e4 * scale
+        return self.flow_noise_um2_s3 if self.flow_noise_um2_s3 is not None else 1e4 * scale
+
+    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
+        """One predict and, where the robot was seen, one update."""
+        q = self.flow_noise(robot)
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
         # State and covariance are set anew for every step: all that the filter knows is in the messages.
         kalman = _filter(sigma_um)
         if previous is None:
+            assert robot.max_speed_um_s is not None
             flow_um_s = 0.5 * robot.max_speed_um_s
             kalman.x = np.array([*track.position_um, 0.0, 0.0])
             kalman.P = np.diag([_UNKNOWN_UM**2, _UNKNOWN_UM**2, flow_um_s**2, flow_um_s**2])
@@ -56,7 +61,7 @@ class Kalman:
             kalman.P = previous.covariance.copy()
             dt = seconds(track.stamp_ns - previous.stamp_ns)
             kalman.predict(
-                u=robot.um_per_rev * applied.turns, B=_B, F=_transition(dt), Q=_noise(dt, q, self.drift_um2_s)
+                u=robot.um_per_rev * applied.turns, B=_B, F=transition(dt), Q=process_noise(dt, q, self.drift_um2_s)
             )
         nis = float("nan")
         if track.seen:
@@ -88,14 +93,15 @@ def _filter(sigma_um: float) -> KalmanFilter:
 
 
 @lru_cache(maxsize=16)
-def _transition(dt: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def transition(dt: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """(4, 4) of the state over dt, without input."""
     matrix = np.eye(4)
     matrix[0, 2] = matrix[1, 3] = dt
     return matrix
 
 
 @lru_cache(maxsize=16)
-def _noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def process_noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
     """Process noise of a random-walk velocity over dt, with a random walk of the position on top."""
     noise = np.zeros((4, 4))
     for axis in (0, 1):

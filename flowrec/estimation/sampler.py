@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
+from flowrec.estimation.trimmed import Trimmed
 from flowrec.messages import Estimate, Observations
 from flowrec.robot import Robot
 from flowrec.units import nanoseconds, seconds
@@ -26,6 +28,12 @@ class Sampler:
     settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
     floor_um_s: float = 2.0  # no observation claims a smaller sigma
     capacity: int = 2000  # the oldest go first
+    method: Literal["filter", "trimmed"] = "filter"  # trimmed: as in the paper, before a refinement uses them
+    trimmed: Trimmed = field(default_factory=Trimmed)
+
+    def treat(self, observations: Observations) -> Observations:
+        """What a refinement is given of them."""
+        return self.trimmed.treat(observations) if self.method == "trimmed" else observations
 
     def collect(
         self, previous: Observations | None, before: Estimate | None, estimate: Estimate, robot: Robot

@@ -9,7 +9,9 @@ import numpy as np
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow.grid import Floats
+from flowrec.flow.kept import chip_key, kept
 from flowrec.flow.modes import FlowModes
+from flowrec.flow.response import FlowResponse, respond
 from flowrec.flow.system import NotConvergedError, System, system
 from flowrec.messages import FlowField
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
@@ -59,6 +61,23 @@ class FlowSolver:
             pressure_pa[-1] + base.pressure_pa,
         )
 
+    def response(self, chip: Chip, friction: bool = False, shapes: bool = False) -> FlowResponse:
+        """How the flow of `solve` answers to boundary values and fluid: made once for a chip, then kept.
+
+        Parameters are also ln of the depth's friction, and the shapes of the inlets' profiles, where they are asked.
+        """
+        extras = (friction and chip.depth_um is not None, shapes)
+
+        def make() -> FlowResponse:
+            equations, scales = self._equations(chip)
+            thickness = 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / self.k / chip.depth_um) ** 2
+            moving = self._steady(chip, equations, scales)
+            drive, per_unit = scales.drive(chip), scales.drive_per_unit
+            return respond(equations, drive, per_unit, scales.inertia, thickness, scales.pressure, moving, extras)
+
+        made: FlowResponse = kept((self, chip_key(chip), extras), make)
+        return made
+
     def _equations(self, chip: Chip) -> tuple[System, _Scales]:
         if self.k not in (1, 2, 4):
             raise FlowError(f"solver.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
@@ -68,7 +87,12 @@ class FlowSolver:
     def _steady(self, chip: Chip, equations: System, scales: _Scales) -> Floats:
         drive = scales.drive(chip)
         try:
-            return equations.steady(drive, scales.inertia, self.max_iterations, self.tolerance)
+            # Kept, because an assimilation asks for the flow again that was assumed.
+            moving: Floats = kept(
+                (self, chip_key(chip)),
+                lambda: equations.steady(drive, scales.inertia, self.max_iterations, self.tolerance),
+            )
+            return moving
         except NotConvergedError as failure:
             widest = max(opening.width_px for opening in chip.openings)
             fastest = float(np.abs(equations.linear(drive[:, None])).max())

@@ -25,7 +25,8 @@ class Refiner:
     def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
         """Better field on the same pixels; stamp and request are those of `assumed`.
 
-        `chip` holds the assumed parameters. Without a usable observation `assumed` comes back with a note.
+        `chip` holds the assumed parameters. Without a usable observation `assumed` comes back with a note, and with the
+        standard deviation that its parameters' prior means.
 
         Raises
         ------
@@ -41,8 +42,8 @@ class Refiner:
             return replace(assumed, note="not refined: method fvm")
         seen = sight(observations, chip.mask, chip.um_per_px)
         if seen.count == 0:
-            why = "none of the observations lies in the fluid" if len(observations.std_um_s) else "no observations"
-            return replace(assumed, note=f"not refined: {why}")
+            why = f"none of the observations is of use ({seen.ignored})" if seen.ignored else "no observations"
+            return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
         if self.method == "assimilate":
             return self.assimilate.fit(assumed, seen, chip, solver)
         start = self.assimilate.fit(assumed, seen, chip, solver) if self.pi_unet.start == "assimilate" else assumed

@@ -21,6 +21,7 @@ class Sight:
     weights: Floats  # (n, 4) summing to 1
     flow_um_s: Floats  # (n, 2)
     std_um_s: Floats  # (n,)
+    ignored: str = ""  # how many others there were, and why they are of no use; for people
 
     @property
     def count(self) -> int:
@@ -37,14 +38,14 @@ def sight(observations: Observations, mask: NDArray[np.bool_], um_per_px: float)
     """The observations that are finite, have a std and lie in a fluid pixel."""
     h, w = mask.shape
     points = observations.position_um / um_per_px
-    usable = (
+    numbers = (
         np.isfinite(points).all(axis=1)
         & np.isfinite(observations.flow_um_s).all(axis=1)
         & np.isfinite(observations.std_um_s)
         & (observations.std_um_s >= 0.0)
-        & (points >= -0.5).all(axis=1)
-        & (points <= np.array([w, h]) - 0.5).all(axis=1)
     )
+    with np.errstate(invalid="ignore"):
+        usable = numbers & (points >= -0.5).all(axis=1) & (points <= np.array([w, h]) - 0.5).all(axis=1)
     usable[usable] = mask[tuple(np.clip(np.rint(points[usable]).astype(np.intp), 0, [w - 1, h - 1]).T[::-1])]
     x, y = np.clip(points[usable], 0.0, [w - 1.0, h - 1.0]).T
     column, row = np.minimum(x.astype(np.intp), max(w - 2, 0)), np.minimum(y.astype(np.intp), max(h - 2, 0))
@@ -56,4 +57,12 @@ def sight(observations: Observations, mask: NDArray[np.bool_], um_per_px: float)
         np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1),
         observations.flow_um_s[usable],
         observations.std_um_s[usable],
+        _ignored(int((~numbers).sum()), int((numbers & ~usable).sum())),
     )
+
+
+def _ignored(broken: int, outside: int) -> str:
+    parts = [
+        f"{count} {why}" for count, why in ((broken, "without finite numbers"), (outside, "outside the fluid")) if count
+    ]
+    return " and ".join(parts)

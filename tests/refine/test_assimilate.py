@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
+from flowrec.chip.chip import Chip, Opening
 from flowrec.errors import FlowError
-from flowrec.flow import FlowSolver
+from flowrec.flow import FlowSolver, kept, sample, system
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
+from flowrec.refine.model_error import ModelError
 
 
 def test_assimilation_recovers_the_truth_from_noisy_observations(twin):
@@ -29,18 +32,47 @@ def test_assimilation_follows_inertia(twin):
     assert case.error(refined) < 0.5 * case.error(stokes)
 
 
-def test_outliers_do_not_pull_the_field(twin):
+@pytest.mark.parametrize("nonsense", ["scattered", "one way", "beside the inlet"])
+def test_outliers_do_not_pull_the_field(twin, nonsense):
     case = twin()
     flow = case.observations.flow_um_s.copy()
-    flow[::6] += [-600.0, 900.0]
+    count = len(flow)
+    rng = np.random.default_rng(3)
+    if nonsense == "scattered":
+        wrong = rng.choice(count, int(0.3 * count), replace=False)
+        flow[wrong] = 300.0 * rng.standard_normal((len(wrong), 2))
+    elif nonsense == "one way":
+        flow[::4] = [-200.0, 300.0]
+    else:
+        flow[: count // 5] = [-200.0, 300.0]
     spoiled = replace(case.observations, flow_um_s=flow)
-    robust = Refiner().refine(case.assumed, spoiled, case.chip, case.solver)
-    gaussian = Refiner(assimilate=Assimilate(tail=1e6)).refine(case.assumed, spoiled, case.chip, case.solver)
-    assert case.error(robust) < 0.06 < case.error(gaussian)
+    refined = Refiner().refine(case.assumed, spoiled, case.chip, case.solver)
+    assert case.error(refined) < 0.06
+    assert "distrusted as outliers" in refined.note
+
+
+def test_walls_that_the_observations_contradict_are_moved(twin):
+    case = twin()
+    truth = case.true
+    narrow = binary_erosion(case.chip.mask, border_value=1)
+    openings = tuple(replace(o, first=o.first + 1, last=o.last - 1) for o in case.chip.openings)
+    case.true = case.solver.solve(replace(case.chip, mask=narrow, openings=openings).with_boundary([130.0, 0.0, 0.004]))
+    flow = sample(case.true, case.observations.position_um)
+    flow += 2.0 * np.random.default_rng(1).standard_normal(flow.shape)
+    observed = replace(case.observations, flow_um_s=flow, std_um_s=np.full(len(flow), 2.0))
+    moved = Refiner().refine(case.assumed, observed, case.chip, case.solver)
+    kept = Refiner(assimilate=Assimilate(doubt_walls=False)).refine(case.assumed, observed, case.chip, case.solver)
+    assert "too wide" in moved.note
+    assert case.error(moved) < 0.3 * case.error(kept)
+    # Flux, not speed: the chip's inlet is 8 px wide, the true one 6.
+    assert moved.boundary_values[0] == pytest.approx(130.0 * 6 / 8, rel=0.05)
+    case.true = truth
+    right = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    assert "mask" not in right.note
 
 
 def test_error_bars_cover_the_truth_and_shrink_with_observations(twin):
-    settings = Assimilate(model_error_share=0.003)  # the twin's model is right
+    settings = Assimilate(model=ModelError(coarse_share=0.003))  # the twin's model is right
     scores, widths = [], []
     for seed in range(8):
         truth = np.array([100.0, 0.0, 0.0]) + np.random.default_rng(50 + seed).standard_normal(3) * [25.0, 0.003, 0.003]
@@ -78,7 +110,10 @@ def test_without_a_usable_observation_the_assumed_field_comes_back(twin):
         for method in ("assimilate", "pi_unet"):
             refined = Refiner(method).refine(case.assumed, observations, case.chip, case.solver)
             assert refined.note.startswith("not refined")
-            assert replace(refined, note="").same_as(replace(case.assumed, note=""))
+            assert replace(refined, note="", std_um_s=None).same_as(replace(case.assumed, note=""))
+            # A quarter of the inlet's speed, in the stem.
+            assert refined.std_um_s[24, 5, 0] == pytest.approx(0.25 * case.assumed.velocity_um_s[24, 5, 0], rel=0.05)
+    assert "2 without finite numbers and 2 outside the fluid" in refined.note
 
 
 def test_the_same_input_gives_the_same_bytes_and_keeps_stamp_and_request(twin):
@@ -87,6 +122,100 @@ def test_the_same_input_gives_the_same_bytes_and_keeps_stamp_and_request(twin):
     first, second = (Refiner().refine(assumed, case.observations, case.chip, case.solver) for _ in range(2))
     assert first.same_as(second)
     assert (first.stamp_ns, first.request) == (77, 5)
+
+
+def test_what_is_kept_changes_no_result(twin):
+    case = twin(scale=300.0)
+    doubled = replace(case.observations, flow_um_s=2.0 * case.observations.flow_um_s)
+    Refiner().refine(case.assumed, doubled, case.chip, case.solver)
+    warm = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    kept.forget()
+    system.forget()
+    cold = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    assert warm.same_as(cold)
+
+
+def test_copies_of_an_observation_count_once_and_a_std_that_is_too_small_is_widened(twin):
+    case = twin()
+    plain = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+    fields = ("position_um", "flow_um_s", "std_um_s")
+    thrice = Observations(0, *(np.concatenate([getattr(case.observations, name)] * 3) for name in fields))
+    again = Refiner().refine(case.assumed, thrice, case.chip, case.solver)
+    assert np.median(again.std_um_s[case.chip.mask] / plain.std_um_s[case.chip.mask]) > 0.95
+    claimed = replace(case.observations, std_um_s=case.observations.std_um_s / 5.0)
+    widened = Refiner().refine(case.assumed, claimed, case.chip, case.solver)
+    assert "times more than their std says" in widened.note
+    assert case.error(widened) < 0.05
+    busy = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
+    score = (widened.velocity_um_s - case.true.velocity_um_s)[busy] / widened.std_um_s[busy]
+    assert np.abs(score).max() < 4.0
+
+
+@pytest.mark.parametrize("which", ["one", "two that contradict", "std of 0", "huge std"])
+def test_few_or_odd_observations_never_make_the_field_worse(twin, which):
+    case = twin(noise=0.0)
+    seen = case.observations
+    points, flow, std = seen.position_um[5:6], seen.flow_um_s[5:6], np.array([2.0])
+    if which == "two that contradict":
+        points, flow, std = np.repeat(points, 2, axis=0), np.concatenate([flow, -3.0 * flow]), np.array([2.0, 2.0])
+    elif which == "std of 0":
+        points, flow, std = seen.position_um, seen.flow_um_s, np.zeros(len(seen.std_um_s))
+    elif which == "huge std":
+        std = np.array([1e7])
+    refined = Refiner().refine(case.assumed, Observations(0, points, flow, std), case.chip, case.solver)
+    assert np.isfinite(refined.velocity_um_s).all() and np.isfinite(refined.std_um_s).all()
+    assert case.error(refined) <= 1.001 * case.error(case.assumed)
+    assert which != "huge std" or "nothing about inlet 0" in refined.note
+
+
+def test_the_note_says_that_only_two_inlets_together_are_seen():
+    mask = np.zeros((30, 60), bool)
+    mask[11:19, 20:] = True
+    mask[:, 20:28] = True
+    openings = (
+        Opening("top", 20, 27, "inlet", 100.0),
+        Opening("bottom", 20, 27, "inlet", 100.0),
+        Opening("right", 11, 18, "outlet", 0.0),
+    )
+    chip = Chip("tee", mask, 10.0, openings, 1.0, 1000.0, walls="pixel")
+    solver = FlowSolver()
+    assumed, true = solver.solve(chip), solver.solve(chip.with_boundary([130.0, 110.0, 0.0]))
+    points = np.column_stack([np.arange(400.0, 550.0, 20.0), np.full(8, 145.0)])
+    observed = Observations(0, points, sample(true, points), np.full(8, 2.0))
+    note = Refiner().refine(assumed, observed, chip, solver).note
+    assert "of inlet 0 (top) and inlet 1 (bottom) they see only the flow together" in note
+
+
+def test_a_skewed_inlet_is_found_where_it_may_be_one(twin):
+    case = twin(noise=0.0)
+    shaped = case.solver.response(case.chip, shapes=True)
+    skew = shaped.modes[len(case.chip.openings) + 1]
+    image = np.zeros((*case.chip.mask.shape, 2))
+    image[case.chip.mask] = shaped.base + 40.0 * skew
+    assert np.abs(image[20:28, 0, 0].mean() - 100.0) < 1e-3  # no flux of its own
+    case.true = replace(case.assumed, velocity_um_s=image)
+    points = np.array([[x, y] for x in (0.0, 10.0, 30.0) for y in range(205, 275, 10)], float)
+    observed = Observations(0, points, sample(case.true, points), np.full(len(points), 1.0))
+    plain, free = (
+        Refiner(assimilate=Assimilate(inlet_shape_std=std)).refine(case.assumed, observed, case.chip, case.solver)
+        for std in (0.0, 0.3)
+    )
+    assert case.error(free) < 0.3 * case.error(plain)
+
+
+def test_an_unknown_depth_is_found_where_it_may_be_one(twin):
+    case = twin()
+    chip = replace(case.chip, depth_um=60.0)
+    case.true = case.solver.solve(replace(chip, depth_um=45.0))
+    points = np.array([[x, y] for x in range(60, 180, 20) for y in range(205, 275, 10)], float)
+    observed = Observations(0, points, sample(case.true, points), np.full(len(points), 0.5))
+    assumed = case.solver.solve(chip)
+    settings = Assimilate(model=ModelError(coarse_share=0.003))
+    plain, free = (
+        Refiner(assimilate=replace(settings, depth_std_share=share)).refine(assumed, observed, chip, case.solver)
+        for share in (0.0, 0.3)
+    )
+    assert case.error(free) < 0.5 * case.error(plain)
 
 
 def test_a_chip_that_is_assumed_to_stand_still_is_refused(twin):

@@ -1,0 +1,81 @@
+"""`smoothed`: position and flow at every frame from the frames before and after it (Rauch, Tung and Striebel, 1965).
+
+The model is the Kalman filter's. Its known input, the robot's own displacement, is taken out by smoothing
+y = x - sum u instead of x, so that the backward pass needs no input: y' = y + v dt + noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowrec.estimation.kalman import Kalman, process_noise, transition
+from flowrec.messages import Applied, Estimate, Matrix, Observations, Track
+from flowrec.robot import Robot
+from flowrec.units import seconds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """One row per frame."""
+
+    stamps_ns: tuple[int, ...]
+    position_um: Matrix  # (n, 2)
+    flow_um_s: Matrix  # (n, 2)
+    covariance: Matrix  # (n, 4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
+    memory_s: Matrix  # (n,) K_x / K_v of the filter: how far apart two flows share their noise
+
+
+def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, robot: Robot) -> Smoothed:
+    """Run the filter forward over a recorded sequence and the smoother back."""
+    estimates: list[Estimate] = []
+    for track, done in zip(tracks, applied, strict=True):
+        estimates.append(kalman.estimate(estimates[-1] if estimates else None, track, done, robot))
+    count = len(estimates)
+    rolled = np.array([robot.um_per_rev * done.turns for done in applied]).reshape(count, 2)
+    # The first frame's input lies before the first estimate.
+    rolled[:1] = 0.0
+    moved = np.cumsum(rolled, axis=0)
+    states = np.array([np.concatenate([e.position_um, e.flow_um_s]) for e in estimates]).reshape(count, 4)
+    states[:, :2] -= moved
+    covariances = np.array([e.covariance for e in estimates]).reshape(count, 4, 4)
+    q = kalman.flow_noise(robot)
+    memory = np.array([_memory_s(covariance) for covariance in covariances])
+    for index in range(count - 2, -1, -1):
+        dt = seconds(tracks[index + 1].stamp_ns - tracks[index].stamp_ns)
+        step = transition(dt)
+        ahead = step @ covariances[index] @ step.T + process_noise(dt, q, kalman.drift_um2_s)
+        gain = np.linalg.solve(ahead, step @ covariances[index]).T
+        states[index] += gain @ (states[index + 1] - step @ states[index])
+        covariance = covariances[index] + gain @ (covariances[index + 1] - ahead) @ gain.T
+        covariances[index] = 0.5 * (covariance + covariance.T)
+    stamps = tuple(track.stamp_ns for track in tracks)
+    return Smoothed(stamps, states[:, :2] + moved, states[:, 2:], covariances, memory)
+
+
+def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settled_share: float = 0.1) -> Observations:
+    """Observations so far apart, in way and in time, that each has noise of its own; std as the smoother has it."""
+    assert robot.max_speed_um_s is not None
+    chosen: list[int] = []
+    std = np.sqrt(0.5 * (smoothed.covariance[:, 2, 2] + smoothed.covariance[:, 3, 3]))
+    for index, position in enumerate(smoothed.position_um):
+        if std[index] > settled_share * robot.max_speed_um_s:
+            continue
+        if chosen:
+            way = math.dist(position, smoothed.position_um[chosen[-1]])
+            passed_s = seconds(smoothed.stamps_ns[index] - smoothed.stamps_ns[chosen[-1]])
+            # Both sides of a smoothed flow remember.
+            if way < spacing_radii * robot.radius or passed_s < 2.0 * smoothed.memory_s[index]:
+                continue
+        chosen.append(index)
+    stamp_ns = smoothed.stamps_ns[-1] if smoothed.stamps_ns else 0
+    return Observations(stamp_ns, smoothed.position_um[chosen], smoothed.flow_um_s[chosen], std[chosen])
+
+
+def _memory_s(covariance: Matrix) -> float:
+    """K_x / K_v = P_xx / P_xv, at most a second."""
+    coupling = 0.5 * (covariance[0, 2] + covariance[1, 3])
+    return float(min(0.5 * (covariance[0, 0] + covariance[1, 1]) / coupling, 1.0)) if coupling > 0.0 else 0.0
