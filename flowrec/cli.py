@@ -27,7 +27,6 @@ app = typer.Typer(
 bench = typer.Typer(help="Measure flowrec itself.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
 
-REFINE_METHODS = ("assimilate", "pi_unet")
 DEFAULT_REFINE = "pi_unet"
 
 View = Literal["spawn", "serve", "rrd", "none"]
@@ -327,12 +326,16 @@ def bench_flow(
     ] = "right",
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
     fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep every field in this folder.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw one case, and the errors of all.")] = None,
+    case: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Case of the figure; by default that of median error.")
+    ] = None,
 ) -> None:
-    """The paper's Table I: error of the flow before and after each refinement."""
+    """The paper's Table I and Fig. 4: error of the flow before and after each refinement."""
     from flowrec.bench.flow import Trouble, measure, show
 
     chosen = methods.split(",") if methods is not None else None
-    figures = measure(cases, chosen, noise, share, k, Trouble(outliers, mask), fields)
+    figures = measure(cases, chosen, noise, share, k, Trouble(outliers, mask), fields, figure, case)
     show(figures)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
