@@ -39,6 +39,7 @@ class Ni:
     largest_work_mpx: float = 6.0  # iterations times pixels in millions: larger fields get fewer iterations
     patience: int = 30  # iterations without a better loss before it stops
     learning_rate: float = 3e-3
+    continuity_weight: float = 1.0  # of its mean squared residual against that of momentum, in pixels
     observation_weight: float = 0.1  # of the mean log-likelihood against the mean squared residual
     base_channels: int = 16
     device: Device = "cpu"
@@ -176,7 +177,8 @@ class _Loss:
         if self.settings.observations == "hard":
             velocity = velocity * (1.0 - self.pinned) + self.given * self.pinned
         residual = self.physics.residuals(velocity, pressure)
-        loss = (residual**2).sum() / self.physics.where.sum().clamp(min=1.0)
+        square = residual.square().sum(dim=(0, 2, 3))
+        loss = (self.settings.continuity_weight * square[0] + square[1:].sum()) / self.physics.where.sum().clamp(min=1.0)
         seen = velocity[0][:, self.rows, self.columns]  # (2, n, 4)
         misfit = ((((seen * self.weights).sum(dim=-1).T - self.flow) / self.noise) ** 2).sum(dim=1)
         likelihood = 0.5 * (TAIL + 2.0) * torch.log1p(misfit / TAIL).mean()
