@@ -1,7 +1,7 @@
 """`flowrec bench train`: weights for the networks, from vessels drawn at random and our own solver.
 
-`pi_unet` learns a first correction from the observations; `unet`, the data-driven baseline, learns the field from the
-assumed one alone. The same seed, lessons and machine give the same weights.
+`pi_unet` learns a first correction from the observations; `unet`, the data-driven baseline, learns one from the
+assumed field alone. The same seed, lessons and machine give the same weights.
 """
 
 from __future__ import annotations
@@ -165,10 +165,10 @@ def _batches(
 
 
 def _predict(net: UNet, scene: Scene, training: Training) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocity, pressure and the network's output: `pi_unet` corrects the initial field, `unet` gives one anew."""
+    """Velocity, pressure and the network's output: both correct the initial field, `unet` without observations."""
     if training.kind == "unet":
-        output = net(scene.printed()) * scene.fluid
-        return output[:, :2], output[:, 2:] * scene.largest, output
+        output = net(scene.printed())
+        return *scene.correct(output, near_wall="free"), output
     output = net(scene.told())
     return *scene.correct(output), output
 
