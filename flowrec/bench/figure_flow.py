@@ -123,8 +123,8 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
         ax.scatter(spread[here], values[here], s=26, facecolors="none", edgecolors=INK, linewidths=0.9)
         mean, std = float(values.mean()), float(values.std())
         # On a logarithmic axis a bar may not reach zero.
-        low = max(mean - std, 0.3 * mean)
-        ax.errorbar(at + 0.2, mean, [[mean - low], [std]], fmt="o", ms=5, color="#2f6f8f", capsize=3, lw=1.4)
+        low = max(mean - std, 0.3 * mean, 1e-4)
+        ax.errorbar(at + 0.2, mean, [[max(mean - low, 0.0)], [std]], fmt="o", ms=5, color="#2f6f8f", capsize=3, lw=1.4)
         ax.annotate(
             f"{mean:.3f}\n±{std:.3f}",
             (at + 0.26, mean),
@@ -135,7 +135,7 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
             color=INK,
         )
     ax.set_yscale("log")
-    everything = [row["rmse_v"] for row in rows]
+    everything = [max(row["rmse_v"], 1e-3) for row in rows]
     ax.set_ylim(0.75 * min(everything), 1.35 * max(everything))
     ax.set_yticks([tick for tick in _TICKS if ax.get_ylim()[0] <= tick <= ax.get_ylim()[1]])
     ax.yaxis.set_major_formatter("{x:g}")

@@ -45,6 +45,7 @@ METHODS = {
     "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
     "ni": Refiner("ni"),
     "pinn": Refiner("pinn"),
+    "unet": Refiner("unet"),
 }
 
 

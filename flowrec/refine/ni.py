@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import median_width_um
 from flowrec.messages import FlowField
+from flowrec.refine.case import MULTIPLE
 from flowrec.refine.crop import Crop
+from flowrec.refine.judge import RELATIVE_NOISE, TAIL
 from flowrec.refine.sight import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-TAIL = 4.0  # Student-t noise, as in the assimilation
-RELATIVE_NOISE = 0.03  # of the measured speed, beside its std: what the pixels can not represent
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +38,6 @@ class Ni:
     largest_work_mpx: float = 6.0  # iterations times pixels in millions: larger fields get fewer iterations
     patience: int = 30  # iterations without a better loss before it stops
     learning_rate: float = 3e-3
-    continuity_weight: float = 1.0  # of its mean squared residual against that of momentum, in pixels
     observation_weight: float = 0.1  # of the mean log-likelihood against the mean squared residual
     base_channels: int = 16
     device: Device = "cpu"
@@ -75,7 +73,7 @@ class Ni:
         """Iterations done, velocity (h, w, 2) in um/s, pressure (h, w) in Pa, misfit before and after."""
         import torch
 
-        from flowrec.refine.network import MULTIPLE, UNet
+        from flowrec.refine.network import UNet
 
         crop = Crop.around(chip.mask, MULTIPLE)
         loss_of = _Loss(scale, crop, sight, chip, self)
@@ -177,8 +175,7 @@ class _Loss:
         if self.settings.observations == "hard":
             velocity = velocity * (1.0 - self.pinned) + self.given * self.pinned
         residual = self.physics.residuals(velocity, pressure)
-        square = residual.square().sum(dim=(0, 2, 3))
-        loss = (self.settings.continuity_weight * square[0] + square[1:].sum()) / self.physics.where.sum().clamp(min=1.0)
+        loss = (residual**2).sum() / self.physics.where.sum().clamp(min=1.0)
         seen = velocity[0][:, self.rows, self.columns]  # (2, n, 4)
         misfit = ((((seen * self.weights).sum(dim=-1).T - self.flow) / self.noise) ** 2).sum(dim=1)
         likelihood = 0.5 * (TAIL + 2.0) * torch.log1p(misfit / TAIL).mean()

@@ -40,8 +40,8 @@ BLOCK = 100  # iterations over which the noisy loss is averaged before it is jud
 class Pinn:
     """Settings of the PINN."""
 
-    iterations: int = 1500
-    patience: int = 400  # iterations without a loss that is lower by a hundredth before it stops
+    iterations: int = 1000
+    patience: int = 300  # iterations without a loss that is lower by a hundredth before it stops
     points: int = 512  # of the fluid, drawn anew for every iteration; half as many of the walls
     width: int = 64
     depth: int = 4

@@ -14,18 +14,21 @@ from flowrec.refine.ni import Ni
 from flowrec.refine.pi_unet import PiUnet
 from flowrec.refine.pinn import Pinn
 from flowrec.refine.sight import sight
+from flowrec.refine.unet import Unet
 
 
 @dataclass(frozen=True, slots=True)
 class Refiner:
     """Which method refines, and the settings of each."""
 
-    # fvm: no refinement. ni, pinn: the paper's baselines, which do not use the assumed field.
-    method: Literal["assimilate", "pi_unet", "fvm", "ni", "pinn"] = "assimilate"
+    # fvm: no refinement. ni, pinn, unet: the paper's baselines; the first two do not use the assumed field, the third
+    # does not use the observations.
+    method: Literal["assimilate", "pi_unet", "fvm", "ni", "pinn", "unet"] = "assimilate"
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)
     ni: Ni = field(default_factory=Ni)
     pinn: Pinn = field(default_factory=Pinn)
+    unet: Unet = field(default_factory=Unet)
 
     def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
         """Better field on the same pixels; stamp and request are those of `assumed`.
@@ -54,5 +57,7 @@ class Refiner:
             return self.ni.fit(assumed, seen, chip)
         if self.method == "pinn":
             return self.pinn.fit(assumed, seen, chip)
+        if self.method == "unet":
+            return self.unet.fit(assumed, seen, chip)
         start = self.assimilate.fit(assumed, seen, chip, solver) if self.pi_unet.start == "assimilate" else assumed
         return self.pi_unet.fit(start, seen, chip)
