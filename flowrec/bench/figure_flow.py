@@ -22,6 +22,7 @@ QUIET = "#8c8c8c"
 SEEN = "#0a8f9c"
 SPEEDS, ERRORS = "viridis", "magma_r"  # uniform in lightness, and told apart by the colour-blind
 BLOCK_PX = 11  # one arrow in each block of so many pixels, where the channel is widest
+SHORTEST = 0.12  # share of the fastest speed from which on there are arrows
 COLUMN_IN, ROW_IN, STRIP_IN = 1.8, 2.1, 2.3
 MM_PER_UM = 1e-3
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
@@ -174,8 +175,9 @@ def _show(ax: Axes, image: NDArray[np.floating], mask: NDArray[np.bool_], colour
 
 
 def _arrows(ax: Axes, velocity: NDArray[np.floating], places: NDArray[np.intp], top: float) -> None:
-    """Arrows at places (n, 2) of row and column; the fastest is as long as a block."""
-    rows, columns = places.T
+    """Arrows at places (n, 2) of row and column, where it is not slow; the fastest is as long as a block."""
+    # A short arrow is but a speck, and the colour says already that it is slow there.
+    rows, columns = places[_length(velocity[places[:, 0], places[:, 1]]) > SHORTEST * top].T
     vx, vy = velocity[rows, columns].T
     ax.quiver(
         columns,

@@ -40,12 +40,12 @@ MADE_UP = 10  # cases, where none are given
 # Name in the table: the refiner that does it. `pi_unet` alone is the paper's, from the solver's prediction.
 METHODS = {
     "fvm": Refiner("fvm"),
-    "assimilate": Refiner("assimilate"),
-    "pi_unet": Refiner("pi_unet", pi_unet=PiUnet(start="fvm")),
-    "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
     "ni": Refiner("ni"),
     "pinn": Refiner("pinn"),
     "unet": Refiner("unet"),
+    "assimilate": Refiner("assimilate"),
+    "pi_unet": Refiner("pi_unet", pi_unet=PiUnet(start="fvm")),
+    "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
 }
 
 

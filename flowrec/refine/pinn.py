@@ -71,7 +71,7 @@ class Pinn:
             return replace(assumed, method="pinn", note="start kept: all observations say that the fluid stands still")
         case = _Case.of(speed, sight, chip)
         with torch_run(self.device, self.threads, self.seed, "refine.pinn.device"):
-            steps, values, misfits = self._descend(case)
+            steps, values, left = self._descend(case)
         if not np.isfinite(values).all():
             raise FlowError("the PINN diverged: lower refine.pinn.learning_rate")
         velocity, pressure = np.zeros((*chip.mask.shape, 2), np.float32), np.zeros(chip.mask.shape, np.float32)
@@ -85,12 +85,12 @@ class Pinn:
             boundary_values=chip.boundary_values,
             viscosity_mpa_s=chip.viscosity_mpa_s,
             density_kg_m3=chip.density_kg_m3,
-            note=f"coordinates to flow in {steps} iterations from {sight.count} observations; root mean square left of "
-            f"them {misfits[0]:.0%} to {misfits[1]:.0%} of their own",
+            note=f"fitted to equations, openings and {sight.count} observations in {steps} iterations; "
+            f"{left:.0%} of the observed speed left",
         )
 
-    def _descend(self, case: _Case) -> tuple[int, Floats, tuple[float, float]]:
-        """Iterations done, dimensionless (vx, vy, p) (fluid pixels, 3), misfit before and after."""
+    def _descend(self, case: _Case) -> tuple[int, Floats, float]:
+        """Iterations done, dimensionless (vx, vy, p) (fluid pixels, 3), what is left of the observations."""
         import torch
 
         from flowrec.refine.coordinate_net import CoordinateNet
@@ -104,7 +104,6 @@ class Pinn:
             optimiser,
             lambda i: min(1.0, (i + 1) / 50) * max(0.02, 0.5 + 0.5 * math.cos(math.pi * i / self.iterations)),
         )
-        before = loss_of.misfit(net)
         lowest, since, done, block = float("inf"), 0, 0, 0.0
         for _ in range(self.iterations):
             loss = loss_of(net, *case.points.draw(rng, self.points))
@@ -120,7 +119,7 @@ class Pinn:
                     break
         with torch.no_grad():
             pixels = sum(loss_of.of(net, points) for points in case.points.subpixels) / len(case.points.subpixels)
-            return done, pixels.cpu().numpy().astype(np.float64), (before, loss_of.misfit(net))  # type: ignore[union-attr]
+            return done, pixels.cpu().numpy().astype(np.float64), loss_of.misfit(net)  # type: ignore[union-attr]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
