@@ -98,7 +98,7 @@ def measure(
     """
     if figure is not None:
         need_matplotlib()
-    methods = tuple(METHODS) if methods is None else methods
+    methods = tuple(METHODS if methods is None else dict.fromkeys(methods))
     unknown = [name for name in methods if name not in METHODS]
     if unknown:
         raise UsageError(f"bench flow: no method {', '.join(map(repr, unknown))}; there are {', '.join(METHODS)}")
