@@ -2,7 +2,9 @@
 
 The network of the PI-UNet sees what that is said to see, [mask, vx, vy, p] of the initial field, and gives a
 correction to it. No equation and no observation enters: it knows how assumed flows were wrong in other vessels, on
-average, and nothing of how this one is. `flowrec bench train --network unet` makes its weights.
+average, and nothing of how this one is. Where those errors have no sign in common there is nothing to learn: on the
+lessons of `flowrec bench train --network unet --count 1800 --steps 1000`, which makes the shipped weights, its error
+is that of the assumed field, 0.207.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from flowrec.refine.sight import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
 from flowrec.refine.weights import SHIPPED, read_weights, sha256
 
-SHIPPED_SHA256 = "?"
+SHIPPED_SHA256 = "15fe83d95346a7c436f910ecdf1b6d722a28f88dade8d0aa01e3106b2c952c32"
 
 
 @dataclass(frozen=True, slots=True)
