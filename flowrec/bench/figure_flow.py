@@ -55,7 +55,7 @@ def median_case(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
-    """Write a PNG: truth and each method's speed, what each gets wrong, and the relative RMSE of every case.
+    """Write a PNG: truth and each method's speed, what each gets wrong, and the relative RMSE of several cases.
 
     `rows` are those of `flowrec bench flow`, of all cases. One colour scale serves all speeds, one all errors.
     """
@@ -66,10 +66,13 @@ def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
     methods = list(picture.fields)
     errors = {row["method"]: row["rmse_v"] for row in rows if row["case"] == picture.name}
     columns = len(methods) + 1
-    figure = Figure(figsize=(COLUMN_IN * columns + 0.9, 2 * ROW_IN + STRIP_IN), layout="constrained", dpi=160)
+    several = len({row["case"] for row in rows}) > 1
+    size = (COLUMN_IN * columns + 0.9, 2 * ROW_IN + STRIP_IN * several)
+    figure = Figure(figsize=size, layout="constrained", dpi=160)
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03, wspace=0.01, hspace=0.02)  # type: ignore[union-attr,call-arg]
     FigureCanvasAgg(figure)  # no window and no global state, unlike pyplot
-    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[2 * ROW_IN, STRIP_IN], hspace=0.04)[:, 0]
+    heights = [2 * ROW_IN, STRIP_IN] if several else [1.0]
+    above, *below = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights, hspace=0.04)[:, 0]
     axes = above.subplots(2, columns, squeeze=False)
     picture, unit = _in_readable_units(picture)
     speed_top = float(np.percentile(_length(picture.truth)[picture.mask], 99.5))
@@ -106,7 +109,8 @@ def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
         x=0.01,
         ha="left",
     )
-    _strip(below.subplots(), methods, rows, picture.name)
+    if several:
+        _strip(below[0].subplots(), methods, rows, picture.name)
     figure.savefig(path)
 
 
@@ -152,7 +156,7 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
     ax.spines["bottom"].set_color(QUIET)
     count = len({row["case"] for row in rows})
     ax.set_title(
-        f"{count} case{'s' if count > 1 else ''}: a dot each, the one above circled; mean ± standard deviation",
+        f"{count} cases: a dot each, the one above circled; mean ± standard deviation",
         fontsize=9,
         color=INK,
         loc="left",
