@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from flowrec.chip.chip import Chip
+from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import border
 from flowrec.messages import FlowField
 from flowrec.refine.judge import noise_of
@@ -31,6 +31,8 @@ class Case:
     inside: NDArray[np.bool_]  # (h, w) not on the border of the image, where a residual would reach outside
     walled: NDArray[np.bool_]  # (h, w) a wall on one of the four sides, and a free pixel close by
     openings: Floats  # (h, w) 1 on the border pixels of inlets, -1 on those of outlets
+    door: NDArray[np.intp]  # (h, w) number of the opening that a border pixel belongs to, from 1; 0 elsewhere
+    doors: tuple[Opening, ...]
     velocity: Floats  # (h, w, 2) in units of `speed`
     pressure: Floats  # (h, w) in units of `unit_pressure`
     rows: NDArray[np.intp]  # (n, 4) as in Sight
@@ -65,10 +67,12 @@ class Case:
         # Beyond the image is not a wall: openings keep their freedom.
         walled = chip.mask & binary_dilation(~chip.mask, CROSS)
         walled &= binary_dilation(chip.mask & ~walled, np.ones((3, 3), bool))
-        openings = np.zeros(chip.mask.shape)
-        for opening in chip.openings:
+        openings, door = np.zeros(chip.mask.shape), np.zeros(chip.mask.shape, np.intp)
+        for number, opening in enumerate(chip.openings):
+            along = slice(opening.first, opening.last + 1)
             sign = 1.0 if opening.kind == "inlet" else -1.0
-            border(openings, opening.side)[opening.first : opening.last + 1] = sign  # type: ignore[arg-type]  # a view
+            border(openings, opening.side)[along] = sign  # type: ignore[arg-type]  # a view
+            border(door, opening.side)[along] = number + 1  # type: ignore[arg-type]
         px_m, mu = chip.um_per_px * M_PER_UM, initial.viscosity_mpa_s * PA_S_PER_MPA_S
         speed = float(np.abs(initial.velocity_um_s).max())
         unit_pressure = mu * speed * M_PER_UM / px_m
@@ -77,6 +81,8 @@ class Case:
             crop(inside),
             crop(walled),
             crop(openings),
+            crop(door),
+            chip.openings,
             crop(initial.velocity_um_s.astype(np.float64) / speed),
             crop(initial.pressure_pa.astype(np.float64) / unit_pressure),
             sight.rows - top,
