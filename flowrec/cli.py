@@ -27,7 +27,6 @@ app = typer.Typer(
 bench = typer.Typer(help="Measure flowrec itself.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
 
-REFINE_METHODS = ("assimilate", "pi_unet")
 DEFAULT_REFINE = "pi_unet"
 
 View = Literal["spawn", "serve", "rrd", "none"]
@@ -330,12 +329,17 @@ def bench_flow(
     ] = "raw",
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
     fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep every field in this folder.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw one case, and the errors of all.")] = None,
+    case: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Case of the figure; by default that of median error.")
+    ] = None,
 ) -> None:
-    """The paper's Table I: error of the flow before and after each refinement."""
+    """The paper's Table I and Fig. 4: error of the flow before and after each refinement."""
     from flowrec.bench.flow import Trouble, measure, show
 
     chosen = methods.split(",") if methods is not None else None
-    figures = measure(cases, chosen, noise, share, k, Trouble(outliers, mask, observations), fields)
+    trouble = Trouble(outliers, mask, observations)
+    figures = measure(cases, chosen, noise, share, k, trouble, fields, figure, case)
     show(figures)
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
@@ -364,6 +368,22 @@ def bench_grid(
     from flowrec.bench.grid_error import measure, show
 
     show(measure(cases, k))
+
+
+@bench.command("train")
+def bench_train(
+    lessons: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of lessons; missing ones are made.")],
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="Weights to write (*.safetensors).")],
+    network: Annotated[Literal["pi_unet", "unet"], typer.Option(help="Which network.")] = "pi_unet",
+    count: Annotated[int, typer.Option(min=4, help="Number of lessons.")] = 1800,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of four lessons each.")] = 4500,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to train.")] = "cpu",
+    seed: Annotated[int, typer.Option(min=0, help="Of lessons and weights.")] = 0,
+) -> None:
+    """Train a network's shipped weights on vessels drawn at random, with our own solver as the teacher."""
+    from flowrec.bench.train import Training, show, train
+
+    show(train(lessons, out, Training(network, count, steps, device=device, seed=seed)))
 
 
 def _point(text: str) -> str:

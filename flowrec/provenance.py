@@ -22,6 +22,7 @@ PACKAGES = (
     "opencv-python-headless",
     "filterpy",
     "torch",
+    "safetensors",
     "mcap",
     "foxglove-sdk",
     "protobuf",

@@ -10,17 +10,25 @@ from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Observations
 from flowrec.refine.assimilate import Assimilate
+from flowrec.refine.ni import Ni
 from flowrec.refine.pi_unet import PiUnet
+from flowrec.refine.pinn import Pinn
 from flowrec.refine.sight import sight
+from flowrec.refine.unet import Unet
 
 
 @dataclass(frozen=True, slots=True)
 class Refiner:
     """Which method refines, and the settings of each."""
 
-    method: Literal["assimilate", "pi_unet", "fvm"] = "assimilate"  # fvm: no refinement
+    # fvm: no refinement. ni, pinn, unet: the paper's baselines; the first two do not use the assumed field, the third
+    # does not use the observations.
+    method: Literal["assimilate", "pi_unet", "fvm", "ni", "pinn", "unet"] = "assimilate"
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)
+    ni: Ni = field(default_factory=Ni)
+    pinn: Pinn = field(default_factory=Pinn)
+    unet: Unet = field(default_factory=Unet)
 
     def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
         """Better field on the same pixels; stamp and request are those of `assumed`.
@@ -46,5 +54,11 @@ class Refiner:
             return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
         if self.method == "assimilate":
             return self.assimilate.fit(assumed, seen, chip, solver)
+        if self.method == "ni":
+            return self.ni.fit(assumed, seen, chip)
+        if self.method == "pinn":
+            return self.pinn.fit(assumed, seen, chip)
+        if self.method == "unet":
+            return self.unet.fit(assumed, seen, chip)
         start = self.assimilate.fit(assumed, seen, chip, solver) if self.pi_unet.start == "assimilate" else assumed
         return self.pi_unet.fit(start, seen, chip)

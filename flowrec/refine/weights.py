@@ -1,0 +1,81 @@
+"""Weights of networks on disk: safetensors, so that reading a file never runs what is in it; checked before use."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flowrec.errors import FlowError
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
+
+FOLDER = Path(__file__).parent / "weights"
+SHIPPED = {"vessels": FOLDER / "pi_unet.safetensors", "unet": FOLDER / "unet.safetensors"}
+
+
+def write_weights(path: Path, network: nn.Module, facts: Mapping[str, str]) -> None:
+    """Store the network's parameters in half precision, with facts about how they were made."""
+    import torch
+    from safetensors.torch import save
+
+    halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in network.state_dict().items()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(save(halves, dict(sorted(facts.items()))))
+
+
+def read_weights(path: Path, network: nn.Module) -> None:
+    """Load a file into the network.
+
+    Raises
+    ------
+    FlowError
+        If the file is not there, is no safetensors file, is damaged, or its tensors are not those of the network.
+    """
+    import torch
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        stored = load(path.read_bytes())
+    except OSError as error:
+        raise FlowError(
+            f"{path}: weights can not be read ({error.strerror}); train them with 'flowrec bench train'"
+        ) from error
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise FlowError(f"{path}: not a sound safetensors file ({error}); train the weights anew") from error
+    wanted: dict[str, Tensor] = network.state_dict()
+    for name in sorted(wanted.keys() | stored.keys()):
+        if name not in stored:
+            raise FlowError(f"{path}: no tensor '{name}'; these weights are of another network")
+        if name not in wanted:
+            raise FlowError(f"{path}: unknown tensor '{name}'; these weights are of another network")
+        if stored[name].shape != wanted[name].shape:
+            shapes = f"{tuple(stored[name].shape)}, not {tuple(wanted[name].shape)}"
+            raise FlowError(f"{path}: tensor '{name}' is {shapes}; these weights are of another network")
+        if not torch.isfinite(stored[name]).all():
+            raise FlowError(f"{path}: tensor '{name}' is not finite; train the weights anew")
+    network.load_state_dict({name: value.to(torch.float32) for name, value in stored.items()})
+
+
+def facts_of(path: Path) -> dict[str, Any]:
+    """What `write_weights` was told about the weights; {} where the file is not readable."""
+    try:
+        with path.open("rb") as file:
+            (length,) = struct.unpack("<Q", file.read(8))
+            head = json.loads(file.read(min(length, 1_000_000)))
+        return dict(head.get("__metadata__", {}))
+    except (OSError, ValueError, struct.error, AttributeError):
+        return {}
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file of weights, '' where there is none."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
