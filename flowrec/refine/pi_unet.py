@@ -21,6 +21,7 @@ from flowrec.messages import FlowField
 from flowrec.refine.case import Case
 from flowrec.refine.judge import doubt, misfit
 from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.weights import SHIPPED, sha256
 
 HELD_OUT = 4  # every fourth observation judges whether a correction gained anything
 FEWEST = 8  # observations of which some can be held out
@@ -32,8 +33,10 @@ class PiUnet:
     """Settings of the PI-UNet."""
 
     start: Literal["assimilate", "fvm"] = "assimilate"  # the initial field
+    # Both of the next two are for the start "fvm": what remains of an assimilated field's misfit is no matter of
+    # boundary values, which is what the weights have learned and the balance assumes.
     weights: Literal["vessels", "none"] = "vessels"  # trained on drawn vessels, or random ones as printed
-    finish: Literal["balance", "none"] = "balance"
+    finish: Literal["balance", "none"] = "balance"  # with soft observations
     observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value, noise and all
     near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as printed, the initial values stay
     iterations: int | None = None  # None: 80 with random weights, none with trained ones
@@ -47,6 +50,11 @@ class PiUnet:
     threads: int = 1
     seed: int = 0
 
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the trained weights that are used, '' where they are random."""
+        return sha256(SHIPPED[self.weights]) if self.weights != "none" and self.start == "fvm" else ""
+
     def fit(self, initial: FlowField, sight: Sight, chip: Chip) -> FlowField:
         """The corrected field, or `initial` with a note where a correction would not be an improvement.
 
@@ -59,11 +67,13 @@ class PiUnet:
         FlowError
             If the device is not there, or the weights can not be read.
         """
+        assimilated = initial.std_um_s is not None
+        if assimilated and (self.weights, self.finish) != ("none", "none"):
+            return replace(self, weights="none", finish="none").fit(initial, sight, chip)
         fastest = float(np.abs(initial.velocity_um_s).max())
         if fastest == 0.0:
             return self._kept(initial, "the initial field stands still")
         before = misfit(initial.velocity_um_s, sight)
-        assimilated = initial.std_um_s is not None
         if assimilated and float(before.mean()) <= 2.0 + 4.0 / np.sqrt(sight.count):  # two standard deviations of chi2
             return self._kept(initial, f"the observations lie within their noise (chi2 {before.mean() / 2:.2f})")
         case = Case.of(initial, sight, chip)
@@ -71,13 +81,18 @@ class PiUnet:
         used = np.arange(sight.count) % HELD_OUT != HELD_OUT // 2 if sight.count >= FEWEST else every
         judges = every if used.all() else ~used
         limit = (WORTH_TAKING if assimilated or used.all() else 1.0) * doubt(before[judges])
-        # The last that predicts what it has not seen as well as any: balanced, or the network's alone.
+        # The balanced field where it predicts what it has not seen, else the network's alone.
         scores = [doubt(misfit(velocity, sight)[judges]) for _, velocity, _ in self._corrections(case, used)]
-        best = min(reversed(range(len(scores))), key=lambda i: scores[i])
+        best = next((i for i in reversed(range(len(scores))) if scores[i] < limit), 0)
         said, velocity, pressure = self._corrections(case, every)[best]
         if not scores[best] < limit or not np.isfinite(velocity).all():  # also where a score is not a number
             return self._kept(initial, "a correction did not predict the observations better")
         std = initial.std_um_s
+        if std is None and float(before.mean()) <= 2.0 + 2.0 / np.sqrt(sight.count):
+            # The start explains the observations: what they ask for is about half noise.
+            velocity = 0.5 * (initial.velocity_um_s + velocity)
+            pressure = 0.5 * (initial.pressure_pa + pressure)
+            said += ", half of it"
         if std is not None:
             # Where the correction moves the field, the start stays within the error bar.
             std = np.hypot(std, velocity - initial.velocity_um_s).astype(np.float32)
@@ -103,9 +118,10 @@ class PiUnet:
         from flowrec.refine.descend import descend
 
         steps, velocity, pressure = descend(case, used, self)
-        said = f"corrected by {'trained' if self.weights == 'vessels' else 'random'} weights in {steps} iterations"
+        weights = f"weights {self.weights_sha256[:8]}" if self.weights_sha256 else "random weights"
+        said = f"corrected by {weights} in {steps} iterations"
         found = [(said, velocity, pressure)]
-        if self.finish == "balance" and int(case.fluid.sum()) <= LARGEST_PX:
+        if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
             found.append((f"{said} and balanced", *balance(case, used, velocity)))
         return [
             (
