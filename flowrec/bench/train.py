@@ -62,10 +62,7 @@ def train(
     UsageError
         If there are too few lessons to keep some apart.
     """
-    import torch
-
-    from flowrec.refine.network import trained_network
-    from flowrec.refine.weights import write_weights
+    from flowrec.refine.still import torch_state
 
     if training.lessons < 4:
         raise UsageError(f"bench train: {training.lessons} lessons are too few; give at least 4")
@@ -76,9 +73,23 @@ def train(
             done(len(paths))
     apart = min(JUDGES, training.lessons // 4)
     lessons, judges = read_lessons(paths[:-apart]), read_lessons(paths[-apart:])
-    torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
-    torch.manual_seed(training.seed)
+    with torch_state(1, training.seed, training.device):
+        return _descend(lessons, judges, out, training, say)
+
+
+def _descend(
+    lessons: list[Lesson],
+    judges: list[Lesson],
+    out: Path,
+    training: Training,
+    say: Callable[[int, float, float], None] | None,
+) -> dict[str, Any]:
+    """AdamW with a cosine, a running mean of the weights, judged now and then."""
+    import torch
+
+    from flowrec.refine.network import trained_network
+    from flowrec.refine.weights import write_weights
+
     device = training.device
     net = trained_network(training.kind).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     mean = trained_network(training.kind).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]

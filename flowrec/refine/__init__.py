@@ -1,7 +1,10 @@
 """Flow field and observations to a better flow field: assimilation, and the paper's PI-UNet.
 
 Secrets: which pixels an observation sees (sight), the prior and its posterior (assimilate), the correction and when
-to believe it (pi_unet), the network (network), the discrete equations (physics). Only the last two import torch.
+to believe it (pi_unet, judge), its units (case), what networks see and how their output becomes a field (scene,
+spread), the network (network), its weights on disk (weights), its descent (descend), the discrete equations (physics,
+stencil) and their direct solution with observations (balance), torch made repeatable (still). The room imports torch
+only when a network runs.
 """
 
 from flowrec.refine.assimilate import Assimilate

@@ -25,7 +25,9 @@ from flowrec.refine.weights import SHIPPED, sha256
 
 HELD_OUT = 4  # every fourth observation judges whether a correction gained anything
 FEWEST = 8  # observations of which some can be held out
-WORTH_TAKING = 0.9  # of an assimilated start's misfit on what was held out
+WORTH_TAKING = 0.9  # of the start's misfit on what was held out, for a network's correction
+# Share of a correction that is taken, up to so many standard deviations of chi2 above what noise alone gives.
+TAKEN = ((1.0, 0.5), (2.0, 0.75))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,7 @@ class PiUnet:
         """
         assimilated = initial.std_um_s is not None
         if assimilated and (self.weights, self.finish) != ("none", "none"):
+            # What remains of its misfit is no matter of boundary values.
             return replace(self, weights="none", finish="none").fit(initial, sight, chip)
         fastest = float(np.abs(initial.velocity_um_s).max())
         if fastest == 0.0:
@@ -80,23 +83,27 @@ class PiUnet:
         every = np.ones(sight.count, bool)
         used = np.arange(sight.count) % HELD_OUT != HELD_OUT // 2 if sight.count >= FEWEST else every
         judges = every if used.all() else ~used
-        limit = (WORTH_TAKING if assimilated or used.all() else 1.0) * doubt(before[judges])
-        # The balanced field where it predicts what it has not seen, else the network's alone.
+        start = doubt(before[judges])
         scores = [doubt(misfit(velocity, sight)[judges]) for _, velocity, _ in self._corrections(case, used)]
-        best = next((i for i in reversed(range(len(scores))) if scores[i] < limit), 0)
-        said, velocity, pressure = self._corrections(case, every)[best]
-        if not scores[best] < limit or not np.isfinite(velocity).all():  # also where a score is not a number
+        # The balanced field where it predicts what it has not seen; the network's alone must do so clearly.
+        bars = [WORTH_TAKING * start] + [(WORTH_TAKING if used.all() else 1.0) * start] * (len(scores) - 1)
+        best = max((i for i in range(len(scores)) if scores[i] < bars[i]), default=-1)
+        if best < 0:
             return self._kept(initial, "a correction did not predict the observations better")
+        said, velocity, pressure = self._corrections(case, every)[best]
+        if not np.isfinite(velocity).all():
+            return self._kept(initial, "a correction is not finite")
         std = initial.std_um_s
-        if std is None and float(before.mean()) <= 2.0 + 2.0 / np.sqrt(sight.count):
-            # The start explains the observations: what they ask for is about half noise.
-            velocity = 0.5 * (initial.velocity_um_s + velocity)
-            pressure = 0.5 * (initial.pressure_pa + pressure)
-            said += ", half of it"
+        # Where the start nearly explains the observations, much of what they ask for is their noise.
+        over = (0.5 * float(before.mean()) - 1.0) * np.sqrt(sight.count)
+        share = 1.0 if assimilated else next((part for most, part in TAKEN if over <= most), 1.0)
+        velocity = initial.velocity_um_s + share * (velocity - initial.velocity_um_s)
+        pressure = initial.pressure_pa + share * (pressure - initial.pressure_pa)
         if std is not None:
             # Where the correction moves the field, the start stays within the error bar.
             std = np.hypot(std, velocity - initial.velocity_um_s).astype(np.float32)
         after = misfit(velocity, sight)
+        said += "" if share == 1.0 else f", {share:.0%} of it"
         return replace(
             initial,
             method="pi_unet",
@@ -116,13 +123,15 @@ class PiUnet:
         """What was done, velocity (h, w, 2) in um/s and pressure (h, w) in Pa: the network's field, and its finish."""
         from flowrec.refine.balance import LARGEST_PX, balance
         from flowrec.refine.descend import descend
+        from flowrec.refine.still import torch_state
 
-        steps, velocity, pressure = descend(case, used, self)
         weights = f"weights {self.weights_sha256[:8]}" if self.weights_sha256 else "random weights"
-        said = f"corrected by {weights} in {steps} iterations"
-        found = [(said, velocity, pressure)]
-        if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
-            found.append((f"{said} and balanced", *balance(case, used, velocity)))
+        with torch_state(self.threads, self.seed, self.device):
+            steps, velocity, pressure = descend(case, used, self)
+            said = f"corrected by {weights} in {steps} iterations"
+            found = [(said, velocity, pressure)]
+            if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
+                found.append((f"{said} and balanced", *balance(case, used, velocity)))
         return [
             (
                 said,
