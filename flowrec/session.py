@@ -55,6 +55,8 @@ def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None 
         "notes": config.recording.notes,
         "seed": str(config.simulated.seed),
     }
+    if config.refine.method == "pi_unet" and config.refine.pi_unet.weights_sha256:
+        facts["weights.pi_unet"] = config.refine.pi_unet.weights_sha256
     return SessionHeader(to_toml(config), png, toml, facts, dict(parent or {}))
 
 

@@ -1,7 +1,8 @@
 """`flowrec bench train`: weights for the networks, from vessels drawn at random and our own solver.
 
-`pi_unet` learns a first correction from the observations; `unet`, the data-driven baseline, learns one from the
-assumed field alone. The same seed, lessons and machine give the same weights.
+Both kinds learn a correction of the assumed field from the observations; `pi_unet` also that mass is conserved and how
+sure it may be, `unet`, the data-driven baseline, from examples alone. The same seed, lessons and machine give the same
+weights.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from flowrec.bench.lessons import Lesson, prepare, read_lessons
 from flowrec.errors import UsageError
 from flowrec.refine.case import Case
 from flowrec.refine.sight import sight
+from flowrec.refine.torch_run import Device, torch_run
 from flowrec.status import progress, table
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ class Training:
     weight_decay: float = 0.01
     averaged: float = 0.998  # the weights are a running mean of this memory
     judged_every: int = 500
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
     seed: int = 0
 
 
@@ -62,11 +64,6 @@ def train(
     UsageError
         If there are too few lessons to keep some apart.
     """
-    import torch
-
-    from flowrec.refine.network import trained_network
-    from flowrec.refine.weights import write_weights
-
     if training.lessons < 4:
         raise UsageError(f"bench train: {training.lessons} lessons are too few; give at least 4")
     paths = []
@@ -76,12 +73,26 @@ def train(
             done(len(paths))
     apart = min(JUDGES, training.lessons // 4)
     lessons, judges = read_lessons(paths[:-apart]), read_lessons(paths[-apart:])
-    torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(True)
-    torch.manual_seed(training.seed)
+    with torch_run(training.device, 1, training.seed, "--device"):
+        return _descend(lessons, judges, out, training, say)
+
+
+def _descend(
+    lessons: list[Lesson],
+    judges: list[Lesson],
+    out: Path,
+    training: Training,
+    say: Callable[[int, float, float], None] | None,
+) -> dict[str, Any]:
+    """AdamW with a cosine, a running mean of the weights, judged now and then."""
+    import torch
+
+    from flowrec.refine.network import trained_network
+    from flowrec.refine.weights import write_weights
+
     device = training.device
-    net = trained_network(training.kind).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    mean = trained_network(training.kind).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    net = trained_network().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    mean = trained_network().to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     mean.load_state_dict(net.state_dict())
     optimiser = torch.optim.AdamW(net.parameters(), lr=training.learning_rate, weight_decay=training.weight_decay)
     warm = max(1, min(300, training.steps // 10))
@@ -90,7 +101,7 @@ def train(
         lambda i: min(1.0, (i + 1) / warm) * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * i / training.steps))),
     )
     exam = list(_batches(judges, Training(training.kind, batch=training.batch, device=device), examined=True))
-    figures: dict[str, Any] = {"loss": [], "error": [], "steps": [], "before": _examine(None, exam, training)}
+    figures: dict[str, Any] = {"loss": [], "error": [], "steps": [], "before": _examine(None, exam)}
     best, total, since, began = math.inf, 0.0, 0, time.process_time()
     batches = _batches(lessons, training)
     for step in range(1, training.steps + 1):
@@ -107,7 +118,7 @@ def train(
                 slow.lerp_(quick, 1.0 - memory)
         total, since = total + float(loss.detach()), since + 1
         if step % training.judged_every == 0 or step == training.steps:
-            error = _examine(mean, exam, training)
+            error = _examine(mean, exam)
             for name, value in (("steps", step), ("loss", total / since), ("error", error)):
                 figures[name].append(value)
             if say is not None:
@@ -150,9 +161,7 @@ def _batches(
                 case = Case.of(lesson.assumed, seen, chip, cropped=False)
                 cases.append(case)
                 units = [lesson.velocity_um_s / case.speed, lesson.pressure_pa[..., None] / case.unit_pressure]
-                image = np.concatenate(units, axis=2).transpose(2, 0, 1).astype(np.float32)
-                padding = [(0, m - n) for m, n in zip(case.fluid.shape, case.size, strict=True)]
-                true.append(np.pad(image, [(0, 0), *padding]))
+                true.append(np.moveaxis(case.box.part(np.concatenate(units, axis=2)), -1, 0).astype(np.float32))
             scene, truth = Scene.of(cases, device=training.device), torch.from_numpy(np.stack(true)).to(training.device)
             velocity, pressure = truth[:, :2], truth[:, 2:]
             if not examined:
@@ -164,11 +173,8 @@ def _batches(
             return
 
 
-def _predict(net: UNet, scene: Scene, training: Training) -> tuple[Tensor, Tensor, Tensor]:
-    """Velocity, pressure and the network's output: both correct the initial field, `unet` without observations."""
-    if training.kind == "unet":
-        output = net(scene.printed())
-        return *scene.correct(output, near_wall="free"), output
+def _predict(net: UNet, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Velocity, pressure and the network's output."""
     output = net(scene.told())
     return *scene.correct(output), output
 
@@ -177,7 +183,7 @@ def _loss(net: UNet, scene: Scene, velocity: Tensor, pressure: Tensor, training:
     """Relative errors of velocity and pressure; for `pi_unet` also the unlikelihood of its error bars, and physics."""
     from flowrec.refine.physics import Physics, balances
 
-    v, p, output = _predict(net, scene, training)
+    v, p, output = _predict(net, scene)
     error = _error(v, velocity)
     loss = error.mean() + 0.1 * _error(p, pressure).mean()
     if training.kind == "unet":
@@ -198,13 +204,12 @@ def _error(field: Tensor, true: Tensor) -> Tensor:
     return (miss / size.clamp(min=1e-12) + 1e-6).sqrt()
 
 
-def _examine(net: UNet | None, exam: list[tuple[Scene, Tensor, Tensor]], training: Training) -> float:
+def _examine(net: UNet | None, exam: list[tuple[Scene, Tensor, Tensor]]) -> float:
     """Mean relative RMSE of the velocity; of the assumed field without a network."""
     import torch
 
     with torch.no_grad():
         errors = [
-            _error(scene.velocity if net is None else _predict(net, scene, training)[0], velocity)
-            for scene, velocity, _ in exam
+            _error(scene.velocity if net is None else _predict(net, scene)[0], velocity) for scene, velocity, _ in exam
         ]
     return float(torch.cat(errors).mean())

@@ -6,7 +6,6 @@ Lengths are in pixels, velocities in units of the fastest initial component V, p
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from scipy.ndimage import binary_dilation
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import border
 from flowrec.messages import FlowField
+from flowrec.refine.crop import Crop
 from flowrec.refine.judge import noise_of
 from flowrec.refine.sight import Floats, Sight
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
@@ -44,24 +44,13 @@ class Case:
     unit_pressure: float  # mu V / px, Pa
     reynolds: float
     friction: float
-    corner: tuple[int, int]
-    size: tuple[int, int]  # of the crop
-    shape: tuple[int, int]  # of the image
+    box: Crop
 
     @classmethod
     def of(cls, initial: FlowField, sight: Sight, chip: Chip, cropped: bool = True) -> Case:
         """Scale, and crop unless a batch needs all cases of one size."""
-        rows, columns = np.flatnonzero(chip.mask.any(axis=1)), np.flatnonzero(chip.mask.any(axis=0))
-        if not cropped:
-            rows, columns = np.arange(chip.mask.shape[0]), np.arange(chip.mask.shape[1])
-        top, left = int(rows[0]), int(columns[0])
-        size = (int(rows[-1]) + 1 - top, int(columns[-1]) + 1 - left)
-        padding = [(0, -length % MULTIPLE) for length in size]
-
-        def crop(array: NDArray[Any]) -> NDArray[Any]:
-            part = array[top : top + size[0], left : left + size[1]]
-            return np.pad(part, padding + [(0, 0)] * (array.ndim - 2))
-
+        box = Crop.around(chip.mask if cropped else np.ones_like(chip.mask), MULTIPLE)
+        crop = box.part
         inside = np.zeros(chip.mask.shape, bool)
         inside[1:-1, 1:-1] = True
         # Beyond the image is not a wall: openings keep their freedom.
@@ -85,8 +74,8 @@ class Case:
             chip.openings,
             crop(initial.velocity_um_s.astype(np.float64) / speed),
             crop(initial.pressure_pa.astype(np.float64) / unit_pressure),
-            sight.rows - top,
-            sight.columns - left,
+            sight.rows - box.corner[0],
+            sight.columns - box.corner[1],
             sight.weights,
             sight.flow_um_s / speed,
             noise_of(sight) / speed,
@@ -94,9 +83,7 @@ class Case:
             unit_pressure,
             initial.density_kg_m3 * speed * M_PER_UM * px_m / mu,
             0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / chip.depth_um) ** 2,
-            (top, left),
-            size,
-            (chip.mask.shape[0], chip.mask.shape[1]),
+            box,
         )
 
     def gaps(self, used: NDArray[np.bool_] | None = None) -> Floats:
@@ -121,7 +108,4 @@ class Case:
 
     def whole(self, channels: Floats) -> Floats:
         """(h, w, c) on the image of channels (c, h, w) on the padded crop."""
-        image = np.zeros((*self.shape, len(channels)))
-        rows, columns = (slice(at, at + length) for at, length in zip(self.corner, self.size, strict=True))
-        image[rows, columns] = np.moveaxis(channels[:, : self.size[0], : self.size[1]], 0, -1)
-        return image
+        return self.box.whole(channels)

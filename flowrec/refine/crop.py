@@ -22,7 +22,9 @@ class Crop:
 
     @classmethod
     def around(cls, mask: NDArray[np.bool_], multiple: int) -> Crop:
-        """The box around the fluid of a mask (h, w)."""
+        """The box around the fluid of a mask (h, w); all of a mask without fluid."""
+        if not mask.any():
+            mask = np.ones_like(mask)
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         corner = (int(rows[0]), int(columns[0]))
         size = (int(rows[-1]) + 1 - corner[0], int(columns[-1]) + 1 - corner[1])

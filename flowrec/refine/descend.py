@@ -6,9 +6,7 @@ observations.
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from flowrec.errors import FlowError
 from flowrec.refine.case import Case
 from flowrec.refine.judge import TAIL
 from flowrec.refine.network import UNet, trained_network
@@ -35,65 +32,49 @@ TRAINED_RATE = 0.1  # of the learning rate of random weights
 def descend(case: Case, used: NDArray[np.bool_], settings: PiUnet) -> tuple[int, Floats, Floats]:
     """Iterations done, velocity (h, w, 2) and pressure (h, w) of the lowest loss, on the pixels of the case.
 
+    Within `torch_run`, which seeds the random weights.
+
     Raises
     ------
     FlowError
-        If the device is not there, or the weights can not be read.
+        If the weights can not be read.
     """
-    if settings.device == "cuda" and not torch.cuda.is_available():
-        raise FlowError("refiner.pi_unet.device = 'cuda', but torch sees no GPU: set it to 'cpu'")
     trained = settings.weights == "vessels"
     wanted = (0 if trained else COLD_ITERATIONS) if settings.iterations is None else settings.iterations
-    steps = min(wanted, int(settings.largest_work_mpx * 1e6 / case.pixels))
-    with _torch_state(settings.threads, settings.seed):
-        loss_of = _Loss(case, used, settings)
-        net = trained_network("pi_unet") if trained else UNet(settings.base_channels)
+    steps = min(wanted, max(1, int(settings.largest_work_mpx * 1e6 / case.pixels)))
+    loss_of = _Loss(case, used, settings)
+    net = trained_network() if trained else UNet(settings.base_channels)
+    if trained:
+        read_weights(SHIPPED["vessels"], net)
+    # Channels last: a fifth faster on a CPU.
+    net = net.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    seen = loss_of.scene.told() if trained else loss_of.scene.printed()
+    seen = seen.contiguous(memory_format=torch.channels_last)
+    rate = settings.learning_rate * (TRAINED_RATE if trained else 1.0)
+    optimiser = torch.optim.Adam(net.parameters(), lr=rate)
+    # A short start, then half a cosine down to zero.
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimiser,
+        lambda i: min(1.0, (i + 1) / (0.1 * steps + 1e-9)) * 0.5 * (1.0 + math.cos(math.pi * i / max(steps, 1))),
+    )
+    lowest, best, since, done = float("inf"), loss_of.start, 0, 0
+    with torch.no_grad():
         if trained:
-            read_weights(SHIPPED["vessels"], net)
-        # Channels last: a fifth faster on a CPU.
-        net = net.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        seen = loss_of.scene.told() if trained else loss_of.scene.printed()
-        seen = seen.contiguous(memory_format=torch.channels_last)
-        rate = settings.learning_rate * (TRAINED_RATE if trained else 1.0)
-        optimiser = torch.optim.Adam(net.parameters(), lr=rate)
-        # A short start, then half a cosine down to zero.
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimiser,
-            lambda i: min(1.0, (i + 1) / (0.1 * steps + 1e-9)) * 0.5 * (1.0 + math.cos(math.pi * i / max(steps, 1))),
-        )
-        lowest, best, since, done = float("inf"), loss_of.start, 0, 0
-        with torch.no_grad():
-            if trained:
-                best = loss_of(net(seen))[1]
-        for _ in range(steps):
-            loss, fields = loss_of(net(seen))
-            value, since, done = float(loss.detach()), since + 1, done + 1
-            if value < lowest:
-                since = since if value > 0.995 * lowest else 0
-                lowest, best = value, fields
-            if since > settings.patience:
-                break
-            optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimiser.step()
-            schedule.step()
-        result = np.moveaxis(best.detach().cpu().numpy()[0].astype(np.float64), 0, -1)
+            best = loss_of(net(seen))[1]
+    for _ in range(steps):
+        loss, fields = loss_of(net(seen))
+        value, since, done = float(loss.detach()), since + 1, done + 1
+        if value < lowest:
+            since = since if value > 0.995 * lowest else 0
+            lowest, best = value, fields
+        if since > settings.patience:
+            break
+        optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+    result = np.moveaxis(best.detach().cpu().numpy()[0].astype(np.float64), 0, -1)
     return done, result[..., :2], result[..., 2]
-
-
-@contextlib.contextmanager
-def _torch_state(threads: int, seed: int) -> Iterator[None]:
-    """Seeded, deterministic, with a fixed number of threads; torch's global state is as before afterwards."""
-    before, strict = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
-    torch.set_num_threads(threads)
-    try:
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            torch.use_deterministic_algorithms(True)
-            yield
-    finally:
-        torch.use_deterministic_algorithms(strict)
-        torch.set_num_threads(before)
 
 
 class _Loss:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -87,8 +86,8 @@ def positions(h: int, w: int, channels: int) -> Tensor:
     return torch.cat([wave(angle) for angle in angles for wave in (torch.sin, torch.cos)], dim=1)[None]
 
 
-def trained_network(kind: Literal["pi_unet", "unet"]) -> UNet:
-    """The network that shipped weights fit: `unet` sees and gives what is printed, `pi_unet` is a `Scene`'s."""
-    from flowrec.refine.scene import OUTPUTS, PRINTED, TOLD
+def trained_network() -> UNet:
+    """The network that shipped weights fit: it sees and gives what a `Scene` says."""
+    from flowrec.refine.scene import OUTPUTS, TOLD
 
-    return UNet(16, *((TOLD, OUTPUTS) if kind == "pi_unet" else (PRINTED, 3)), folded=True, depth=3)
+    return UNet(16, TOLD, OUTPUTS, folded=True, depth=3)

@@ -21,10 +21,14 @@ from flowrec.messages import FlowField
 from flowrec.refine.case import Case
 from flowrec.refine.judge import doubt, misfit
 from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.torch_run import Device, torch_run
+from flowrec.refine.weights import SHIPPED, sha256
 
 HELD_OUT = 4  # every fourth observation judges whether a correction gained anything
 FEWEST = 8  # observations of which some can be held out
-WORTH_TAKING = 0.9  # of an assimilated start's misfit on what was held out
+WORTH_TAKING = 0.9  # of the start's misfit on what was held out, for a network's correction
+# Share of a correction that is taken, up to so many standard deviations of chi2 above what noise alone gives.
+TAKEN = ((1.0, 0.5), (2.0, 0.75))
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +36,10 @@ class PiUnet:
     """Settings of the PI-UNet."""
 
     start: Literal["assimilate", "fvm"] = "assimilate"  # the initial field
+    # Both of the next two are for the start "fvm": what remains of an assimilated field's misfit is no matter of
+    # boundary values, which is what the weights have learned and the balance assumes.
     weights: Literal["vessels", "none"] = "vessels"  # trained on drawn vessels, or random ones as printed
-    finish: Literal["balance", "none"] = "balance"
+    finish: Literal["balance", "none"] = "balance"  # with soft observations
     observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value, noise and all
     near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as printed, the initial values stay
     iterations: int | None = None  # None: 80 with random weights, none with trained ones
@@ -42,10 +48,15 @@ class PiUnet:
     learning_rate: float = 3e-3
     observation_weight: float = 0.03  # of the mean log-likelihood against the mean squared residual
     base_channels: int = 16  # of the network with random weights
-    device: Literal["cpu", "cuda"] = "cpu"
+    device: Device = "cpu"
     # More than one only on idle cores: torch spins at its barriers, and on two shared cores two are ten times slower.
     threads: int = 1
     seed: int = 0
+
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the trained weights that are used, '' where they are random."""
+        return sha256(SHIPPED[self.weights]) if self.weights != "none" and self.start == "fvm" else ""
 
     def fit(self, initial: FlowField, sight: Sight, chip: Chip) -> FlowField:
         """The corrected field, or `initial` with a note where a correction would not be an improvement.
@@ -59,29 +70,41 @@ class PiUnet:
         FlowError
             If the device is not there, or the weights can not be read.
         """
+        assimilated = initial.std_um_s is not None
+        if assimilated and (self.weights, self.finish) != ("none", "none"):
+            # What remains of its misfit is no matter of boundary values.
+            return replace(self, weights="none", finish="none").fit(initial, sight, chip)
         fastest = float(np.abs(initial.velocity_um_s).max())
         if fastest == 0.0:
             return self._kept(initial, "the initial field stands still")
         before = misfit(initial.velocity_um_s, sight)
-        assimilated = initial.std_um_s is not None
         if assimilated and float(before.mean()) <= 2.0 + 4.0 / np.sqrt(sight.count):  # two standard deviations of chi2
             return self._kept(initial, f"the observations lie within their noise (chi2 {before.mean() / 2:.2f})")
         case = Case.of(initial, sight, chip)
         every = np.ones(sight.count, bool)
         used = np.arange(sight.count) % HELD_OUT != HELD_OUT // 2 if sight.count >= FEWEST else every
         judges = every if used.all() else ~used
-        limit = (WORTH_TAKING if assimilated or used.all() else 1.0) * doubt(before[judges])
-        # The last that predicts what it has not seen as well as any: balanced, or the network's alone.
+        start = doubt(before[judges])
         scores = [doubt(misfit(velocity, sight)[judges]) for _, velocity, _ in self._corrections(case, used)]
-        best = min(reversed(range(len(scores))), key=lambda i: scores[i])
-        said, velocity, pressure = self._corrections(case, every)[best]
-        if not scores[best] < limit or not np.isfinite(velocity).all():  # also where a score is not a number
+        # The balanced field where it predicts what it has not seen; the network's alone must do so clearly.
+        bars = [WORTH_TAKING * start] + [(WORTH_TAKING if used.all() else 1.0) * start] * (len(scores) - 1)
+        best = max((i for i in range(len(scores)) if scores[i] < bars[i]), default=-1)
+        if best < 0:
             return self._kept(initial, "a correction did not predict the observations better")
+        said, velocity, pressure = self._corrections(case, every)[best]
+        if not np.isfinite(velocity).all():
+            return self._kept(initial, "a correction is not finite")
         std = initial.std_um_s
+        # Where the start nearly explains the observations, much of what they ask for is their noise.
+        over = (0.5 * float(before.mean()) - 1.0) * np.sqrt(sight.count)
+        share = 1.0 if assimilated else next((part for most, part in TAKEN if over <= most), 1.0)
+        velocity = initial.velocity_um_s + share * (velocity - initial.velocity_um_s)
+        pressure = initial.pressure_pa + share * (pressure - initial.pressure_pa)
         if std is not None:
             # Where the correction moves the field, the start stays within the error bar.
             std = np.hypot(std, velocity - initial.velocity_um_s).astype(np.float32)
         after = misfit(velocity, sight)
+        said += "" if share == 1.0 else f", {share:.0%} of it"
         return replace(
             initial,
             method="pi_unet",
@@ -102,11 +125,13 @@ class PiUnet:
         from flowrec.refine.balance import LARGEST_PX, balance
         from flowrec.refine.descend import descend
 
-        steps, velocity, pressure = descend(case, used, self)
-        said = f"corrected by {'trained' if self.weights == 'vessels' else 'random'} weights in {steps} iterations"
-        found = [(said, velocity, pressure)]
-        if self.finish == "balance" and int(case.fluid.sum()) <= LARGEST_PX:
-            found.append((f"{said} and balanced", *balance(case, used, velocity)))
+        weights = f"weights {self.weights_sha256[:8]}" if self.weights_sha256 else "random weights"
+        with torch_run(self.device, self.threads, self.seed, "refine.pi_unet.device"):
+            steps, velocity, pressure = descend(case, used, self)
+            said = f"corrected by {weights} in {steps} iterations"
+            found = [(said, velocity, pressure)]
+            if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
+                found.append((f"{said} and balanced", *balance(case, used, velocity)))
         return [
             (
                 said,

@@ -25,7 +25,8 @@ def write_weights(path: Path, network: nn.Module, facts: Mapping[str, str]) -> N
 
     halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(save(halves, dict(sorted(facts.items()))))
+    # One entry: the order of several is not the same twice.
+    path.write_bytes(save(halves, {"facts": json.dumps(dict(facts), sort_keys=True)}))
 
 
 def read_weights(path: Path, network: nn.Module) -> None:
@@ -68,8 +69,8 @@ def facts_of(path: Path) -> dict[str, Any]:
         with path.open("rb") as file:
             (length,) = struct.unpack("<Q", file.read(8))
             head = json.loads(file.read(min(length, 1_000_000)))
-        return dict(head.get("__metadata__", {}))
-    except (OSError, ValueError, struct.error, AttributeError):
+        return dict(json.loads(head["__metadata__"]["facts"]))
+    except (OSError, ValueError, struct.error, KeyError, TypeError):
         return {}
 
 

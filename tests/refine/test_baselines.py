@@ -16,8 +16,7 @@ from flowrec.refine.coordinate_net import CoordinateNet
 from flowrec.refine.crop import Crop
 from flowrec.refine.network import trained_network
 from flowrec.refine.sight import sight
-from flowrec.refine.unet import SHIPPED_SHA256
-from flowrec.refine.weights import SHIPPED, sha256, write_weights
+from flowrec.refine.weights import write_weights
 
 QUICK = {
     "ni": Refiner("ni", ni=Ni(iterations=25, base_channels=8)),
@@ -188,32 +187,33 @@ def trained(tmp_path):
     """Weights of the right shapes that move the field; not trained, so nothing can be said of the error."""
     path = tmp_path / "any.safetensors"
     torch.manual_seed(0)
-    network = trained_network("unet")
+    network = trained_network()
     torch.nn.init.normal_(network.last.weight, std=0.05)
     write_weights(path, network, {})
     return path
 
 
-def test_unet_uses_the_assumed_field_and_no_observation(twin, tmp_path):
+def test_unet_corrects_the_assumed_field_by_what_was_observed_in_units_of_its_own(twin, tmp_path):
     case = twin()
     refiner = Refiner("unet", unet=Unet(weights=str(trained(tmp_path))))
     field = refiner.refine(case.assumed, case.observations, case.chip, case.solver)
     other = replace(case.observations, flow_um_s=-2.0 * case.observations.flow_um_s)
-    assert field.same_as(refiner.refine(case.assumed, other, case.chip, case.solver))
-    assert not np.array_equal(field.velocity_um_s, case.assumed.velocity_um_s)
+    assert not field.same_as(refiner.refine(case.assumed, other, case.chip, case.solver))
     assert not field.velocity_um_s[~case.chip.mask].any() and not field.pressure_pa[~case.chip.mask].any()
-    assert field.method == "unet" and field.std_um_s is None and "observations not used" in field.note
-    # No scale but that of the assumed field: twice the flow in, twice the flow out.
+    assert field.method == "unet" and field.std_um_s is None and "observations" in field.note
+    # Twice the flow in and seen, twice the flow out.
     double = replace(
         case.assumed,
         velocity_um_s=2.0 * case.assumed.velocity_um_s,
         pressure_pa=2.0 * case.assumed.pressure_pa,
     )
-    twice = refiner.refine(double, case.observations, case.chip, case.solver)
+    seen = case.observations
+    faster = replace(seen, flow_um_s=2.0 * seen.flow_um_s, std_um_s=2.0 * seen.std_um_s)
+    twice = refiner.refine(double, faster, case.chip, case.solver)
     assert np.allclose(twice.velocity_um_s, 2.0 * field.velocity_um_s, rtol=1e-3, atol=1e-2)
 
 
-def test_missing_damaged_and_exchanged_weights_are_said_in_one_line(twin, tmp_path, monkeypatch):
+def test_missing_and_damaged_weights_are_said_in_one_line(twin, tmp_path):
     case = twin()
     path = trained(tmp_path)
 
@@ -228,17 +228,12 @@ def test_missing_damaged_and_exchanged_weights_are_said_in_one_line(twin, tmp_pa
     (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FlowError, match="not a sound safetensors file"):
         refine(tmp_path / "cut.safetensors")
-    monkeypatch.setitem(SHIPPED, "unet", path)
-    with pytest.raises(FlowError, match="not the weights that are shipped"):
-        refine("")
 
 
-def test_the_shipped_unet_moves_an_assumed_field_but_a_little(twin):
+def test_the_shipped_unet_helps_a_little(twin):
     case = twin()
     field = Refiner("unet").refine(case.assumed, case.observations, case.chip, case.solver)
-    assert sha256(SHIPPED["unet"]) == SHIPPED_SHA256
-    moved = field.velocity_um_s - case.assumed.velocity_um_s
-    assert 0.0 < np.linalg.norm(moved) < 0.3 * np.linalg.norm(case.assumed.velocity_um_s)
+    assert case.error(field) < 0.9 * case.error(case.assumed)
 
 
 def test_fluid_that_is_assumed_at_rest_stays_so_and_the_note_says_why(twin):

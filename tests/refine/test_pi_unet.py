@@ -7,6 +7,7 @@ import torch
 from flowrec.flow import sample
 from flowrec.refine import PiUnet, Refiner
 from flowrec.refine.physics import Physics
+from flowrec.refine.stencil import jacobian
 
 
 def poiseuille(width, length):
@@ -38,8 +39,8 @@ def test_the_discrete_equations_vanish_on_poiseuille_flow():
 
 def test_pi_unet_lowers_the_error_of_a_wrong_solution_by_a_third(twin):
     case = twin()
-    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", iterations=40))
-    refined = refiner.refine(case.assumed, case.observations, case.chip, case.solver)
+    printed = PiUnet(start="fvm", weights="none", finish="none", iterations=40)
+    refined = Refiner("pi_unet", pi_unet=printed).refine(case.assumed, case.observations, case.chip, case.solver)
     assert case.error(refined) < 2.0 / 3.0 * case.error(case.assumed)
     assert not refined.velocity_um_s[~case.chip.mask].any()
     assert refined.method == "pi_unet"
@@ -73,9 +74,32 @@ def test_pi_unet_corrects_what_no_boundary_value_can_explain(twin):
 @pytest.mark.parametrize("settings", [{"observations": "hard"}, {"near_wall": "hard"}, {"near_wall": "free"}])
 def test_the_printed_variants_run_and_give_the_same_bytes_twice(twin, settings):
     case = twin(noise=0.0)
-    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", iterations=10, **settings))
+    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm", weights="none", finish="none", iterations=10, **settings))
     threads = torch.get_num_threads()
     first, second = (refiner.refine(case.assumed, case.observations, case.chip, case.solver) for _ in range(2))
     assert first.same_as(second)
     assert torch.get_num_threads() == threads
     assert case.error(first) < case.error(case.assumed)
+
+
+def test_the_finish_gives_the_same_bytes_twice_and_bears_outliers(twin):
+    case = twin()
+    flow = case.observations.flow_um_s.copy()
+    flow[::6] += [-600.0, 900.0]
+    spoiled = replace(case.observations, flow_um_s=flow)
+    refiner = Refiner("pi_unet", pi_unet=PiUnet(start="fvm"))
+    first, second = (refiner.refine(case.assumed, spoiled, case.chip, case.solver) for _ in range(2))
+    assert first.same_as(second)
+    assert case.error(first) < 0.3 * case.error(case.assumed)
+    assert "balanced" in first.note
+
+
+def test_the_jacobian_is_the_derivative_of_the_discrete_equations():
+    fluid, velocity, pressure = poiseuille(7, 9)
+    physics = Physics.of(fluid, torch.ones_like(fluid), reynolds=3.0, friction=0.1)
+    image = torch.cat([velocity, pressure], dim=1)
+    change = 1e-3 * torch.randn(image.shape, generator=torch.Generator().manual_seed(0)) * fluid
+    more, less = image + change, image - change
+    wanted = 0.5 * (physics.residuals(more[:, :2], more[:, 2:]) - physics.residuals(less[:, :2], less[:, 2:]))
+    found = jacobian(physics, image) @ change.numpy().ravel()
+    assert np.allclose(found, wanted.numpy().ravel(), atol=1e-6)
