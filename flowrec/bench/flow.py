@@ -37,12 +37,14 @@ from flowrec.status import progress, table
 
 MADE_UP = 10  # cases, where none are given
 
-# Name in the table: the refiner that does it. `pi_unet` alone is the paper's, from the solver's prediction.
+# Name in the table: the refiner that does it. `pi_unet` starts from the solver's prediction, as the paper's does;
+# `pi_unet:printed` also with random weights and nothing but the network's descent.
 METHODS = {
     "fvm": Refiner("fvm"),
     "ni": Refiner("ni"),
     "pinn": Refiner("pinn"),
     "unet": Refiner("unet"),
+    "pi_unet:printed": Refiner("pi_unet", pi_unet=PiUnet(start="fvm", weights="none", finish="none")),
     "assimilate": Refiner("assimilate"),
     "pi_unet": Refiner("pi_unet", pi_unet=PiUnet(start="fvm")),
     "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
@@ -242,7 +244,7 @@ def _picture(case: Path, methods: Sequence[str], noise: str, share: str, trouble
 
 
 def _field_path(fields: Path, case: Path, method: str) -> Path:
-    return fields / f"{case.stem}.{method.replace(':', '_from_')}.npz"
+    return fields / f"{case.stem}.{method.replace(':', '_')}.npz"
 
 
 def with_outliers(observations: Observations, share: float, seed: int) -> Observations:
