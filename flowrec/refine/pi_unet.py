@@ -4,8 +4,10 @@ What differs from the print, and why (science.md, section 2): true operators in 
 residual of the field minus that of the initial field, since a field from the solver obeys finer equations and its
 residual on pixels is truncation error; near-wall pixels keep the initial profile but not its amplitude, because a
 wrong inlet makes them wrong in proportion. Weights trained on drawn vessels give a correction without iterations.
-The last step balances physics, observations and boundary values directly (`balance`), which brings most of the gain:
-on 24 crops of real vessels MEASURED. With weights "none" and finish "none" it is the paper's.
+The last step balances physics, observations and boundary values directly (`balance`) and brings nearly all of the
+gain: on 24 crops of real vessels the mean relative RMSE falls from 0.198 to 0.063 in 2 s a case. On eight of them, of
+0.169, the trained network alone leaves 0.125 in 0.1 s, 80 iterations from random weights as printed 0.125 in 13 s, and
+balancing 0.083 after the one and 0.084 after the other. With weights "none" and finish "none" it is the paper's.
 """
 
 from __future__ import annotations
