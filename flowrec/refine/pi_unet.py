@@ -62,9 +62,9 @@ class PiUnet:
     def fit(self, initial: FlowField, sight: Sight, chip: Chip) -> FlowField:
         """The corrected field, or `initial` with a note where a correction would not be an improvement.
 
-        A correction is found without every fourth observation first, and must predict those better than `initial`;
-        then it is found anew with all. A start that has error bars has already used the observations: it is kept when
-        they lie within their noise around it.
+        A correction is found without every fourth observation first and must predict those better than `initial`;
+        from the unrefined start it is then found anew with all. A start that has error bars has already used the
+        observations: it is kept when they lie within their noise around it.
 
         Raises
         ------
@@ -86,13 +86,15 @@ class PiUnet:
         used = np.arange(sight.count) % HELD_OUT != HELD_OUT // 2 if sight.count >= FEWEST else every
         judges = every if used.all() else ~used
         start = doubt(before[judges])
-        scores = [doubt(misfit(velocity, sight)[judges]) for _, velocity, _ in self._corrections(case, used)]
+        found = self._corrections(case, used)
+        scores = [doubt(misfit(velocity, sight)[judges]) for _, velocity, _ in found]
         # The balanced field where it predicts what it has not seen; the network's alone must do so clearly.
         bars = [WORTH_TAKING * start] + [(WORTH_TAKING if used.all() else 1.0) * start] * (len(scores) - 1)
         best = max((i for i in range(len(scores)) if scores[i] < bars[i]), default=-1)
         if best < 0:
             return self._kept(initial, "a correction did not predict the observations better")
-        said, velocity, pressure = self._corrections(case, every)[best]
+        # An assimilated start has used all observations already; descending once more is not worth its time.
+        said, velocity, pressure = (found if assimilated else self._corrections(case, every))[best]
         if not np.isfinite(velocity).all():
             return self._kept(initial, "a correction is not finite")
         std = initial.std_um_s
