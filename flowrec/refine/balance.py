@@ -29,7 +29,8 @@ from flowrec.refine.physics import Physics
 from flowrec.refine.sight import Floats
 from flowrec.refine.stencil import jacobian
 
-LARGEST_PX = 12_000  # fluid pixels: beyond, the factorisation takes too long
+LARGEST_PX = 12_000  # fluid pixels: 2 s for two thousand of them, 10 s for five, and beyond these too long
+# They hardly matter: half of either, or twice the roughness, changes the mean error of 24 cases by 0.002 at most.
 CONTINUITY, MOMENTUM = 0.01, 0.1  # allowed share of the speed around, on one pixel
 ROUGH = 6.0  # allowed second difference of the correction, in speeds around
 ASSUMED_SPEED = 0.3  # std of an inlet's speed, of what is assumed

@@ -6,12 +6,14 @@ import torch
 
 from flowrec.bench.lessons import prepare, read_lessons
 from flowrec.bench.train import Training, train
+from flowrec.config import load_config
 from flowrec.errors import FlowError, UsageError
 from flowrec.refine import PiUnet, Refiner, weights
 from flowrec.refine.case import Case
 from flowrec.refine.network import UNet, trained_network
 from flowrec.refine.scene import Scene, turn
 from flowrec.refine.sight import sight
+from flowrec.session import session_header
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +104,11 @@ def test_the_shipped_weights_beat_a_cold_start_and_the_finish_beats_both(twin):
     warm, cold = error(finish="none", iterations=3), error(finish="none", weights="none", iterations=3)
     assert warm < cold
     assert error() < 0.5 * warm
+
+
+def test_a_session_names_the_weights_that_its_flow_came_from(twin):
+    def facts(*sets):
+        return session_header(load_config(None, ["refine.method=pi_unet", *sets]), twin().chip).provenance
+
+    assert facts("refine.pi_unet.start=fvm")["weights.pi_unet"] == weights.sha256(weights.SHIPPED["vessels"])
+    assert "weights.pi_unet" not in facts("refine.pi_unet.weights=none", "refine.pi_unet.start=fvm")
