@@ -20,7 +20,7 @@ from flowrec.control.mission import Commander
 from flowrec.control.narrator import narrate
 from flowrec.estimation import Observer, Sampler
 from flowrec.flow import FlowSolver
-from flowrec.messages import Applied, FlowField, Frame, OperatorEvent, Route, Tick, Track, Truth
+from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEvent, Route, Tick, Track, Truth
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
@@ -63,6 +63,8 @@ class Pipeline:
     refiner: Refiner
     survey: SurveyPlanner
     planner: Planner
+    # What a replay knows better: the observations up to a stamp, in place of the sampler's.
+    hindsight: Callable[[int], Observations] | None = None
 
 
 def assemble(config: Config, chip: Chip) -> Pipeline:

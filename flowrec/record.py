@@ -70,6 +70,11 @@ class Witness:
 
 def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
     """The resolved configuration, its chip and its pipeline. Warns where the plan will have to be honest."""
+    if config.sampler.method == "smoothed":
+        raise UsageError(
+            "sampler.method = 'smoothed' looks at what came later: use it in flowrec replay --refine; a run takes "
+            "'filter' or 'trimmed'"
+        )
     chip = load_chip(config.chip)
     config = resolve(config, chip)
     assert config.robot.max_speed_um_s is not None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,7 +15,8 @@ from flowrec.chip.chip import Chip
 from flowrec.compare import Comparison
 from flowrec.config import Config, with_sets
 from flowrec.errors import SessionError, UsageError
-from flowrec.messages import Demand, FlowField, Route, Tick
+from flowrec.estimation.smoother import observe, smooth
+from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, StopSwitch, run
@@ -146,6 +148,8 @@ def replay(
     if verify and (stale or config != recorded_config):
         raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
     pipeline = assemble(config, chip)
+    if config.sampler.method == "smoothed":
+        pipeline = replace(pipeline, hindsight=hindsight(reader, pipeline))
     start_ns = nanoseconds(from_s) if from_s is not None else None
     if start_ns is not None and not reader.first_ns <= start_ns <= reader.last_ns:
         raise UsageError(
@@ -201,6 +205,32 @@ def replay(
         commands=commands,
         worker_check=checker,
     )
+
+
+def hindsight(reader: SessionReader, pipeline: Pipeline) -> Callable[[int], Observations]:
+    """The recorded way up to a stamp as the RTS smoother sees it, for `sampler.method = "smoothed"`.
+
+    Raises
+    ------
+    UsageError
+        If the observer is not the Kalman filter, whose model the smoother shares.
+    """
+    if pipeline.observer.method != "kalman":
+        raise UsageError("sampler.method = 'smoothed' needs observer.method = 'kalman', whose model it shares")
+    tracks: list[Track] = []
+    applied: list[Applied] = []
+    for tick in reader.ticks(with_frames=False):
+        if tick.track is not None and tick.applied is not None and (not tracks or tick.track is not tracks[-1]):
+            tracks.append(tick.track)
+            applied.append(tick.applied)
+    robot, sampler = pipeline.robot, pipeline.sampler
+
+    def upto(stamp_ns: int) -> Observations:
+        known = sum(track.stamp_ns <= stamp_ns for track in tracks)
+        smoothed = smooth(tracks[:known], applied[:known], pipeline.observer.kalman, robot)
+        return observe(smoothed, robot, sampler.spacing_radii, sampler.settled_share)
+
+    return upto
 
 
 def adoption_stamps(reader: SessionReader) -> dict[int, int]:

@@ -33,7 +33,10 @@ def work(pipeline: Pipeline, order: Tick) -> FlowField | Route:
         result = pipeline.solver.solve(pipeline.chip)
     elif mission.wanted == "refine":
         assert order.assumed is not None
-        observations = pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
+        if pipeline.hindsight is not None:
+            observations = pipeline.hindsight(order.stamp_ns)
+        else:
+            observations = pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
         result = pipeline.refiner.refine(order.assumed, observations, pipeline.chip, pipeline.solver)
     elif mission.wanted == "survey_route":
         assert order.field is not None

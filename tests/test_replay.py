@@ -97,6 +97,25 @@ def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp
     assert written.tick_before(written.last_ns).refined.same_as(done.replayed.refined)  # type: ignore[union-attr]
 
 
+def test_a_replay_can_refine_with_what_the_smoother_sees_in_hindsight(session: Path) -> None:
+    smoothed = Change(refine="assimilate", sets=("sampler.method=smoothed",))
+    done = verb.replay(session, smoothed)
+    assert done.true_field is not None and done.replayed.assumed is not None and done.replayed.refined is not None
+    before = relative_rmse(done.replayed.assumed, done.true_field, done.chip.mask).v
+    assert relative_rmse(done.replayed.refined, done.true_field, done.chip.mask).v < 0.3 * before
+    # No later than the work order itself, and other observations than the filter's.
+    filtered = verb.replay(session, Change(refine="assimilate"))
+    assert filtered.replayed.refined is not None
+    assert not done.replayed.refined.same_as(filtered.replayed.refined)
+    with pytest.raises(UsageError, match="needs observer"):
+        verb.replay(session, replace(smoothed, observer="luenberger"))
+
+
+def test_a_run_can_not_smooth_what_is_still_to_come() -> None:
+    with pytest.raises(UsageError, match="flowrec replay"):
+        record(load_config(None, [*SMALL, "sampler.method=smoothed"]))
+
+
 def test_another_controller_changes_the_commands_and_nothing_before_them(session: Path) -> None:
     done = verb.replay(session, Change(controller="ff_fb"))
     topics = done.comparison.topics

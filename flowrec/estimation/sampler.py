@@ -28,7 +28,8 @@ class Sampler:
     settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
     floor_um_s: float = 2.0  # no observation claims a smaller sigma
     capacity: int = 2000  # the oldest go first
-    method: Literal["filter", "trimmed"] = "filter"  # trimmed: as in the paper, before a refinement uses them
+    # trimmed: as in the paper, before a refinement uses them; smoothed: by the RTS smoother, in a replay only.
+    method: Literal["filter", "trimmed", "smoothed"] = "filter"
     trimmed: Trimmed = field(default_factory=Trimmed)
 
     def treat(self, observations: Observations) -> Observations:
