@@ -39,14 +39,21 @@ def straight_case(width_px: int, k: int) -> dict[str, Any]:
 
 
 def oblique_case(width_px: int, k: int, walls: Walls, angles_deg: tuple[float, ...]) -> dict[str, Any]:
-    """Largest and mean absolute error of the resistance over angles between channel and pixels."""
-    errors = [abs(_oblique(float(width_px), angle, k, walls)) for angle in angles_deg]
+    """Largest and mean absolute error of the resistance over angles between channel and pixels.
+
+    `undecided` is how far the resistances of all channels that would be drawn as the same mask lie from their middle:
+    a straight wall of slope p / q is known to 1 / (2 sqrt(p^2 + q^2)) pixels only.
+    """
+    found = [_oblique(float(width_px), angle, k, walls) for angle in angles_deg]
+    errors, undecided = [abs(error) for error, _ in found], [share for _, share in found]
     return {
         "width_px": width_px,
         "k": k,
         "walls": walls,
         "largest_resistance_error_percent": 100.0 * max(errors),
         "mean_resistance_error_percent": 100.0 * float(np.mean(errors)),
+        "largest_undecided_percent": 100.0 * max(undecided),
+        "mean_undecided_percent": 100.0 * float(np.mean(undecided)),
     }
 
 
@@ -88,8 +95,8 @@ def _slope_pa_m(width_px: float) -> float:
     return 12e-3 * _SPEED_UM_S * 1e-6 / (width_px * _UM_PER_PX * 1e-6) ** 2
 
 
-def _oblique(width: float, angle_deg: float, k: int, walls: Walls) -> float:
-    """Relative error of the resistance of a channel that crosses the mask from left to right."""
+def _oblique(width: float, angle_deg: float, k: int, walls: Walls) -> tuple[float, float]:
+    """Relative error of the resistance of a channel that crosses the mask, and what the mask leaves open of it."""
     angle, length = np.radians(angle_deg), 80
     rows, columns = np.mgrid[: int(length * np.tan(angle)) + 24, :length].astype(float)
     # Off the pixels' symmetry, as a real channel is.
@@ -106,4 +113,8 @@ def _oblique(width: float, angle_deg: float, k: int, walls: Walls) -> float:
     pressure = FlowSolver(k).solve(chip).pressure_pa
     core = mask & (np.abs(across) < 1.0) & (np.abs(along) < 20.0)
     fall = -float(np.polyfit(along[core] * _UM_PER_PX * 1e-6, pressure[core], 1)[0])
-    return fall / _slope_pa_m(width) - 1.0
+    inside, outside = across[mask], across[~mask]
+    narrowest = inside.max() - inside.min()
+    widest = outside[outside > inside.max()].min() - outside[outside < inside.min()].max()
+    # The resistance goes with the third power of the width.
+    return fall / _slope_pa_m(width) - 1.0, 1.5 * float(widest - narrowest) / width

@@ -30,6 +30,8 @@ _TABLES: dict[str, tuple[str, dict[str, str]]] = {
             "k": "k",
             "mean_resistance_error_percent": "resistance %, mean",
             "largest_resistance_error_percent": "largest",
+            "mean_undecided_percent": "open by the mask %, mean",
+            "largest_undecided_percent": "largest",
         },
     ),
     "bend": (
