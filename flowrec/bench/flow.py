@@ -29,7 +29,7 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import FlowError, FlowrecError, UsageError
 from flowrec.estimation import Trimmed
-from flowrec.flow import FlowSolver, kept, system
+from flowrec.flow import FlowSolver, kept
 from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import FlowField, Observations
 from flowrec.refine import PiUnet, Refiner
@@ -192,7 +192,6 @@ def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Troub
     observations = _observations(case, noise, share, trouble)
     believed = with_wrong_mask(chip, trouble.mask)
     solver, refiner = FlowSolver(k), METHODS[method]
-    system.forget()
     kept.forget()
     began, began_cpu = time.perf_counter(), time.process_time()
     assumed = solver.solve(believed)

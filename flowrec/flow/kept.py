@@ -9,23 +9,25 @@ from typing import Any
 
 from flowrec.chip.chip import Chip
 
-KEPT = 48  # of all kinds: one chip and one fluid, and the walls that it may have instead
+# Factors take about 5 kB a cell: two gigabytes, or one large chip with what is asked of it.
+LARGEST_CELLS, FEWEST = 400_000, 4
 
-_kept: OrderedDict[Hashable, Any] = OrderedDict()
+_kept: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
 _lock = threading.Lock()
 
 
-def kept(key: Hashable, make: Callable[[], Any]) -> Any:
-    """What `make` returned for this key; made anew where that was too long ago."""
+def kept(key: Hashable, cells: int, make: Callable[[], Any]) -> Any:
+    """What `make` returned for this key; made anew where that was too long ago. `cells` says how large it is."""
     with _lock:
         if key in _kept:
             _kept.move_to_end(key)
-            return _kept[key]
+            return _kept[key][0]
     made = make()
     with _lock:
-        _kept[key] = made
-        while len(_kept) > KEPT:
-            _kept.popitem(last=False)
+        _kept[key] = (made, cells)
+        total = sum(size for _, size in _kept.values())
+        while total > LARGEST_CELLS and len(_kept) > FEWEST:
+            total -= _kept.popitem(last=False)[1][1]
     return made
 
 
@@ -47,3 +49,8 @@ def chip_key(chip: Chip) -> Hashable:
         chip.depth_um,
         chip.walls,
     )
+
+
+def cells_of(chip: Chip, k: int) -> int:
+    """Number of fluid cells on k x k subcells a pixel."""
+    return int(chip.mask.sum()) * k * k

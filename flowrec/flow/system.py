@@ -6,8 +6,6 @@ the cache is keyed by all that enters, so that it cannot change a result.
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,11 +18,10 @@ from flowrec.flow import momentum as momenta
 from flowrec.flow import stream as streams
 from flowrec.flow.factors import Factors, factorise
 from flowrec.flow.grid import INLET, Floats, Grid
+from flowrec.flow.kept import cells_of, kept
 from flowrec.flow.momentum import Momentum
 from flowrec.flow.outline import Outline
 from flowrec.flow.stream import Stream
-
-KEPT = 4  # geometries in memory; a session needs one or two
 
 # A frozen factorisation is used as long as each step leaves at most this share of the last one.
 WORTH_KEEPING = 0.3
@@ -68,6 +65,12 @@ class System:
         """(faces,) what the pressure inside has to balance; m/s. `push` as in `steady`."""
         given = self.momentum.outlet @ drive + push
         return np.asarray(self.resisting @ moving + inertia * self.momentum.convection(moving) - given)
+
+    def unbalanced(self, moving: Floats, drive: Floats, inertia: float) -> float:
+        """What is left of the balance of momentum, over the largest of its terms."""
+        left = self.stream.curl.T @ self.residual(moving, drive, inertia)
+        terms = abs(self.stream.curl).T @ np.abs(self.resisting @ moving)
+        return float(np.abs(left).max(initial=0.0) / max(float(terms.max(initial=0.0)), 1e-300))
 
     def steady(
         self, drive: Floats, inertia: float, max_iterations: int, tolerance: float, push: Floats | None = None
@@ -176,31 +179,13 @@ class System:
         return np.asarray(factors.solve(np.ascontiguousarray(transposed @ load)))
 
 
-_kept: OrderedDict[tuple[Any, ...], System] = OrderedDict()
-_lock = threading.Lock()
-
-
 def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel; a few geometries are kept."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    key = (*mask, openings, chip.walls, k, _friction(chip, k))
-    with _lock:
-        if key in _kept:
-            _kept.move_to_end(key)
-            return _kept[key]
-    made = assembled(chip, k)
-    with _lock:
-        _kept[key] = made
-        while len(_kept) > KEPT:
-            _kept.popitem(last=False)
+    key = ("system", *mask, openings, chip.walls, k, _friction(chip, k))
+    made: System = kept(key, cells_of(chip, k), lambda: assembled(chip, k))
     return made
-
-
-def forget() -> None:
-    """Drop the kept geometries, as in a process that has just started."""
-    with _lock:
-        _kept.clear()
 
 
 def assembled(chip: Chip, k: int, drawn: Outline | None = None) -> System:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
-from flowrec.flow.kept import chip_key, kept
+from flowrec.flow.kept import cells_of, chip_key, kept
 from flowrec.flow.response import FlowResponse, State, fluid_image
 from flowrec.messages import FlowField
 from flowrec.refine.mask_doubt import other_walls
@@ -178,7 +178,7 @@ class Assimilate:
             left = np.maximum(grid.left_std, 1e-3 * grid.left_std.max() + 1e-9)
             return _Ready(response, prior, columns, base, np.repeat(left[:, None], 2, axis=1))
 
-        made: _Ready = kept((self, solver, chip_key(chip)), make)
+        made: _Ready = kept((self, solver, chip_key(chip)), cells_of(chip, solver.k) // 10, make)
         return made
 
 

@@ -8,7 +8,7 @@ from scipy.ndimage import binary_erosion
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.errors import FlowError
-from flowrec.flow import FlowSolver, kept, sample, system
+from flowrec.flow import FlowSolver, kept, sample
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
 from flowrec.refine.model_error import ModelError
@@ -130,7 +130,6 @@ def test_what_is_kept_changes_no_result(twin):
     Refiner().refine(case.assumed, doubled, case.chip, case.solver)
     warm = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
     kept.forget()
-    system.forget()
     cold = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
     assert warm.same_as(cold)
 
