@@ -356,7 +356,7 @@ def verdict(done: Replayed) -> tuple[bool, list[str]]:
         lines.extend(done.worker_check.results)
         same = same and done.worker_check.same
     if done.frames_missing:
-        lines.append(f"{done.frames_missing} frames were dropped by the recording; their recorded tracks stood in")
+        lines.append(f"{done.frames_missing} frames are not in the file; their recorded tracks stood in")
     if comparison.first is not None:
         lines.append(f"first difference: {comparison.first}")
     lines.append(

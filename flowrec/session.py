@@ -55,8 +55,8 @@ def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None 
         "notes": config.recording.notes,
         "seed": str(config.simulated.seed),
     }
-    if config.refine.method == "pi_unet" and config.refine.pi_unet.weights_sha256:
-        facts["weights.pi_unet"] = config.refine.pi_unet.weights_sha256
+    if config.refine.weights_sha256:
+        facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
     return SessionHeader(to_toml(config), png, toml, facts, dict(parent or {}))
 
 
@@ -94,6 +94,9 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
         "recorded": said.get("wall_time", "unknown"),
         "by": f"flowrec {said.get('flowrec', '?')}" + _bracketed(said.get("git_commit", "")[:10]),
     }
+    for key, code in said.items():
+        if key.startswith("weights."):
+            facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
     if reader.header.parent:
         facts["replay of"] = reader.header.parent.get("file", "?")
     facts |= {

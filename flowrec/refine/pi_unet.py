@@ -116,13 +116,13 @@ class PiUnet:
             pressure_pa=pressure.astype(np.float32),
             std_um_s=std,
             note=f"{said}; misfit of the observations (chi2) {before.mean() / 2:.2f} to "
-            f"{after.mean() / 2:.2f}" + (f"; start: {initial.note}" if initial.note else ""),
+            f"{after.mean() / 2:.2f}" + f"; start: {_said(initial)}",
         )
 
     @staticmethod
     def _kept(initial: FlowField, why: str) -> FlowField:
         """The start as it is, and why."""
-        return replace(initial, method="pi_unet", note=f"start kept, {why}; start: {initial.note or initial.method}")
+        return replace(initial, method="pi_unet", note=f"start kept, {why}; start: {_said(initial)}")
 
     def _corrections(self, case: Case, used: NDArray[np.bool_]) -> list[tuple[str, Floats, Floats]]:
         """What was done, velocity (h, w, 2) in um/s and pressure (h, w) in Pa: the network's field, and its finish."""
@@ -132,7 +132,7 @@ class PiUnet:
         weights = f"weights {self.weights_sha256[:8]}" if self.weights_sha256 else "random weights"
         with torch_run(self.device, self.threads, self.seed, "refine.pi_unet.device"):
             steps, velocity, pressure = descend(case, used, self)
-            said = f"corrected by {weights} in {steps} iterations"
+            said = f"corrected by {weights}" + (f" in {steps} iterations" if steps else "")
             found = [(said, velocity, pressure)]
             if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
                 found.append((f"{said} and balanced", *balance(case, used, velocity)))
@@ -144,3 +144,8 @@ class PiUnet:
             )
             for said, velocity, pressure in found
         ]
+
+
+def _said(initial: FlowField) -> str:
+    """What is known of the initial field; an assimilation says itself what it is."""
+    return initial.note if initial.method in initial.note else f"{initial.method}, {initial.note}".rstrip(", ")

@@ -30,6 +30,13 @@ class Refiner:
     pinn: Pinn = field(default_factory=Pinn)
     unet: Unet = field(default_factory=Unet)
 
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the trained weights that the method uses, '' where it uses none."""
+        if self.method == "unet":
+            return self.unet.weights_sha256
+        return self.pi_unet.weights_sha256 if self.method == "pi_unet" else ""
+
     def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
         """Better field on the same pixels; stamp and request are those of `assumed`.
 

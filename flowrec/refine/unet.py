@@ -29,6 +29,16 @@ class Unet:
     device: Device = "cpu"
     threads: int = 1
 
+    @property
+    def path(self) -> Path:
+        """Of the weights."""
+        return Path(self.weights) if self.weights else SHIPPED["unet"]
+
+    @property
+    def weights_sha256(self) -> str:
+        """Hash of the weights, '' where there are none."""
+        return sha256(self.path)
+
     def fit(self, initial: FlowField, sight: Sight, chip: Chip) -> FlowField:
         """The corrected field.
 
@@ -39,20 +49,18 @@ class Unet:
         """
         if not initial.velocity_um_s.any():
             return replace(initial, method="unet", note="start kept: the initial field stands still")
-        velocity, pressure, code = self._correct(Case.of(initial, sight, chip))
+        velocity, pressure = self._correct(Case.of(initial, sight, chip))
         return replace(
             initial,
             method="unet",
             velocity_um_s=velocity.astype(np.float32),
             pressure_pa=pressure.astype(np.float32),
             std_um_s=None,
-            note=f"weights {code[:8]}, from other vessels; {sight.count} observations",
+            note=f"weights {self.weights_sha256[:8]}, from other vessels; {sight.count} observations",
         )
 
-    def _correct(self, case: Case) -> tuple[Floats, Floats, str]:
-        """Velocity (h, w, 2) in um/s, pressure (h, w) in Pa, hash of the weights."""
-        path = Path(self.weights) if self.weights else SHIPPED["unet"]
-        code = sha256(path)
+    def _correct(self, case: Case) -> tuple[Floats, Floats]:
+        """Velocity (h, w, 2) in um/s, pressure (h, w) in Pa."""
         with torch_run(self.device, self.threads, 0, "refine.unet.device"):
             import torch
 
@@ -60,10 +68,10 @@ class Unet:
             from flowrec.refine.scene import Scene
 
             network = trained_network()
-            read_weights(path, network)
+            read_weights(self.path, network)
             network.to(self.device).eval()
             scene = Scene.of([case], device=self.device)
             with torch.no_grad():
                 fields = scene.correct(network(scene.told()))
             image = case.whole(torch.cat(fields, dim=1)[0].cpu().numpy().astype(np.float64))
-        return image[..., :2] * case.speed, image[..., 2] * case.unit_pressure, code
+        return image[..., :2] * case.speed, image[..., 2] * case.unit_pressure
