@@ -9,7 +9,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -307,8 +307,7 @@ def bench_loop(
 
     figures = measure(ticks)
     show(figures)
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    _keep(figures, json_file)
 
 
 @bench.command("flow")
@@ -341,8 +340,7 @@ def bench_flow(
     trouble = Trouble(outliers, mask, observations)
     figures = measure(cases, chosen, noise, share, k, trouble, fields, figure, case)
     show(figures)
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    _keep(figures, json_file)
 
 
 @bench.command("solver")
@@ -355,8 +353,7 @@ def bench_solver(
 
     figures = measure(quick)
     show(figures)
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    _keep(figures, json_file)
 
 
 @bench.command("grid")
@@ -384,6 +381,12 @@ def bench_train(
     from flowrec.bench.train import Training, show, train
 
     show(train(lessons, out, Training(network, count, steps, device=device, seed=seed)))
+
+
+def _keep(figures: dict[str, Any], json_file: Path | None) -> None:
+    """Write the figures of a bench where they are wanted."""
+    if json_file is not None:
+        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
 def _point(text: str) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import multiprocessing
 import os
 import platform
-import resource
 import tempfile
 import time
 from collections.abc import Sequence
@@ -20,12 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from flowrec.bench.figure_flow import Picture, draw, median_case, need_matplotlib
+from flowrec.bench.memory import peak_mb
 from flowrec.bench.vessels import make_up
 from flowrec.chip.chip import Chip
+from flowrec.chip.openings import border, run_around
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import FlowError, FlowrecError, UsageError
 from flowrec.estimation import Trimmed
@@ -179,11 +179,7 @@ def _start() -> None:
     import torch
 
     torch.set_num_threads(1)
-    _floor_mb = _peak_mb()
-
-
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    _floor_mb = peak_mb()
 
 
 def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Trouble, fields: Path | None) -> Row:
@@ -228,7 +224,7 @@ def _scored(
             mask=chip.mask,
         )
     return Row(
-        case.stem, method, error.vx, error.vy, error.v, *seconds, covered, stated, _peak_mb() - _floor_mb, field.note
+        case.stem, method, error.vx, error.vy, error.v, *seconds, covered, stated, peak_mb() - _floor_mb, field.note
     )
 
 
@@ -281,15 +277,9 @@ def with_wrong_mask(chip: Chip, how: str) -> Chip:
         raise UsageError(f"bench flow: no wrong mask {how!r}; there are right, grown, shrunk, shifted")
     openings = []
     for opening in chip.openings:
-        line: NDArray[np.bool_] = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}[
-            opening.side
-        ]
         middle = (opening.first + opening.last + (how == "shifted" and opening.side in ("top", "bottom"))) // 2
-        first = last = middle
-        while first > 0 and line[first - 1]:
-            first -= 1
-        while last + 1 < len(line) and line[last + 1]:
-            last += 1
+        # An opening that is closed stays one pixel of solid, which the solver refuses by name.
+        first, last = run_around(border(mask, opening.side), middle) or (middle, middle)
         openings.append(replace(opening, first=first, last=last))
     return replace(chip, mask=mask, openings=tuple(openings))
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.bench.memory import peak_mb
 from flowrec.chip.builtin import straight
 from flowrec.chip.chip import Chip
 from flowrec.chip.files import without_pockets
@@ -45,23 +44,16 @@ def _mask(pattern: Pattern, side: int) -> NDArray[np.bool_]:
     return np.asarray(mask)
 
 
-def _peak_kb() -> float:
-    """Largest memory of this process so far, of Linux; getrusage's would include the parent's before the exec."""
-    status = Path("/proc/self/status")
-    found = re.search(r"VmHWM:\s+(\d+)", status.read_text(encoding="ascii")) if status.exists() else None
-    return float(found[1]) if found else float("nan")
-
-
 def _measure(pattern: Pattern, side: int, k: int) -> dict[str, Any]:
     FlowSolver(1).solve(straight())  # imports and compiled code are not what is measured
     mask = _mask(pattern, side)
     openings = guess_inlets(find_openings(mask))
     chip = without_pockets(Chip(pattern, mask, 10.0, openings, 1.0, 1000.0))
-    before = _peak_kb()
+    before = peak_mb()
     began = time.perf_counter()
     FlowSolver(k).solve(chip)
     cold = time.perf_counter() - began
-    peak = _peak_kb()
+    peak = peak_mb()
     other = chip.with_boundary(0.8 * chip.boundary_values, viscosity_mpa_s=1.2)
     began = time.perf_counter()
     FlowSolver(k).solve(other)
@@ -80,7 +72,7 @@ def _measure(pattern: Pattern, side: int, k: int) -> dict[str, Any]:
         "unknowns": int(equations.stream.curl.shape[1]),
         "cold_s": cold,
         "warm_s": warm,
-        "peak_memory_mb": (peak - before) / 1024,
+        "peak_memory_mb": peak - before,
         "mass_lost_in_a_cell": float(lost),
     }
 

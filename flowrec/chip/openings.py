@@ -37,6 +37,16 @@ def border_runs(mask: NDArray[np.bool_], side: Side) -> list[tuple[int, int]]:
     return list(zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True))
 
 
+def run_around(line: NDArray[np.bool_], middle: int) -> tuple[int, int] | None:
+    """First and last of the fluid around a pixel of a side, None where that is solid."""
+    if not (0 <= middle < len(line) and line[middle]):
+        return None
+    solid = np.flatnonzero(~line)
+    first = int(solid[solid < middle].max(initial=-1)) + 1
+    last = int(solid[solid > middle].min(initial=len(line))) - 1
+    return first, last
+
+
 def _meet(a: Opening, b: Opening, shape: tuple[int, ...]) -> bool:
     """Two runs on different sides share the pixel in the corner."""
     last = {"left": shape[0] - 1, "right": shape[0] - 1, "top": shape[1] - 1, "bottom": shape[1] - 1}

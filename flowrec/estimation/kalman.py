@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from flowrec.messages import Applied, Estimate, Track
+from flowrec.messages import Applied, Estimate, Matrix, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -109,3 +109,11 @@ def process_noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ..
         noise[axis, axis + 2] = noise[axis + 2, axis] = q * dt**2 / 2
         noise[axis + 2, axis + 2] = q * dt
     return noise
+
+
+def memory_s(covariance: Matrix) -> float:
+    """How long a filter remembers, at most 1 s: K_x / K_v = P_xx / P_xv; 0 for one that states no coupling."""
+    coupling = 0.5 * (covariance[0, 2] + covariance[1, 3])
+    if coupling <= 0:
+        return 0.0
+    return float(min(0.5 * (covariance[0, 0] + covariance[1, 1]) / coupling, 1.0))

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from flowrec.estimation.kalman import memory_s
 from flowrec.estimation.trimmed import Trimmed
 from flowrec.messages import Estimate, Observations
 from flowrec.robot import Robot
@@ -48,7 +49,7 @@ class Sampler:
             return previous
         if variance > (self.settled_share * robot.max_speed_um_s) ** 2:
             return previous
-        lag_s = _lag_s(estimate)
+        lag_s = memory_s(estimate.covariance)
         dt = seconds(estimate.stamp_ns - before.stamp_ns)
         position = estimate.position_um - lag_s * (estimate.position_um - before.position_um) / dt
         if previous is not None and len(previous.position_um):
@@ -69,11 +70,3 @@ class Sampler:
             np.concatenate((previous.flow_um_s[keep], estimate.flow_um_s[None])),
             np.concatenate((previous.std_um_s[keep], [sigma])),
         )
-
-
-def _lag_s(estimate: Estimate) -> float:
-    """K_x / K_v = P_xx / P_xv of a filter that couples them, 0 for one that states no coupling."""
-    coupling = 0.5 * (estimate.covariance[0, 2] + estimate.covariance[1, 3])
-    if coupling <= 0:
-        return 0.0
-    return float(min(0.5 * (estimate.covariance[0, 0] + estimate.covariance[1, 1]) / coupling, 1.0))

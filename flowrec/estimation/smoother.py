@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.estimation.kalman import Kalman, process_noise, transition
+from flowrec.estimation.kalman import Kalman, memory_s, process_noise, transition
 from flowrec.messages import Applied, Estimate, Matrix, Observations, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
@@ -43,7 +43,7 @@ def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, 
     states[:, :2] -= moved
     covariances = np.array([e.covariance for e in estimates]).reshape(count, 4, 4)
     q = kalman.flow_noise(robot)
-    memory = np.array([_memory_s(covariance) for covariance in covariances])
+    memory = np.array([memory_s(covariance) for covariance in covariances])
     for index in range(count - 2, -1, -1):
         dt = seconds(tracks[index + 1].stamp_ns - tracks[index].stamp_ns)
         step = transition(dt)
@@ -73,9 +73,3 @@ def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settle
         chosen.append(index)
     stamp_ns = smoothed.stamps_ns[-1] if smoothed.stamps_ns else 0
     return Observations(stamp_ns, smoothed.position_um[chosen], smoothed.flow_um_s[chosen], std[chosen])
-
-
-def _memory_s(covariance: Matrix) -> float:
-    """K_x / K_v = P_xx / P_xv, at most a second."""
-    coupling = 0.5 * (covariance[0, 2] + covariance[1, 3])
-    return float(min(0.5 * (covariance[0, 0] + covariance[1, 1]) / coupling, 1.0)) if coupling > 0.0 else 0.0

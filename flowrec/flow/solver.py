@@ -12,7 +12,7 @@ from flowrec.flow.grid import Floats
 from flowrec.flow.kept import cells_of, chip_key, kept
 from flowrec.flow.modes import FlowModes
 from flowrec.flow.response import FlowResponse, respond
-from flowrec.flow.system import NotConvergedError, System, system
+from flowrec.flow.system import NotConvergedError, System, depth_friction, system
 from flowrec.messages import FlowField
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
 
@@ -72,10 +72,9 @@ class FlowSolver:
 
         def make() -> FlowResponse:
             equations, scales = self._equations(chip)
-            thickness = 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / self.k / chip.depth_um) ** 2
             moving = self._steady(chip, equations, scales)
-            drive, per_unit = scales.drive(chip), scales.drive_per_unit
-            return respond(equations, drive, per_unit, scales.inertia, thickness, scales.pressure, moving, extras)
+            drive, per_unit, resists = scales.drive(chip), scales.drive_per_unit, depth_friction(chip, self.k)
+            return respond(equations, drive, per_unit, scales.inertia, resists, scales.pressure, moving, extras)
 
         made: FlowResponse = kept((self, chip_key(chip), extras), cells_of(chip, self.k), make)
         return made
@@ -109,7 +108,7 @@ class FlowSolver:
     def _field(self, chip: Chip, equations: System, scales: _Scales, moving: Floats) -> FlowField:
         load = equations.residual(moving, scales.drive(chip), scales.inertia)
         pressure = equations.pressure(load[:, None])[:, 0]
-        residual = equations.unbalanced(moving, scales.drive(chip), scales.inertia)
+        residual = equations.unbalanced(moving, load)
         return FlowField(
             stamp_ns=0,
             request=0,

@@ -63,12 +63,14 @@ class System:
 
     def residual(self, moving: Floats, drive: Floats, inertia: float, push: Floats | float = 0.0) -> Floats:
         """(faces,) what the pressure inside has to balance; m/s. `push` as in `steady`."""
-        given = self.momentum.outlet @ drive + push
-        return np.asarray(self.resisting @ moving + inertia * self.momentum.convection(moving) - given)
+        return self._load(moving, self.momentum.outlet @ drive + push, inertia)
 
-    def unbalanced(self, moving: Floats, drive: Floats, inertia: float) -> float:
-        """What is left of the balance of momentum, over the largest of its terms."""
-        left = self.stream.curl.T @ self.residual(moving, drive, inertia)
+    def _load(self, moving: Floats, force: Floats, inertia: float) -> Floats:
+        return np.asarray(self.resisting @ moving + inertia * self.momentum.convection(moving) - force)
+
+    def unbalanced(self, moving: Floats, load: Floats) -> float:
+        """What the pressure can not balance of a load (faces,), over the largest term of its balance."""
+        left = self.stream.curl.T @ load
         terms = abs(self.stream.curl).T @ np.abs(self.resisting @ moving)
         return float(np.abs(left).max(initial=0.0) / max(float(terms.max(initial=0.0)), 1e-300))
 
@@ -123,8 +125,7 @@ class System:
         speed = float(np.abs(moving).max())
         factors, last, step, grew = self.stokes, np.inf, np.inf, 0
         for number in range(1, max_iterations + 1):
-            load = self.resisting @ moving + inertia * self.momentum.convection(moving) - force
-            right = -(self.stream.curl.T @ load)
+            right = -(self.stream.curl.T @ self._load(moving, force, inertia))
             change = np.asarray(self.stream.curl @ factors.solve(right))
             step = float(np.abs(change).max()) / speed
             if not np.isfinite(step) or step > WORTH_KEEPING * last or step > 0.5:
@@ -183,7 +184,7 @@ def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel; a few geometries are kept."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    key = ("system", *mask, openings, chip.walls, k, _friction(chip, k))
+    key = ("system", *mask, openings, chip.walls, k, depth_friction(chip, k))
     made: System = kept(key, cells_of(chip, k), lambda: assembled(chip, k))
     return made
 
@@ -193,10 +194,10 @@ def assembled(chip: Chip, k: int, drawn: Outline | None = None) -> System:
     grid = grids.build(chip, k, drawn)
     momentum = momenta.assemble(grid)
     stream = streams.assemble(grid)
-    resisting = sp.csr_array(momentum.viscous + sp.diags_array(_friction(chip, k) * momentum.volume))
+    resisting = sp.csr_array(momentum.viscous + sp.diags_array(depth_friction(chip, k) * momentum.volume))
     return System(grid, momentum, stream, resisting, factorise(stream.curl.T @ resisting @ stream.curl))
 
 
-def _friction(chip: Chip, k: int) -> float:
-    """The factor 12 h^2 / H^2 of a shallow chip, else 0."""
+def depth_friction(chip: Chip, k: int) -> float:
+    """The factor f = 12 h^2 / H^2 of a shallow chip, else 0."""
     return 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / k / chip.depth_um) ** 2

@@ -7,6 +7,7 @@ observations.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,31 +51,48 @@ def descend(case: Case, used: NDArray[np.bool_], settings: PiUnet) -> tuple[int,
     net = net.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     seen = loss_of.scene.told() if trained else loss_of.scene.printed()
     seen = seen.contiguous(memory_format=torch.channels_last)
+    with torch.no_grad():
+        best = loss_of(net(seen))[1] if trained else loss_of.start
     rate = settings.learning_rate * (TRAINED_RATE if trained else 1.0)
+    done, _, lowest = lowest_of(net, seen, loss_of, steps, rate, settings.patience)
+    best = best if lowest is None else lowest
+    result = np.moveaxis(best.cpu().numpy()[0].astype(np.float64), 0, -1)
+    return done, result[..., :2], result[..., 2]
+
+
+def lowest_of(
+    net: UNet,
+    seen: Tensor,
+    loss_of: Callable[[Tensor], tuple[Tensor, Tensor]],
+    steps: int,
+    rate: float,
+    patience: int,
+) -> tuple[int, int, Tensor | None]:
+    """Iterations done, the one of the lowest loss from 0, and the field of that; None where no loss was finite.
+
+    `loss_of` gives loss and field for the network's output; after `patience` iterations without a better loss it ends.
+    """
     optimiser = torch.optim.Adam(net.parameters(), lr=rate)
     # A short start, then half a cosine down to zero.
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimiser,
         lambda i: min(1.0, (i + 1) / (0.1 * steps + 1e-9)) * 0.5 * (1.0 + math.cos(math.pi * i / max(steps, 1))),
     )
-    lowest, best, since, done = float("inf"), loss_of.start, 0, 0
-    with torch.no_grad():
-        if trained:
-            best = loss_of(net(seen))[1]
+    best: Tensor | None = None
+    lowest, since, done, kept = float("inf"), 0, 0, 0
     for _ in range(steps):
-        loss, fields = loss_of(net(seen))
+        loss, field = loss_of(net(seen))
         value, since, done = float(loss.detach()), since + 1, done + 1
         if value < lowest:
             since = since if value > 0.995 * lowest else 0
-            lowest, best = value, fields
-        if since > settings.patience:
+            lowest, best, kept = value, field.detach(), done - 1
+        if since > patience:
             break
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-    result = np.moveaxis(best.detach().cpu().numpy()[0].astype(np.float64), 0, -1)
-    return done, result[..., :2], result[..., 2]
+    return done, kept, best
 
 
 class _Loss:

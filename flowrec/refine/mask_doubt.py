@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion
 
 from flowrec.chip.chip import Chip, Opening
-from flowrec.chip.openings import border
+from flowrec.chip.openings import border, run_around
 
 Mask = NDArray[np.bool_]
 
@@ -35,22 +35,12 @@ def other_walls(chip: Chip) -> Iterator[tuple[str, Chip]]:
         for opening in chip.openings:
             along = down if opening.side in ("left", "right") else right
             line = border(other, opening.side)
-            span = _run(line, (opening.first + opening.last) // 2 + along)
+            span = run_around(line, (opening.first + opening.last) // 2 + along)
             if span is None:
                 break
             openings.append(replace(opening, first=span[0], last=span[1]))
         if len(openings) == len(chip.openings) and not _meet(openings):
             yield words, replace(chip, mask=np.ascontiguousarray(other), openings=tuple(openings))
-
-
-def _run(line: Mask, middle: int) -> tuple[int, int] | None:
-    """First and last of the fluid around `middle`."""
-    if not (0 <= middle < len(line) and line[middle]):
-        return None
-    solid = np.flatnonzero(~line)
-    first = int(solid[solid < middle].max(initial=-1)) + 1
-    last = int(solid[solid > middle].min(initial=len(line))) - 1
-    return first, last
 
 
 def _meet(openings: list[Opening]) -> bool:

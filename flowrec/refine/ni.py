@@ -8,7 +8,6 @@ nothing was observed only the equations speak, and those are fulfilled by fluid 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -73,6 +72,7 @@ class Ni:
         """Iterations done, velocity (h, w, 2) in um/s, pressure (h, w) in Pa, misfit before and after."""
         import torch
 
+        from flowrec.refine.descend import lowest_of
         from flowrec.refine.network import UNet
 
         crop = Crop.around(chip.mask, MULTIPLE)
@@ -81,27 +81,15 @@ class Ni:
         # Channels last: a fifth faster on a CPU.
         net = UNet(self.base_channels).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         seen = loss_of.seen.contiguous(memory_format=torch.channels_last)
-        optimiser = torch.optim.Adam(net.parameters(), lr=self.learning_rate)
-        # A short start, then half a cosine down to zero.
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimiser, lambda i: min(1.0, (i + 1) / (0.1 * steps)) * 0.5 * (1.0 + math.cos(math.pi * i / steps))
-        )
-        lowest, since, done, kept = float("inf"), 0, 0, 0
         misfits: list[float] = []
-        best = loss_of.seen[:, 1:]
-        for _ in range(steps):
-            loss, misfit, field = loss_of(net(seen))
-            value, since, done = float(loss.detach()), since + 1, done + 1
+
+        def noted(output: Tensor) -> tuple[Tensor, Tensor]:
+            loss, misfit, field = loss_of(output)
             misfits.append(float(misfit.detach()) / 2.0)
-            if value < lowest:
-                since = since if value > 0.995 * lowest else 0
-                lowest, best, kept = value, field.detach(), done - 1
-            if since > self.patience:
-                break
-            optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimiser.step()
-            schedule.step()
+            return loss, field
+
+        done, kept, lowest = lowest_of(net, seen, noted, steps, self.learning_rate, self.patience)
+        best = loss_of.seen[:, 1:] if lowest is None else lowest
         image = crop.whole(best.cpu().numpy()[0].astype(np.float64))
         return done, image[..., :2] * scale.speed, image[..., 2] * scale.pressure_pa, (misfits[0], misfits[kept])
 

@@ -21,8 +21,7 @@ from flowrec.refine.unet import Unet
 class Refiner:
     """Which method refines, and the settings of each."""
 
-    # fvm: no refinement. ni, pinn, unet: the paper's baselines; the first two do not use the assumed field, the third
-    # does not use the observations.
+    # fvm: no refinement. ni, pinn, unet: the paper's baselines; the first two do not use the assumed field.
     method: Literal["assimilate", "pi_unet", "fvm", "ni", "pinn", "unet"] = "assimilate"
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)

@@ -64,8 +64,7 @@ def _unseen(chip: Chip, found: Fit, prior: Prior) -> str:
         weak = np.flatnonzero(ratio > WEAK)
         together = see[:, weak].sum(axis=1, keepdims=True)
         if 1 < len(weak) < count + (kind == "inlet") and _ratio(together, covariance)[0] < SEEN_TOGETHER:
-            names = [_name(chip, those[index]) for index in weak]
-            parts.append(f"of {', '.join(names[:-1])} and {names[-1]} they see only the {what} together")
+            parts.append(f"of {_and(chip, [those[index] for index in weak])} they see only the {what} together")
             weak = weak[:0]
         hidden += [those[index] for index in weak if ratio[index] > UNSEEN]
     if hidden:
