@@ -128,6 +128,9 @@ class Route(Message):
     reason: str  # why not, when it is not
     waypoints_um: Matrix  # (n, 2), n = 0 when unreachable
     arrival_s: Vector  # (n,) since the start of the route, strictly increasing
+    # (h, w) s from every pixel centre to the goal by the fastest way, inf where there is none; None where the planner
+    # knows it along its path only. Its slope is a policy: -grad T is the best heading anywhere.
+    time_to_go_s: Raster | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
