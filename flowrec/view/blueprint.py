@@ -1,4 +1,4 @@
-"""Which views a person sees first, and where. Every origin and every entity named here is logged by log.py."""
+"""Which views a person sees first, and where. Every origin and every entity named here is logged by the loggers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flowrec.view import palette
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Scene
 
-_EVERYTHING = frozenset({"assumed", "refined", "change", "uncertainty", "truth", "true robot", "timing"})
+_EVERYTHING = frozenset({"assumed", "refined", "change", "uncertainty", "truth", "true robot", "timing", "time to go"})
 _COIL_WINDOW_S = 2.0  # the currents turn several times a second; a whole session of them is a solid block
 
 _SEVERAL_LINES = frozenset({e.CURRENT, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
@@ -49,6 +49,7 @@ def _single(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
                 _map(scene, "Uncertainty (1 σ)", e.UNCERTAINTY, e.UNCERTAINTY_SCALE)
                 if "uncertainty" in present
                 else None,
+                _map(scene, "Time to go", e.TIME_TO_GO, e.TIME_TO_GO_SCALE) if "time to go" in present else None,
             ),
         ]
     )
@@ -108,6 +109,9 @@ def _replay(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
                 else None,
                 _map(scene, "Replayed: uncertainty (1 σ)", e.UNCERTAINTY, e.UNCERTAINTY_SCALE, new)
                 if "replayed uncertainty" in present
+                else None,
+                _map(scene, "Replayed: time to go", e.TIME_TO_GO, e.TIME_TO_GO_SCALE, new)
+                if "replayed time to go" in present
                 else None,
             ),
         ]

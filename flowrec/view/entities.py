@@ -1,4 +1,4 @@
-"""The names of everything that is logged: written by log.py, shown by blueprint.py, read by people in the viewer."""
+"""The names of everything that is logged, shown by blueprint.py and read by people in the viewer."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ NOT_YET = "not yet"  # beside a map that comes later in the session
 SPEED_SCALE = "flow/speed scale"  # colour bar and ticks, common to all maps of speed
 CHANGE_SCALE = "flow/change/scale"
 UNCERTAINTY_SCALE = "flow/uncertainty/scale"
+TIME_TO_GO = "plan/time to go/map"
+TIME_TO_GO_SCALE = "plan/time to go/scale"
 
 CURRENT = "coils/current"
 FREQUENCY = "coils/frequency"

@@ -58,9 +58,26 @@ def scale_of(values: NDArray[np.float64], colours: palette.Colours) -> Scale:
     return Scale.up_to(float(np.quantile(known, 0.995)) if known.size else 1.0, colours)
 
 
+def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: Scale) -> rr.EncodedImage:
+    """A time to go (h, w), darker where a front passes it, twice between two ticks; red where there is no way."""
+    known = mask & np.isfinite(time_s)
+    colours = scale.paint(np.where(known, time_s, np.nan))
+    front = np.floor(np.where(known, time_s, 0.0) / (0.5 * scale.step))
+    crossed = np.zeros(mask.shape, np.bool_)
+    crossed[:, :-1] |= (front[:, :-1] != front[:, 1:]) & known[:, 1:]
+    crossed[:-1] |= (front[:-1] != front[1:]) & known[1:]
+    colours[crossed & known] = (0.6 * colours[crossed & known]).astype(np.uint8)
+    colours[mask & ~known] = palette.NO_WAY
+    return _encoded(colours)
+
+
 def picture(values: NDArray[np.float64], scale: Scale) -> rr.EncodedImage:
     """A map (h, w) in the colours of its scale."""
-    done, png = cv2.imencode(".png", scale.paint(values)[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return _encoded(scale.paint(values))
+
+
+def _encoded(colours: NDArray[np.uint8]) -> rr.EncodedImage:
+    done, png = cv2.imencode(".png", colours[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert done
     return rr.EncodedImage(contents=png.tobytes(), media_type="image/png")
 
@@ -110,7 +127,7 @@ class ColourBar:
         )
         sign = "+" if scale.colours == "change" else ""
         labels = [f"{value:{sign}g}" if abs(value) > 1e-9 * scale.high else "0" for value in scale.ticks]
-        labels.append("µm/s")
+        labels.append(scale.unit)
         # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
         at = [(right + 2.0 * self.width, row - 0.045 * self.height) for row in y]
         at.append((self.left + 0.5 * self.width, self.top - 0.14 * self.height))

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Rgb = tuple[int, int, int]
 
 SOLID: Rgb = (48, 48, 54)  # where nothing flows: walls, and what is not known
+NO_WAY: Rgb = (110, 40, 44)  # fluid from which the goal can not be reached
 ORANGE: Rgb = (255, 140, 26)
 CYAN: Rgb = (64, 214, 255)
 GREEN: Rgb = (92, 224, 92)
@@ -27,7 +28,11 @@ WHITE: Rgb = (236, 236, 240)
 # Viridis for speeds: as bright as it is fast, also for the colour-blind; the others so that no map is mistaken.
 _TABLES: dict[str, NDArray[np.uint8]] = {
     name: np.ascontiguousarray(cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], code)[:, 0, ::-1])
-    for name, code in (("speed", cv2.COLORMAP_VIRIDIS), ("uncertainty", cv2.COLORMAP_INFERNO))
+    for name, code in (
+        ("speed", cv2.COLORMAP_VIRIDIS),
+        ("uncertainty", cv2.COLORMAP_INFERNO),
+        ("time", cv2.COLORMAP_CIVIDIS),
+    )
 }
 
 
@@ -40,7 +45,7 @@ def _diverging() -> NDArray[np.uint8]:
 
 _TABLES["change"] = _diverging()
 
-Colours = Literal["speed", "uncertainty", "change"]
+Colours = Literal["speed", "uncertainty", "change", "time"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +56,11 @@ class Scale:
     low: float
     high: float
     step: float  # between ticks
+
+    @property
+    def unit(self) -> str:
+        """What the numbers are in."""
+        return "s" if self.colours == "time" else "µm/s"
 
     @classmethod
     def up_to(cls, largest: float, colours: Colours) -> Scale:

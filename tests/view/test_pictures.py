@@ -77,6 +77,25 @@ def test_a_recorded_and_a_replayed_session_share_one_scale(scene: Scene, ticks: 
     )
 
 
+def test_a_map_of_the_time_to_go_tells_far_from_unreachable(scene: Scene, ticks: list[Tick]) -> None:
+    route = ticks[-1].route
+    assert route is not None
+    fluid = scene.chip.mask
+    time_s = np.where(fluid, np.arange(fluid.shape[1]) * 0.05, np.inf)
+    time_s[:, -20:] = np.inf
+    record = Record()
+    logger = TickLogger(record, scene)  # type: ignore[arg-type]
+    logger.log(Tick(0, route=replace(route, time_to_go_s=time_s)))
+    seen = record.map("/plan/time\\ to\\ go/map")
+    assert (seen[~fluid] == palette.SOLID).all()
+    assert (seen[:, -20:][fluid[:, -20:]] == palette.NO_WAY).all()
+    assert "time to go" in logger.present
+    row = int(np.argmax(fluid[:, :-20].sum(1)))
+    assert seen[row, -30].astype(int).sum() > seen[row, 10].astype(int).sum()  # lighter is farther
+    logger.log(Tick(1, route=route))
+    assert isinstance(record.logged["/plan/time\\ to\\ go/map"], rr.Clear)
+
+
 @pytest.mark.parametrize("largest", [3e-7, 0.9, 1.0, 7.3, 42.0, 100.0, 456.0, 1e6])
 def test_a_scale_holds_its_largest_value_on_few_round_ticks(largest: float) -> None:
     for colours in ("speed", "change"):
