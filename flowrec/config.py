@@ -272,6 +272,7 @@ def _refuse_nonsense(config: Config, where: str) -> None:
     for key, value in positive.items():
         if value is not None and not value > 0:
             raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
+    config.coils.check(where)
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:

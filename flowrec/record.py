@@ -136,6 +136,7 @@ def record(
         config.mission.start,
         duration_s=config.duration_s,
         realtime=realtime,
+        coils=config.coils,
     )
     worker: Worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
     if fields:
