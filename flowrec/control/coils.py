@@ -20,7 +20,7 @@ from flowrec.units import seconds
 Matrix3 = tuple[Coilwise, Coilwise, Coilwise]
 _TURN_RAD = 2.0 * math.pi
 _FADE_SHARE = 0.1  # below this share of the full amplitude the compensation of the bias fades with the field
-_WORST_CONDITION = 1e3
+WORST_CONDITION = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class Coils:
             if not np.isfinite(getattr(self, key)).all():
                 raise UsageError(f"{where}: coils.{key} = {getattr(self, key)}: must be finite numbers")
         _, strength, across = np.linalg.svd(np.array(self.mt_per_a).T)
-        if strength[-1] * _WORST_CONDITION <= strength[0]:
+        if strength[-1] * WORST_CONDITION <= strength[0]:
             raise UsageError(
                 f"{where}: coils.mt_per_a: no currents make a field along {named(across[-1])} "
                 f"({strength[-1]:.3g} mT/A, {strength[0]:.3g} in the best direction); three coils must span the room; "
