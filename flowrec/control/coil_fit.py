@@ -167,10 +167,11 @@ def _refuse_too_little(excitations: Excitations) -> None:
         why = f"the currents of coils {names} always change together, so their fields can not be told apart"
     else:
         why = f"coil{'s' if len(coils) > 1 else ''} {names} {'were' if len(coils) > 1 else 'was'} hardly driven"
-    rows = []
-    for c in coils if len(missing) == len(coils) else coils[:1]:
-        for sign in (1.0, -1.0):
-            rows.append(",".join(f"{sign * level:g}" if k == c else "0" for k in range(3)))
+    rows = [
+        ",".join(f"{sign * level:g}" if k == c else "0" for k in range(3))
+        for c in (coils if len(missing) == len(coils) else coils[:1])
+        for sign in (1.0, -1.0)
+    ]
     raise UsageError(f"{where}: {why}; add rows with the currents {' and '.join(rows)} A")
 
 

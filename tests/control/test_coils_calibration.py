@@ -119,7 +119,7 @@ def test_excitations_that_do_not_suffice_are_refused_with_those_to_add(currents,
 
 def test_a_probe_with_a_dead_axis_makes_no_coils():
     table = measured(1)
-    with pytest.raises(UsageError, match="no field along z .*probe axis dead"):
+    with pytest.raises(UsageError, match=r"no field along z .*probe axis dead"):
         fit_coils(Excitations(table.currents_a, table.field_mt * [1.0, 1.0, 0.0], table.lines, "made up"))
 
 
