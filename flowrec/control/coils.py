@@ -54,9 +54,7 @@ class Coils:
             return previous
         dt_s = seconds(demand.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         now = course(*self.state_and_order(previous)).after(dt_s) if previous is not None else Rotation()
-        assert robot.step_out_hz is not None, "robot is resolved with the chip"
-        followed_hz = robot.step_out_margin * robot.step_out_hz
-        full_mt = reach_of(self).amplitude_mt(followed_hz)
+        full_mt, followed_hz = self.full_mt(robot), _followed_hz(robot)
         amplitude_mt = self._ramped_mt(now.amplitude_mt, dt_s, full_mt, finished or math.isnan(demand.error_um))
         # The torque goes with the field, and so does the frequency up to which the robot follows it.
         limit_hz = followed_hz * min(amplitude_mt / self.amplitude_mt, 1.0)
@@ -80,6 +78,14 @@ class Coils:
             limit_hz=limit_hz,
             voltages_v=voltages[0],
         )
+
+    def full_mt(self, robot: Robot) -> float:
+        """The amplitude to run at: as wanted, or what currents and voltages leave of it for this robot."""
+        return reach_of(self).amplitude_mt(_followed_hz(robot))
+
+    def fastest_um_s(self, robot: Robot) -> float:
+        """The robot's speed at the highest frequency up to which it follows that amplitude."""
+        return robot.um_per_rev * _followed_hz(robot) * min(self.full_mt(robot) / self.amplitude_mt, 1.0)
 
     @property
     def ramp_mt_s(self) -> float:
@@ -184,6 +190,12 @@ class Coils:
         step_mt = self.ramp_mt_s * dt_s if self.ramp_s > 0.0 else self.amplitude_mt
         goal_mt = 0.0 if off else full_mt
         return max(last_mt - step_mt, goal_mt) if last_mt > goal_mt else min(last_mt + step_mt, goal_mt)
+
+
+def _followed_hz(robot: Robot) -> float:
+    """Up to where the robot follows the wanted amplitude, with the margin."""
+    assert robot.step_out_hz is not None, "robot is resolved with the chip"
+    return robot.step_out_margin * robot.step_out_hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)

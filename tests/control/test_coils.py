@@ -4,7 +4,8 @@ from itertools import groupby
 import numpy as np
 import pytest
 
-from flowrec.config import load_config
+from flowrec.chip import load_chip
+from flowrec.config import load_config, resolve
 from flowrec.control import Coils
 from flowrec.control.amplifier import Amplifier
 from flowrec.control.coils import reach_of
@@ -147,6 +148,7 @@ def test_voltages_limit_the_field_and_the_frequency_at_once_where_they_agree():
     assert reach_of(coils).room_mt(fast.frequency_hz) == pytest.approx(fast.amplitude_mt), "all the field for it"
     assert fast.frequency_hz > 1.05 * 18.0 * reach_of(coils).room_mt(18.0) / 4.0, "more than at the full frequency"
     assert slow.amplitude_mt == fast.amplitude_mt, "no waiting for the field when the frequency rises again"
+    assert coils.fastest_um_s(ROBOT) == pytest.approx(25.0 * fast.frequency_hz)
     volts = np.abs([c.voltages_v for c in said])
     assert 9.5 < volts.max() <= 10.0, "all that the ramp leaves: here 4 %"
     frequencies = np.array([c.frequency_hz for c in said[:450]])
@@ -187,3 +189,12 @@ def test_coils_that_can_not_be_are_refused_before_anything_is_switched_on(key, v
         load_config(None, ["coils.bias_mt=[0.0, 9.6, 0.0]"])
     with pytest.raises(UsageError, match=r"max_voltage_v = 0.05 V: coil z needs all of it against coils\.bias_mt"):
         load_config(None, ["coils.amplifier.max_voltage_v=0.05", "coils.bias_mt=[0.0, 0.0, 0.1]"])
+
+
+def test_a_plan_is_made_for_the_speed_that_the_coils_leave_the_robot():
+    sets = ["coils.max_current_a=1.5", "robot.max_speed_um_s=600"]
+    config = load_config(None, sets)
+    resolved = resolve(config, load_chip(config.chip))
+    share = 1.5 * 1.5 / 4.0  # of the full field, by the z coil
+    assert resolved.robot.max_speed_um_s == pytest.approx(600.0 * 1.2 * 0.9 * share, abs=0.1)
+    assert resolve(resolved, load_chip(config.chip)).robot == resolved.robot

@@ -117,6 +117,7 @@ def test_inductive_coils_driven_with_these_voltages_make_this_field():
             state = played.after
             wanted.append(played.field_mt)
             volts.append(played.voltages_v)
+    assert np.abs(volts).max() <= INDUCTIVE.max_voltage_v
     wanted, volts = np.concatenate(wanted), np.concatenate(volts) * np.array(INDUCTIVE.v_per_v)
     ohm, henry = np.array(INDUCTIVE.resistance_ohm), 1e-3 * np.array(INDUCTIVE.inductance_mh)
     fine = 50  # steps of Euler's method in a sample
