@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from flowrec.control.coils import WORST_CONDITION, named
 from flowrec.control.excitations import Excitations
+from flowrec.control.reach import WORST_CONDITION, named
 from flowrec.errors import UsageError
 
 _UNKNOWNS = 4  # of each axis: three coils and the bias

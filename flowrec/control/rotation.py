@@ -10,7 +10,8 @@ B = a (z cos theta + h sin theta). With every new command
   what is left of the turn is done there at once: half a revolution is the longest that a turn can last;
 - the amplitude goes to the new one at the rate of the ramp. Without a field the plane is free.
 
-Nothing here jumps but derivatives: B is continuous.
+Nothing here jumps but derivatives: B is continuous. While the plane turns a roller also creeps sideways, by up to
+um_per_rev / 4 pi for each radian (2 um at 25 um per revolution), to either side by chance; that is not counted.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
@@ -55,6 +55,7 @@ def test_the_circle_is_round_and_no_sample_is_further_from_the_last_than_the_fie
 
 @settings(max_examples=150, deadline=None)
 @given(situations(), st.integers(1, 400), st.integers(1, 400))
+@example((Rotation(0.0, 2.0, 0.125), Order(0.9375, 0.0, 0.0, 0.9375, 20.0)), 125, 3)  # ends on a sample
 def test_two_blocks_on_end_are_one_of_both_lengths(situation, first, second):
     state, order = situation
     whole = block(COILS, state, order, first + second)
@@ -65,8 +66,9 @@ def test_two_blocks_on_end_are_one_of_both_lengths(situation, first, second):
             np.concatenate([getattr(one, name), getattr(two, name)]), getattr(whole, name), atol=1e-9
         )
     np.testing.assert_allclose(np.concatenate([one.voltages_v, two.voltages_v]), whole.voltages_v, atol=1e-6)
-    assert math.cos(two.after.phase_rad - whole.after.phase_rad) == pytest.approx(1.0)
     assert two.after.amplitude_mt == pytest.approx(whole.after.amplitude_mt)
+    if whole.after.amplitude_mt > 0.0:  # without a field a phase says nothing
+        assert math.cos(two.after.phase_rad - whole.after.phase_rad) == pytest.approx(1.0)
 
 
 @settings(max_examples=200, deadline=None)
