@@ -297,6 +297,23 @@ def compare(
     raise typer.Exit(0 if comparison.identical else 3)
 
 
+@app.command()
+def calibrate(
+    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
+    out: Annotated[Path | None, typer.Option(metavar="TOML", help="Write the [coils] of a configuration.")] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit the coils' field per ampere and the bias to measured fields, and say how far they are to be trusted."""
+    from flowrec import calibrate as verb
+
+    fit = verb.calibrate(file, out, overwrite)
+    if as_json:
+        typer.echo(json.dumps(verb.figures(fit)))
+    else:
+        verb.show(fit, out)
+
+
 @bench.command("loop")
 def bench_loop(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,

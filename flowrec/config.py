@@ -151,6 +151,10 @@ def resolve(config: Config, chip: Chip) -> Config:
     if robot.step_out_hz is None:
         robot = replace(robot, step_out_hz=1.2 * robot.max_speed_um_s / robot.um_per_rev)
     assert robot.max_speed_um_s is not None
+    # Coils that can not make the full field can not make the robot as fast either; plans must know.
+    if config.coils.full_mt(robot) < config.coils.amplitude_mt:
+        robot = replace(robot, max_speed_um_s=min(robot.max_speed_um_s, round(config.coils.fastest_um_s(robot), 1)))
+    assert robot.max_speed_um_s is not None
     if camera.rate_hz is None:
         rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), 100.0)
         camera = replace(camera, rate_hz=round(rate, 1))
@@ -272,6 +276,7 @@ def _refuse_nonsense(config: Config, where: str) -> None:
     for key, value in positive.items():
         if value is not None and not value > 0:
             raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
+    config.coils.check(where)
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import typing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -58,8 +58,8 @@ class Message:
         """Bit for bit the same record (NaN equals NaN)."""
         if type(other) is not type(self):
             return False
-        for field in fields(self):  # type: ignore[arg-type]
-            mine, theirs = getattr(self, field.name), getattr(other, field.name)
+        for part in fields(self):  # type: ignore[arg-type]
+            mine, theirs = getattr(self, part.name), getattr(other, part.name)
             if isinstance(mine, np.ndarray) and isinstance(theirs, np.ndarray):
                 if mine.shape != theirs.shape or mine.tobytes() != theirs.tobytes():
                     return False
@@ -205,11 +205,14 @@ class Currents(Message):
 
     stamp_ns: int
     frequency_hz: float
-    heading_rad: float
+    heading_rad: float  # where the robot is to go
     amplitude_mt: float
     phase_rad: float  # one accumulator over all frequency and heading changes
     currents_a: Vector  # (3,) x, y, z at this phase
-    saturated: bool
+    saturated: bool  # the coils can not make the full amplitude
+    plane_rad: float = 0.0  # heading of the plane that the field turns in, on its way to heading_rad or its opposite
+    limit_hz: float = 0.0  # up to here a robot follows this amplitude; the field's direction never turns faster
+    voltages_v: Vector = field(default_factory=lambda: np.zeros(3))  # (3,) what is put out; none in older files
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -78,6 +78,12 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
     chip = load_chip(config.chip)
     config = resolve(config, chip)
     assert config.robot.max_speed_um_s is not None
+    full_mt = config.coils.full_mt(config.robot)
+    if full_mt < config.coils.amplitude_mt:
+        warn(
+            f"coils and amplifiers make {full_mt:.2g} of {config.coils.amplitude_mt:g} mT: the robot follows it up to "
+            f"{config.robot.max_speed_um_s:.0f} um/s; see coils.max_current_a and coils.amplifier"
+        )
     for opening in chip.openings:
         if opening.kind == "inlet" and opening.value > config.robot.max_speed_um_s:
             warn(
@@ -136,6 +142,7 @@ def record(
         config.mission.start,
         duration_s=config.duration_s,
         realtime=realtime,
+        coils=config.coils,
     )
     worker: Worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
     if fields:

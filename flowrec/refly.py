@@ -41,7 +41,14 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
         flown = replace(config, mission=mission)
         pipeline = assemble(flown, done.chip)
         rig = SimulatedRig(
-            done.chip, flown.robot, pipeline.calibration, flown.camera, flown.simulated, start, true_field=flow
+            done.chip,
+            flown.robot,
+            pipeline.calibration,
+            flown.camera,
+            flown.simulated,
+            start,
+            true_field=flow,
+            coils=flown.coils,
         )
         known: Mapping[str, FlowField] = {
             key: value for key in ("assumed", "refined") if (value := getattr(tick, key)) is not None

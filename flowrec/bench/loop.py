@@ -82,6 +82,7 @@ def prepare_inputs(config: Config, pipeline: Pipeline, ticks: int) -> list[Input
         config.simulated,
         config.mission.start,
         duration_s=ticks / (config.camera.rate_hz or RATE_HZ),
+        coils=config.coils,
     )
     kept = Keep()
     with progress("preparing frames", ticks) as done:

@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import check_point, clearance_um
+from flowrec.control.coils import Coils
+from flowrec.control.rotation import Order, Rotation, course
 from flowrec.errors import RigError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
@@ -66,6 +68,7 @@ class SimulatedRig:
     duration_s : None goes on for ever
     realtime : pace the frames to the wall clock; none is skipped, a late one is just late
     true_field : a flow to use instead of solving for one, for tests and for known flows
+    coils : how strong the field is beside the full one, and the currents it takes; None: always full, as commanded
 
     Raises RigError or ChipError for settings that no world can be made of.
     """
@@ -81,6 +84,7 @@ class SimulatedRig:
         duration_s: float | None = None,
         realtime: bool = False,
         true_field: FlowField | None = None,
+        coils: Coils | None = None,
     ) -> None:
         _refuse_nonsense(camera, simulated)
         check_point(chip, start_um, "start", robot.radius)
@@ -97,8 +101,10 @@ class SimulatedRig:
         self._field = true_field
         self._delay_ns = nanoseconds(robot.delay if simulated.delay_s is None else simulated.delay_s)
         self._now_ns = 0
-        # What the coils do now, and what is on its way to them: (stamp of its effect, command).
+        self._coils = coils
+        # What the coils were told last and where their field is; what is on its way: (stamp of its effect, command).
         self._acting: Currents | None = None
+        self._rotation = Rotation()
         self._coming: list[tuple[int, Currents]] = []
         self._latest: Currents | None = None
 
@@ -186,21 +192,42 @@ class SimulatedRig:
             if end > now and self._acting is None:
                 swimmer.advance(seconds(end - now), 0.0, 0.0, 0.0)
             elif end > now and self._acting is not None:
-                field = self._acting
-                swimmer.advance(seconds(end - now), field.frequency_hz, field.heading_rad, field.amplitude_mt)
-                if field.amplitude_mt > 0:
-                    heading = np.array([math.cos(field.heading_rad), math.sin(field.heading_rad)])
-                    turns += field.frequency_hz * seconds(end - now) * heading
+                turns += self._turn(swimmer, self._acting, seconds(end - now))
             now = end
             if not (self._coming and self._coming[0][0] <= now):
                 return turns
             self._acting = self._coming.pop(0)[1]
 
+    def _turn(self, swimmer: Swimmer, command: Currents, duration_s: float) -> NDArray[np.float64]:
+        """Let the field turn, and the robot with it, as control/rotation.py says. Returns the turns (2,)."""
+        way = course(self._rotation, _order(command))
+        self._rotation = way.after(duration_s)
+        turns = np.zeros(2)
+        full_mt = self._coils.amplitude_mt if self._coils is not None else 0.0
+        strength = min(command.amplitude_mt / full_mt, 1.0) if full_mt > 0.0 else float(command.amplitude_mt > 0.0)
+        for leg in way.legs(duration_s):
+            swimmer.advance(leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
+            if strength > 0.0:
+                heading = np.array([math.cos(leg.heading_rad), math.sin(leg.heading_rad)])
+                turns += leg.frequency_hz * leg.duration_s * heading
+        return turns
+
     def _applied(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
-        field = self._acting
-        if field is None:
+        command, now = self._acting, self._rotation
+        if command is None:
             return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(_COILS), turns)
-        return Applied(stamp_ns, field.frequency_hz, field.heading_rad, field.amplitude_mt, field.currents_a, turns)
+        currents = command.currents_a
+        if self._coils is not None:
+            field = self._coils.field_mt(now.phase_rad, now.plane_rad, command.amplitude_mt)
+            currents = self._coils.currents_a(field, command.amplitude_mt)
+        heading = course(now, _order(command)).heading_rad(0.0)
+        return Applied(stamp_ns, command.frequency_hz, heading, command.amplitude_mt, currents, turns)
+
+
+def _order(command: Currents) -> Order:
+    """What a command asks of the field; its amplitude, already on a ramp, at once."""
+    c = command
+    return Order(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz)
 
 
 def _refuse_nonsense(camera: CameraSettings, simulated: Simulated) -> None:

@@ -117,8 +117,12 @@ class Swimmer:
         x, y = self.position_um / self._um_per_px
         return float(bilinear(self._clearance, x, y)) - self._robot.radius
 
-    def advance(self, duration_s: float, frequency_hz: float, heading_rad: float, amplitude_mt: float) -> None:
-        """Move on for a while under a constant field. Without amplitude the robot only drifts."""
+    def advance(self, duration_s: float, frequency_hz: float, heading_rad: float, strength: float) -> None:
+        """Move on for a while under a constant field, as strong as the full one or a share of it.
+
+        The torque goes with the field, so the robot steps out at that share of the frequency; without a field it
+        only drifts.
+        """
         if self.gone or duration_s <= 0:
             return
         steps = max(4, math.ceil(duration_s / _SUBSTEP_S))
@@ -126,7 +130,7 @@ class Swimmer:
         keep = math.exp(-duration_s / _MEMORY_S)
         self._wander = keep * self._wander + math.sqrt(1 - keep**2) * self._rng.standard_normal(2)
         noise = self._rng.standard_normal((steps, 2)) * (self._simulated.position_noise_um * math.sqrt(dt))
-        speed = self._robot.rolled_speed_um_s(frequency_hz) if amplitude_mt > 0 else 0.0
+        speed = strength * self._robot.rolled_speed_um_s(frequency_hz / strength) if strength > 0 else 0.0
         speed *= 1.0 + self._simulated.speed_noise * self._wander[1]
         heading = heading_rad + self._simulated.heading_noise_rad * self._wander[0]
         touched, free = self._run(speed * math.cos(heading), speed * math.sin(heading), dt, noise)

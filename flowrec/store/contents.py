@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import MISSING, fields
 from pathlib import Path
 
 from google.protobuf import descriptor_pb2
@@ -106,11 +107,22 @@ class Contents:
             return
         with self.source.parsing(0):
             theirs, ours = _fields_of(found.data), _fields_of(expected.data)
+        # A field that has come since is empty in an older file; where the message allows for that, it is read.
+        if same_kind and theirs < ours and {name for name, _ in ours - theirs} <= _may_be_missing(channel.topic):
+            return
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
             f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
             f" read it with flowrec {self.flowrec_version}, which wrote it (this is {flowrec.__version__})"
         )
+
+
+def _may_be_missing(topic: str) -> set[str]:
+    """Fields of the topic's message that have a default, and what only they need."""
+    kind = BY_PATH[topic].type
+    needed = {part.name for part in fields(kind) if part.default is MISSING and part.default_factory is MISSING}  # type: ignore[arg-type]
+    known = _fields_of(codec_of(kind).schema.data)
+    return {name for name, _ in known if name.removeprefix(f"{kind.__name__}.") not in needed}
 
 
 def _fields_of(data: bytes) -> set[tuple[str, bytes]]:

@@ -8,6 +8,7 @@ import pytest
 
 from flowrec.chip import ChipSettings, load_chip
 from flowrec.chip.calibration import Calibration
+from flowrec.control import Coils
 from flowrec.errors import ChipError, RigError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Currents, FlowField
@@ -105,6 +106,38 @@ def test_several_commands_on_their_way_are_obeyed_in_order():
 def test_above_step_out_the_robot_rolls_slower():
     far = {f: fly(rig_with(), {0: command(f)})[-1].truth.position_um[0] for f in (20.0, 24.0, 40.0)}
     assert far[24.0] > far[20.0] > far[40.0] > 1000.0
+
+
+def test_the_simulated_field_turns_to_a_new_heading_within_half_a_revolution_and_carries_the_robot_all_the_while():
+    # With nothing left to turn the plane with, the new heading waits for the field to stand on z; 12.5 Hz from 0.04 s
+    # on stands there every 0.04 s, so at 0.16 s, where the command of frame 3 (sent at 0.1 s) is 20 ms old.
+    limit = {"limit_hz": 12.5}
+    seen = fly(rig_with(), {0: replace(command(12.5), **limit), 3: replace(command(12.5, 1.2), **limit)})
+    turns = np.array([i.applied.turns for i in seen])
+    waited = 12.5 * (0.16 - 4 / 30) * np.array([1.0, 0.0])
+    turned = 12.5 * (5 / 30 - 0.16) * np.array([math.cos(1.2), math.sin(1.2)])
+    assert turns[5] == pytest.approx(waited + turned, abs=1e-6)
+    assert seen[4].applied.heading_rad == 0.0 and seen[5].applied.heading_rad == pytest.approx(1.2)
+    # With something left it does not wait so long, and back it goes at once.
+    limit = {"limit_hz": 24.0}
+    seen = fly(rig_with(), {0: replace(command(12.5), **limit), 3: replace(command(12.5, math.pi), **limit)})
+    assert seen[5].applied.turns == pytest.approx([12.5 * (2 * 0.14 - 4 / 30 - 5 / 30), 0.0], abs=1e-6)
+    positions = np.array([i.truth.position_um for i in seen])
+    moved = ROBOT.um_per_rev * np.array([i.applied.turns for i in seen])
+    assert np.allclose(np.diff(positions, axis=0), moved[1:], atol=1e-5)
+
+
+def test_currents_are_read_back_as_they_are_now_and_a_weak_field_loses_the_robot():
+    coils = Coils(bias_mt=(0.0, 0.0, 0.3))
+    first, second = command(12.0, amplitude_mt=4.0), command(12.0, amplitude_mt=1.0)
+    seen = fly(rig_with(coils=coils), {0: first, 15: second})
+    elapsed = 10 / 30 - 0.04
+    field = 4.0 * np.array([math.sin(2 * math.pi * 12.0 * elapsed), 0.0, math.cos(2 * math.pi * 12.0 * elapsed)])
+    assert seen[10].applied.currents_a == pytest.approx(field / [2.1, 1.9, 1.5] - [0.0, 0.0, 0.2], abs=1e-6)
+    x = np.array([i.truth.position_um[0] for i in seen])
+    full, weak = (x[14] - x[10]) * 30 / 4, (x[-1] - x[-5]) * 30 / 4
+    assert full == pytest.approx(12.0 * 25.0, rel=1e-3)
+    assert weak == pytest.approx(25.0 * (12.0 - math.sqrt(12.0**2 - 6.0**2)), rel=1e-3)  # a quarter of 24 Hz
 
 
 def test_a_wall_stops_the_robot_at_its_radius_and_lets_it_slide_along():

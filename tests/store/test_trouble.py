@@ -9,6 +9,7 @@ from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from google.protobuf import descriptor_pb2
@@ -20,6 +21,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from flowrec.errors import SessionError
+from flowrec.messages import Currents
 from flowrec.store import SessionReader, SessionWriter, header, layout
 from flowrec.store.mcap_file import McapFile
 from tests.store.made_up import HEADER, ticks_of
@@ -182,6 +184,24 @@ def test_a_message_that_is_laid_out_differently_is_named(tmp_path, monkeypatch):
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
     with pytest.raises(SessionError, match=r"/robot/track is laid out differently \(Track\.likeness, Track\.score\)"):
         SessionReader(tmp_path / "s.mcap")
+
+
+def test_a_file_from_before_a_message_gained_a_field_that_may_be_missing_is_read(tmp_path, monkeypatch):
+    slot = layout.SLOTS["/coils/command"]
+    files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
+    message = files.file[0].message_type[0]
+    while message.field[-1].name != "saturated":
+        del message.field[-1]
+    older = replace(slot, schema=replace(slot.schema, data=files.SerializeToString(deterministic=True)))
+    monkeypatch.setitem(layout.SLOTS, "/coils/command", older)
+    currents = Currents(
+        0, 7.0, 0.2, 3.0, 1.0, np.ones(3), False, voltages_v=np.zeros(0)
+    )  # as these leave nothing behind
+    tick = replace(TICKS[0], currents=replace(currents, stamp_ns=TICKS[0].stamp_ns))
+    with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+        writer.write(tick)
+    read = [tick.currents for tick in SessionReader(tmp_path / "s.mcap").ticks()]
+    assert read[0].same_as(tick.currents)
 
 
 def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
