@@ -103,7 +103,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
         track = inputs.track
     lap("track")
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot)
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, refined or assumed)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
     mission = p.commander.decide(
