@@ -74,8 +74,8 @@ class Controller:
 
     vector: u = sat(xd_dot - v(x+) + Kp (xd - x+)); x+ is the estimate rolled forward over the demands still on
     their way to the coils.
-    policy: u = -V grad T / |grad T| at x+, with V the robot's limit and T the route's time to go. It needs no
-    reference and no new plan wherever it is blown. Beside the goal, and on a route without T (a survey), vector.
+    policy: u = -V grad T / |grad T| at x+, with V the robot's limit and T the route's time to go; the slope is felt
+    over a radius, or over a frame's way. No reference, and no new plan wherever the robot is blown. Beside the goal, and on a route without T (a survey), vector.
     ff_fb: the paper's feedforward-feedback law, made sound, with the map's flow; ff_fb_literal as it is printed,
     ff_fb_no_flow without flow compensation, ff_fb_observer with the observer's flow.
 
@@ -133,7 +133,7 @@ class Controller:
             place = self._place(previous, mission, estimate, point)
             aim = _Aim.at_rest(place, estimate.position_um)
         elif self.method == "policy" and route.time_to_go_s is not None:
-            aim = self._homing(route, route.time_to_go_s, estimate, point, robot, um_per_px)
+            aim = self._homing(route, route.time_to_go_s, estimate, point, robot, um_per_px, limit_um_s * dt_s)
         else:
             aim = self._following(previous, mission, route, estimate, belief, robot, limit_um_s, dt_s)
         demand, cut = np.zeros(2), False
@@ -199,10 +199,12 @@ class Controller:
         point: Vector,
         robot: Robot,
         um_per_px: float,
+        frame_um: float,
     ) -> _Aim:
-        """Down the slope of the time to go. There is no error but to have left where that is known."""
+        """Down the time to go. There is no error but to have left where that is known; `frame_um` is swum a frame."""
         goal = route.waypoints_um[-1]
-        if _distance(goal, point) <= max(self.hold_radii * robot.radius, um_per_px):
+        left_um = _distance(goal, point)
+        if left_um <= max(self.hold_radii * robot.radius, um_per_px):
             return _Aim.at_rest(goal, estimate.position_um, float(route.arrival_s[-1]))
         progress_s = nearest_on(route, estimate.position_um)
         return _Aim(
@@ -211,7 +213,7 @@ class Controller:
             moving_um_s=np.zeros(2),
             progress_s=progress_s,
             error_um=astray_um(time_to_go_s, um_per_px, estimate.position_um),
-            heading=downhill(time_to_go_s, um_per_px, point),
+            heading=downhill(time_to_go_s, um_per_px, point, min(max(robot.radius, frame_um), left_um)),
         )
 
     @staticmethod
@@ -244,7 +246,7 @@ class Controller:
             return limit_um_s * aim.heading, False
         if self.method in _PAPER:
             law, flow_of = _PAPER[self.method]
-            error, flow = aim.reference_um - estimate.position_um, flow_of(field, estimate)
+            error, flow = aim.reference_then_um - estimate.position_um, flow_of(field, estimate)
             return shortened(law(error, aim.moving_um_s, flow, self.ff_fb_kp_per_s, dt_s), limit_um_s)
         wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, _quicker(self.kp_per_s, robot, dt_s))
         return saturated(wanted, belief.at(point), limit_um_s)
