@@ -92,8 +92,8 @@ class Controller:
     map_error: float = 0.3  # share of the flow's speed that the map is thought to be wrong by
     observer_lag_s: float = 0.3  # how far behind a changing flow an observer without a map is thought to be
     guard_radii: float = 1.1  # clearance kept from walls, in robot radii; 0: no wall guard
-    guard_per_s: float = 5.0  # how fast the room left above that may be used up
-    hold_radii: float = 0.5  # so near to the goal the policy hands over
+    guard_per_s: float = 12.0  # how fast the room left above that may be used up
+    hold_radii: float = 0.5  # so near to the goal, or a frame's way, the policy hands over to vector
     blind_s: float = 0.5  # while the robot is not seen the demand dies away with this time constant
 
     def control(
@@ -204,7 +204,7 @@ class Controller:
         """Down the time to go. There is no error but to have left where that is known; `frame_um` is swum a frame."""
         goal = route.waypoints_um[-1]
         left_um = _distance(goal, point)
-        if left_um <= max(self.hold_radii * robot.radius, um_per_px):
+        if left_um <= max(self.hold_radii * robot.radius, um_per_px, frame_um):
             return _Aim.at_rest(goal, estimate.position_um, float(route.arrival_s[-1]))
         progress_s = nearest_on(route, estimate.position_um)
         return _Aim(
