@@ -64,8 +64,8 @@ class _Aim:
     heading: Vector | None = None
 
     @staticmethod
-    def at_rest(place_um: Vector, position_um: Vector, progress_s: float = 0.0) -> _Aim:
-        return _Aim(place_um, place_um, np.zeros(2), progress_s, _distance(place_um, position_um))
+    def at_rest(place_um: Vector, position_um: Vector) -> _Aim:
+        return _Aim(place_um, place_um, np.zeros(2), 0.0, _distance(place_um, position_um))
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,8 @@ class Controller:
             place = self._place(previous, mission, estimate, point)
             aim = _Aim.at_rest(place, estimate.position_um)
         elif self.method == "policy" and route.time_to_go_s is not None:
-            aim = self._homing(route, route.time_to_go_s, estimate, point, robot, um_per_px, limit_um_s * dt_s)
+            frame_um = (limit_um_s + _length(belief.at(point))) * dt_s
+            aim = self._homing(route, route.time_to_go_s, estimate, point, robot, um_per_px, frame_um)
         else:
             aim = self._following(previous, mission, route, estimate, belief, robot, limit_um_s, dt_s)
         demand, cut = np.zeros(2), False
@@ -201,19 +202,20 @@ class Controller:
         um_per_px: float,
         frame_um: float,
     ) -> _Aim:
-        """Down the time to go. There is no error but to have left where that is known; `frame_um` is swum a frame."""
+        """Down the time to go, and to rest at its end; `frame_um` is how far the robot may come in a frame."""
         goal = route.waypoints_um[-1]
         left_um = _distance(goal, point)
-        if left_um <= max(self.hold_radii * robot.radius, um_per_px, frame_um):
-            return _Aim.at_rest(goal, estimate.position_um, float(route.arrival_s[-1]))
-        progress_s = nearest_on(route, estimate.position_um)
+        hold = left_um <= max(self.hold_radii * robot.radius, um_per_px, frame_um)
+        progress_s = float(route.arrival_s[-1]) if hold else nearest_on(route, estimate.position_um)
+        reach_um = min(max(robot.radius, frame_um), left_um)
         return _Aim(
-            reference_um=place_on(route, progress_s),
+            reference_um=goal if hold else place_on(route, progress_s),
             reference_then_um=goal,
             moving_um_s=np.zeros(2),
             progress_s=progress_s,
+            # Off the route is no error where a way is known.
             error_um=astray_um(time_to_go_s, um_per_px, estimate.position_um),
-            heading=downhill(time_to_go_s, um_per_px, point, min(max(robot.radius, frame_um), left_um)),
+            heading=None if hold else downhill(time_to_go_s, um_per_px, point, reach_um),
         )
 
     @staticmethod
@@ -269,6 +271,10 @@ def _hurry(robot: Robot) -> float:
 def _quicker(per_s: float, robot: Robot, dt_s: float) -> float:
     """A rate for this robot; what is held for a whole frame must not undo more than a third of an error in one."""
     return max(per_s, min(per_s * _hurry(robot), _LARGEST_SHARE / dt_s)) if dt_s > 0.0 else per_s
+
+
+def _length(vector: Vector) -> float:
+    return math.hypot(vector[0], vector[1])
 
 
 def _distance(a: Vector, b: Vector) -> float:
