@@ -133,8 +133,7 @@ class Controller:
             place = self._place(previous, mission, estimate, point)
             aim = _Aim.at_rest(place, estimate.position_um)
         elif self.method == "policy" and route.time_to_go_s is not None:
-            frame_um = (limit_um_s + _length(belief.at(point))) * dt_s
-            aim = self._homing(route, route.time_to_go_s, estimate, point, robot, um_per_px, frame_um)
+            aim = self._homing(route, route.time_to_go_s, estimate, belief.at(point), point, robot, um_per_px, dt_s)
         else:
             aim = self._following(previous, mission, route, estimate, belief, robot, limit_um_s, dt_s)
         demand, cut = np.zeros(2), False
@@ -197,17 +196,22 @@ class Controller:
         route: Route,
         time_to_go_s: NDArray[np.float32],
         estimate: Estimate,
+        flow_um_s: Vector,
         point: Vector,
         robot: Robot,
         um_per_px: float,
-        frame_um: float,
+        dt_s: float,
     ) -> _Aim:
-        """Down the time to go, and to rest at its end; `frame_um` is how far the robot may come in a frame."""
+        """Down the time to go, and to rest at its end."""
         goal = route.waypoints_um[-1]
         left_um = _distance(goal, point)
-        hold = left_um <= max(self.hold_radii * robot.radius, um_per_px, frame_um)
+        drift = flow_um_s / robot.speed_limit_um_s
+        fastest = 1.0 + _length(drift)  # over ground, as a share of the robot's own speed
+        frame_um = robot.speed_limit_um_s * dt_s
+        hold = left_um <= max(self.hold_radii * robot.radius, um_per_px, fastest * frame_um)
         progress_s = float(route.arrival_s[-1]) if hold else nearest_on(route, estimate.position_um)
-        reach_um = min(max(robot.radius, frame_um), left_um)
+        # The slope of pixels is felt over two of them; beyond the goal there is nothing to be felt.
+        reach_um = min(max(robot.radius, 2.0 * um_per_px, frame_um), left_um / fastest)
         return _Aim(
             reference_um=goal if hold else place_on(route, progress_s),
             reference_then_um=goal,
@@ -215,7 +219,7 @@ class Controller:
             progress_s=progress_s,
             # Off the route is no error where a way is known.
             error_um=astray_um(time_to_go_s, um_per_px, estimate.position_um),
-            heading=None if hold else downhill(time_to_go_s, um_per_px, point, reach_um),
+            heading=None if hold else downhill(time_to_go_s, um_per_px, point, reach_um, drift),
         )
 
     @staticmethod
