@@ -59,7 +59,7 @@ class Flight:
     @property
     def error_um(self) -> NDArray[np.float64]:
         """(n,) distance to the reference."""
-        return np.hypot(*(self.reference_um - self.position_um).T)
+        return np.asarray(np.hypot(*(self.reference_um - self.position_um).T))
 
 
 def lemniscate(turns: int = 2) -> Route:
@@ -75,8 +75,8 @@ def vortex_map(error: float) -> FlowField:
     """The vortex, too strong by a share."""
     size = round(2 * CENTRE_UM / _UM_PER_PX) + 1
     y, x = np.mgrid[0:size, 0:size] * _UM_PER_PX - CENTRE_UM
-    velocity = (1.0 + error) * SPIN_PER_S * np.stack([-y, x], -1)
-    zero = np.zeros((size, size))
+    velocity = ((1.0 + error) * SPIN_PER_S * np.stack([-y, x], -1)).astype(np.float32)
+    zero = np.zeros((size, size), np.float32)
     return FlowField(0, 0, "vortex", _UM_PER_PX, velocity, zero, None, np.zeros(0), 1.0, 1000.0, "")
 
 

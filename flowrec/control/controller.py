@@ -75,7 +75,8 @@ class Controller:
     vector: u = sat(xd_dot - v(x+) + Kp (xd - x+)); x+ is the estimate rolled forward over the demands still on
     their way to the coils.
     policy: u = -V grad T / |grad T| at x+, with V the robot's limit and T the route's time to go; the slope is felt
-    over a radius, or over a frame's way. No reference, and no new plan wherever the robot is blown. Beside the goal, and on a route without T (a survey), vector.
+    over a radius, or over a frame's way. No reference, and no new plan wherever the robot is blown. Beside the goal,
+    and on a route without T (a survey), vector.
     ff_fb: the paper's feedforward-feedback law, made sound, with the map's flow; ff_fb_literal as it is printed,
     ff_fb_no_flow without flow compensation, ff_fb_observer with the observer's flow.
 

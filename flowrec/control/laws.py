@@ -47,9 +47,7 @@ def ff_fb_law(error_um: Vector, moving_um_s: Vector, flow_um_s: Vector, kp_per_s
     return _ff_fb(_average_direction, error_um, moving_um_s, flow_um_s, kp_per_s, dt_s)
 
 
-def ff_fb_literal_law(
-    error_um: Vector, moving_um_s: Vector, flow_um_s: Vector, kp_per_s: float, dt_s: float
-) -> Vector:
+def ff_fb_literal_law(error_um: Vector, moving_um_s: Vector, flow_um_s: Vector, kp_per_s: float, dt_s: float) -> Vector:
     """The same as the paper prints it: the raw average of two angles, which wraps around. Only 0/0 is caught."""
     return _ff_fb(_average_angle, error_um, moving_um_s, flow_um_s, kp_per_s, dt_s)
 
