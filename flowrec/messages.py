@@ -175,6 +175,25 @@ class Estimate(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Health(Message):
+    """Whether the observer can be believed. All means are leaky; the message is their memory."""
+
+    stamp_ns: int
+    alarm: str  # nis, pulsation, tracking, parted by "; "; '' when all is well
+    nis: float  # mean normalised innovation squared; 2 when all noise is stated right
+    lost_share: float  # of the frames, without the robot
+    heard_s: float  # for how long the flow was known well enough to listen to it
+    pulsation_hz: float  # the strongest line in the flow ...
+    pulsation_share: float  # ... its amplitude as a share of the flow ...
+    line_share: float  # ... and the part of the flow's unrest that it is, 0 to 1
+    bank_re: Vector  # (24,) resonators, as shares of the flow
+    bank_im: Vector  # (24,)
+    bank_power: Vector  # (24,) mean square of what they listen to
+    mean_um_s: Vector  # (2,) flow
+    offset_share: float  # mean of what the resonators listen to, taken out of it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Observations(Message):
     """Local flow measured along the way: what a refinement may use."""
 
@@ -274,6 +293,7 @@ class Tick:
     route: Route | None = None
     track: Track | None = None
     estimate: Estimate | None = None
+    health: Health | None = None
     observations: Observations | None = None
     mission: Mission | None = None
     demand: Demand | None = None
