@@ -219,9 +219,9 @@ def memory_s(covariance: Matrix) -> float:
 def behind_s(estimate: Estimate) -> float:
     """By how much the estimated flow is that of earlier: its memory where it takes the flow for constant.
 
-    With slopes in the state a quarter of that (on missions in channels the observations then fit the flow best where
-    they are placed), with those of a map nothing.
+    With slopes in the state half of that (on missions in channels the observations then fit the flow best where they
+    are placed), with those of a map nothing.
     """
     if estimate.slopes_per_s.size == 0:
         return memory_s(estimate.covariance)
-    return 0.25 * memory_s(estimate.covariance) if len(estimate.covariance) >= 7 else 0.0
+    return 0.5 * memory_s(estimate.covariance) if len(estimate.covariance) >= 7 else 0.0
