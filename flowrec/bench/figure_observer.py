@@ -50,15 +50,17 @@ def draw(path: Path, time_s: Floats, truth: Floats, curves: dict[str, Floats], r
             told.plot(time_s, flow[:, 0], color=colour, lw=0.9, alpha=0.9, label=name)
         miss = np.hypot(*(flow - truth).T)
         kernel = np.ones(_SMOOTHED_FRAMES) / _SMOOTHED_FRAMES
-        wrong.plot(time_s, np.convolve(miss, kernel, "same"), color=colour, lw=1.3, label=name)
+        half = _SMOOTHED_FRAMES // 2
+        wrong.plot(time_s[half:-half], np.convolve(miss, kernel, "valid"), color=colour, lw=1.3, label=name)
     told.set_ylim(1.6 * truth[:, 0].min(), 1.6 * truth[:, 0].max())
     told.set_title("flow at the robot along x, 10 µm noise, 30 Hz", **_TITLE)
     told.set_ylabel("µm/s", fontsize=9, color=INK)
-    told.legend(fontsize=8, ncols=3, frameon=False, loc="upper right")
+    told.legend(fontsize=8, ncols=6, frameon=False, loc="upper right")
     wrong.set_title("error of the vector, mean over a second", **_TITLE)
     wrong.set_ylabel("µm/s", fontsize=9, color=INK)
     wrong.set_xlabel("time (s)", fontsize=9, color=INK)
     wrong.set_ylim(0.0, 90.0)
+    wrong.legend(fontsize=8, ncols=3, frameon=False, loc="upper right")
     levels = [5.0, 10.0, 15.0]
     for name, colour in COLOURS.items():
         values = [_rmse(rows, f"{level:g} um", name) for level in levels]

@@ -43,7 +43,8 @@ class Case:
 
     name: str
     noise_um: float = 10.0
-    pulsation: float = 0.0  # share of the flow, at 1 Hz
+    pulsation: float = 0.0  # share of the flow
+    pulsation_hz: float = 1.0
     gain: float = 1.0  # true um per revolution over the nominal
     map_share: float = MAP_SHARE
 
@@ -82,15 +83,15 @@ def vortex_map(share: float, um_per_px: float = 20.0) -> FlowField:
     return FlowField(0, 0, "map", um_per_px, velocity.astype(np.float32), nothing, None, np.zeros(0), 1.0, 1000.0, "")
 
 
-def drive(case: Case, seed: int = 0) -> Run:
+def drive(case: Case, seed: int = 0, laps: int = LAPS) -> Run:
     """The robot on its lemniscate: its own displacement is what the flow (Simpson's rule) leaves of the way."""
     rng = np.random.default_rng(seed)
-    count = round(LAPS * LAP_S * RATE_HZ)
+    count = round(laps * LAP_S * RATE_HZ)
     time = np.arange(count) / RATE_HZ
 
     def flow(at: Floats) -> Floats:
         away = lemniscate(at) - MIDDLE_UM
-        pulse = 1.0 + case.pulsation * np.sin(2 * np.pi * at)
+        pulse = 1.0 + case.pulsation * np.sin(2 * np.pi * case.pulsation_hz * at)
         return np.asarray(SPIN_PER_S * pulse[:, None] * np.stack([-away[:, 1], away[:, 0]], -1))
 
     place, true = lemniscate(time), flow(time)
