@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.flow import sample
 from flowrec.messages import Estimate, FlowField, Health
@@ -71,7 +73,7 @@ class HealthMonitor:
             stronger = float((estimate.flow_um_s - expected) @ expected) / size**2
             stronger = min(max(stronger, -1.0), 1.0)
             offset += share * (stronger - offset)
-            fresh = 1.0 - np.exp(-dt / np.maximum(self.periods / _BANK_HZ, 1.0))
+            fresh = _fresh(dt, self.periods)
             phase = np.exp(-2j * math.pi * _BANK_HZ * seconds(estimate.stamp_ns))
             z = z + fresh * ((stronger - offset) * phase - z)
             power = power + fresh * ((stronger - offset) ** 2 - power)
@@ -100,3 +102,9 @@ class HealthMonitor:
             mean_um_s=mean,
             offset_share=offset,
         )
+
+
+@lru_cache(maxsize=16)
+def _fresh(dt: float, periods: float) -> NDArray[np.float64]:
+    """Weight of the newest frame in each resonator."""
+    return np.asarray(1.0 - np.exp(-dt / np.maximum(periods / _BANK_HZ, 1.0)))

@@ -25,6 +25,7 @@ from flowrec.messages import Applied, Estimate, FlowField, Matrix, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
+_NONE = np.zeros(0)
 _UNKNOWN_UM = 1e4  # one sigma of a position that has never been measured
 _SLOPE_SHARE = 0.2  # one sigma of a slope that nothing is known of: v_max times this per radius
 _GAIN_SHARE = 0.15  # one sigma of the robot's um per revolution before it is estimated
@@ -74,14 +75,16 @@ class Kalman:
         kalman.x, kalman.P = state, covariance
         nis = math.nan
         surprise = np.zeros(2) if previous is None or previous.surprise.size == 0 else previous.surprise
-        seen = track.seen and bool(np.isfinite(track.position_um).all())
+        seen = track.seen and math.isfinite(float(track.position_um.sum()))
         if seen:
             innovation = track.position_um - state[:2]
             expected = covariance[:2, :2] + kalman.R
-            nis = float(innovation @ np.linalg.solve(expected, innovation))
+            xx, xy, yy = float(expected[0, 0]), float(expected[0, 1]), float(expected[1, 1])
+            x, y = float(innovation[0]), float(innovation[1])
+            nis = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
             if previous is not None:
                 share = self._watch_share(robot, seconds(track.stamp_ns - previous.stamp_ns))
-                normal = innovation / math.sqrt(0.5 * float(np.trace(expected)))
+                normal = innovation / math.sqrt(0.5 * (xx + yy))
                 size = math.hypot(normal[0], normal[1])
                 surprise = surprise + share * (min(1.0, _SURPRISE_LIMIT / max(size, 1e-9)) * normal - surprise)
             if nis <= self.gate_nis:
@@ -159,9 +162,13 @@ def carried(previous: Estimate, layout: Layout, robot: Robot) -> tuple[Floats, F
 
     So an observer goes on from another one's estimate, and one with a map from its own without.
     """
-    state, covariance = _usual(layout, robot)
     gain = previous.um_per_rev is not None
     had = Layout(slopes=len(previous.covariance) - gain == 7, gain=gain)  # a map's slopes are not of the state
+    if had == layout:
+        slopes = previous.slopes_per_s if had.slopes else _NONE
+        felt = _NONE if previous.um_per_rev is None else np.array([previous.um_per_rev])
+        return np.concatenate((previous.position_um, previous.flow_um_s, slopes, felt)), previous.covariance.copy()
+    state, covariance = _usual(layout, robot)
     kept = [0, 1, 2, 3]
     state[:4] = *previous.position_um, *previous.flow_um_s
     if layout.slopes and had.slopes:

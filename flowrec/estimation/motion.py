@@ -95,8 +95,7 @@ def noise(layout: Layout, dt: float, flow: float, slope: float, gain: float, dri
 
 def slope_of(field: FlowField, point_um: Floats) -> Floats:
     """(2, 2) 1/s: dv_i/dx_j of a map over one of its pixels."""
-    h = 0.5 * field.um_per_px
-    x, y = float(point_um[0]), float(point_um[1])
-    by_x = sample(field, np.array([x + h, y])) - sample(field, np.array([x - h, y]))
-    by_y = sample(field, np.array([x, y + h])) - sample(field, np.array([x, y - h]))
+    right, down = np.array([[0.5, 0.0], [0.0, 0.5]]) * field.um_per_px
+    by_x = sample(field, point_um + right) - sample(field, point_um - right)
+    by_y = sample(field, point_um + down) - sample(field, point_um - down)
     return np.column_stack((by_x, by_y)) / field.um_per_px
