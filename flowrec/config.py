@@ -26,7 +26,7 @@ from flowrec.chip.places import opening_point_um
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import PHASES, Commander
 from flowrec.errors import UsageError
-from flowrec.estimation import Observer, Sampler
+from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
@@ -76,6 +76,7 @@ class Config:
     start: Start = field(default_factory=Start)
     tracker: Tracker = field(default_factory=Tracker)
     observer: Observer = field(default_factory=Observer)
+    health: HealthMonitor = field(default_factory=HealthMonitor)
     sampler: Sampler = field(default_factory=Sampler)
     flow: FlowSolver = field(default_factory=FlowSolver)
     refine: Refiner = field(default_factory=Refiner)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import typing
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -38,6 +38,16 @@ def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
     return tuple(found)
 
 
+def defaulted_fields(message_type: type) -> frozenset[str]:
+    """Names of the fields with a default: those that a file made before they existed does without.
+
+    The default must be what the wire's absence means: None, an empty vector, 0, False or "".
+    """
+    return frozenset(
+        each.name for each in fields(message_type) if each.default is not MISSING or each.default_factory is not MISSING
+    )
+
+
 class Message:
     """Base of all records: fixes the dtype of the arrays and makes them read-only."""
 
@@ -58,8 +68,8 @@ class Message:
         """Bit for bit the same record (NaN equals NaN)."""
         if type(other) is not type(self):
             return False
-        for field in fields(self):  # type: ignore[arg-type]
-            mine, theirs = getattr(self, field.name), getattr(other, field.name)
+        for each in fields(self):  # type: ignore[arg-type]
+            mine, theirs = getattr(self, each.name), getattr(other, each.name)
             if isinstance(mine, np.ndarray) and isinstance(theirs, np.ndarray):
                 if mine.shape != theirs.shape or mine.tobytes() != theirs.tobytes():
                     return False
@@ -153,10 +163,34 @@ class Estimate(Message):
     stamp_ns: int
     position_um: Vector  # (2,)
     flow_um_s: Vector  # (2,) the disturbance: flow velocity at the robot
-    covariance: Matrix  # (4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
+    # (n, n) of [x, y, vx, vy], then the slopes (without a map) and um_per_rev if estimated: um2, um2/s, um2/s2, ...
+    covariance: Matrix
     nis: float  # normalised innovation squared; NaN on a frame without measurement
     measured_um: Vector  # (2,) last measured position that went in
     seen: bool
+    # (3,) of the flow at the robot: dvx/dx, dvx/dy, dvy/dx, where dvy/dy = -dvx/dx; (0,) where not known
+    slopes_per_s: Vector = field(default_factory=lambda: np.zeros(0))
+    surprise: Vector = field(default_factory=lambda: np.zeros(0))  # (2,) sliding mean of the innovations in sigma
+    um_per_rev: float | None = None  # of the robot; None where its nominal one is taken as true
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Health(Message):
+    """Whether the observer can be believed. All means are leaky; the message is their memory."""
+
+    stamp_ns: int
+    alarm: str  # nis, pulsation, tracking, parted by "; "; '' when all is well
+    nis: float  # mean normalised innovation squared; 2 when all noise is stated right
+    lost_share: float  # of the frames, without the robot
+    heard_s: float  # for how long the flow was known well enough to listen to it
+    pulsation_hz: float  # the strongest line in the flow ...
+    pulsation_share: float  # ... its amplitude as a share of the flow ...
+    line_share: float  # ... and the part of the flow's unrest that it is, 0 to 1
+    bank_re: Vector  # (24,) resonators, as shares of the flow
+    bank_im: Vector  # (24,)
+    bank_power: Vector  # (24,) mean square of what they listen to
+    mean_um_s: Vector  # (2,) flow
+    offset_share: float  # mean of what the resonators listen to, taken out of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -261,6 +295,7 @@ class Tick:
     route: Route | None = None
     track: Track | None = None
     estimate: Estimate | None = None
+    health: Health | None = None
     observations: Observations | None = None
     mission: Mission | None = None
     demand: Demand | None = None

@@ -10,6 +10,7 @@ from mcap.records import ChunkIndex, Statistics
 
 import flowrec
 from flowrec.errors import SessionError
+from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
 from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
 from flowrec.store.source import Source, Summary
@@ -106,6 +107,11 @@ class Contents:
             return
         with self.source.parsing(0):
             theirs, ours = _fields_of(found.data), _fields_of(expected.data)
+        # A field that was added since has a default, which is what its absence decodes to.
+        kind = BY_PATH[channel.topic].type
+        added = {f"{kind.__name__}.{name}" for name in defaulted_fields(kind)}
+        if same_kind and theirs <= ours and {name for name, _ in ours - theirs} <= added:
+            return
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
             f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
