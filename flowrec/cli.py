@@ -327,6 +327,23 @@ def bench_loop(
     _keep(figures, json_file)
 
 
+@bench.command("observer")
+def bench_observer(
+    session: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Also say which settings suit this recording.")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the flow as told, and the errors.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+) -> None:
+    """Error of each observer on the paper's lemniscate, and the tuning of the Kalman filter from a recording."""
+    from flowrec.bench.observer import measure, show
+
+    figures = measure(session, figure, seed)
+    show(figures)
+    _keep(figures, json_file)
+
+
 @bench.command("flow")
 def bench_flow(
     cases: Annotated[
@@ -356,6 +373,20 @@ def bench_flow(
     chosen = methods.split(",") if methods is not None else None
     trouble = Trouble(outliers, mask, observations)
     figures = measure(cases, chosen, noise, share, k, trouble, fields, figure, case)
+    show(figures)
+    _keep(figures, json_file)
+
+
+@bench.command("track")
+def bench_track(
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the ways and the errors.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5,
+) -> None:
+    """The paper's lemniscate in a vortex: how well each control law tracks it."""
+    from flowrec.bench.track import measure, show
+
+    figures = measure(seeds, figure)
     show(figures)
     _keep(figures, json_file)
 

@@ -26,7 +26,7 @@ from flowrec.chip.places import opening_point_um
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import PHASES, Commander
 from flowrec.errors import UsageError
-from flowrec.estimation import Observer, Sampler
+from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
@@ -76,6 +76,7 @@ class Config:
     start: Start = field(default_factory=Start)
     tracker: Tracker = field(default_factory=Tracker)
     observer: Observer = field(default_factory=Observer)
+    health: HealthMonitor = field(default_factory=HealthMonitor)
     sampler: Sampler = field(default_factory=Sampler)
     flow: FlowSolver = field(default_factory=FlowSolver)
     refine: Refiner = field(default_factory=Refiner)
@@ -277,6 +278,11 @@ def _refuse_nonsense(config: Config, where: str) -> None:
         if value is not None and not value > 0:
             raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
     config.coils.check(where)
+    if config.control.method == "policy" and config.plan.method != "time_field":
+        raise UsageError(
+            f"{where}: control.method = 'policy' goes down the time to go, which plan.method = {config.plan.method!r} "
+            "does not know; set plan.method = 'time_field', or control.method = 'vector'"
+        )
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:

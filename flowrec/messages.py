@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 import typing
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Annotated, Any
 
 import numpy as np
@@ -36,6 +36,16 @@ def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
                 scalar = typing.get_args(typing.get_args(typing.get_args(option)[0])[1])[0]
                 found.append((name, np.dtype(scalar)))
     return tuple(found)
+
+
+def defaulted_fields(message_type: type) -> frozenset[str]:
+    """Names of the fields with a default: those that a file made before they existed does without.
+
+    The default must be what the wire's absence means: None, an empty vector, 0, False or "".
+    """
+    return frozenset(
+        each.name for each in fields(message_type) if each.default is not MISSING or each.default_factory is not MISSING
+    )
 
 
 class Message:
@@ -153,10 +163,34 @@ class Estimate(Message):
     stamp_ns: int
     position_um: Vector  # (2,)
     flow_um_s: Vector  # (2,) the disturbance: flow velocity at the robot
-    covariance: Matrix  # (4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
+    # (n, n) of [x, y, vx, vy], then the slopes (without a map) and um_per_rev if estimated: um2, um2/s, um2/s2, ...
+    covariance: Matrix
     nis: float  # normalised innovation squared; NaN on a frame without measurement
     measured_um: Vector  # (2,) last measured position that went in
     seen: bool
+    # (3,) of the flow at the robot: dvx/dx, dvx/dy, dvy/dx, where dvy/dy = -dvx/dx; (0,) where not known
+    slopes_per_s: Vector = field(default_factory=lambda: np.zeros(0))
+    surprise: Vector = field(default_factory=lambda: np.zeros(0))  # (2,) sliding mean of the innovations in sigma
+    um_per_rev: float | None = None  # of the robot; None where its nominal one is taken as true
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Health(Message):
+    """Whether the observer can be believed. All means are leaky; the message is their memory."""
+
+    stamp_ns: int
+    alarm: str  # nis, pulsation, tracking, parted by "; "; '' when all is well
+    nis: float  # mean normalised innovation squared; 2 when all noise is stated right
+    lost_share: float  # of the frames, without the robot
+    heard_s: float  # for how long the flow was known well enough to listen to it
+    pulsation_hz: float  # the strongest line in the flow ...
+    pulsation_share: float  # ... its amplitude as a share of the flow ...
+    line_share: float  # ... and the part of the flow's unrest that it is, 0 to 1
+    bank_re: Vector  # (24,) resonators, as shares of the flow
+    bank_im: Vector  # (24,)
+    bank_power: Vector  # (24,) mean square of what they listen to
+    mean_um_s: Vector  # (2,) flow
+    offset_share: float  # mean of what the resonators listen to, taken out of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,7 +228,9 @@ class Demand(Message):
     velocity_um_s: Vector  # (2,) relative to the fluid
     reference_um: Vector  # (2,) where the robot should be now
     progress_s: float  # time along the route, slowed while the robot lags behind
-    error_um: float  # distance to the reference, NaN without one
+    # Distance to the reference, NaN without one. Under a policy, which may go another way than the route, that to the
+    # nearest place from which a way to the goal is known.
+    error_um: float
     saturated: bool
     sent_um_s: Matrix  # (m, 2) the latest demands, oldest first: what may still be on its way to the coils
 
@@ -262,6 +298,7 @@ class Tick:
     route: Route | None = None
     track: Track | None = None
     estimate: Estimate | None = None
+    health: Health | None = None
     observations: Observations | None = None
     mission: Mission | None = None
     demand: Demand | None = None

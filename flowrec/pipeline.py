@@ -18,7 +18,7 @@ from flowrec.config import Config, calibration_of
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import Commander
 from flowrec.control.narrator import narrate
-from flowrec.estimation import Observer, Sampler
+from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEvent, Route, Tick, Track, Truth
 from flowrec.planning import Planner, SurveyPlanner
@@ -54,6 +54,7 @@ class Pipeline:
     clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
     tracker: Tracker
     observer: Observer
+    health: HealthMonitor
     sampler: Sampler
     commander: Commander
     controller: Controller
@@ -76,6 +77,7 @@ def assemble(config: Config, chip: Chip) -> Pipeline:
         clearance_um=clearance_um(chip.mask, chip.um_per_px),
         tracker=config.tracker,
         observer=config.observer,
+        health=config.health,
         sampler=config.sampler,
         commander=config.mission,
         controller=config.control,
@@ -85,6 +87,12 @@ def assemble(config: Config, chip: Chip) -> Pipeline:
         survey=config.survey,
         planner=config.plan,
     )
+
+
+def _strength(coils: Coils, last: Tick) -> float:
+    """Share of its full amplitude that the field had in the tick before; all of it before there is any."""
+    full_mt = coils.amplitude_mt
+    return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
 
 
 def _no_lap(_stage: str) -> None:
@@ -103,16 +111,28 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
         track = inputs.track
     lap("track")
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot)
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, refined or assumed)
+    # The robot as it is felt, where the observer estimates how far it rolls per revolution.
+    robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
+    health = p.health.watch(last.health, last.estimate, estimate, refined or assumed, p.robot)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
     mission = p.commander.decide(
-        last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, p.robot
+        last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, robot
     )
     demand = p.controller.control(
-        last.demand, mission, route, estimate, refined or assumed, p.robot, p.clearance_um, p.chip.um_per_px
+        last.demand,
+        mission,
+        route,
+        estimate,
+        refined or assumed,
+        robot,
+        p.clearance_um,
+        p.chip.um_per_px,
+        _strength(p.coils, last),
+        p.observer.method == "kalman_map",
     )
-    currents = p.coils.drive(last.currents, demand, p.robot, mission.finished)
+    currents = p.coils.drive(last.currents, demand, robot, mission.finished)
     lap("control")
     tick = replace(
         last,
@@ -125,6 +145,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         route=route,
         track=track,
         estimate=estimate,
+        health=health,
         observations=observations,
         mission=mission,
         demand=demand,

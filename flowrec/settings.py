@@ -37,4 +37,6 @@ class Simulated:
     heading_noise_rad: float = 0.03  # the robot rolls off its heading: one sigma, forgotten within a second
     speed_noise: float = 0.02  # the same for its speed, as a share
     delay_s: float | None = None  # from command to motion; None: what the robot is assumed to have
+    pulsation_share: float = 0.0  # the true flow is the steady one times 1 + this sin(2 pi pulsation_hz t)
+    pulsation_hz: float = 1.0
     k: int = 1  # cells of the true flow per pixel side

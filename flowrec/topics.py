@@ -40,6 +40,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("route", "/plan/route", m.Route, Role.INPUT, 1e-4),
     Topic("track", "/robot/track", m.Track, Role.OUTPUT, 1e-6),
     Topic("estimate", "/robot/estimate", m.Estimate, Role.OUTPUT, 1e-6),
+    Topic("health", "/run/health", m.Health, Role.OUTPUT, 1e-6),
     Topic("observations", "/flow/observations", m.Observations, Role.OUTPUT, 1e-6),
     Topic("mission", "/run/mission", m.Mission, Role.OUTPUT, 1e-6),
     Topic("demand", "/control/demand", m.Demand, Role.OUTPUT, 1e-6),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowrec.messages import Event, Tick
+from flowrec.messages import Event, Health, Tick
 
 
 def narrate(last: Tick, tick: Tick) -> Event | None:
@@ -30,6 +30,10 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
     if tick.track is not None and last.track is not None and tick.track.seen != last.track.seen:
         lines.append("robot seen" if tick.track.seen else "robot lost from view")
         level = "info" if tick.track.seen else "warning"
+    if tick.health is not None and tick.health is not last.health:
+        lines += _alarms(last.health, tick.health)
+        if tick.health.alarm and (last.health is None or tick.health.alarm != last.health.alarm):
+            level = "warning"
     if mission is not None and (before is None or mission.phase != before.phase):
         said = f"{mission.outcome}" if mission.finished else mission.phase
         lines.append(f"mission: {said}" + (f" ({mission.note})" if mission.note else ""))
@@ -43,3 +47,15 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
     if not lines:
         return None
     return Event(tick.stamp_ns, level, "; ".join(lines))
+
+
+def _alarms(before: Health | None, health: Health) -> list[str]:
+    """What began and what ended."""
+    was = set() if before is None else set(before.alarm.split("; ")) - {""}
+    now = set(health.alarm.split("; ")) - {""}
+    said = {
+        "nis": f"the robot is moved by what the observer does not know (NIS {health.nis:.1f}, should be 2)",
+        "pulsation": f"the flow pulsates at {health.pulsation_hz:.1f} Hz by {health.pulsation_share:.0%}",
+        "tracking": f"the robot is out of sight on {health.lost_share:.0%} of the frames",
+    }
+    return [said[name] for name in sorted(now - was)] + [f"alarm over: {name}" for name in sorted(was - now)]

@@ -1,5 +1,6 @@
 """Track and applied field to Estimate; estimates to observations of the flow."""
 
+from flowrec.estimation.health import HealthMonitor
 from flowrec.estimation.kalman import Kalman
 from flowrec.estimation.luenberger import Luenberger
 from flowrec.estimation.observer import Observer
@@ -7,4 +8,4 @@ from flowrec.estimation.sampler import Sampler
 from flowrec.estimation.smoother import Smoothed, observe, smooth
 from flowrec.estimation.trimmed import Trimmed
 
-__all__ = ["Kalman", "Luenberger", "Observer", "Sampler", "Smoothed", "Trimmed", "observe", "smooth"]
+__all__ = ["HealthMonitor", "Kalman", "Luenberger", "Observer", "Sampler", "Smoothed", "Trimmed", "observe", "smooth"]

@@ -1,114 +1,218 @@
-"""`kalman`: position and flow from filterpy's Kalman filter, the flow as a random walk.
+"""`kalman` and `kalman_map`: position and flow from filterpy's Kalman filter.
 
-State [x, y, vx, vy]; x' = x + v dt + d with d the displacement by the field as really applied; v' = v + noise of
-spectral density q (continuous white acceleration of the flow along the path). The normalised innovation squared (NIS)
-has mean 2 when R and q are right.
+The state is motion.py's. `kalman` knows nothing of the channel: it estimates the flow with its slopes. `kalman_map`
+follows a known map of the flow and estimates what that misses. The normalised innovation squared (NIS) has mean 2
+when all noise is stated right.
+
+How much the flow may change is stated per way, not per time, as the flow is steady: over a way of one radius by the
+share `flow_change` (a variance) of its square. In a wide vortex it changes less than in a vessel tree, so the filter
+watches itself: innovations that keep their sign, as white ones do not, say that it is left behind; the noise is scaled
+by how much they do.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from flowrec.messages import Applied, Estimate, Matrix, Track
+from flowrec.estimation.motion import ISOTROPIC, Floats, Layout, noise, onward, slope_of
+from flowrec.flow import sample
+from flowrec.messages import Applied, Estimate, FlowField, Matrix, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
-_H = np.eye(2, 4)
-_B = np.eye(4, 2)
+_NONE = np.zeros(0)
 _UNKNOWN_UM = 1e4  # one sigma of a position that has never been measured
+_SLOPE_SHARE = 0.2  # one sigma of a slope that nothing is known of: v_max times this per radius
+_GAIN_SHARE = 0.15  # one sigma of the robot's um per revolution before it is estimated
+_GAIN_WANDERS = 0.005  # of it, within a second
+_STILL_SHARE = 0.05  # of v_max: even a robot at rest has this way behind it, as no flow is quite steady
+_SLOWEST_SHARE = 1.0 / 6.0  # of v_max: changes of a slow flow are a share of this
+_CALM, _HURRY = 0.2, 100.0  # the noise is scaled within these
+_SURPRISE_LIMIT = 4.0  # sigma: one wild measurement is no trend
 
 
 @dataclass(frozen=True, slots=True)
 class Kalman:
-    """Settings; None is scaled to the robot.
-
-    A robot of 50 um that swims at up to 600 um/s is the measure. Where it turns from one branch into another the flow
-    along its path changes by 200 um/s within 0.3 s: q = 1e4 um2/s3 follows that (13 to 16 um/s RMSE on three simulated
-    missions, 42 to 62 um/s at the 99th percentile), q = 1e3 is left behind there (76 to 90 um/s) and wins nothing
-    elsewhere. In a channel of another size and speed the flow along the path changes by v within L / v, so q goes as
-    v^3 / L.
-    """
+    """Settings; None is scaled to the robot."""
 
     position_noise_um: float | None = None  # one sigma of a measured position; None: 2 % of the radius
-    flow_noise_um2_s3: float | None = None  # q
+    # q of a plain random walk of the flow in time, um2/s3, in place of all that follows up to `watch_radii`.
+    flow_noise_um2_s3: float | None = None
+    flow_change: float = 2e-3  # variance of the flow's change over a way of one radius, as a share of its square
+    slope_change: float = 2e-5  # the same of its slopes times the radius
+    map_share: float = 0.25  # of the flow, and so of its changes, that a map misses
+    agility: float = 1.0  # all changes' variances times this: the knob of `flowrec bench observer --session`
+    watch_radii: float = 2.2  # innovations are averaged over the time that the robot needs for this way at v_max
     drift_um2_s: float = 4.0  # of the position: Brownian motion and uneven rolling
     gate_nis: float = 25.0  # a measurement less likely than this is not used at once ...
     gate_growth: float = 4.0  # ... but the position's variance is multiplied, so that a real jump is soon believed
+    # Also estimate the robot's um per revolution. It shows only against its heading: see `estimate`.
+    estimate_gain: bool = False
 
-    def flow_noise(self, robot: Robot) -> float:
-        """Spectral density q of the flow's random walk, um2/s3."""
-        assert robot.max_speed_um_s is not None
-        scale = (robot.max_speed_um_s / 600.0) ** 3 / (robot.radius / 50.0)
-        return self.flow_noise_um2_s3 if self.flow_noise_um2_s3 is not None else 1e4 * scale
+    def estimate(
+        self,
+        previous: Estimate | None,
+        track: Track,
+        applied: Applied,
+        robot: Robot,
+        field: FlowField | None = None,
+    ) -> Estimate:
+        """One predict and, where the robot was seen, one update. With a `field` it filters what that misses.
 
-    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
-        """One predict and, where the robot was seen, one update."""
-        q = self.flow_noise(robot)
+        A wrong um per revolution looks like a flow along the heading. Only turns set it apart from a flow, so with
+        `estimate_gain` the filter needs headings that vary within the memory of the flow; on a straight way its
+        variance stays what it was and the belief with it.
+        """
+        state, covariance, layout, _ = self.predict(previous, track, applied, robot, field)
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
         # State and covariance are set anew for every step: all that the filter knows is in the messages.
-        kalman = _filter(sigma_um)
-        if previous is None:
-            assert robot.max_speed_um_s is not None
-            flow_um_s = 0.5 * robot.max_speed_um_s
-            kalman.x = np.array([*track.position_um, 0.0, 0.0])
-            kalman.P = np.diag([_UNKNOWN_UM**2, _UNKNOWN_UM**2, flow_um_s**2, flow_um_s**2])
-        else:
-            kalman.x = np.concatenate((previous.position_um, previous.flow_um_s))
-            kalman.P = previous.covariance.copy()
-            dt = seconds(track.stamp_ns - previous.stamp_ns)
-            kalman.predict(
-                u=robot.um_per_rev * applied.turns, B=_B, F=transition(dt), Q=process_noise(dt, q, self.drift_um2_s)
-            )
-        nis = float("nan")
-        if track.seen:
-            innovation = track.position_um - kalman.x[:2]
-            nis = float(innovation @ np.linalg.solve(kalman.P[:2, :2] + kalman.R, innovation))
+        kalman = _filter(layout.size, sigma_um)
+        kalman.x, kalman.P = state, covariance
+        nis = math.nan
+        surprise = np.zeros(2) if previous is None or previous.surprise.size == 0 else previous.surprise
+        seen = track.seen and math.isfinite(float(track.position_um.sum()))
+        if seen:
+            innovation = track.position_um - state[:2]
+            expected = covariance[:2, :2] + kalman.R
+            xx, xy, yy = float(expected[0, 0]), float(expected[0, 1]), float(expected[1, 1])
+            x, y = float(innovation[0]), float(innovation[1])
+            nis = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+            if previous is not None:
+                share = self._watch_share(robot, seconds(track.stamp_ns - previous.stamp_ns))
+                normal = innovation / math.sqrt(0.5 * (xx + yy))
+                size = math.hypot(normal[0], normal[1])
+                surprise = surprise + share * (min(1.0, _SURPRISE_LIMIT / max(size, 1e-9)) * normal - surprise)
             if nis <= self.gate_nis:
                 kalman.update(track.position_um)
             else:
                 kalman.P[:2, :2] *= self.gate_growth
-        covariance = 0.5 * (kalman.P + kalman.P.T)
+        slopes = kalman.x[4:7] if layout.slopes else np.zeros(0)
+        if field is not None:
+            slope = slope_of(field, kalman.x[:2])
+            slopes = np.array([0.5 * (slope[0, 0] - slope[1, 1]), slope[0, 1], slope[1, 0]])
         return Estimate(
             stamp_ns=track.stamp_ns,
             position_um=kalman.x[:2],
-            flow_um_s=kalman.x[2:],
-            covariance=covariance,
+            flow_um_s=kalman.x[2:4],
+            covariance=0.5 * (kalman.P + kalman.P.T),
             nis=nis,
             measured_um=track.position_um,
-            seen=track.seen,
+            seen=seen,
+            slopes_per_s=slopes,
+            surprise=surprise,
+            um_per_rev=float(kalman.x[-1]) if layout.gain else None,
         )
 
+    def predict(
+        self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot, field: FlowField | None = None
+    ) -> tuple[Floats, Floats, Layout, Floats]:
+        """State (n,) and covariance (n, n) before the track is looked at, their layout, and the derivative (n, n)."""
+        layout = self.layout(field)
+        if previous is None:
+            state, covariance = _first(layout, track, robot, field)
+            return state, covariance, layout, np.eye(layout.size)
+        state, covariance = carried(previous, layout, robot)
+        dt = max(seconds(track.stamp_ns - previous.stamp_ns), 0.0)
+        ahead, step = onward(state, layout, applied.turns, robot.um_per_rev, dt, field, held=not previous.seen)
+        covariance = step @ covariance @ step.T + self._noise(previous, layout, ahead - state, dt, robot, field)
+        return ahead, covariance, layout, step
 
-@lru_cache(maxsize=8)
-def _filter(sigma_um: float) -> KalmanFilter:
+    def layout(self, field: FlowField | None = None) -> Layout:
+        """What the state holds."""
+        return Layout(slopes=field is None and self.flow_noise_um2_s3 is None, gain=self.estimate_gain)
+
+    def _noise(
+        self, previous: Estimate, layout: Layout, change: Floats, dt: float, robot: Robot, field: FlowField | None
+    ) -> Floats:
+        assert robot.max_speed_um_s is not None
+        gain = (_GAIN_WANDERS * robot.um_per_rev) ** 2 * dt
+        if self.flow_noise_um2_s3 is not None:
+            q = self.flow_noise_um2_s3 * (1.0 if field is None else self.map_share**2)
+            return noise(layout, dt, q * dt, 0.0, gain, self.drift_um2_s)
+        way = math.hypot(change[0], change[1]) + _STILL_SHARE * robot.max_speed_um_s * dt
+        flow = previous.flow_um_s
+        speed = math.hypot(flow[0], flow[1], _SLOWEST_SHARE * robot.max_speed_um_s)
+        unit = self.agility * self._scale(previous, robot, dt) * way / robot.radius * speed**2
+        if field is not None:
+            unit *= self.map_share**2
+        slope = self.slope_change * unit / robot.radius**2
+        return noise(layout, dt, self.flow_change * unit, slope, gain, self.drift_um2_s)
+
+    def _watch_share(self, robot: Robot, dt: float) -> float:
+        """Weight of the newest innovation in their sliding mean."""
+        assert robot.max_speed_um_s is not None
+        return min(max(dt, 0.0) * robot.max_speed_um_s / (self.watch_radii * robot.radius), 0.5)
+
+    def _scale(self, previous: Estimate, robot: Robot, dt: float) -> float:
+        """By how much the noise is scaled: 1 where the mean innovation is as large as that of white ones."""
+        share = self._watch_share(robot, dt)
+        if previous.surprise.size == 0 or share == 0.0:
+            return 1.0
+        excess = 0.5 * float(previous.surprise @ previous.surprise) * (2.0 - share) / share
+        return min(max(excess * math.sqrt(excess), _CALM), _HURRY)
+
+
+def carried(previous: Estimate, layout: Layout, robot: Robot) -> tuple[Floats, Floats]:
+    """State and covariance of a message in a layout; what the message does not hold begins with what is usual.
+
+    So an observer goes on from another one's estimate, and one with a map from its own without.
+    """
+    gain = previous.um_per_rev is not None
+    had = Layout(slopes=len(previous.covariance) - gain == 7, gain=gain)  # a map's slopes are not of the state
+    if had == layout:
+        slopes = previous.slopes_per_s if had.slopes else _NONE
+        felt = _NONE if previous.um_per_rev is None else np.array([previous.um_per_rev])
+        return np.concatenate((previous.position_um, previous.flow_um_s, slopes, felt)), previous.covariance.copy()
+    state, covariance = _usual(layout, robot)
+    kept = [0, 1, 2, 3]
+    state[:4] = *previous.position_um, *previous.flow_um_s
+    if layout.slopes and had.slopes:
+        kept += [4, 5, 6]
+        state[4:7] = previous.slopes_per_s
+    origin = list(kept)
+    if layout.gain and previous.um_per_rev is not None:
+        kept.append(layout.size - 1)
+        origin.append(had.size - 1)
+        state[-1] = previous.um_per_rev
+    covariance[np.ix_(kept, kept)] = previous.covariance[np.ix_(origin, origin)]
+    return state, covariance
+
+
+def _first(layout: Layout, track: Track, robot: Robot, field: FlowField | None) -> tuple[Floats, Floats]:
+    state, covariance = _usual(layout, robot)
+    if np.isfinite(track.position_um).all():
+        state[:2] = track.position_um
+    if field is not None:
+        state[2:4] = sample(field, state[:2])
+    return state, covariance
+
+
+def _usual(layout: Layout, robot: Robot) -> tuple[Floats, Floats]:
+    """State and covariance before anything was measured."""
+    assert robot.max_speed_um_s is not None
+    state = np.zeros(layout.size)
+    variance = np.full(layout.size, _UNKNOWN_UM**2)
+    variance[2:4] = (0.5 * robot.max_speed_um_s) ** 2
+    if layout.slopes:
+        variance[4:7] = (_SLOPE_SHARE * robot.max_speed_um_s / robot.radius) ** 2 * ISOTROPIC
+    if layout.gain:
+        state[-1] = robot.um_per_rev
+        variance[-1] = (_GAIN_SHARE * robot.um_per_rev) ** 2
+    return state, np.diag(variance)
+
+
+@lru_cache(maxsize=16)
+def _filter(size: int, sigma_um: float) -> KalmanFilter:
     """A filter for positions with this noise; making one costs as much as using it."""
-    kalman = KalmanFilter(dim_x=4, dim_z=2, dim_u=2)
-    kalman.H = _H
+    kalman = KalmanFilter(dim_x=size, dim_z=2)
+    kalman.H = np.eye(2, size)
     kalman.R = np.eye(2) * sigma_um**2
     return kalman
-
-
-@lru_cache(maxsize=16)
-def transition(dt: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """(4, 4) of the state over dt, without input."""
-    matrix = np.eye(4)
-    matrix[0, 2] = matrix[1, 3] = dt
-    return matrix
-
-
-@lru_cache(maxsize=16)
-def process_noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Process noise of a random-walk velocity over dt, with a random walk of the position on top."""
-    noise = np.zeros((4, 4))
-    for axis in (0, 1):
-        noise[axis, axis] = q * dt**3 / 3 + drift * dt
-        noise[axis, axis + 2] = noise[axis + 2, axis] = q * dt**2 / 2
-        noise[axis + 2, axis + 2] = q * dt
-    return noise
 
 
 def memory_s(covariance: Matrix) -> float:
@@ -117,3 +221,14 @@ def memory_s(covariance: Matrix) -> float:
     if coupling <= 0:
         return 0.0
     return float(min(0.5 * (covariance[0, 0] + covariance[1, 1]) / coupling, 1.0))
+
+
+def behind_s(estimate: Estimate) -> float:
+    """By how much the estimated flow is that of earlier: its memory where it takes the flow for constant.
+
+    With slopes in the state half of that (on missions in channels the observations then fit the flow best where they
+    are placed), with those of a map nothing.
+    """
+    if estimate.slopes_per_s.size == 0:
+        return memory_s(estimate.covariance)
+    return 0.5 * memory_s(estimate.covariance) if len(estimate.covariance) >= 7 else 0.0

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from flowrec.estimation.kalman import memory_s
+from flowrec.estimation.kalman import behind_s, memory_s
 from flowrec.estimation.trimmed import Trimmed
 from flowrec.messages import Estimate, Observations
 from flowrec.robot import Robot
@@ -19,15 +19,17 @@ from flowrec.units import nanoseconds, seconds
 class Sampler:
     """Keeps one observation every so often. The filter's memory makes neighbours alike and late; both are allowed for.
 
-    A filter that weighs position and velocity by gains K_x and K_v answers to a changing flow K_x / K_v later. An
-    observation is therefore placed where the robot was that long ago, and its standard deviation is raised so
-    that observations closer in time than that do not count the same noise twice.
+    A filter that weighs position and velocity by gains K_x and K_v and takes the flow for constant answers to a
+    changing one K_x / K_v later; one that knows the slopes or a map hardly lags. An observation is therefore placed
+    where the robot was that long ago, and its standard deviation is raised so that observations closer in time than
+    the filter remembers do not count the same noise twice.
     """
 
     spacing_radii: float = 0.8  # least way between two observations, in radii of the robot
-    memories: float = 2.0  # and least time, in memories of the filter
+    memories: float = 1.0  # and least time, in memories of the filter
     settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
     floor_um_s: float = 2.0  # no observation claims a smaller sigma
+    rolling_share: float = 0.02  # of the robot's own speed, one sigma: rolled off course, which passes for flow
     capacity: int = 2000  # the oldest go first
     # trimmed: as in the paper, before a refinement uses them; smoothed: by the RTS smoother, in a replay only.
     method: Literal["filter", "trimmed", "smoothed"] = "filter"
@@ -51,7 +53,10 @@ class Sampler:
             return previous
         lag_s = memory_s(estimate.covariance)
         dt = seconds(estimate.stamp_ns - before.stamp_ns)
-        position = estimate.position_um - lag_s * (estimate.position_um - before.position_um) / dt
+        if dt <= 0.0:
+            return previous
+        velocity = (estimate.position_um - before.position_um) / dt
+        position = estimate.position_um - behind_s(estimate) * velocity
         if previous is not None and len(previous.position_um):
             way = math.dist(position, previous.position_um[-1])
             soon = estimate.stamp_ns < previous.stamp_ns + nanoseconds(self.memories * lag_s)
@@ -60,7 +65,9 @@ class Sampler:
             wait_s = seconds(estimate.stamp_ns - previous.stamp_ns)
         else:
             wait_s = math.inf
-        sigma = max(self.floor_um_s, math.sqrt(variance * (1.0 + 2.0 * lag_s / wait_s)))
+        own_um_s = math.hypot(*(velocity - estimate.flow_um_s))
+        spread = variance * (1.0 + 2.0 * lag_s / wait_s) + (self.rolling_share * own_um_s) ** 2
+        sigma = max(self.floor_um_s, math.sqrt(spread))
         if previous is None:
             return Observations(estimate.stamp_ns, position[None], estimate.flow_um_s[None], np.array([sigma]))
         keep = slice(-self.capacity + 1, None)

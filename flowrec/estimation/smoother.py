@@ -1,7 +1,7 @@
 """`smoothed`: position and flow at every frame from the frames before and after it (Rauch, Tung and Striebel, 1965).
 
-The model is the Kalman filter's. Its known input, the robot's own displacement, is taken out by smoothing
-y = x - sum u instead of x, so that the backward pass needs no input: y' = y + v dt + noise.
+The model is the Kalman filter's own prediction at every frame, with the robot's displacement in it (filterpy's
+rts_smoother leaves that input out): x_s = x + C (x_s' - x'), C = P F^T P'^-1, where primes are of the next frame.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.estimation.kalman import Kalman, memory_s, process_noise, transition
+from flowrec.estimation.kalman import Kalman, carried, memory_s
 from flowrec.messages import Applied, Estimate, Matrix, Observations, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
@@ -35,25 +35,26 @@ def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, 
     for track, done in zip(tracks, applied, strict=True):
         estimates.append(kalman.estimate(estimates[-1] if estimates else None, track, done, robot))
     count = len(estimates)
-    rolled = np.array([robot.um_per_rev * done.turns for done in applied]).reshape(count, 2)
-    # The first frame's input lies before the first estimate.
-    rolled[:1] = 0.0
-    moved = np.cumsum(rolled, axis=0)
-    states = np.array([np.concatenate([e.position_um, e.flow_um_s]) for e in estimates]).reshape(count, 4)
-    states[:, :2] -= moved
-    covariances = np.array([e.covariance for e in estimates]).reshape(count, 4, 4)
-    q = kalman.flow_noise(robot)
-    memory = np.array([memory_s(covariance) for covariance in covariances])
-    for index in range(count - 2, -1, -1):
-        dt = seconds(tracks[index + 1].stamp_ns - tracks[index].stamp_ns)
-        step = transition(dt)
-        ahead = step @ covariances[index] @ step.T + process_noise(dt, q, kalman.drift_um2_s)
-        gain = np.linalg.solve(ahead, step @ covariances[index]).T
-        states[index] += gain @ (states[index + 1] - step @ states[index])
-        covariance = covariances[index] + gain @ (covariances[index + 1] - ahead) @ gain.T
-        covariances[index] = 0.5 * (covariance + covariance.T)
+    states = np.zeros((count, 4))
+    covariances = np.zeros((count, 4, 4))
+    memory = np.array([memory_s(estimate.covariance) for estimate in estimates])
+    state, covariance = np.zeros(0), np.zeros((0, 0))
+    for index in range(count - 1, -1, -1):
+        if index == count - 1:
+            layout = kalman.layout()
+            state, covariance = carried(estimates[index], layout, robot)
+        else:
+            ahead, expected, layout, step = kalman.predict(
+                estimates[index], tracks[index + 1], applied[index + 1], robot
+            )
+            known, spread = carried(estimates[index], layout, robot)
+            gain = np.linalg.solve(expected, step @ spread).T
+            state = known + gain @ (state - ahead)
+            covariance = spread + gain @ (covariance - expected) @ gain.T
+            covariance = 0.5 * (covariance + covariance.T)
+        states[index], covariances[index] = state[:4], covariance[:4, :4]
     stamps = tuple(track.stamp_ns for track in tracks)
-    return Smoothed(stamps, states[:, :2] + moved, states[:, 2:], covariances, memory)
+    return Smoothed(stamps, states[:, :2], states[:, 2:], covariances, memory)
 
 
 def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settled_share: float = 0.1) -> Observations:

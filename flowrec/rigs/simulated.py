@@ -251,10 +251,11 @@ def _refuse_nonsense(camera: CameraSettings, simulated: Simulated) -> None:
         "simulated.position_noise_um": simulated.position_noise_um,
         "simulated.seed": simulated.seed,
         "simulated.delay_s": simulated.delay_s or 0.0,
+        "simulated.pulsation_hz": simulated.pulsation_hz,
     }
     for name, value in at_least_zero.items():
         if not (math.isfinite(value) and value >= 0):
             raise RigError(f"{name} = {value:g}: the simulated rig can not take less than zero")
-    for name in ("inlet_speed_error", "viscosity_error"):
+    for name in ("inlet_speed_error", "viscosity_error", "pulsation_share"):
         if not 0 <= getattr(simulated, name) < 1:
             raise RigError(f"simulated.{name} = {getattr(simulated, name):g}: it is a share, from 0 to below 1")

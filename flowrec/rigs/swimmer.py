@@ -43,6 +43,7 @@ def _swim(
     noise: NDArray[np.float64],
     vx: NDArray[np.float32],
     vy: NDArray[np.float32],
+    strength: float,
     clearance: NDArray[np.float32],
     um_per_px: float,
     radius: float,
@@ -52,10 +53,10 @@ def _swim(
     free = 0.0
     for n in range(noise.shape[0]):
         # Midpoint rule in the flow, then the random walk.
-        mx = x + 0.5 * dt * (own_x + bilinear(vx, x / um_per_px, y / um_per_px))
-        my = y + 0.5 * dt * (own_y + bilinear(vy, x / um_per_px, y / um_per_px))
-        x += dt * (own_x + bilinear(vx, mx / um_per_px, my / um_per_px)) + noise[n, 0]
-        y += dt * (own_y + bilinear(vy, mx / um_per_px, my / um_per_px)) + noise[n, 1]
+        mx = x + 0.5 * dt * (own_x + strength * bilinear(vx, x / um_per_px, y / um_per_px))
+        my = y + 0.5 * dt * (own_y + strength * bilinear(vy, x / um_per_px, y / um_per_px))
+        x += dt * (own_x + strength * bilinear(vx, mx / um_per_px, my / um_per_px)) + noise[n, 0]
+        y += dt * (own_y + strength * bilinear(vy, mx / um_per_px, my / um_per_px)) + noise[n, 1]
         free = bilinear(clearance, x / um_per_px, y / um_per_px)
         if free < radius:
             touched += 1
@@ -91,6 +92,7 @@ class Swimmer:
         self.contacts = 0
         self.gone = False
         self._touching = False
+        self._time_s = 0.0
         self._robot = robot
         self._simulated = simulated
         self._vx = np.ascontiguousarray(velocity_um_s[..., 0])
@@ -107,7 +109,12 @@ class Swimmer:
         if self.gone:
             return np.zeros(2)
         x, y = self.position_um / self._um_per_px
-        return np.array([bilinear(self._vx, x, y), bilinear(self._vy, x, y)])
+        return self._strength(self._time_s) * np.array([bilinear(self._vx, x, y), bilinear(self._vy, x, y)])
+
+    def _strength(self, time_s: float) -> float:
+        """Of the pulsating flow as a share of the steady one."""
+        pulse = self._simulated
+        return 1.0 + pulse.pulsation_share * math.sin(2.0 * math.pi * pulse.pulsation_hz * time_s)
 
     @property
     def clearance_um(self) -> float:
@@ -125,6 +132,7 @@ class Swimmer:
         """
         if self.gone or duration_s <= 0:
             return
+        self._time_s += duration_s
         steps = max(4, math.ceil(duration_s / _SUBSTEP_S))
         dt = duration_s / steps
         keep = math.exp(-duration_s / _MEMORY_S)
@@ -152,6 +160,7 @@ class Swimmer:
             noise,
             self._vx,
             self._vy,
+            self._strength(self._time_s - 0.5 * dt * len(noise)),
             self._clearance,
             self._um_per_px,
             self._robot.radius,

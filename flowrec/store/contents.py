@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 
 from google.protobuf import descriptor_pb2
@@ -11,6 +11,7 @@ from mcap.records import ChunkIndex, Statistics
 
 import flowrec
 from flowrec.errors import SessionError
+from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
 from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
 from flowrec.store.source import Source, Summary
@@ -120,7 +121,7 @@ class Contents:
 def _may_be_missing(topic: str) -> set[str]:
     """Fields of the topic's message that have a default, and what only they need."""
     kind = BY_PATH[topic].type
-    needed = {part.name for part in fields(kind) if part.default is MISSING and part.default_factory is MISSING}  # type: ignore[arg-type]
+    needed = {part.name for part in fields(kind)} - defaulted_fields(kind)  # type: ignore[arg-type]
     known = _fields_of(codec_of(kind).schema.data)
     return {name for name, _ in known if name.removeprefix(f"{kind.__name__}.") not in needed}
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from flowrec.estimation import Kalman, Luenberger, Observer, Sampler
-from flowrec.messages import Applied, Estimate, Track
+from flowrec.messages import Applied, Estimate, FlowField, Track
 from flowrec.robot import Robot
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 RATE_HZ = 30.0
+MIDDLE = np.array([2200.0, 1200.0])  # of the vortex, um
 
 
 def track(index: int, position: NDArray[np.float64], seen: bool = True) -> Track:
@@ -27,7 +29,13 @@ def applied(index: int, moved_um: NDArray[np.float64]) -> Applied:
 def lemniscate(time_s: float) -> NDArray[np.float64]:
     """The reference of the paper's tracking study, once around in 40 s."""
     sine, cosine = math.sin(2 * math.pi * time_s / 40.0), math.cos(2 * math.pi * time_s / 40.0)
-    return np.array([1800.0 * cosine, 1500.0 * sine * cosine]) / (1.0 + sine**2)
+    return MIDDLE + np.array([1800.0 * cosine, 1500.0 * sine * cosine]) / (1.0 + sine**2)
+
+
+def across(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(..., 2) the vortex of strength 1/s."""
+    x, y = position[..., 0] - MIDDLE[0], position[..., 1] - MIDDLE[1]
+    return np.stack((-y, x), -1)
 
 
 def swim(
@@ -37,6 +45,7 @@ def swim(
     seed: int = 0,
     flow_noise: float = 0.0,
     swirl: float = 0.2,
+    field: FlowField | None = None,
 ):  # type: ignore[no-untyped-def]
     """A robot on the paper's lemniscate in its swirling flow, held there exactly: true flows and estimates."""
     rng = np.random.default_rng(seed)
@@ -47,14 +56,14 @@ def swim(
     for index in range(round(seconds * RATE_HZ)):
         moved = np.zeros(2)
         if index:
-            flow = swirl * np.array([-position[1], position[0]]) + walk
             onward = lemniscate(index * dt)
+            flow = swirl * across(0.5 * (position + onward)) + walk
             moved, position = onward - position - flow * dt, onward
             walk = walk + math.sqrt(flow_noise * dt) * rng.standard_normal(2)
         tracks.append(track(index, position + noise_um * rng.standard_normal(2)))
         inputs.append(applied(index, moved))
-        before = observer.estimate(before, tracks[-1], inputs[-1], ROBOT)
-        truth.append(swirl * np.array([-position[1], position[0]]) + walk)
+        before = observer.estimate(before, tracks[-1], inputs[-1], ROBOT, field)
+        truth.append(swirl * across(position) + walk)
         estimates.append(before)
     return np.array(truth), estimates, tracks, inputs
 
@@ -72,15 +81,86 @@ def test_with_the_right_noise_the_normalised_innovation_squared_is_two() -> None
     assert abs(np.nanmean(nis) - 2.0) < 3.0 * 2.0 / math.sqrt(len(nis))
 
 
-def test_at_ten_um_noise_kalman_has_at_most_half_the_error_of_the_papers_observer() -> None:
-    kalman = Observer(kalman=Kalman(position_noise_um=10.0, flow_noise_um2_s3=1000.0))
+def vortex(share: float = 1.0, spacing_um: float = 20.0) -> FlowField:
+    """The swirling flow as a map, `share` of its strength; the chip's origin is (0, 0) as ever."""
+    y, x = np.mgrid[0:120, 0:220] * spacing_um
+    velocity = share * 0.2 * np.stack((-(y - MIDDLE[1]), x - MIDDLE[0]), -1)
+    return FlowField(
+        0, 0, "map", spacing_um, velocity, np.zeros(velocity.shape[:2]), None, np.zeros(0), 1.0, 1000.0, ""
+    )
+
+
+def test_at_ten_um_noise_kalman_has_less_than_half_the_error_of_the_best_luenberger() -> None:
+    kalman = Observer(kalman=Kalman(position_noise_um=10.0))
     best = min(
         rmse(*swim(Observer(method="luenberger", luenberger=Luenberger(gain)), 10.0)[:2]) for gain in (0.5, 1, 2, 3)
     )
-    paper = rmse(*swim(Observer(method="luenberger"), 10.0)[:2])
-    ours = rmse(*swim(kalman, 10.0)[:2])
-    assert ours < 0.5 * paper
-    assert ours < 0.7 * best
+    assert rmse(*swim(kalman, 10.0)[:2]) < 0.5 * best
+
+
+@pytest.mark.parametrize(("share", "noise_um", "limit_um_s"), [(1.0, 0.01, 0.3), (1.1, 10.0, 8.0)])
+def test_with_a_map_what_it_misses_is_found(share: float, noise_um: float, limit_um_s: float) -> None:
+    kalman = Kalman(position_noise_um=max(noise_um, 1.0))
+    with_map = Observer(method="kalman_map", kalman=kalman)
+    assert rmse(*swim(with_map, noise_um, field=vortex(share))[:2]) < limit_um_s
+    without = Observer(method="kalman_map", kalman=kalman)
+    _, mapless, tracks, inputs = swim(without, noise_um, 2.0)
+    plain = Observer(kalman=kalman)
+    assert mapless[-1].same_as(swim(plain, noise_um, 2.0)[1][-1])
+
+
+def test_another_map_does_not_make_the_estimate_jump() -> None:
+    observer = Observer(method="kalman_map")
+    _, estimates, tracks, inputs = swim(observer, 1.0, 4.0, field=vortex(1.2))
+    old = observer.estimate(estimates[-2], tracks[-1], inputs[-1], ROBOT, vortex(1.2))
+    new = observer.estimate(estimates[-2], tracks[-1], inputs[-1], ROBOT, vortex(0.9))
+    assert math.dist(old.flow_um_s, new.flow_um_s) < 1.0
+
+
+@pytest.mark.parametrize("method", ["kalman", "kalman_map"])
+def test_an_observer_goes_on_from_another_ones_estimate(method: str) -> None:
+    _, estimates, tracks, inputs = swim(Observer(method="luenberger"), 2.0, 4.0)
+    observer = Observer(method=method)  # type: ignore[arg-type]
+    last = estimates[60]
+    for index in range(61, 120):
+        last = observer.estimate(last, tracks[index], inputs[index], ROBOT, vortex())
+    assert math.dist(last.flow_um_s, estimates[-1].flow_um_s) < 60.0
+    assert np.linalg.eigvalsh(last.covariance).min() > 0
+
+
+def test_the_estimate_turns_and_shifts_with_the_world() -> None:
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    _, estimates, tracks, inputs = swim(Observer(), 3.0, 8.0)
+    last = None
+    for seen, done in zip(tracks, inputs, strict=True):
+        there = replace(seen, position_um=turn @ seen.position_um + [700.0, -300.0])
+        last = Observer().estimate(last, there, replace(done, turns=turn @ done.turns), ROBOT)
+    assert last is not None
+    np.testing.assert_allclose(last.flow_um_s, turn @ estimates[-1].flow_um_s, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["kalman", "kalman_map", "luenberger"])
+def test_a_clock_that_stands_still_and_a_position_that_is_no_number_do_no_harm(method: str) -> None:
+    observer = Observer(method=method)  # type: ignore[arg-type]
+    _, estimates, tracks, inputs = swim(observer, 2.0, 2.0, field=vortex())
+    still = replace(inputs[-1], turns=np.zeros(2))
+    last = observer.estimate(estimates[-1], tracks[-1], still, ROBOT, vortex())
+    assert math.dist(last.flow_um_s, estimates[-1].flow_um_s) < 20.0
+    nowhere = track(61, np.full(2, np.nan), seen=False)
+    last = observer.estimate(last, nowhere, applied(61, np.zeros(2)), ROBOT, vortex())
+    assert np.isfinite(last.flow_um_s).all() and np.isfinite(last.position_um).all()
+    assert Sampler().collect(None, last, last, ROBOT) is None
+
+
+def test_where_the_robot_was_lost_for_seconds_the_flow_is_soon_found_again() -> None:
+    observer = Observer(kalman=Kalman(position_noise_um=2.0))
+    truth, estimates, tracks, inputs = swim(observer, 2.0, 20.0)
+    last = estimates[299]
+    for index in range(300, 420):
+        seen = tracks[index] if index >= 390 else replace(tracks[index], seen=False)
+        last = observer.estimate(last, seen, inputs[index], ROBOT)
+        assert math.hypot(*last.flow_um_s) < 600.0
+    assert math.dist(last.flow_um_s, truth[419]) < 30.0
 
 
 def test_a_steady_flow_is_found_without_bias_whatever_the_coils_did() -> None:
@@ -95,7 +175,7 @@ def test_a_steady_flow_is_found_without_bias_whatever_the_coils_did() -> None:
     np.testing.assert_allclose(before.flow_um_s, flow, atol=1.0)
 
 
-@pytest.mark.parametrize("method", ["kalman", "luenberger"])
+@pytest.mark.parametrize("method", ["kalman", "kalman_map", "luenberger"])
 def test_an_observer_goes_on_from_any_message_as_if_it_had_never_stopped(method: str) -> None:
     observer = Observer(method=method)  # type: ignore[arg-type]
     _, estimates, tracks, inputs = swim(observer, 5.0, 4.0)
@@ -138,9 +218,9 @@ def test_observations_are_spaced_out_and_honest_about_their_noise() -> None:
             assert after.stamp_ns == estimate.stamp_ns
         rows, before = after, estimate
     assert rows is not None
-    assert len(rows.position_um) > 50
+    assert len(rows.position_um) > 25
     ways = np.linalg.norm(np.diff(rows.position_um, axis=0), axis=1)
     assert ways.min() >= sampler.spacing_radii * ROBOT.radius * 0.999
-    true = np.column_stack((-0.2 * rows.position_um[:, 1], 0.2 * rows.position_um[:, 0]))
+    true = 0.2 * across(rows.position_um)
     pulls = (rows.flow_um_s - true) / rows.std_um_s[:, None]
     assert np.sqrt(np.mean(np.square(pulls[5:]))) < 1.5

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from flowrec.errors import SessionError
-from flowrec.messages import Event, Frame, Matrix, Message, OperatorEvent, Track, Vector, array_fields
+from flowrec.messages import Event, Frame, Matrix, Message, OperatorEvent, Track, Vector, array_fields, defaulted_fields
 from flowrec.store import codec
 from flowrec.store.schemas import forms_of
 from flowrec.topics import TOPICS
@@ -135,3 +135,19 @@ def test_vectors_are_packed_doubles_that_viewers_can_plot():
 def test_rubbish_is_a_session_error_or_a_message(kind, rubbish):
     with contextlib.suppress(SessionError):
         assert isinstance(codec.decode(kind, rubbish), kind)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in TYPES if defaulted_fields(kind)], ids=lambda kind: kind.__name__)
+def test_what_a_file_made_before_a_field_existed_lacks_is_that_fields_default(kind):
+    needed = {
+        form.name: {"vector": np.zeros(2), "array": np.zeros((2, 2))}.get(form.kind)
+        if form.kind in ("vector", "array")
+        else form.kind(1)
+        for form in forms_of(kind)
+        if form.name not in defaulted_fields(kind)
+    }
+    plain = kind(**needed)
+    wire = codec.schema_of(kind).wire.FromString(codec.encode(plain))
+    for name in defaulted_fields(kind):
+        wire.ClearField(name)
+    assert codec.decode(kind, wire.SerializeToString()).same_as(plain)

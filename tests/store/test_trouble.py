@@ -175,6 +175,18 @@ def test_a_session_of_a_later_format_says_which_flowrec_it_needs(tmp_path, monke
         SessionReader(tmp_path / "s.mcap")
 
 
+def test_a_file_made_before_a_field_with_a_default_existed_is_read(tmp_path, monkeypatch):
+    slot = layout.SLOTS["/robot/estimate"]
+    files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
+    estimate = files.file[-1].message_type[0]
+    assert estimate.name == "Estimate" and estimate.field[-1].name == "um_per_rev"
+    del estimate.field[-1]
+    other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
+    monkeypatch.setitem(layout.SLOTS, "/robot/estimate", other)
+    SessionWriter(tmp_path / "s.mcap", HEADER).close()
+    SessionReader(tmp_path / "s.mcap")
+
+
 def test_a_message_that_is_laid_out_differently_is_named(tmp_path, monkeypatch):
     slot = layout.SLOTS["/robot/track"]
     files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)

@@ -1,0 +1,30 @@
+"""A pump that pulses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flowrec.rigs.swimmer import Swimmer
+from flowrec.robot import Robot
+from flowrec.settings import Simulated
+
+
+def drifter(share: float) -> Swimmer:
+    robot = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0)
+    velocity = np.zeros((40, 200, 2), np.float32)
+    velocity[..., 0] = 100.0
+    quiet = Simulated(pulsation_share=share, pulsation_hz=2.0, position_noise_um=0.0)
+    return Swimmer((400.0, 400.0), robot, quiet, velocity, np.full((40, 200), 500.0, np.float32), 20.0)
+
+
+def test_a_pulsating_flow_swings_about_the_steady_one_and_carries_as_far() -> None:
+    steady, pulsating = drifter(0.0), drifter(0.5)
+    speeds = []
+    for _ in range(30):
+        steady.advance(1 / 30, 0.0, 0.0, 0.0)
+        pulsating.advance(1 / 30, 0.0, 0.0, 0.0)
+        speeds.append(pulsating.flow_um_s[0])
+    assert max(speeds) == pytest.approx(150.0, rel=0.02)
+    assert min(speeds) == pytest.approx(50.0, rel=0.02)
+    np.testing.assert_allclose(pulsating.position_um, steady.position_um, atol=0.2)
