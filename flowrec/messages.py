@@ -248,7 +248,7 @@ class Currents(Message):
     saturated: bool  # the coils can not make the full amplitude
     plane_rad: float = 0.0  # heading of the plane that the field turns in, on its way to heading_rad or its opposite
     limit_hz: float = 0.0  # up to here a robot follows this amplitude; the field's direction never turns faster
-    voltages_v: Vector = field(default_factory=lambda: np.zeros(3))  # (3,) what is put out; none in older files
+    voltages_v: Vector = field(default_factory=lambda: np.zeros(0))  # (3,) what is put out; (0,) in older files
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -138,7 +138,7 @@ def test_rubbish_is_a_session_error_or_a_message(kind, rubbish):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in TYPES if defaulted_fields(kind)], ids=lambda kind: kind.__name__)
-def test_what_a_file_made_before_a_field_existed_lacks_is_that_fields_default(kind):
+def test_a_file_made_before_a_field_existed_is_read_with_its_default(kind):
     needed = {
         form.name: {"vector": np.zeros(2), "array": np.zeros((2, 2))}.get(form.kind)
         if form.kind in ("vector", "array")
