@@ -55,11 +55,12 @@ class Change:
 
     def apply(self, config: Config) -> Config:
         """The recorded configuration with the changes; a what-if never replans on a robot that can not follow."""
+        plan, controller = _that_go_together(self.plan, self.controller, config)
         words = {
             "refine.method": self.refine,
-            "plan.method": self.plan,
+            "plan.method": plan,
             "observer.method": self.observer,
-            "control.method": self.controller,
+            "control.method": controller,
         }
         sets = [f"{key}={value}" for key, value in words.items() if value is not None] + list(self.sets)
         if not sets:
@@ -70,6 +71,15 @@ class Change:
             phases = tuple(dict.fromkeys((*phases, "refine", "plan")))
         mission = replace(changed.mission, phases=phases, replan_error_um=math.inf)
         return replace(changed, mission=mission)
+
+
+def _that_go_together(plan: str | None, controller: str | None, config: Config) -> tuple[str | None, str | None]:
+    """Planner and controller asked for; where only one is and the recorded other does not suit it, one that does."""
+    if controller == "policy" and plan is None and config.plan.method != "time_field":
+        return "time_field", controller
+    if plan not in (None, "time_field") and controller is None and config.control.method == "policy":
+        return plan, "vector"
+    return plan, controller
 
 
 @dataclass(slots=True)

@@ -26,7 +26,7 @@ class Sampler:
     """
 
     spacing_radii: float = 0.8  # least way between two observations, in radii of the robot
-    memories: float = 1.0  # and least time, in memories of the filter
+    memories: float = 2.0  # and least time, in memories of the filter
     settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
     floor_um_s: float = 2.0  # no observation claims a smaller sigma
     rolling_share: float = 0.02  # of the robot's own speed, one sigma: rolled off course, which passes for flow
