@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from flowrec.bench.store_kills import kills
 from flowrec.bench.store_loop import soak, stall
 from flowrec.bench.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
 from flowrec.status import progress, table
@@ -26,14 +27,16 @@ _MEMORY = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is mad
 _AIM = {"p99_ratio": 1.2, "disk_mb_s": 350.0, "throughput": 0.9}
 
 
-def measure(folder: Path | None = None, quick: bool = False, minutes: float = 0.0) -> dict[str, Any]:
+def measure(folder: Path | None = None, quick: bool = False, minutes: float = 0.0, killed: int = 0) -> dict[str, Any]:
     """Throughput of each writer, stall of the control step, read, seek and recovery times.
 
     `folder` is where the disk is measured and the stall is; by default that for temporary files. With `minutes`
-    nothing but memory is measured, for so long.
+    nothing but memory is measured, for so long; with `killed` nothing but what so many kills cost.
     """
     if minutes:
         return {"soak": soak(minutes, folder)}
+    if killed:
+        return {"kills": kills(killed, folder)}
     share = 0.1 if quick else 1.0
     seconds = 2.0 if quick else 10.0
     with tempfile.TemporaryDirectory(dir=folder) as disk_name:
@@ -137,6 +140,12 @@ def show(figures: dict[str, Any]) -> None:
         found = figures["soak"]
         names = ("minutes", "file_mb", "dropped", "lowest_mb", "highest_mb", "growth_mb_per_minute")
         table("Soak, 640x512 at 100 Hz", ("", ""), [(name.replace("_", " "), f"{found[name]:.1f}") for name in names])
+        return
+    if "kills" in figures:
+        found = figures["kills"]
+        rows = [(name.replace("_", " "), str(found[name])) for name in ("kills", "before_the_first_flush", "broken")]
+        rows += [(f"lost, {name}, s", f"{value:.3f}") for name, value in found["lost_s"].items()]
+        table("kill -9 of a recording, 640x512 at 100 Hz", ("", ""), rows)
         return
     for load in figures["throughput"]:
         best = load["rows"][load["rival"]]["messages_s"]
