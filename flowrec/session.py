@@ -39,7 +39,7 @@ def session_writer(
     return SessionWriter(
         path,
         session_header(config, chip, named),
-        frames=_frames(config),
+        frames=frames_of(config),
         flush_s=config.recording.flush_s,
         sync_s=config.recording.sync_s,
         queue_limit_bytes=int(config.recording.queue_mb * 1e6),
@@ -48,7 +48,8 @@ def session_writer(
     )
 
 
-def _frames(config: Config) -> str:
+def frames_of(config: Config) -> str:
+    """How the images of a run travel, a name of store/frames.py."""
     camera, chosen = config.camera, config.recording.frames
     if chosen != "auto":
         return chosen
