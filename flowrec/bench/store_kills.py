@@ -67,9 +67,9 @@ def kills(count: int, folder: Path | None = None) -> dict[str, Any]:
         "before_the_first_flush": too_short,
         "broken": broken,
         "lost_s": {
-            "median": float(np.median(lost_s)),
-            "p99": float(np.percentile(lost_s, 99)),
-            "max": float(max(lost_s)),
+            "median": float(np.median(lost_s)) if lost_s else float("nan"),
+            "p99": float(np.percentile(lost_s, 99)) if lost_s else float("nan"),
+            "max": max(lost_s, default=float("nan")),
         },
         "lost_s_each": lost_s,
     }
