@@ -241,7 +241,7 @@ class Drops(Message):
 
     stamp_ns: int
     topic: str
-    by_disk: int  # left out because the disk was slower than the camera
+    by_backlog: int  # left out because writing, by disk or processor, was slower than the camera
     by_camera: int  # counted by the camera and never delivered: gaps in the index
     kept_every: int  # from here on one frame in so many is kept; 1: all
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.loop import PacedRig, TimingsOnly, prepare_inputs
+from flowrec.bench.store_rivals import BareProcess, BareThread
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.config import load_config
 from flowrec.messages import Frame, Image, Tick
@@ -23,6 +24,7 @@ from flowrec.store import SessionWriter
 
 RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 2448, 2048
+_RING = 64
 _SOAK_RATE_HZ = 100.0
 _WARM_S = 5.0  # until the queue, the pools and the caches have their size
 
@@ -31,16 +33,19 @@ _WARM_S = 5.0  # until the queue, the pools and the caches have their size
 class LargeCamera:
     """A sink before the writer: the loop flies on 640x512, what is recorded are 2448x2048 images.
 
-    Each is copied into memory of its own, as a driver does; also when nothing is recorded.
+    Each is copied into a ring of buffers that is longer than the writer's queue, as a driver does; also when nothing
+    is recorded.
     """
 
     images: list[Image]
-    writer: SessionWriter | None
+    ring: list[Image]
+    writer: Sink | None
     kept: Tick = field(default_factory=Tick)
 
     def write(self, tick: Tick) -> None:
         if tick.frame is not None:
-            image = self.images[tick.frame.index % len(self.images)].copy()
+            image = self.ring[tick.frame.index % len(self.ring)]
+            np.copyto(image, self.images[tick.frame.index % len(self.images)])
             tick = replace(tick, frame=Frame(tick.frame.stamp_ns, tick.frame.index, image))
         self.kept = tick
         if self.writer is not None:
@@ -48,22 +53,23 @@ class LargeCamera:
 
 
 def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
-    """The control step with recording off and on, in turn, in the real loop at 60 Hz.
+    """The control step with recording off, on, and with what else could have been built, in turn, at 60 Hz.
 
     The step is what the loop times: tracking, observing, control, and the hand-over to the sinks of the tick before.
     """
     config, _chip, pipeline = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
     prepared = prepare_inputs(config, pipeline, round(duration_s * RATE_HZ))
     images = pictures(_WIDTH, _HEIGHT)
-    kinds = ("off", "zstd", "delta", "raw")
+    ring = [np.ones_like(images[0]) for _ in range(_RING)]
+    kinds = ("off", "zstd", "delta", "raw", "a bare thread", "a bare process")
     rows: dict[str, list[Any]] = {kind: [] for kind in kinds}
     path = folder / "stall.mcap"
     with progress("flying", rounds * len(kinds)) as done:
         for number in range(rounds * len(kinds)):
             kind = kinds[number % len(kinds)]
-            writer = None if kind == "off" else SessionWriter(path, made_up_header(), frames=kind, overwrite=True)
+            writer = _writer(kind, path)
             timings = TimingsOnly()
-            sinks: list[Sink] = [timings, LargeCamera(images, writer)]
+            sinks: list[Sink] = [timings, LargeCamera(images, ring, writer)]
             worker = LockstepWorker(pipeline, config.worker.adopt_after_s, fills=())
             cpu_s = time.process_time()
             run(
@@ -76,7 +82,7 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
             )
             cpu_s = time.process_time() - cpu_s
             if writer is not None:
-                writer.close({"outcome": "bench"})
+                writer.close()
             skip = len(timings.ticks) // 10  # the robot is found and caches are filled in the first frames
             rows[kind].append(([t.timing for t in timings.ticks[skip:] if t.timing is not None], cpu_s))
             done(number + 1)
@@ -86,8 +92,18 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
     }
 
 
-def _queue_of(writer: SessionWriter | None) -> tuple[float, int]:
-    return (writer.queue_bytes / 1e6, writer.dropped_frames) if writer is not None else (0.0, 0)
+def _writer(kind: str, path: Path) -> SessionWriter | BareThread | BareProcess | None:
+    if kind == "off":
+        return None
+    if kind == "a bare thread":
+        return BareThread()
+    if kind == "a bare process":
+        return BareProcess(_WIDTH * _HEIGHT)
+    return SessionWriter(path, made_up_header(), frames=kind, overwrite=True)
+
+
+def _queue_of(writer: object) -> tuple[float, int]:
+    return (writer.queue_bytes / 1e6, writer.dropped_frames) if isinstance(writer, SessionWriter) else (0.0, 0)
 
 
 def _row(runs: list[Any], ticks: int) -> dict[str, float]:

@@ -225,7 +225,7 @@ class SessionWriter:
         said, every = self._said, self._thinning.every
         if said is None and not self.dropped_frames and not self.missing_frames:
             return
-        told = (said.by_disk, said.by_camera, said.kept_every) if said is not None else (0, 0, 1)
+        told = (said.by_backlog, said.by_camera, said.kept_every) if said is not None else (0, 0, 1)
         now = (self.dropped_frames, self.missing_frames, every)
         due = said is None or stamp_ns >= said.stamp_ns + _TELL_DROPS_NS
         if told != now and (due or told[1:] != now[1:]):

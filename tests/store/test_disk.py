@@ -54,8 +54,8 @@ def test_a_slow_disk_costs_evenly_spaced_images_and_nothing_else(tmp_path, monke
     drops = list(reader.messages("drops"))
     assert drops[0].topic == "/camera/frame" and drops[0].kept_every > 1
     assert drops[0].stamp_ns <= ticks[next(i for i in range(240) if i not in kept)].stamp_ns
-    assert [drop.by_disk for drop in drops] == sorted(drop.by_disk for drop in drops)
-    assert 0 < drops[-1].by_disk <= writer.dropped_frames and all(drop.by_camera == 0 for drop in drops)
+    assert [drop.by_backlog for drop in drops] == sorted(drop.by_backlog for drop in drops)
+    assert 0 < drops[-1].by_backlog <= writer.dropped_frames and all(drop.by_camera == 0 for drop in drops)
 
 
 def kept_by(disk_share, seconds=60.0, rate_hz=60.0, room_s=1.0):
@@ -98,7 +98,7 @@ def test_frames_that_the_camera_never_delivered_are_counted_apart(tmp_path):
             writer.write(Tick(now, frame=Frame(now, number, np.zeros((4, 4), np.uint8))))
     reader = SessionReader(tmp_path / "s.mcap")
     (drops,) = reader.messages("drops")
-    assert (drops.by_camera, drops.by_disk, drops.kept_every) == (2, 0, 1)
+    assert (drops.by_camera, drops.by_backlog, drops.kept_every) == (2, 0, 1)
     assert reader.outcome["frames_missing_from_camera"] == "2" and reader.outcome["dropped_frames"] == "0"
 
 
