@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import operator
 import os
@@ -25,6 +26,7 @@ from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S
 
 PARTIAL_SUFFIX = ".partial"
+_NICE = 5  # where there are too few cores for all, the control loop goes first
 _TELL_DROPS_NS = NS_PER_S // 2
 _MESSAGE_BYTES = 500  # about what a message weighs besides its pixels
 _FIELDS = tuple(topic.field for topic in TOPICS)
@@ -233,6 +235,8 @@ class SessionWriter:
             news["drops"] = self._said
 
     def _work(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # of Linux, where each thread has its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
             while not self._backlog.drained:
                 entry = self._backlog.take(self._recorder.patience_s)
