@@ -391,6 +391,24 @@ def bench_track(
     _keep(figures, json_file)
 
 
+@bench.command("store")
+def bench_store(
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
+    minutes: Annotated[float, typer.Option(min=0.0, help="Only watch memory while recording for so long.")] = 0.0,
+    kills: Annotated[int, typer.Option(min=0, help="Only kill so many recordings and recover them.")] = 0,
+    folder: Annotated[
+        Path | None, typer.Option("--at", metavar="DIR", help="On which disk; by default that of temporary files.")
+    ] = None,
+) -> None:
+    """Recording beside a bare mcap and a bare foxglove-sdk writer: speed, stall of the control loop, reading."""
+    from flowrec.bench.store import measure, show
+
+    figures = measure(folder, quick, minutes, kills)
+    show(figures)
+    _keep(figures, json_file)
+
+
 @bench.command("solver")
 def bench_solver(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,

@@ -48,8 +48,10 @@ class Worker:
 class Recording:
     """How a session is written."""
 
-    flush_s: float = 0.5  # at most this much of the end is lost when the process is killed
-    queue_mb: float = 256.0  # waiting for the disk before a live run drops camera frames
+    frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"  # auto: what the camera's rate allows
+    flush_s: float = 0.5  # at most this much of the end is lost when the process is killed, in wall or session time
+    sync_s: float = 1.0  # the same when the power fails
+    queue_mb: float = 256.0  # waiting for the disk; a live run thins out its frames from the half of it on
     operator: str = ""
     notes: str = ""
     sample: str = ""

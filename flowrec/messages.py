@@ -275,6 +275,17 @@ class Timing(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Drops(Message):
+    """What is missing of a topic so far, said by the writer when it begins, changes and ends. Diagnostic."""
+
+    stamp_ns: int
+    topic: str
+    by_backlog: int  # left out because writing, by disk or processor, was slower than the camera
+    by_camera: int  # counted by the camera and never delivered: gaps in the index
+    kept_every: int  # from here on one frame in so many is kept; 1: all
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth(Message):
     """What only a simulated rig can know. Recorded for judging; no stage ever sees it."""
 
@@ -305,6 +316,7 @@ class Tick:
     currents: Currents | None = None
     event: Event | None = None
     timing: Timing | None = None
+    drops: Drops | None = None
     truth: Truth | None = None
     true_field: FlowField | None = None
 

@@ -16,7 +16,7 @@ from flowrec.config import Config, config_from_toml, to_toml
 from flowrec.errors import SessionError
 from flowrec.messages import Route
 from flowrec.provenance import provenance
-from flowrec.store import SessionHeader, SessionReader, SessionWriter, is_growing
+from flowrec.store import SessionHeader, SessionReader, SessionWriter, encoding_for, is_growing
 from flowrec.topics import BY_FIELD
 
 SESSION_NAMES = (".mcap", ".mcap.partial")
@@ -39,11 +39,21 @@ def session_writer(
     return SessionWriter(
         path,
         session_header(config, chip, named),
+        frames=frames_of(config),
         flush_s=config.recording.flush_s,
+        sync_s=config.recording.sync_s,
         queue_limit_bytes=int(config.recording.queue_mb * 1e6),
         block=not live,
         overwrite=overwrite,
     )
+
+
+def frames_of(config: Config) -> str:
+    """How the images of a run travel, a name of store/frames.py."""
+    camera, chosen = config.camera, config.recording.frames
+    if chosen != "auto":
+        return chosen
+    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz or 0.0)
 
 
 def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:

@@ -47,6 +47,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("currents", "/coils/command", m.Currents, Role.OUTPUT, 1e-6),
     Topic("event", "/run/events", m.Event, Role.OUTPUT),
     Topic("timing", "/run/timing", m.Timing, Role.DIAGNOSTIC),
+    Topic("drops", "/run/drops", m.Drops, Role.DIAGNOSTIC),
     Topic("truth", "/truth/robot", m.Truth, Role.TRUTH),
     Topic("true_field", "/truth/flow", m.FlowField, Role.TRUTH),
 )

@@ -1,4 +1,7 @@
-"""What waits for the disk: a queue bounded by bytes, from the control loop to the writer's thread."""
+"""What waits for the disk: a queue bounded by bytes, from the control loop to the writer's thread.
+
+Two lanes: images wait behind everything else, so that a slow disk delays no pose and a kill takes none with it.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +23,20 @@ class Entry(NamedTuple):
 
 
 class Backlog:
-    """First in, first out; `close` lets the thread drain it, `abandon` frees everyone who waits."""
+    """First in, first out in each lane; `close` lets the thread drain it, `abandon` frees everyone who waits."""
 
     def __init__(self, limit_bytes: int) -> None:
         self.nbytes = 0  # waiting, or in the hands of the thread
         self._limit = limit_bytes
-        self._entries: deque[Entry] = deque()
+        self._state: deque[Entry] = deque()
+        self._images: deque[Entry] = deque()
         self._changed = threading.Condition()
         self._closed = self._abandoned = False
+
+    @property
+    def fill(self) -> float:
+        """Share of the room that is taken, 0 to 1."""
+        return self.nbytes / self._limit
 
     def has_room(self, nbytes: int) -> bool:
         """Whether that many bytes fit in; an empty queue takes anything."""
@@ -38,18 +47,26 @@ class Backlog:
         with self._changed:
             self._changed.wait_for(lambda: self._abandoned or self.has_room(nbytes))
 
-    def put(self, entry: Entry) -> None:
-        """Append; never blocks."""
+    def put(self, entry: Entry, image: Entry | None = None) -> None:
+        """Append what is not empty, `image` to the lane that waits; never blocks."""
         with self._changed:
-            self._entries.append(entry)
-            self.nbytes += entry.nbytes
+            for news, lane in ((entry, self._state), (image, self._images)):
+                if news is not None and news.news:
+                    lane.append(news)
+                    self.nbytes += news.nbytes
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None) -> Entry | None:
         """The next entry, None after the time is over or when the closed queue has run dry."""
         with self._changed:
-            self._changed.wait_for(lambda: self._entries or self._closed, timeout_s)
-            return self._entries.popleft() if self._entries else None
+            self._changed.wait_for(lambda: self._state or self._images or self._closed, timeout_s)
+            lane = self._state or self._images
+            return lane.popleft() if lane else None
+
+    @property
+    def images_wait(self) -> bool:
+        """Whether the next entry may be the image of a tick that was taken before."""
+        return bool(self._images)
 
     def done(self, entry: Entry) -> None:
         """The entry has been dealt with: its bytes are free again."""
@@ -61,7 +78,7 @@ class Backlog:
     def drained(self) -> bool:
         """Closed, with nothing left to take."""
         with self._changed:
-            return self._closed and not self._entries
+            return self._closed and not self._state and not self._images
 
     def close(self) -> None:
         """Nothing more will come."""
@@ -73,6 +90,7 @@ class Backlog:
         """Forget what waits; the disk has failed."""
         with self._changed:
             self._closed = self._abandoned = True
-            self._entries.clear()
+            self._state.clear()
+            self._images.clear()
             self.nbytes = 0
             self._changed.notify_all()

@@ -1,13 +1,15 @@
-"""One MCAP chunk being filled: messages of one group, compressed together when it is sealed."""
+"""One MCAP chunk being filled: messages of one group, sealed together."""
 
 from __future__ import annotations
 
 import struct
 import zlib
+from dataclasses import dataclass
 
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
-from mcap.records import Chunk, MessageIndex
+from mcap.records import MessageIndex
 
 from flowrec.store.form import Payload
 
@@ -15,40 +17,76 @@ _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, l
 _FIXED_PART = 22  # bytes of a message record besides its payload
 # Noise does not compress: level 1 gets the same 1.2 to 1.6 of a camera image as higher ones, five times quicker.
 _ZSTD_LEVEL = 1
+_LARGE_BYTES = 1 << 16  # from here on numpy copies, which leaves the interpreter free meanwhile
+
+
+@dataclass(frozen=True, slots=True)
+class Sealed:
+    """What goes into one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
+
+    `data` may lie in the builder's memory: it is to be written before the builder is used again.
+    """
+
+    compression: str
+    data: bytes | memoryview
+    message_start_time: int
+    message_end_time: int
+    uncompressed_crc: int
+    uncompressed_size: int
+    indexes: list[MessageIndex]
 
 
 class ChunkBuilder:
-    """Collects messages in order of time; `seal` empties it."""
+    """Collects messages in order of time; `seal` empties it.
 
-    def __init__(self) -> None:
+    The memory is kept from chunk to chunk: a new one for each image costs as much as copying the image.
+
+    Parameters
+    ----------
+    compressed : with zstd; otherwise the chunk is stored as it is, for what is compressed already.
+    """
+
+    def __init__(self, *, compressed: bool = True) -> None:
         self.size = 0  # bytes before compression
-        self._parts: list[bytes | memoryview] = []
+        self._memory = bytearray(1 << 18)
         self._index: dict[int, list[tuple[int, int]]] = {}
         self._first_ns = self._last_ns = 0
-        self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL) if compressed else None
 
     def add(self, channel: int, sequence: int, log_ns: int, publish_ns: int, payload: Payload) -> None:
-        """Append one message; its payload must not change before the chunk is sealed."""
-        if not self._parts:
+        """Append a copy of one message."""
+        if not self.size:
             self._first_ns = log_ns
         self._last_ns = log_ns
         self._index.setdefault(channel, []).append((log_ns, self.size))
         length = _FIXED_PART + sum(map(len, payload))
-        self._parts.append(_MESSAGE_HEAD.pack(Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns))
-        self._parts.extend(payload)
-        self.size += 9 + length
+        end = self.size + 9 + length
+        if end > len(self._memory):
+            # A new one, with the old content: the growth of a bytearray would refuse while somebody looks at it.
+            grown = bytearray(end + end // 4)
+            grown[: self.size] = memoryview(self._memory)[: self.size]
+            self._memory = grown
+        _MESSAGE_HEAD.pack_into(self._memory, self.size, Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns)
+        at = self.size + _MESSAGE_HEAD.size
+        for part in payload:
+            if len(part) < _LARGE_BYTES:
+                self._memory[at : at + len(part)] = part
+            else:
+                np.copyto(np.frombuffer(self._memory, np.uint8, len(part), at), np.frombuffer(part, np.uint8))
+            at += len(part)
+        self.size = end
 
-    def seal(self) -> tuple[Chunk, list[MessageIndex]]:
-        """The finished chunk with the index of each channel; the interpreter is free while it is compressed."""
-        content = b"".join(self._parts)
-        chunk = Chunk(
-            compression="zstd",
-            data=self._compressor.compress(content),
+    def seal(self) -> Sealed:
+        """The finished chunk; the interpreter is free while it is compressed."""
+        content = memoryview(self._memory)[: self.size]
+        sealed = Sealed(
+            compression="zstd" if self._compressor else "",
+            data=self._compressor.compress(content) if self._compressor else content,
             message_start_time=self._first_ns,
             message_end_time=self._last_ns,
             uncompressed_crc=zlib.crc32(content),
-            uncompressed_size=len(content),
+            uncompressed_size=self.size,
+            indexes=[MessageIndex(channel, records) for channel, records in self._index.items()],
         )
-        indexes = [MessageIndex(channel, records) for channel, records in self._index.items()]
-        self.size, self._parts, self._index = 0, [], {}
-        return chunk, indexes
+        self.size, self._index = 0, {}
+        return sealed

@@ -1,6 +1,6 @@
 """Message <-> bytes, one codec per message type, bit for bit.
 
-Frames and events travel in standard schemas (standard.py); all others field by field, as schemas.py lays them out.
+Frames (frames.py) and events (standard.py) travel in standard schemas, all others field by field (schemas.py).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, Message, OperatorEvent
 from flowrec.store import standard
 from flowrec.store.form import Codec, Payload
+from flowrec.store.frames import FRAME_CODECS, RAW_IMAGE
 from flowrec.store.schemas import FieldForm, array_schema, forms_of, schema_of
 
 _M = TypeVar("_M", bound=Message)
@@ -27,18 +28,20 @@ _SHORT_VECTOR = 64
 
 
 _codecs: dict[type[Any], Codec] = {
-    Frame: standard.frame_codec(),
+    Frame: FRAME_CODECS[RAW_IMAGE],
     Event: standard.event_codec(),
     OperatorEvent: standard.operator_codec(),
 }
 
 
-def codec_of(message_type: type[Any]) -> Codec:
-    """The codec of a message type; made once."""
+def codec_of(message_type: type[Any], schema: str = "") -> Codec:
+    """The codec of a message type, of that schema where it may travel in several; made once."""
+    if message_type is Frame and schema in FRAME_CODECS:
+        return FRAME_CODECS[schema]
     codec = _codecs.get(message_type)
     if codec is None:
-        schema = schema_of(message_type)
-        codec = Codec(schema, _encoder(message_type, schema.wire), _decoder(message_type, schema.wire))
+        derived = schema_of(message_type)
+        codec = Codec(derived, _encoder(message_type, derived.wire), _decoder(message_type, derived.wire))
         _codecs[message_type] = codec
     return codec
 
@@ -48,14 +51,16 @@ def encode(message: Message) -> bytes:
     return b"".join(encode_record(message)[1])
 
 
-def encode_record(message: Message) -> tuple[int | None, Payload]:
+def encode_record(message: Message, codec: Codec | None = None) -> tuple[int | None, Payload]:
     """The MCAP sequence that a message must have, if any, and its payload in parts, large arrays uncopied.
+
+    `codec` is the one of its type where nothing else is said.
 
     Raises
     ------
     SessionError : a value that does not fit the message's declaration, such as an int beyond 64 bit.
     """
-    codec = codec_of(type(message))
+    codec = codec or codec_of(type(message))
     try:
         try:
             return codec.sequence(message), codec.encode(message)
@@ -67,15 +72,15 @@ def encode_record(message: Message) -> tuple[int | None, Payload]:
         raise SessionError(f"a {kind} at {stamp_ns} ns can not be stored: {error}") from error
 
 
-def decode(message_type: type[_M], payload: bytes | memoryview, sequence: int = 0) -> _M:
-    """One message from its bytes; `sequence` is MCAP's, where a Frame keeps its index.
+def decode(message_type: type[_M], payload: bytes | memoryview, sequence: int = 0, schema: str = "") -> _M:
+    """One message from its bytes; `sequence` is MCAP's, where a Frame keeps its index; `schema` as in `codec_of`.
 
     Raises
     ------
     SessionError : bytes that are no such message.
     """
     try:
-        message: _M = codec_of(message_type).decode(payload, sequence)
+        message: _M = codec_of(message_type, schema).decode(payload, sequence)
     except (DecodeError, ValueError, TypeError, OverflowError) as error:
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
     return message

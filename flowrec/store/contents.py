@@ -15,7 +15,7 @@ from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
 from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
 from flowrec.store.source import Source, Summary
-from flowrec.topics import BY_PATH
+from flowrec.topics import BY_FIELD, BY_PATH
 
 
 class Contents:
@@ -30,6 +30,7 @@ class Contents:
     ----------
     source : the file.
     fields : field of Tick by channel number, for the topics that this flowrec knows.
+    schemas : name of the schema by channel number, for the same.
     chunks : where the messages are.
     statistics : how many there are.
     outcome : how the run ended.
@@ -73,8 +74,15 @@ class Contents:
             for channel in self._summary.channels.values()
             if channel.topic in BY_PATH
         }
+        self.schemas: dict[int, str] = {}
         for channel in self.fields:
             self._check_schema(channel)
+
+    @property
+    def frame_encoding(self) -> str:
+        """Name of the way in which frames travel (frames.py); empty in files that do not say."""
+        channels = self._summary.channels.values()
+        return next((c.metadata.get("encoding", "") for c in channels if c.topic == BY_FIELD["frame"].path), "")
 
     @functools.cached_property
     def header(self) -> SessionHeader:
@@ -101,7 +109,8 @@ class Contents:
     def _check_schema(self, channel_number: int) -> None:
         channel = self._summary.channels[channel_number]
         found = self._summary.schemas[channel.schema_id]
-        expected = codec_of(BY_PATH[channel.topic].type).schema
+        expected = codec_of(BY_PATH[channel.topic].type, found.name).schema
+        self.schemas[channel_number] = found.name
         same_kind = (found.name, found.encoding, channel.message_encoding) == (expected.name, "protobuf", "protobuf")
         # The standard schemas may gain fields and comments with a new foxglove-sdk and stay what they are.
         if same_kind and (found.data == expected.data or not expected.name.startswith("flowrec.")):

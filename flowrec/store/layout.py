@@ -7,15 +7,16 @@ neither images nor previews. Identifiers depend on the tables only: the same tic
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mcap.records import Channel
 from mcap.records import Schema as SchemaRecord
 
 from flowrec.store.codec import codec_of
+from flowrec.store.frames import FrameEncoding
 from flowrec.store.mirrors import MIRRORS
 from flowrec.store.schemas import Schema, foxglove_schema
-from flowrec.topics import TOPICS
+from flowrec.topics import BY_FIELD, TOPICS
 
 FRAMES, STATE, VIEW = "frames", "state", "view"
 GROUPS = (FRAMES, STATE, VIEW)
@@ -46,10 +47,17 @@ def _slots() -> Iterator[tuple[str, Slot]]:
 SLOTS: dict[str, Slot] = dict(_slots())
 
 
-def declarations() -> Iterator[SchemaRecord | Channel]:
+FRAME_PATH = BY_FIELD["frame"].path
+
+
+def declarations(frames: FrameEncoding) -> Iterator[SchemaRecord | Channel]:
     """Every schema, each before the first channel that uses it, and every channel."""
     schemas: dict[str, int] = {}
-    for path, slot in SLOTS.items():
+    for path, usual in SLOTS.items():
+        slot = usual
+        if path == FRAME_PATH:
+            notes = {"encoding": frames.name, "lossless": "yes" if frames.lossless else "no"}
+            slot = replace(usual, schema=frames.codec.schema, notes=usual.notes | notes)
         name = slot.schema.name
         if name not in schemas:
             schemas[name] = len(schemas) + 1

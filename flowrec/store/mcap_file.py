@@ -7,10 +7,12 @@ Layout: https://mcap.dev/spec.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import struct
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
@@ -19,13 +21,11 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
     Header,
     McapRecord,
-    MessageIndex,
     Metadata,
     MetadataIndex,
     Schema,
@@ -33,7 +33,12 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from flowrec.store.chunk import Sealed
+
 MAGIC = b"\x89MCAP0\r\n"
+_CHUNK_HEAD = struct.Struct("<BQQQQII")  # opcode, length, first and last time, size, checksum, length of the name
+_SIZE = struct.Struct("<Q")
+_PARTS_PER_WRITE = 1024
 
 
 class McapFile:
@@ -49,7 +54,8 @@ class McapFile:
         self._crc = 0
         self._schemas: list[McapRecord] = []
         self._channels: list[McapRecord] = []
-        self._chunks: list[McapRecord] = []
+        self._chunks = bytearray()  # their indexes, as they will stand in the summary: a long run has millions
+        self._chunk_count = 0
         self._attachments: list[McapRecord] = []
         self._metadata: list[McapRecord] = []
         self._counts: dict[int, int] = {}
@@ -87,52 +93,52 @@ class McapFile:
             )
         self._append(data)
 
-    def add_chunks(self, sealed: Iterable[tuple[Chunk, list[MessageIndex]]]) -> None:
-        """Sealed chunks with their indexes, all in one write: a killed process leaves them whole or not at all."""
-        parts: list[bytes] = []
+    def add_chunks(self, sealed: Iterable[Sealed]) -> None:
+        """Sealed chunks with their indexes, all in one write, so that a flushed file holds whole ticks."""
+        parts: list[bytes | memoryview] = []
         at = self.size
-        for chunk, indexes in sealed:
+        for chunk in sealed:
             start = at
-            parts.append(_bytes_of(chunk))
-            at += len(parts[-1])
-            length, offsets = at - start, {}
-            for index in indexes:
+            head = _chunk_head(chunk)
+            parts += (head, chunk.data)
+            length, offsets = len(head) + len(chunk.data), {}
+            at += length
+            for index in chunk.indexes:
                 parts.append(_bytes_of(index))
                 offsets[index.channel_id] = at
                 at += len(parts[-1])
                 self._counts[index.channel_id] += len(index.records)
-            self._chunks.append(
-                ChunkIndex(
-                    chunk_length=length,
-                    chunk_start_offset=start,
-                    compression=chunk.compression,
-                    compressed_size=len(chunk.data),
-                    message_end_time=chunk.message_end_time,
-                    message_index_length=at - start - length,
-                    message_index_offsets=offsets,
-                    message_start_time=chunk.message_start_time,
-                    uncompressed_size=chunk.uncompressed_size,
-                )
+            place = ChunkIndex(
+                chunk_length=length,
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=len(chunk.data),
+                message_end_time=chunk.message_end_time,
+                message_index_length=at - start - length,
+                message_index_offsets=offsets,
+                message_start_time=chunk.message_start_time,
+                uncompressed_size=chunk.uncompressed_size,
             )
+            self._chunks += _bytes_of(place)
+            self._chunk_count += 1
             first, last = self._span or (chunk.message_start_time, chunk.message_end_time)
             self._span = min(first, chunk.message_start_time), max(last, chunk.message_end_time)
-        self._append(b"".join(parts))
+        self._append(*parts)
 
     def finish(self) -> None:
         """Data end, summary and footer; then the file is whole."""
         self._append(_bytes_of(DataEnd(data_section_crc=self._crc)))
         start = self.size
-        groups: list[tuple[Opcode, Iterable[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
+        groups: list[tuple[Opcode, bytes | bytearray]] = [
+            (Opcode.SCHEMA, _all_bytes_of(self._schemas)),
+            (Opcode.CHANNEL, _all_bytes_of(self._channels)),
+            (Opcode.STATISTICS, _bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
+            (Opcode.ATTACHMENT_INDEX, _all_bytes_of(self._attachments)),
+            (Opcode.METADATA_INDEX, _all_bytes_of(self._metadata)),
         ]
         summary, offsets = bytearray(), bytearray()
-        for opcode, records in groups:
-            group = b"".join(map(_bytes_of, records))
+        for opcode, group in groups:
             if group:
                 at = start + len(summary)
                 offsets += _bytes_of(SummaryOffset(group_opcode=opcode, group_start=at, group_length=len(group)))
@@ -144,19 +150,31 @@ class McapFile:
         self._append(tail + zlib.crc32(tail).to_bytes(4, "little") + MAGIC)
 
     def sync(self) -> None:
-        """Have the disk itself keep what was appended."""
+        """Have the disk itself keep what was appended; may run beside the other methods, in a thread of its own."""
+        # Without this a run would fill a file without a name until its end, and nothing would be left of it.
+        if os.fstat(self._file.fileno()).st_nlink == 0:
+            raise OSError(errno.ENOENT, "the file was removed while it was recorded")
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Close the file as it is; without `finish` it can only be recovered."""
         self._file.close()
 
-    def _append(self, data: bytes) -> None:
-        self._crc = zlib.crc32(data, self._crc)
-        rest = memoryview(data)
-        while rest:
-            rest = rest[self._file.write(rest) :]
-        self.size += len(data)
+    def _append(self, *parts: bytes | memoryview) -> None:
+        for part in parts:
+            self._crc = zlib.crc32(part, self._crc)
+            self.size += len(part)
+        self._put(parts)
+
+    def _put(self, parts: Sequence[bytes | memoryview]) -> None:
+        """Hand the bytes over as they lie in memory; one call takes a limited number of parts and may stop early."""
+        waiting = [memoryview(part) for part in parts if len(part)]
+        while waiting:
+            done = os.writev(self._file.fileno(), waiting[:_PARTS_PER_WRITE])
+            while waiting and done >= len(waiting[0]):
+                done -= len(waiting.pop(0))
+            if done:
+                waiting[0] = waiting[0][done:]
 
     def _statistics(self) -> Statistics:
         first, last = self._span or (0, 0)
@@ -164,7 +182,7 @@ class McapFile:
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts={channel: count for channel, count in self._counts.items() if count},
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunk_count,
             message_count=sum(self._counts.values()),
             message_end_time=last,
             message_start_time=first,
@@ -190,3 +208,23 @@ def _bytes_of(record: McapRecord) -> bytes:
     record.write(builder)
     data: bytes = builder.end()  # type: ignore[no-untyped-call]
     return data
+
+
+def _all_bytes_of(records: Iterable[McapRecord]) -> bytes:
+    return b"".join(map(_bytes_of, records))
+
+
+def _chunk_head(chunk: Sealed) -> bytes:
+    """A chunk record up to its data, which would be copied twice by mcap's own builder."""
+    name = chunk.compression.encode()
+    length = _CHUNK_HEAD.size - 9 + len(name) + _SIZE.size + len(chunk.data)
+    head = _CHUNK_HEAD.pack(
+        Opcode.CHUNK,
+        length,
+        chunk.message_start_time,
+        chunk.message_end_time,
+        chunk.uncompressed_size,
+        chunk.uncompressed_crc,
+        len(name),
+    )
+    return head + name + _SIZE.pack(len(chunk.data))

@@ -132,7 +132,8 @@ class SessionReader:
     def _message(self, record: Record) -> Message:
         field = self._fields[record.channel]
         try:
-            return decode(BY_FIELD[field].type, record.payload, record.sequence)
+            schema = self._contents.schemas[record.channel]
+            return decode(BY_FIELD[field].type, record.payload, record.sequence, schema)
         except SessionError as error:
             raise DamageError(self.path, f"{BY_FIELD[field].path} at {record.log_ns} ns: {error}") from error
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
 from flowrec.store.contents import Contents
+from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
 from flowrec.store.mcap_file import is_growing
 from flowrec.store.reader import SessionReader
@@ -81,13 +82,17 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             return Recovered(target, whole.ticks, whole.duration_s)
         with contextlib.closing(Source(path)) as source:
             found = scan(source)
-        reader = SessionReader(path, Contents(path, found.summary))
+        contents = Contents(path, found.summary)
+        reader = SessionReader(path, contents)
         _require_head(path, found)
+        # Pixels that a JPEG has given are kept as they are: once more through it, they would be others.
+        known = ENCODINGS.get(contents.frame_encoding)
+        frames = known.name if known is not None and known.lossless else "zstd"
         end_ns = _last_whole_ns(path, reader, found)
     _refuse_if_taken(target)
     draft = target.with_name(f"{target.stem}.recovering{target.suffix}")
     try:
-        ticks, lost = _rewrite(reader, found, end_ns, draft)
+        ticks, lost = _rewrite(reader, found, end_ns, draft, frames)
         done = _checked(draft)
         if done is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
@@ -142,13 +147,15 @@ def _channel(found: Scan, topic: str) -> int:
     return next((number for number, channel in found.summary.channels.items() if channel.topic == topic), -1)
 
 
-def _rewrite(reader: SessionReader, found: Scan, end_ns: int, draft: Path) -> tuple[int, str]:
+def _rewrite(reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str) -> tuple[int, str]:
     """Write the ticks up to a stamp; their number and what was lost."""
     before = Tick()
     whole = images_missing = images_ahead = dropped = 0
     # Only replays are written without images.
     has_images = "frame" in reader.counts or not reader.header.parent
-    with SessionWriter(draft, reader.header, overwrite=True, block=True, queue_limit_bytes=_QUEUE_BYTES) as writer:
+    with SessionWriter(
+        draft, reader.header, frames=frames, overwrite=True, block=True, queue_limit_bytes=_QUEUE_BYTES
+    ) as writer:
         for tick in reader.ticks():
             if tick.stamp_ns > end_ns:
                 images_ahead += 1

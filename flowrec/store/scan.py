@@ -6,6 +6,7 @@ looked for by its shape.
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -28,7 +29,9 @@ from flowrec.store.mcap_file import MAGIC
 from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Source, Summary
 
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the content
-_CHUNK_MARK = b"\x04\x00\x00\x00zstd"  # follows the head of every chunk that flowrec writes
+_HEAD_BYTES = _CHUNK_HEAD.size + 16
+# The chunks that flowrec writes: a head, then `zstd`, or no name and the size of the content once more.
+_CHUNK_SHAPE = re.compile(rb"(?s)(?=\x06.{24}(.{8}).{4}(?:\x04\x00\x00\x00zstd|\x00\x00\x00\x00\1))")
 _WINDOW_BYTES = 1 << 20
 _SEQUENCES = 2**32
 
@@ -193,15 +196,12 @@ def _extent(source: Source, at: int) -> tuple[int, int]:
 
 def _next_chunk(source: Source, start: int) -> int:
     """Offset of the next thing that has the shape of a chunk, the end of the file where there is none."""
-    head = _CHUNK_HEAD.size
     while start < source.size:
-        window = source.read(start, min(source.size - start, _WINDOW_BYTES + head + len(_CHUNK_MARK)))
-        place = window.find(_CHUNK_MARK, head)
-        while place >= 0:
-            opcode, length, _, _, size, _ = _CHUNK_HEAD.unpack_from(window, place - head)
-            at = start + place - head
-            if opcode == Opcode.CHUNK and size <= CHUNK_LIMIT_BYTES and length <= source.size - at - RECORD_HEAD.size:
+        window = source.read(start, min(source.size - start, _WINDOW_BYTES + _HEAD_BYTES))
+        for shape in _CHUNK_SHAPE.finditer(window):
+            _, length, _, _, size, _ = _CHUNK_HEAD.unpack_from(window, shape.start())
+            at = start + shape.start()
+            if size <= CHUNK_LIMIT_BYTES and length <= source.size - at - RECORD_HEAD.size:
                 return at
-            place = window.find(_CHUNK_MARK, place + 1)
         start += _WINDOW_BYTES
     return source.size

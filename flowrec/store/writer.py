@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import operator
 import os
@@ -14,13 +15,19 @@ from typing import Any, Self
 import numpy as np
 
 from flowrec.errors import SessionError
-from flowrec.messages import Message, Tick, array_fields
+from flowrec.messages import Drops, Frame, Message, Tick, array_fields
 from flowrec.store.backlog import Backlog, Entry, News
+from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
+from flowrec.store.layout import FRAME_PATH
 from flowrec.store.recorder import Recorder
+from flowrec.store.thinning import Thinning
 from flowrec.topics import TOPICS
+from flowrec.units import NS_PER_S
 
 PARTIAL_SUFFIX = ".partial"
+_NICE = 5  # where there are too few cores for all, the control loop goes first
+_TELL_DROPS_NS = NS_PER_S // 2
 _MESSAGE_BYTES = 500  # about what a message weighs besides its pixels
 _FIELDS = tuple(topic.field for topic in TOPICS)
 _messages_of: Callable[[Tick], tuple[Any, ...]] = operator.attrgetter(*_FIELDS)
@@ -45,10 +52,13 @@ class SessionWriter:
     ----------
     path : file to make.
     header : what goes first into the file and is on the disk when the constructor returns.
-    flush_s : at most this much of a run is lost when the process is killed, in s.
+    frames : how images travel, a name of frames.py: raw, zstd, png, delta, or jpeg, which alone loses something.
+    flush_s : at most this much of a run is lost when the process is killed, in s, of wall time and of stamps;
+        besides, of its images and where `block` is set, what `queue_bytes` says is waiting.
+    sync_s : the same when the power fails, as long as an fsync takes less than half of it.
     overwrite : replace an existing file, and the remains of an unfinished one.
     block : what to do when the disk is slower than the run. True: `write` waits (simulation).
-        False: images are dropped and counted, nothing else ever is (live run).
+        False: images are thinned out (thinning.py) and counted, nothing else ever is dropped (live run).
     queue_limit_bytes : how much may wait for the disk.
 
     Raises
@@ -61,7 +71,9 @@ class SessionWriter:
         path: Path | str,
         header: SessionHeader,
         *,
+        frames: str = "zstd",
         flush_s: float = 0.5,
+        sync_s: float = 1.0,
         overwrite: bool = False,
         block: bool = False,
         queue_limit_bytes: int = 256 << 20,
@@ -70,6 +82,10 @@ class SessionWriter:
         self.partial_path = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
         self.ticks = 0  # written so far
         self.dropped_frames = 0  # for want of a faster disk
+        self.missing_frames = 0  # live: those that the camera counted and never delivered
+        self._thinning = Thinning()
+        self._next_index: int | None = None
+        self._said: Drops | None = None
         self._block = block
         self._overwrite = overwrite
         self._last: tuple[Any, ...] = (None,) * len(_FIELDS)
@@ -78,7 +94,14 @@ class SessionWriter:
         self._closed = False
         self._refuse_if_taken()
         try:
-            self._recorder = Recorder(self.partial_path, header, flush_s=flush_s, truncate=overwrite)
+            self._recorder = Recorder(
+                self.partial_path,
+                header,
+                frames=ENCODINGS[frames],
+                flush_s=flush_s,
+                sync_s=sync_s,
+                truncate=overwrite,
+            )
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         self._backlog = Backlog(queue_limit_bytes)
@@ -113,16 +136,20 @@ class SessionWriter:
             )
         self._last_ns = tick.stamp_ns
         self.ticks += 1
-        news, nbytes = self._news_of(tick)
-        if not self._backlog.has_room(nbytes):
-            if self._block:
-                self._backlog.wait_for_room(nbytes)
+        news = self._news_of(tick)
+        if self._block:
+            entry = _entry(tick.stamp_ns, news)
+            if not self._backlog.has_room(entry.nbytes):
+                self._backlog.wait_for_room(entry.nbytes)
                 self._raise_failure()
-            elif "frame" in news:
-                nbytes -= _nbytes(news.pop("frame"))
-                self.dropped_frames += 1
-        if news:
-            self._backlog.put(Entry(tick.stamp_ns, news, nbytes))
+            self._backlog.put(entry)
+            return
+        frame = news.pop("frame", None)
+        if isinstance(frame, Frame) and not self._takes(frame):
+            frame = None
+        self._tell_drops(news, tick.stamp_ns)
+        image: News = {"frame": frame} if frame is not None else {}
+        self._backlog.put(_entry(tick.stamp_ns, news), _entry(tick.stamp_ns, image))
 
     def close(self, outcome: Mapping[str, str] | None = None) -> None:
         """Finish the file and give it its name; a second call does nothing.
@@ -141,6 +168,10 @@ class SessionWriter:
         self._backlog.close()
         self._thread.join()
         counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
+        if self.missing_frames:
+            counts["frames_missing_from_camera"] = str(self.missing_frames)
+        if not self._recorder.lossless:
+            counts["frames_encoding"] = f"{self._recorder.encoding}, not lossless: a replay sees other pixels"
         try:
             if self._failure is None:
                 self._finish({**(outcome or {"outcome": "ended"}), **counts})
@@ -165,12 +196,11 @@ class SessionWriter:
             if str(second) != str(error):  # the first one matters more
                 error.add_note(str(second))
 
-    def _news_of(self, tick: Tick) -> tuple[News, int]:
+    def _news_of(self, tick: Tick) -> News:
         # This and `put` are all that recording costs the control loop: some 50 us.
         messages = _messages_of(tick)
         last, self._last = self._last, messages
         news: News = {}
-        nbytes = 0
         for name, message, before in zip(_FIELDS, messages, last, strict=True):
             # A stage that says the same thing again in a new object has said nothing new.
             if (
@@ -179,16 +209,42 @@ class SessionWriter:
                 and (before is None or message.stamp_ns != before.stamp_ns or not message.same_as(before))
             ):
                 news[name] = message
-                nbytes += _nbytes(message)
-        return news, nbytes
+        return news
+
+    def _takes(self, frame: Frame) -> bool:
+        """Whether there is room for an image of a live run; counts those that are missing."""
+        if self._next_index is not None and frame.index > self._next_index:
+            self.missing_frames += frame.index - self._next_index
+        self._next_index = frame.index + 1
+        kept = self._thinning.keeps(self._backlog.fill, frame.stamp_ns)
+        if kept and self._backlog.has_room(_nbytes(frame)):
+            return True
+        self.dropped_frames += 1
+        return False
+
+    def _tell_drops(self, news: News, stamp_ns: int) -> None:
+        """Add what is missing to the news when it begins, changes or ends, and twice a second in between."""
+        said, every = self._said, self._thinning.every
+        if said is None and not self.dropped_frames and not self.missing_frames:
+            return
+        told = (said.by_backlog, said.by_camera, said.kept_every) if said is not None else (0, 0, 1)
+        now = (self.dropped_frames, self.missing_frames, every)
+        due = said is None or stamp_ns >= said.stamp_ns + _TELL_DROPS_NS
+        if told != now and (due or told[1:] != now[1:]):
+            self._said = Drops(stamp_ns, FRAME_PATH, *now)
+            news["drops"] = self._said
 
     def _work(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # of Linux, where each thread has its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
             while not self._backlog.drained:
                 entry = self._backlog.take(self._recorder.patience_s)
                 if entry is not None:
                     self._recorder.add(entry)
-                self._recorder.flush_if_due()
+                # The image of a tick comes after its other messages: where it can be, what is flushed are whole ticks.
+                if entry is None or "frame" in entry.news or not self._backlog.images_wait:
+                    self._recorder.flush_if_due()
                 if entry is not None:
                     self._backlog.done(entry)
         except Exception as error:  # noqa: BLE001  whatever it is, the control loop has to hear of it
@@ -228,6 +284,10 @@ class SessionWriter:
             )
 
 
+def _entry(stamp_ns: int, news: News) -> Entry:
+    return Entry(stamp_ns, news, sum(map(_nbytes, news.values())))
+
+
 def _nbytes(message: Message) -> int:
     nbytes = _MESSAGE_BYTES
     for name in _PIXELS[type(message)]:
@@ -253,5 +313,7 @@ def _not_writable(path: Path, error: OSError) -> SessionError:
 
 
 def _disk_failed(path: Path, error: OSError) -> SessionError:
+    if error.errno == errno.ENOENT:
+        return SessionError(f"{path}: is gone, it or its directory was removed or renamed; look for it there")
     what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
     return SessionError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")

@@ -1,0 +1,194 @@
+"""`flowrec bench store`: what recording costs, beside a bare mcap Writer and a bare foxglove-sdk writer.
+
+The writers take turns on the same data in memory-backed storage where there is some, so that the disk does not
+blur them; what the disk itself takes is measured apart, where the session would be written.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowrec.bench.store_kills import kills
+from flowrec.bench.store_loop import soak, stall
+from flowrec.bench.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
+from flowrec.status import progress, table
+from flowrec.store import SessionReader, SessionWriter, recover
+
+_MEMORY = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is made in it
+_AIM = {"p99_ratio": 1.2, "disk_mb_s": 350.0, "throughput": 0.9}
+
+
+def measure(folder: Path | None = None, quick: bool = False, minutes: float = 0.0, killed: int = 0) -> dict[str, Any]:
+    """Throughput of each writer, stall of the control step, read, seek and recovery times.
+
+    `folder` is where the disk is measured and the stall is; by default that for temporary files. With `minutes`
+    nothing but memory is measured, for so long; with `killed` nothing but what so many kills cost.
+    """
+    if minutes:
+        return {"soak": soak(minutes, folder)}
+    if killed:
+        return {"kills": kills(killed, folder)}
+    share = 0.1 if quick else 1.0
+    seconds = 2.0 if quick else 10.0
+    with tempfile.TemporaryDirectory(dir=folder) as disk_name:
+        disk = Path(disk_name)
+        with tempfile.TemporaryDirectory(dir=_MEMORY if _MEMORY.is_dir() else folder) as fast_name:
+            fast = Path(fast_name)
+            throughput = [_one_load(load, fast, share, 1 if quick else 3) for load in LOADS]
+            reading = _reading(fast, 300 if quick else 3000)
+        return {
+            "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
+            "storage": {"throughput": str(fast.parent), "stall": str(disk.parent)},
+            "disk_mb_s": _disk_mb_s(disk, 100e6 if quick else 1e9),
+            "throughput": throughput,
+            "stall": stall(disk, seconds, 1 if quick else 3),
+            "reading": reading,
+            "aims": _AIM,
+        }
+
+
+def _one_load(load: Load, folder: Path, share: float, rounds: int) -> dict[str, Any]:
+    """Every writer on one load: the median of its rounds, the writers in turn."""
+    count = max(20, round(load.messages * share))
+    data = load.data()
+    nbytes = len(data[0].payload)
+    taken: dict[str, list[tuple[float, float, int]]] = {name: [] for name in load.writers}
+    with progress(load.name, rounds * len(taken)) as done:
+        for number in range(rounds * len(taken)):
+            name = load.writers[number % len(taken)]
+            path = folder / "bench.mcap"
+            began, began_cpu = time.perf_counter(), time.process_time()
+            WRITERS[name](path, data, count)
+            taken[name].append((time.perf_counter() - began, time.process_time() - began_cpu, path.stat().st_size))
+            path.unlink()
+            done(number + 1)
+    rows = {}
+    for name, times in taken.items():
+        wall_s, cpu_s, size = (float(np.median(column)) for column in zip(*times, strict=True))
+        rows[name] = {
+            "messages_s": count / wall_s,
+            "mb_s": count * nbytes / wall_s / 1e6,
+            "cpu_ms_per_message": 1e3 * cpu_s / count,
+            "ratio": count * nbytes / size,
+        }
+    return {"load": load.name, "messages": count, "nbytes": nbytes, "rows": rows, "rival": load.rival}
+
+
+def _disk_mb_s(folder: Path, nbytes: float) -> float:
+    """What the disk takes of one writer with an fsync at the end."""
+    block = np.random.default_rng(0).integers(0, 256, 1 << 22, dtype=np.uint8).tobytes()
+    count = int(nbytes / len(block)) + 1
+    path = folder / "disk"
+    began = time.perf_counter()
+    with path.open("wb", buffering=0) as file:
+        for _ in range(count):
+            file.write(block)
+        os.fsync(file.fileno())
+    taken = time.perf_counter() - began
+    path.unlink()
+    return count * len(block) / taken / 1e6
+
+
+def _reading(folder: Path, count: int) -> dict[str, float]:
+    """Seconds to open, seek, read and recover one session of poses and 640x512 images."""
+    path = folder / "session.mcap"
+    with SessionWriter(path, made_up_header(), frames="delta", block=True) as writer:
+        for tick in ticks_of(pictures(640, 512), count, 100.0):
+            writer.write(tick)
+    found: dict[str, float] = {"mb": path.stat().st_size / 1e6, "ticks": count}
+
+    def timed(name: str, began: float) -> None:
+        found[name] = time.perf_counter() - began
+
+    began = time.perf_counter()
+    with closing(SessionReader(path)) as reader:
+        timed("open_s", began)
+        middle_ns = (reader.first_ns + reader.last_ns) // 2
+        began = time.perf_counter()
+        reader.tick_before(middle_ns)
+        timed("seek_s", began)
+        began = time.perf_counter()
+        for tick in reader.ticks(middle_ns, with_frames=False):
+            if tick.stamp_ns > middle_ns + 10**9:
+                break
+        timed("one_second_of_poses_s", began)
+        began = time.perf_counter()
+        for _ in reader.ticks():
+            pass
+        timed("all_s", began)
+    cut = folder / "cut.mcap.partial"
+    shutil.copyfile(path, cut)
+    os.truncate(cut, int(0.9 * path.stat().st_size))
+    began = time.perf_counter()
+    recover(cut)
+    timed("recover_s", began)
+    return found
+
+
+def show(figures: dict[str, Any]) -> None:
+    """Print the figures as tables."""
+    if "soak" in figures:
+        found = figures["soak"]
+        names = ("minutes", "file_mb", "dropped", "lowest_mb", "highest_mb", "growth_mb_per_minute")
+        table("Soak, 640x512 at 100 Hz", ("", ""), [(name.replace("_", " "), f"{found[name]:.1f}") for name in names])
+        return
+    if "kills" in figures:
+        found = figures["kills"]
+        rows = [(name.replace("_", " "), str(found[name])) for name in ("kills", "before_the_first_flush", "broken")]
+        rows += [(f"lost, {name}, s", f"{value:.3f}") for name, value in found["lost_s"].items()]
+        table("kill -9 of a recording, 640x512 at 100 Hz", ("", ""), rows)
+        return
+    for load in figures["throughput"]:
+        best = load["rows"][load["rival"]]["messages_s"]
+        table(
+            f"{load['load']}: {load['messages']} messages of {load['nbytes'] / 1e3:.1f} kB",
+            ("writer", "messages/s", "MB/s", "of foxglove-sdk", "CPU ms", "ratio"),
+            [
+                (
+                    name,
+                    f"{row['messages_s']:.0f}",
+                    f"{row['mb_s']:.0f}",
+                    f"{row['messages_s'] / best:.2f}",
+                    f"{row['cpu_ms_per_message']:.3f}",
+                    f"{row['ratio']:.2f}",
+                )
+                for name, row in load["rows"].items()
+            ],
+        )
+    loop = figures["stall"]
+    table(
+        f"Control step, 2448x2048 at 60 Hz, {loop['ticks']} steps each; disk {figures['disk_mb_s']:.0f} MB/s",
+        ("recording", "p50 ms", "p99 ms", "max ms", "p99 of off", "dropped", "queue MB", "CPU ms per frame"),
+        [
+            (
+                name,
+                f"{row['p50_ms']:.2f}",
+                f"{row['p99_ms']:.2f}",
+                f"{row['max_ms']:.1f}",
+                f"{row['p99_ms'] / loop['rows']['off']['p99_ms']:.2f}",
+                str(row["dropped"]),
+                f"{row['queue_mb']:.0f}",
+                f"{row['cpu_ms_per_frame']:.1f}",
+            )
+            for name, row in loop["rows"].items()
+        ],
+    )
+    read = figures["reading"]
+    table(
+        f"Reading {read['mb']:.0f} MB, {read['ticks']} ticks with 640x512 images",
+        ("", "ms"),
+        [
+            (name.removesuffix("_s").replace("_", " "), f"{1e3 * read[name]:.1f}")
+            for name in read
+            if name.endswith("_s")
+        ],
+    )

@@ -1,0 +1,160 @@
+"""What recording does to the control loop, and to memory in a long run."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowrec.bench.loop import PacedRig, TimingsOnly, prepare_inputs
+from flowrec.bench.store_rivals import BareProcess, BareThread
+from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
+from flowrec.config import load_config
+from flowrec.messages import Frame, Image, Tick
+from flowrec.record import prepare
+from flowrec.run import LockstepWorker, Sink, run
+from flowrec.status import progress
+from flowrec.store import SessionWriter
+
+RATE_HZ = 60.0
+_WIDTH, _HEIGHT = 2448, 2048
+_RING = 64
+_SOAK_RATE_HZ = 100.0
+_WARM_S = 5.0  # until the queue, the pools and the caches have their size
+
+
+@dataclass(slots=True)
+class LargeCamera:
+    """A sink before the writer: the loop flies on 640x512, what is recorded are 2448x2048 images.
+
+    Each is copied into a ring of buffers that is longer than the writer's queue, as a driver does; also when nothing
+    is recorded.
+    """
+
+    images: list[Image]
+    ring: list[Image]
+    writer: Sink | None
+    kept: Tick = field(default_factory=Tick)
+
+    def write(self, tick: Tick) -> None:
+        if tick.frame is not None:
+            image = self.ring[tick.frame.index % len(self.ring)]
+            np.copyto(image, self.images[tick.frame.index % len(self.images)])
+            tick = replace(tick, frame=Frame(tick.frame.stamp_ns, tick.frame.index, image))
+        self.kept = tick
+        if self.writer is not None:
+            self.writer.write(tick)
+
+
+def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
+    """The control step with recording off, on, and with what else could have been built, in turn, at 60 Hz.
+
+    The step is what the loop times: tracking, observing, control, and the hand-over to the sinks of the tick before.
+    """
+    config, _chip, pipeline = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
+    prepared = prepare_inputs(config, pipeline, round(duration_s * RATE_HZ))
+    images = pictures(_WIDTH, _HEIGHT)
+    ring = [np.ones_like(images[0]) for _ in range(_RING)]
+    kinds = ("off", "zstd", "delta", "raw", "a bare thread", "a bare process")
+    rows: dict[str, list[Any]] = {kind: [] for kind in kinds}
+    path = folder / "stall.mcap"
+    with progress("flying", rounds * len(kinds)) as done:
+        for number in range(rounds * len(kinds)):
+            kind = kinds[number % len(kinds)]
+            writer = _writer(kind, path)
+            timings = TimingsOnly()
+            sinks: list[Sink] = [timings, LargeCamera(images, ring, writer)]
+            worker = LockstepWorker(pipeline, config.worker.adopt_after_s, fills=())
+            cpu_s = time.process_time()
+            run(
+                pipeline,
+                PacedRig(prepared, RATE_HZ),
+                worker,
+                sinks,
+                queue_state=partial(_queue_of, writer),
+                end_when_finished=False,
+            )
+            cpu_s = time.process_time() - cpu_s
+            if writer is not None:
+                writer.close()
+            skip = len(timings.ticks) // 10  # the robot is found and caches are filled in the first frames
+            rows[kind].append(([t.timing for t in timings.ticks[skip:] if t.timing is not None], cpu_s))
+            done(number + 1)
+    return {
+        "ticks": len(prepared) * rounds,
+        "rows": {kind: _row(runs, len(prepared)) for kind, runs in rows.items()},
+    }
+
+
+def _writer(kind: str, path: Path) -> SessionWriter | BareThread | BareProcess | None:
+    if kind == "off":
+        return None
+    if kind == "a bare thread":
+        return BareThread()
+    if kind == "a bare process":
+        return BareProcess(_WIDTH * _HEIGHT)
+    return SessionWriter(path, made_up_header(), frames=kind, overwrite=True)
+
+
+def _queue_of(writer: object) -> tuple[float, int]:
+    return (writer.queue_bytes / 1e6, writer.dropped_frames) if isinstance(writer, SessionWriter) else (0.0, 0)
+
+
+def _row(runs: list[Any], ticks: int) -> dict[str, float]:
+    timings = [timing for one, _ in runs for timing in one]
+    total_ms = [timing.total_ms for timing in timings]
+    return {
+        "p50_ms": float(np.median(total_ms)),
+        "p99_ms": float(np.percentile(total_ms, 99)),
+        "max_ms": max(total_ms),
+        "hand_over_p99_ms": float(np.percentile([timing.sinks_ms for timing in timings], 99)),
+        "dropped": sum(one[-1].dropped_frames for one, _ in runs),
+        "queue_mb": max(timing.queue_mb for timing in timings),
+        "cpu_ms_per_frame": 1e3 * sum(cpu_s for _, cpu_s in runs) / len(runs) / ticks,
+    }
+
+
+def soak(minutes: float, folder: Path | None = None) -> dict[str, Any]:
+    """Memory of this process while 640x512 images are recorded at 100 Hz, once a second."""
+    images = pictures(640, 512)
+    mb: list[float] = []
+    count = round(minutes * 60 * _SOAK_RATE_HZ)
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        path = Path(name) / "soak.mcap"
+        with SessionWriter(path, made_up_header(), frames="delta") as writer, progress("soaking", count) as done:
+            began = time.perf_counter()
+            for number, tick in enumerate(ticks_of(images, count, _SOAK_RATE_HZ)):
+                wait_s = began + number / _SOAK_RATE_HZ - time.perf_counter()
+                if wait_s > 0:
+                    time.sleep(wait_s)
+                assert tick.frame is not None
+                writer.write(replace(tick, frame=replace(tick.frame, image=tick.frame.image.copy())))
+                if number % _SOAK_RATE_HZ == 0:
+                    mb.append(memory_mb())
+                    done(number)
+            dropped = writer.dropped_frames
+        size = path.stat().st_size
+    settled = np.array(mb[int(_WARM_S) :]) if len(mb) > 2 * _WARM_S else np.array(mb)
+    growth = np.polyfit(np.arange(len(settled)), settled, 1)[0] * 60.0 if len(settled) > 1 else 0.0
+    return {
+        "minutes": minutes,
+        "file_mb": size / 1e6,
+        "dropped": dropped,
+        "memory_mb": mb,
+        "highest_mb": float(settled.max()),
+        "lowest_mb": float(settled.min()),
+        "growth_mb_per_minute": float(growth),
+    }
+
+
+def memory_mb() -> float:
+    """Memory of this process now, in MB, of Linux; NaN elsewhere."""
+    status = Path("/proc/self/status")
+    found = re.search(r"VmRSS:\s+(\d+)", status.read_text(encoding="ascii")) if status.exists() else None
+    return float(found[1]) / 1024.0 if found else float("nan")
