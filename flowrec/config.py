@@ -154,7 +154,11 @@ def resolve(config: Config, chip: Chip) -> Config:
     if camera.rate_hz is None:
         rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), 100.0)
         camera = replace(camera, rate_hz=round(rate, 1))
-    resolved = replace(config, camera=camera, robot=robot)
+    assert camera.rate_hz is not None
+    blind_s = robot.delay + 1.0 / camera.rate_hz
+    plan = config.plan if config.plan.blind_s is not None else replace(config.plan, blind_s=blind_s)
+    survey = config.survey if config.survey.blind_s is not None else replace(config.survey, blind_s=blind_s)
+    resolved = replace(config, camera=camera, robot=robot, plan=plan, survey=survey)
     mission = config.mission
     mission = replace(
         mission,

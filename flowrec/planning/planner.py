@@ -22,6 +22,7 @@ from flowrec.planning.space import (
     margin_remark,
     margins_um,
     open_space,
+    too_swift,
     why_apart,
 )
 from flowrec.planning.zermelo import line_is_clear
@@ -43,6 +44,9 @@ class Planner:
     method: Method = "astar_time"
     clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
+    # From what the camera sees to its effect on the robot. None: latency and one frame, when the run is resolved.
+    blind_s: float | None = None
+    flow_doubt: float = 0.3  # share of the flow's speed by which it may carry the robot astray in that time
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
     refine: bool = True  # astar_time's path
@@ -63,9 +67,10 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
         margins = margins_um(self.clearance_margin_um, robot)
+        drift_s = self.flow_doubt * (self.blind_s or 0.0)
         trouble = ""
         for margin_um in margins:
-            space = open_space(chip, field, robot.radius, margin_um)
+            space = open_space(chip, field, robot.radius, margin_um, drift_s)
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
@@ -73,7 +78,8 @@ class Planner:
                 lean = margin_remark(margin_um, margins)
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
-        return no_route(self.method, trouble)
+        swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift_s)
+        return no_route(self.method, swift or trouble)
 
     def _through(self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float) -> Route:
         """The route between two ends that geometry connects."""

@@ -57,8 +57,11 @@ class End:
     trouble: str = ""
 
 
-def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float) -> Space:
-    """The space of a robot that keeps a margin from the walls.
+def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift_s: float = 0.0) -> Space:
+    """The space of a robot that keeps a margin from the walls, and more where the flow is swift.
+
+    Before anything can be done about it the flow may carry the robot aside by its own speed times `drift_s` (the
+    blind time times the share of the flow that is in doubt), so that much room must be left at a node as well.
 
     Raises
     ------
@@ -78,10 +81,11 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float)
     far_px = float(sum(chip.mask.shape))
     clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
     need = float((radius_um + margin_um) / chip.um_per_px)
+    swept = _swept(field, radius_um, drift_s)
     return Space(
         clearance=clearance,
         fluid=np.ascontiguousarray(chip.mask),
-        free=chip.mask & (clearance >= need),
+        free=chip.mask & (clearance >= need) & (clearance >= swept),
         radius=float(radius_um) / chip.um_per_px,
         need=need,
         vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
@@ -113,6 +117,35 @@ def why_apart(space: Space, a: int, b: int) -> str:
         f"the channel is too narrow at {column * px:.0f},{row * px:.0f} um: half its width there is "
         f"{widest * px:.0f} um and the robot needs {space.need * px:.0f} um"
     )
+
+
+def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, radius_um: float, drift_s: float) -> str:
+    """Why a robot that geometry lets through can not be steered on its way, '' when it can; names the worst place."""
+    wide = open_space(chip, field, radius_um, 0.0)
+    swept = _swept(field, radius_um, drift_s)
+    a, b = attach_start(wide, start_um).node, attach_goal(wide, goal_um).node
+    if a < 0 or b < 0 or not _joined(wide.free, a, b):
+        return ""
+    # How many times over there is room: the best way is the one whose worst place has most.
+    room = np.where(wide.free, wide.clearance / swept, -1.0)
+    widest = _bottleneck(room, a, b)
+    if not 0.0 < widest < 1.0:
+        return ""
+    column, row = _narrowest_place(room, widest, a, b)
+    px = wide.um_per_px
+    flow_um_s = float(np.hypot(wide.vx[row, column], wide.vy[row, column])) * px
+    return (
+        f"the flow is too swift to be steered in: {flow_um_s:.0f} um/s at {column * px:.0f},{row * px:.0f} um may carry "
+        f"the robot {flow_um_s * drift_s:.0f} um aside before it can be corrected, and there are "
+        f"{wide.clearance[row, column] * px - radius_um:.0f} um to the wall; a faster camera (camera.rate_hz), "
+        "less latency (robot.delay_s) or a slower flow would do"
+    )
+
+
+def _swept(field: FlowField, radius_um: float, drift_s: float) -> Raster:
+    """(h, w) clearance (px) that a robot needs where the flow may carry it aside."""
+    velocity = field.velocity_um_s.astype(np.float64)
+    return np.asarray((radius_um + drift_s * np.hypot(velocity[..., 0], velocity[..., 1])) / field.um_per_px)
 
 
 def _attach(space: Space, name: str, point_um: Points, within: float) -> End:
