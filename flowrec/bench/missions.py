@@ -50,7 +50,6 @@ TRIPS: dict[tuple[str, str], tuple[str, ...]] = {
     ("down", "assumed"): ("mission.phases=plan,navigate",),
     ("up", "assumed"): ("mission.phases=plan,navigate", "mission.start=outlet", "mission.goal=inlet"),
 }
-_BUILT_IN_CAMERA = ("camera.width_px=320", "camera.height_px=256")
 # Everything that a planner may want to know about the truth, and nothing kept back for the controller.
 _BEST = Planner(method="astar_time", clearance_margin_um=0.0, speed_share=1.0)
 
@@ -186,9 +185,9 @@ def chip_of(seed: int, paths: Sequence[Path]) -> tuple[str, ...]:
     kinds = 4 if paths else 2
     turn, kind = divmod(seed - 1, kinds)
     if kind == 0:
-        return ("chip.name=bifurcation", *_BUILT_IN_CAMERA)
+        return ("chip.name=bifurcation",)
     if kind == 1:
-        return ("chip.name=vessels", f"chip.seed={seed}", *_BUILT_IN_CAMERA)
+        return ("chip.name=vessels", f"chip.seed={seed}")
     return (f"chip.path={paths[(2 * turn + kind - 2) % len(paths)]}",)
 
 
