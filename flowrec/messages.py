@@ -194,7 +194,9 @@ class Demand(Message):
     velocity_um_s: Vector  # (2,) relative to the fluid
     reference_um: Vector  # (2,) where the robot should be now
     progress_s: float  # time along the route, slowed while the robot lags behind
-    error_um: float  # distance to the reference, NaN without one
+    # Distance to the reference, NaN without one. Under a policy, which may go another way than the route, that to the
+    # nearest place from which a way to the goal is known.
+    error_um: float
     saturated: bool
     sent_um_s: Matrix  # (m, 2) the latest demands, oldest first: what may still be on its way to the coils
 

@@ -87,6 +87,12 @@ def assemble(config: Config, chip: Chip) -> Pipeline:
     )
 
 
+def _strength(coils: Coils, last: Tick) -> float:
+    """Share of its full amplitude that the field had in the tick before; all of it before there is any."""
+    full_mt = coils.amplitude_mt
+    return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
+
+
 def _no_lap(_stage: str) -> None:
     """Ignore the end of a stage."""
 
@@ -103,14 +109,23 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
         track = inputs.track
     lap("track")
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot)
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, refined or assumed)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
     mission = p.commander.decide(
         last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, p.robot
     )
     demand = p.controller.control(
-        last.demand, mission, route, estimate, refined or assumed, p.robot, p.clearance_um, p.chip.um_per_px
+        last.demand,
+        mission,
+        route,
+        estimate,
+        refined or assumed,
+        p.robot,
+        p.clearance_um,
+        p.chip.um_per_px,
+        _strength(p.coils, last),
+        p.observer.method == "kalman_map",
     )
     currents = p.coils.drive(last.currents, demand, p.robot, mission.finished)
     lap("control")

@@ -215,7 +215,7 @@ def hindsight(reader: SessionReader, pipeline: Pipeline) -> Callable[[int], Obse
     UsageError
         If the observer is not the Kalman filter, whose model the smoother shares.
     """
-    if pipeline.observer.method != "kalman":
+    if pipeline.observer.method == "luenberger":
         raise UsageError("sampler.method = 'smoothed' needs observer.method = 'kalman', whose model it shares")
     tracks: list[Track] = []
     applied: list[Applied] = []

@@ -39,6 +39,11 @@ class Robot:
         assert self.max_speed_um_s is not None and self.step_out_hz is not None, "robot is resolved with the chip"
         return min(self.max_speed_um_s, self.step_out_margin * self.step_out_hz * self.um_per_rev)
 
+    def speed_limit_at(self, strength: float) -> float:
+        """The same with a field of this share of its full amplitude, um/s: step-out falls with the torque."""
+        assert self.step_out_hz is not None, "robot is resolved with the chip"
+        return min(self.speed_limit_um_s, strength * self.step_out_margin * self.step_out_hz * self.um_per_rev)
+
     def rolled_speed_um_s(self, frequency_hz: float) -> float:
         """Speed at a field frequency: proportional up to step-out, then the mean of Adler's equation, um/s."""
         assert self.step_out_hz is not None

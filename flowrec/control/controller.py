@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.laws import ff_fb_law, saturated, shortened, vector_law
+from flowrec.control.laws import ff_fb_law, ff_fb_literal_law, saturated, shortened, vector_law
+from flowrec.control.policy import astray_um, downhill
 from flowrec.control.prediction import FlowBelief, blend, remembered, roll_forward
-from flowrec.control.reference import governed_pace, place_on, velocity_on
+from flowrec.control.reference import bearable_pace, governed_pace, nearest_on, place_on, velocity_on
 from flowrec.control.walls import guarded
 from flowrec.flow import sample
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
@@ -19,45 +21,79 @@ from flowrec.robot import Robot
 from flowrec.units import seconds
 
 Vector = NDArray[np.float64]
+Method = Literal["vector", "policy", "ff_fb", "ff_fb_literal", "ff_fb_no_flow", "ff_fb_observer"]
 _FOLLOWING = ("survey", "navigate")
 _USUAL_RADII_PER_S = 12.0
 _LARGEST_SHARE = 0.3
 
 
+def _mapped_flow(field: FlowField | None, estimate: Estimate) -> Vector:
+    return sample(field, estimate.position_um) if field is not None else estimate.flow_um_s
+
+
+def _no_flow(_field: FlowField | None, _estimate: Estimate) -> Vector:
+    return np.zeros(2)
+
+
+def _observed_flow(_field: FlowField | None, estimate: Estimate) -> Vector:
+    return estimate.flow_um_s
+
+
+# The paper's law and those that it is compared with: the law itself, and the flow that it makes up for.
+_PaperLaw = Callable[[Vector, Vector, Vector, float, float], Vector]
+_PAPER: dict[str, tuple[_PaperLaw, Callable[[FlowField | None, Estimate], Vector]]] = {
+    "ff_fb": (ff_fb_law, _mapped_flow),
+    "ff_fb_literal": (ff_fb_literal_law, _mapped_flow),
+    "ff_fb_no_flow": (ff_fb_law, _no_flow),
+    "ff_fb_observer": (ff_fb_law, _observed_flow),
+}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Aim:
-    """What the robot is to do: be at the reference now, and at the other one, moving, when a demand takes effect."""
+    """What the robot is to do: be at the reference now, and at the other one, moving, when a demand takes effect.
+
+    Under the policy there is a heading instead, and the reference is for people.
+    """
 
     reference_um: Vector
     reference_then_um: Vector
     moving_um_s: Vector
     progress_s: float
+    error_um: float
+    heading: Vector | None = None
 
     @staticmethod
-    def at_rest(place_um: Vector) -> _Aim:
-        return _Aim(place_um, place_um, np.zeros(2), 0.0)
+    def at_rest(place_um: Vector, position_um: Vector, progress_s: float = 0.0) -> _Aim:
+        return _Aim(place_um, place_um, np.zeros(2), progress_s, _distance(place_um, position_um))
 
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """Tracking with the flow compensated (science.md, section 5).
+    """Tracking with the flow compensated, or the planner's own policy (science.md, section 5).
 
     vector: u = sat(xd_dot - v(x+) + Kp (xd - x+)); x+ is the estimate rolled forward over the demands still on
-    their way to the coils. ff_fb: the paper's feedforward-feedback law, made sound.
+    their way to the coils.
+    policy: u = -V grad T / |grad T| at x+, with V the robot's limit and T the route's time to go; the slope is felt
+    over a radius, or over a frame's way. No reference, and no new plan wherever the robot is blown. Beside the goal, and on a route without T (a survey), vector.
+    ff_fb: the paper's feedforward-feedback law, made sound, with the map's flow; ff_fb_literal as it is printed,
+    ff_fb_no_flow without flow compensation, ff_fb_observer with the observer's flow.
 
     Rates and times are meant for a robot that swims up to 12 of its radii in a second. For one that is faster, in
     smaller or swifter vessels, they are that much quicker, as far as the frame rate allows.
     """
 
-    method: Literal["vector", "ff_fb"] = "vector"
+    method: Method = "vector"
     kp_per_s: float = 3.0  # of vector
     ff_fb_kp_per_s: float = 1.0  # of ff_fb, as in the paper
     lag_free_radii: float = 0.5  # the robot may be this far off before the reference slows down,
     lag_full_radii: float = 3.0  # and waits for it from here on
+    pace_share: float = 0.95  # of the robot's limit that the reference may ask for; the rest is left to feedback
     map_error: float = 0.3  # share of the flow's speed that the map is thought to be wrong by
-    observer_lag_s: float = 0.3  # how far behind a changing flow the observer is thought to be
+    observer_lag_s: float = 0.3  # how far behind a changing flow an observer without a map is thought to be
     guard_radii: float = 1.1  # clearance kept from walls, in robot radii; 0: no wall guard
     guard_per_s: float = 5.0  # how fast the room left above that may be used up
+    hold_radii: float = 0.5  # so near to the goal the policy hands over
     blind_s: float = 0.5  # while the robot is not seen the demand dies away with this time constant
 
     def control(
@@ -70,8 +106,10 @@ class Controller:
         robot: Robot,
         clearance_um: NDArray[np.float32] | None,
         um_per_px: float,
+        strength: float = 1.0,
+        observer_knows_map: bool = False,
     ) -> Demand:
-        """The demand after this frame.
+        """The demand after this frame, never above what the robot can do.
 
         In the phases survey and navigate the reference runs along the route, from its start when the phase begins;
         else it is the place where the phase found the robot. A finished mission asks for nothing.
@@ -80,18 +118,32 @@ class Controller:
         ----------
         clearance_um : (h, w) distance to the walls at the pixels of the chip, None without walls.
         um_per_px : size of those pixels.
+        strength : 0 to 1, the share of its full amplitude that the field has just now: the step-out goes with it.
+        observer_knows_map : the estimate's flow is already that of the map, corrected (kalman_map).
         """
         if previous is not None and previous.stamp_ns == estimate.stamp_ns:
             return previous
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
+        limit_um_s = robot.speed_limit_at(strength)
         sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
-        belief = blend(field, estimate, sent, self.map_error, self.observer_lag_s / _hurry(robot))
+        lag_s = 0.0 if observer_knows_map else self.observer_lag_s / _hurry(robot)
+        belief = blend(field, estimate, sent, self.map_error, lag_s)
         point = roll_forward(estimate.position_um, sent, dt_s, robot.delay, belief)
-        aim = self._aim(previous, mission, route, estimate, point, robot, dt_s)
-        error = aim.reference_um - estimate.position_um
-        demand, saturated = np.zeros(2), False
-        if not mission.finished and np.isfinite(error).all():
-            demand, saturated = self._law(aim, estimate, field, belief, point, robot, clearance_um, um_per_px, dt_s)
+        if mission.finished or mission.phase not in _FOLLOWING or route is None or not len(route.waypoints_um):
+            place = self._place(previous, mission, estimate, point)
+            aim = _Aim.at_rest(place, estimate.position_um)
+        elif self.method == "policy" and route.time_to_go_s is not None:
+            aim = self._homing(route, route.time_to_go_s, estimate, point, robot, um_per_px, limit_um_s * dt_s)
+        else:
+            aim = self._following(previous, mission, route, estimate, belief, robot, limit_um_s, dt_s)
+        demand, cut = np.zeros(2), False
+        if not mission.finished and math.isfinite(aim.error_um):
+            demand, cut = self._law(aim, estimate, field, belief, point, robot, limit_um_s, dt_s)
+            if clearance_um is not None and self.guard_radii > 0.0:
+                keep_um, per_s = self.guard_radii * robot.radius, _quicker(self.guard_per_s, robot, dt_s)
+                demand = guarded(demand, belief.at(point), point, clearance_um, um_per_px, keep_um, per_s)
+                demand, cut_again = shortened(demand, limit_um_s)
+                cut = cut or cut_again
             if not estimate.seen:
                 demand = self._blind(previous, demand, robot, dt_s)
         return Demand(
@@ -99,46 +151,73 @@ class Controller:
             velocity_um_s=demand,
             reference_um=aim.reference_um,
             progress_s=aim.progress_s,
-            error_um=math.hypot(error[0], error[1]),
-            saturated=saturated,
+            error_um=aim.error_um,
+            saturated=cut,
             sent_um_s=remembered(sent, demand, dt_s, robot.delay),
         )
 
-    def _aim(
+    def _following(
         self,
         previous: Demand | None,
         mission: Mission,
-        route: Route | None,
+        route: Route,
         estimate: Estimate,
-        point: Vector,
+        belief: FlowBelief,
         robot: Robot,
+        limit_um_s: float,
         dt_s: float,
     ) -> _Aim:
-        """The reference of this frame; `point` is where the robot will be when the demand takes effect."""
-        began = previous is None or mission.since_ns > previous.stamp_ns
-        if mission.finished or mission.phase not in _FOLLOWING or route is None or not route.reachable:
-            return _Aim.at_rest(self._place(previous, began, mission, estimate, point))
-        if previous is None or began or route.stamp_ns > previous.stamp_ns:
+        """The reference on its way along the route, at a pace that the robot can keep up with."""
+        if previous is None or mission.since_ns > previous.stamp_ns or route.stamp_ns > previous.stamp_ns:
             progress_s, pace = 0.0, 1.0
         else:
-            span_s = max(dt_s, 1e-3)
+            place = place_on(route, previous.progress_s)
+            planned = velocity_on(route, previous.progress_s, max(dt_s, 1e-3))
             pace = governed_pace(
-                place_on(route, previous.progress_s) - estimate.position_um,
-                velocity_on(route, previous.progress_s, span_s),
+                place - estimate.position_um,
+                planned,
                 self.lag_free_radii * robot.radius,
                 self.lag_full_radii * robot.radius,
             )
+            pace = bearable_pace(planned, belief.at(place), self.pace_share * limit_um_s, pace)
             progress_s = min(previous.progress_s + pace * dt_s, float(route.arrival_s[-1]))
         then_s = progress_s + pace * robot.delay
+        reference = place_on(route, progress_s)
         return _Aim(
-            reference_um=place_on(route, progress_s),
+            reference_um=reference,
             reference_then_um=place_on(route, then_s),
             moving_um_s=pace * velocity_on(route, then_s, max(pace * dt_s, 1e-3)),
             progress_s=progress_s,
+            error_um=_distance(reference, estimate.position_um),
+        )
+
+    def _homing(
+        self,
+        route: Route,
+        time_to_go_s: NDArray[np.float32],
+        estimate: Estimate,
+        point: Vector,
+        robot: Robot,
+        um_per_px: float,
+        frame_um: float,
+    ) -> _Aim:
+        """Down the time to go. There is no error but to have left where that is known; `frame_um` is swum a frame."""
+        goal = route.waypoints_um[-1]
+        left_um = _distance(goal, point)
+        if left_um <= max(self.hold_radii * robot.radius, um_per_px):
+            return _Aim.at_rest(goal, estimate.position_um, float(route.arrival_s[-1]))
+        progress_s = nearest_on(route, estimate.position_um)
+        return _Aim(
+            reference_um=place_on(route, progress_s),
+            reference_then_um=goal,
+            moving_um_s=np.zeros(2),
+            progress_s=progress_s,
+            error_um=astray_um(time_to_go_s, um_per_px, estimate.position_um),
+            heading=downhill(time_to_go_s, um_per_px, point, min(max(robot.radius, frame_um), left_um)),
         )
 
     @staticmethod
-    def _place(previous: Demand | None, began: bool, mission: Mission, estimate: Estimate, point: Vector) -> Vector:
+    def _place(previous: Demand | None, mission: Mission, estimate: Estimate, point: Vector) -> Vector:
         """Where to stay: as near as the robot can stop to where the phase found it, or it was found after a loss.
 
         NaN while it has not been seen, or not for so long that nothing is asked of it any more.
@@ -149,7 +228,7 @@ class Controller:
             return previous.reference_um
         if not estimate.seen and not previous.velocity_um_s.any():
             return np.full(2, np.nan)
-        return point if began else previous.reference_um
+        return point if mission.since_ns > previous.stamp_ns else previous.reference_um
 
     def _law(
         self,
@@ -159,27 +238,18 @@ class Controller:
         belief: FlowBelief,
         point: Vector,
         robot: Robot,
-        clearance_um: NDArray[np.float32] | None,
-        um_per_px: float,
+        limit_um_s: float,
         dt_s: float,
     ) -> tuple[Vector, bool]:
-        """The demand (2,) um/s and whether the robot's limit cut it."""
-        limit_um_s = robot.speed_limit_um_s
-        if self.method == "vector":
-            flow = belief.at(point)
-            wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, _quicker(self.kp_per_s, robot, dt_s))
-            demand, cut = saturated(wanted, flow, limit_um_s)
-        else:
-            point = estimate.position_um
-            flow = sample(field, point) if field is not None else estimate.flow_um_s
-            wanted = ff_fb_law(aim.reference_um - point, aim.moving_um_s, flow, self.ff_fb_kp_per_s, dt_s)
-            demand, cut = shortened(wanted, limit_um_s)
-        if clearance_um is None or self.guard_radii <= 0.0:
-            return demand, cut
-        keep_um = self.guard_radii * robot.radius
-        demand = guarded(demand, flow, point, clearance_um, um_per_px, keep_um, _quicker(self.guard_per_s, robot, dt_s))
-        demand, cut_again = shortened(demand, limit_um_s)
-        return demand, cut or cut_again
+        """The demand (2,) um/s, walls aside, and whether the robot's limit cut it."""
+        if aim.heading is not None:
+            return limit_um_s * aim.heading, False
+        if self.method in _PAPER:
+            law, flow_of = _PAPER[self.method]
+            error, flow = aim.reference_then_um - estimate.position_um, flow_of(field, estimate)
+            return shortened(law(error, aim.moving_um_s, flow, self.ff_fb_kp_per_s, dt_s), limit_um_s)
+        wanted = vector_law(aim.reference_then_um - point, aim.moving_um_s, _quicker(self.kp_per_s, robot, dt_s))
+        return saturated(wanted, belief.at(point), limit_um_s)
 
     def _blind(self, previous: Demand | None, demand_um_s: Vector, robot: Robot, dt_s: float) -> Vector:
         """The demand while the robot is not seen: never more than what is left of the last one, in the end nothing."""
@@ -199,3 +269,7 @@ def _hurry(robot: Robot) -> float:
 def _quicker(per_s: float, robot: Robot, dt_s: float) -> float:
     """A rate for this robot; what is held for a whole frame must not undo more than a third of an error in one."""
     return max(per_s, min(per_s * _hurry(robot), _LARGEST_SHARE / dt_s)) if dt_s > 0.0 else per_s
+
+
+def _distance(a: Vector, b: Vector) -> float:
+    return math.hypot(a[0] - b[0], a[1] - b[1])

@@ -6,6 +6,7 @@ All vectors are (2,) in um and um/s; the flow is what the controller believes of
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +44,41 @@ def ff_fb_law(error_um: Vector, moving_um_s: Vector, flow_um_s: Vector, kp_per_s
     of e = xd - x - v dt, weighted by the errors along and across the heading of xd_dot. As printed, but that the
     average is one of directions on the circle, and that of the feedforward where there is no error (science.md, 5).
     """
+    return _ff_fb(_average_direction, error_um, moving_um_s, flow_um_s, kp_per_s, dt_s)
+
+
+def ff_fb_literal_law(error_um: Vector, moving_um_s: Vector, flow_um_s: Vector, kp_per_s: float, dt_s: float) -> Vector:
+    """The same as the paper prints it: the raw average of two angles, which wraps around. Only 0/0 is caught."""
+    return _ff_fb(_average_angle, error_um, moving_um_s, flow_um_s, kp_per_s, dt_s)
+
+
+def _ff_fb(
+    average: Callable[[float, float, float], float],
+    error_um: Vector,
+    moving_um_s: Vector,
+    flow_um_s: Vector,
+    kp_per_s: float,
+    dt_s: float,
+) -> Vector:
     e = error_um - flow_um_s * dt_s
     forward = moving_um_s - flow_um_s
     course = math.atan2(moving_um_s[1], moving_um_s[0])
     along = abs(math.cos(course) * e[0] + math.sin(course) * e[1])
     across = abs(-math.sin(course) * e[0] + math.cos(course) * e[1])
-    ahead, back = math.atan2(forward[1], forward[0]), math.atan2(e[1], e[0])
     share = across / (along + across) if along + across > 1e-9 else 0.0
-    heading = ahead + share * math.atan2(math.sin(back - ahead), math.cos(back - ahead))
+    heading = average(math.atan2(forward[1], forward[0]), math.atan2(e[1], e[0]), share)
     unit = np.array([math.cos(heading), math.sin(heading)])
     return (math.hypot(forward[0], forward[1]) + kp_per_s * float(e @ unit)) * unit
+
+
+def _average_direction(ahead: float, back: float, share: float) -> float:
+    """The heading a share of the shorter way round from one to another."""
+    return ahead + share * math.atan2(math.sin(back - ahead), math.cos(back - ahead))
+
+
+def _average_angle(ahead: float, back: float, share: float) -> float:
+    """The mean of two numbers, which of 179 and -179 degrees is 0."""
+    return (1.0 - share) * ahead + share * back
 
 
 def shortened(vector: Vector, limit: float) -> tuple[Vector, bool]:

@@ -3,6 +3,10 @@
 State [x, y, vx, vy]; x' = x + v dt + d with d the displacement by the field as really applied; v' = v + noise of
 spectral density q (continuous white acceleration of the flow along the path). The normalised innovation squared (NIS)
 has mean 2 when R and q are right.
+
+`kalman_map`: the same filter on what a known map m of the flow misses, v - m(x). The state stays the whole flow at
+the robot; the map's change along the way is added to it, v' = v + m(x') - m(x) + noise of a smaller q, so nothing
+jumps when another map is adopted. The map is not linear in x: an extended filter, with the midpoint rule for the way.
 """
 
 from __future__ import annotations
@@ -12,13 +16,18 @@ from functools import lru_cache
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
 
-from flowrec.messages import Applied, Estimate, Matrix, Track
+from flowrec.flow import sample
+from flowrec.messages import Applied, Estimate, FlowField, Matrix, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
+Floats = NDArray[np.float64]
+
 _H = np.eye(2, 4)
 _B = np.eye(4, 2)
+_RESIDUAL_SHARE = 0.03  # a map wrong by a sixth leaves a sixth of the flow's changes
 _UNKNOWN_UM = 1e4  # one sigma of a position that has never been measured
 
 
@@ -35,6 +44,7 @@ class Kalman:
 
     position_noise_um: float | None = None  # one sigma of a measured position; None: 2 % of the radius
     flow_noise_um2_s3: float | None = None  # q
+    residual_noise_um2_s3: float | None = None  # q of what a map misses; None: 3 % of flow_noise
     drift_um2_s: float = 4.0  # of the position: Brownian motion and uneven rolling
     gate_nis: float = 25.0  # a measurement less likely than this is not used at once ...
     gate_growth: float = 4.0  # ... but the position's variance is multiplied, so that a real jump is soon believed
@@ -45,24 +55,42 @@ class Kalman:
         scale = (robot.max_speed_um_s / 600.0) ** 3 / (robot.radius / 50.0)
         return self.flow_noise_um2_s3 if self.flow_noise_um2_s3 is not None else 1e4 * scale
 
-    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
-        """One predict and, where the robot was seen, one update."""
-        q = self.flow_noise(robot)
+    def residual_noise(self, robot: Robot) -> float:
+        """Spectral density q of the random walk of what a map misses, um2/s3."""
+        q = self.residual_noise_um2_s3
+        return q if q is not None else _RESIDUAL_SHARE * self.flow_noise(robot)
+
+    def estimate(
+        self,
+        previous: Estimate | None,
+        track: Track,
+        applied: Applied,
+        robot: Robot,
+        field: FlowField | None = None,
+    ) -> Estimate:
+        """One predict and, where the robot was seen, one update. With a `field` it filters what that misses."""
+        q = self.flow_noise(robot) if field is None else self.residual_noise(robot)
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
         # State and covariance are set anew for every step: all that the filter knows is in the messages.
         kalman = _filter(sigma_um)
         if previous is None:
             assert robot.max_speed_um_s is not None
             flow_um_s = 0.5 * robot.max_speed_um_s
-            kalman.x = np.array([*track.position_um, 0.0, 0.0])
+            guess = np.zeros(2) if field is None else sample(field, track.position_um)
+            kalman.x = np.concatenate((track.position_um, guess))
             kalman.P = np.diag([_UNKNOWN_UM**2, _UNKNOWN_UM**2, flow_um_s**2, flow_um_s**2])
         else:
             kalman.x = np.concatenate((previous.position_um, previous.flow_um_s))
             kalman.P = previous.covariance.copy()
             dt = seconds(track.stamp_ns - previous.stamp_ns)
-            kalman.predict(
-                u=robot.um_per_rev * applied.turns, B=_B, F=transition(dt), Q=process_noise(dt, q, self.drift_um2_s)
-            )
+            moved = robot.um_per_rev * applied.turns
+            noise = process_noise(dt, q, self.drift_um2_s)
+            if field is None:
+                kalman.predict(u=moved, B=_B, F=transition(dt), Q=noise)
+            else:
+                onward, step = along(field, kalman.x, moved, dt)
+                kalman.predict(F=step, Q=noise)  # the covariance; the state goes the curved way
+                kalman.x = onward
         nis = float("nan")
         if track.seen:
             innovation = track.position_um - kalman.x[:2]
@@ -109,6 +137,25 @@ def process_noise(dt: float, q: float, drift: float) -> np.ndarray[tuple[int, ..
         noise[axis, axis + 2] = noise[axis + 2, axis] = q * dt**2 / 2
         noise[axis + 2, axis + 2] = q * dt
     return noise
+
+
+def along(field: FlowField, state: Floats, moved: Floats, dt: float) -> tuple[Floats, Floats]:
+    """The state (4,) after dt along a map, by the midpoint rule, and the derivative (4, 4) of it by the state before.
+
+    Of the derivative what the map's own curvature adds over one step is left out.
+    """
+    here = sample(field, state[:2])
+    middle = state[2:] + sample(field, state[:2] + 0.5 * (dt * state[2:] + moved)) - here
+    position = state[:2] + dt * middle + moved
+    flow = state[2:] + sample(field, position) - here
+    step = np.eye(4)
+    step[0, 2] = step[1, 3] = dt
+    for axis in (0, 1):  # dv'/dv = 1 + dt dm/dx
+        aside = np.zeros(2)
+        aside[axis] = 0.5 * field.um_per_px
+        slope = (sample(field, position + aside) - sample(field, position - aside)) / field.um_per_px
+        step[2:, 2 + axis] += dt * slope
+    return np.concatenate((position, flow)), step
 
 
 def memory_s(covariance: Matrix) -> float:

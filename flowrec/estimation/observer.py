@@ -7,7 +7,7 @@ from typing import Literal
 
 from flowrec.estimation.kalman import Kalman
 from flowrec.estimation.luenberger import Luenberger
-from flowrec.messages import Applied, Estimate, Track
+from flowrec.messages import Applied, Estimate, FlowField, Track
 from flowrec.robot import Robot
 
 
@@ -15,11 +15,22 @@ from flowrec.robot import Robot
 class Observer:
     """Chooses the method; every method has the same verb."""
 
-    method: Literal["kalman", "luenberger"] = "kalman"
+    method: Literal["kalman", "kalman_map", "luenberger"] = "kalman"
     kalman: Kalman = field(default_factory=Kalman)
     luenberger: Luenberger = field(default_factory=Luenberger)
 
-    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
-        """The belief after this frame. The robot's own displacement is um_per_rev times the turns really applied."""
-        method = self.kalman if self.method == "kalman" else self.luenberger
-        return method.estimate(previous, track, applied, robot)
+    def estimate(
+        self,
+        previous: Estimate | None,
+        track: Track,
+        applied: Applied,
+        robot: Robot,
+        field: FlowField | None = None,
+    ) -> Estimate:
+        """The belief after this frame. The robot's own displacement is um_per_rev times the turns really applied.
+
+        `field` is the best flow known, which only `kalman_map` looks at; without one it is `kalman`.
+        """
+        if self.method == "luenberger":
+            return self.luenberger.estimate(previous, track, applied, robot)
+        return self.kalman.estimate(previous, track, applied, robot, field if self.method == "kalman_map" else None)

@@ -15,6 +15,7 @@ from flowrec.planning.paper import adjacency, search_paper
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
 from flowrec.planning.space import (
+    Drift,
     End,
     Space,
     attach_goal,
@@ -25,17 +26,20 @@ from flowrec.planning.space import (
     too_swift,
     why_apart,
 )
+from flowrec.planning.time_field import descend, time_field, with_band
 from flowrec.planning.zermelo import line_is_clear
 from flowrec.robot import Robot
 
-Method = Literal["astar_time", "astar_paper", "astar_length"]
+Method = Literal["time_field", "astar_time", "astar_paper", "astar_length"]
 Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Planner:
-    """Flow-aware A* (science.md, section 3), and beside it what it is compared with.
+    """The fastest way through a flow (science.md, section 3), and beside it what it is compared with.
 
+    time_field: the time to go from everywhere, the way down it, then a local refinement of the path. The route keeps
+        the field: its slope is a policy, -grad T the best heading wherever the robot is pushed.
     astar_time: exact travel time on the pixels, admissible heuristic, then a local refinement of the path.
     astar_paper: cost and heuristic as the paper prints them, neighbours by K-D tree.
     astar_length: the shortest way, blind to the flow.
@@ -44,12 +48,13 @@ class Planner:
     method: Method = "astar_time"
     clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
+    policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
     # From what the camera sees to its effect on the robot. None: latency and one frame, when the run is resolved.
     blind_s: float | None = None
-    flow_doubt: float = 0.3  # share of the flow's speed by which it may carry the robot astray in that time
+    astray: float = 0.3  # share of its way over ground in that time by which the robot may be off its course
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
-    refine: bool = True  # astar_time's path
+    refine: bool = True  # the path of time_field and astar_time
 
     def plan(self, field: FlowField, start_um: ArrayLike, goal_um: ArrayLike, chip: Chip, robot: Robot) -> Route:
         """Route from start to goal, both (2,) um; stamp and request are 0.
@@ -67,18 +72,20 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
         margins = margins_um(self.clearance_margin_um, robot)
-        drift_s = self.flow_doubt * (self.blind_s or 0.0)
+        drift = Drift(self.astray * (self.blind_s or 0.0), robot.speed_limit_um_s)
         trouble = ""
         for margin_um in margins:
-            space = open_space(chip, field, robot.radius, margin_um, drift_s)
+            space = open_space(chip, field, robot.radius, margin_um, drift)
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
                 route = self._through(space, field, start, goal, speed_um_s)
+                if self.method == "time_field" and route.reachable:
+                    route = replace(route, time_to_go_s=self._time_to_go(space, goal, robot))
                 lean = margin_remark(margin_um, margins)
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
-        swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift_s)
+        swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift)
         return no_route(self.method, swift or trouble)
 
     def _through(self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float) -> Route:
@@ -90,7 +97,7 @@ class Planner:
             assert shortest is not None, "free pixels that touch are joined by edges"
             return no_route(self.method, too_fast(field, shortest * px, speed_um_s))
         path = _between(space, nodes, start, goal)
-        if self.method == "astar_time" and self.refine:
+        if self.method in ("time_field", "astar_time") and self.refine:
             even = np.ones_like(space.clearance)
             refined = relax(path, space.clearance, space.need, space.vx, space.vy, even, speed_um_s / px)
             route = timed_route(self.method, field, refined * px, speed_um_s, "")
@@ -98,8 +105,29 @@ class Planner:
                 return route
         return timed_route(self.method, field, path * px, speed_um_s, "")
 
+    def _time_to_go(self, space: Space, goal: End, robot: Robot) -> NDArray[np.float32]:
+        """(h, w) s: the policy, also where the robot is nearer to the walls than the route."""
+        speed = planning_speed_um_s(self.policy_share, robot) / space.um_per_px
+        at = _place(space, goal.node) if goal.point is None else goal.point
+        every = np.full_like(space.clearance, speed)
+        times = time_field(space.free, space.clearance, space.need, space.vx, space.vy, every, at)
+        return with_band(times, space.free, space.fluid, speed).astype(np.float32)
+
+    def _down(self, space: Space, start: int, goal: int, speed: float) -> Points | None:
+        """(n, 2) the way down the time to go; None where that is infinite."""
+        every = np.full_like(space.clearance, speed)
+        flow = (space.clearance, space.need, space.vx, space.vy, every)
+        first, last = _place(space, start), _place(space, goal)
+        times = time_field(space.free, *flow, last, start)
+        if not np.isfinite(times.ravel()[start]):
+            return None
+        path = descend(times, *flow, first, last)
+        return self._search(space, "astar_time", start, goal, speed) if path is None else path
+
     def _search(self, space: Space, method: Method, start: int, goal: int, speed: float) -> Points | None:
-        """(n, 2) pixels from node to node, None when the search finds no way; speed in px/s."""
+        """(n, 2) points from node to node, None when the search finds no way; speed in px/s."""
+        if method == "time_field":
+            return self._down(space, start, goal, speed)
         if method == "astar_paper":
             rows, columns = np.nonzero(space.free)
             nodes = np.column_stack([columns, rows]).astype(np.float64)
@@ -119,9 +147,14 @@ class Planner:
             start,
             goal,
             speed,
-            method == "astar_time",
+            method != "astar_length",
         )
         return backtrack(parent, goal, space.width) if np.isfinite(cost[goal]) else None
+
+
+def _place(space: Space, node: int) -> Points:
+    """(2,) px of a node."""
+    return np.array([node % space.width, node // space.width], np.float64)
 
 
 def _between(space: Space, nodes: Points, start: End, goal: End) -> Points:

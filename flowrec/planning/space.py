@@ -57,11 +57,21 @@ class End:
     trouble: str = ""
 
 
-def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift_s: float = 0.0) -> Space:
-    """The space of a robot that keeps a margin from the walls, and more where the flow is swift.
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far a robot may be off its course before that is seen and put right: a share of its way over ground."""
 
-    Before anything can be done about it the flow may carry the robot aside by its own speed times `drift_s` (the
-    blind time times the share of the flow that is in doubt), so that much room must be left at a node as well.
+    seconds: float = 0.0  # that share times the blind time, from what the camera sees to its effect
+    speed_um_s: float = 0.0  # the robot's own, through the fluid
+
+    def um(self, field: FlowField) -> Raster:
+        """(h, w) at most so far: the map is wrong, and a heading held for a frame cuts every bend."""
+        velocity = field.velocity_um_s.astype(np.float64)
+        return np.asarray(self.seconds * (np.hypot(velocity[..., 0], velocity[..., 1]) + self.speed_um_s))
+
+
+def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift: Drift = Drift()) -> Space:
+    """The space of a robot that keeps a margin from the walls, and as much as it may drift where that is more.
 
     Raises
     ------
@@ -81,7 +91,7 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float,
     far_px = float(sum(chip.mask.shape))
     clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
     need = float((radius_um + margin_um) / chip.um_per_px)
-    swept = _swept(field, radius_um, drift_s)
+    swept = (radius_um + drift.um(field)) / chip.um_per_px
     return Space(
         clearance=clearance,
         fluid=np.ascontiguousarray(chip.mask),
@@ -119,10 +129,10 @@ def why_apart(space: Space, a: int, b: int) -> str:
     )
 
 
-def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, radius_um: float, drift_s: float) -> str:
+def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, radius_um: float, drift: Drift) -> str:
     """Why a robot that geometry lets through can not be steered on its way, '' when it can; names the worst place."""
     wide = open_space(chip, field, radius_um, 0.0)
-    swept = _swept(field, radius_um, drift_s)
+    swept = (radius_um + drift.um(field)) / chip.um_per_px
     a, b = attach_start(wide, start_um).node, attach_goal(wide, goal_um).node
     if a < 0 or b < 0 or not _joined(wide.free, a, b):
         return ""
@@ -135,17 +145,11 @@ def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, r
     px = wide.um_per_px
     flow_um_s = float(np.hypot(wide.vx[row, column], wide.vy[row, column])) * px
     return (
-        f"the flow is too swift to be steered in: {flow_um_s:.0f} um/s at {column * px:.0f},{row * px:.0f} um may carry "
-        f"the robot {flow_um_s * drift_s:.0f} um aside before it can be corrected, and there are "
-        f"{wide.clearance[row, column] * px - radius_um:.0f} um to the wall; a faster camera (camera.rate_hz), "
-        "less latency (robot.delay_s) or a slower flow would do"
+        f"too swift to be steered at {column * px:.0f},{row * px:.0f} um: in a flow of {flow_um_s:.0f} um/s and with "
+        f"{drift.speed_um_s:.0f} um/s of its own the robot may be {drift.um(field)[row, column]:.0f} um off its course "
+        f"before that is put right, and the walls leave {wide.clearance[row, column] * px - radius_um:.0f} um; less "
+        "latency (robot.delay_s), more frames (camera.rate_hz) or a slower flow would do"
     )
-
-
-def _swept(field: FlowField, radius_um: float, drift_s: float) -> Raster:
-    """(h, w) clearance (px) that a robot needs where the flow may carry it aside."""
-    velocity = field.velocity_um_s.astype(np.float64)
-    return np.asarray((radius_um + drift_s * np.hypot(velocity[..., 0], velocity[..., 1])) / field.um_per_px)
 
 
 def _attach(space: Space, name: str, point_um: Points, within: float) -> End:

@@ -75,7 +75,7 @@ def test_upstream_the_plan_takes_the_slow_long_branch_and_downstream_the_fast_sh
     assert length_um(up) > 1.5 * length_um(down)
 
 
-@pytest.mark.parametrize("method", ["astar_time", "astar_paper", "astar_length"])
+@pytest.mark.parametrize("method", ["time_field", "astar_time", "astar_paper", "astar_length"])
 def test_every_method_keeps_the_robots_radius_from_the_walls_and_agrees_on_how_it_is_timed(method):
     chip, field = loop()
     swimmer = robot(200.0, radius_um=20.0)
