@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.bench.shares import paired, wilson
-from flowrec.chip import load_chip
+from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.config import Config, load_config, resolve
 from flowrec.errors import FlowrecError, UsageError
@@ -29,8 +29,9 @@ from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import assemble
 from flowrec.planning import Planner
-from flowrec.rigs.simulated import SimulatedRig
-from flowrec.robot import Robot
+from flowrec.record import refuse_adrift
+from flowrec.rigs.simulated import SimulatedRig, true_chip
+from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run import LockstepWorker, run
 from flowrec.status import progress, say, table
 from flowrec.units import seconds
@@ -51,7 +52,7 @@ TRIPS: dict[tuple[str, str], tuple[str, ...]] = {
     ("up", "assumed"): ("mission.phases=plan,navigate", "mission.start=outlet", "mission.goal=inlet"),
 }
 # Everything that a planner may want to know about the truth, and nothing kept back for the controller.
-_BEST = Planner(method="astar_time", clearance_margin_um=0.0, speed_share=1.0)
+_BEST = Planner(method="time_field", clearance_margin_um=0.0, speed_share=1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +131,7 @@ def measure(
 ) -> dict[str, Any]:
     """Rows per mission, a summary per policy, and the policies compared on the trips that both arrived from.
 
-    Seeds take the bifurcation, the vessels and two of the `cases` (*.npz) in turn.
+    Seeds take the bifurcation, the vessels and each of the `cases` (*.npz), as it is and slowed down, in turn.
 
     Raises
     ------
@@ -181,14 +182,32 @@ def measure(
 
 
 def chip_of(seed: int, paths: Sequence[Path]) -> tuple[str, ...]:
-    """The settings of a seed's chip: bifurcation, vessels, and two cases in turn where there are any."""
-    kinds = 4 if paths else 2
-    turn, kind = divmod(seed - 1, kinds)
+    """The settings of a seed's chip: bifurcation, vessels, and each case as it is and slowed down, in turn."""
+    turn, kind = divmod(seed - 1, 4 if paths else 2)
     if kind == 0:
         return ("chip.name=bifurcation",)
     if kind == 1:
         return ("chip.name=vessels", f"chip.seed={seed}")
-    return (f"chip.path={paths[(2 * turn + kind - 2) % len(paths)]}",)
+    path = paths[turn % len(paths)]
+    return (f"chip.path={path}",) if kind == 2 else slowed(path)
+
+
+def slowed(path: Path) -> tuple[str, ...]:
+    """A vessel case with a flow, and a robot to match, that 40 ms of latency and 30 frames a second can master.
+
+    In that time the robot, 1.3 times as fast as the flow, swims a fifth of the median channel. Many cases as they are
+    run a thousand times faster: there the right answer is that nobody can steer in them.
+    """
+    plain = load_config(None, [f"chip.path={path}"])
+    chip = load_chip(plain.chip)
+    speed_um_s = 0.2 * median_width_um(chip) / (USUAL_DELAY_S + 1.0 / 30.0)
+    peak_um_s = float(np.linalg.norm(plain.flow.solve(chip).velocity_um_s, axis=-1).max())
+    inlet_um_s = max(opening.value for opening in chip.openings if opening.kind == "inlet")
+    return (
+        f"chip.path={path}",
+        f"chip.inlet_speed_um_s={inlet_um_s * speed_um_s / 1.3 / peak_um_s:.4g}",
+        f"robot.max_speed_um_s={speed_um_s:.4g}",
+    )
 
 
 def _fly(order: tuple[int, tuple[str, ...], str, str, str, World]) -> Row:
@@ -216,9 +235,11 @@ def fly(
     ]
     config = load_config(None, sets)
     name = Path(config.chip.path).stem or config.chip.name
+    name += " slowed" if config.chip.path and config.chip.inlet_speed_um_s is not None else ""
     try:
         chip = load_chip(config.chip)
         config = resolve(config, chip)
+        refuse_adrift(config, chip)
         truth = true_field(chip, config, world)
     except FlowrecError as error:  # said in one line before anything is switched on
         nothing = (0, 0, None, None, None, None, None, 0, math.nan, math.nan, math.nan)
@@ -240,7 +261,7 @@ def fly(
     outcome = report.outcome
     taken_s = best_s = None
     if log.began is not None:
-        began_ns, place_um, route = log.began
+        began_ns, place_um, _route = log.began
         tolerance_um = config.mission.goal_tolerance_um or config.robot.radius
         best_s = optimum_s(truth, place_um, mission.goal_um, tolerance_um, chip, config.robot)
         if outcome == "reached":
@@ -271,8 +292,6 @@ def fly(
 
 def true_field(chip: Chip, config: Config, world: World) -> FlowField:
     """The flow that really is: every inlet off by exactly the world's share, outlets and viscosity as the rig draws."""
-    from flowrec.rigs.simulated import true_chip
-
     solver = FlowSolver(k=config.simulated.k)
     drawn = true_chip(chip, config.simulated, solver)
     rng = np.random.default_rng([config.simulated.seed, 0xF10])

@@ -15,9 +15,9 @@ from flowrec.planning.paper import adjacency, search_paper
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
 from flowrec.planning.space import (
-    Drift,
     End,
     Space,
+    Swift,
     attach_goal,
     attach_start,
     margin_remark,
@@ -49,9 +49,7 @@ class Planner:
     clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
     policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
-    # From what the camera sees to its effect on the robot. None: latency and one frame, when the run is resolved.
-    blind_s: float | None = None
-    astray: float = 0.3  # share of its way over ground in that time by which the robot may be off its course
+    swift: Swift = Swift()  # more is kept where the flow is swift
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
     refine: bool = True  # the path of time_field and astar_time
@@ -72,7 +70,7 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
         margins = margins_um(self.clearance_margin_um, robot)
-        drift = Drift(self.astray * (self.blind_s or 0.0), robot.speed_limit_um_s)
+        drift = self.swift.drift(robot, robot.speed_limit_um_s)
         trouble = ""
         for margin_um in margins:
             space = open_space(chip, field, robot.radius, margin_um, drift)

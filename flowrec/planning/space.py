@@ -59,15 +59,39 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Drift:
-    """How far a robot may be off its course before that is seen and put right: a share of its way over ground."""
+    """How far a robot may get off its course before that is seen and put right.
 
-    seconds: float = 0.0  # that share times the blind time, from what the camera sees to its effect
+    The map's error carries it off all through the blind time, from what the camera sees to its effect. And a heading
+    is held for a frame, so a bend is cut: by w^2 / 8 r for the way w over ground in a frame and a bend of radius r,
+    here the robot's diameter.
+    """
+
+    map_error: float = 0.0  # share of the flow's speed
+    blind_s: float = 0.0
+    frame_s: float = 0.0
     speed_um_s: float = 0.0  # the robot's own, through the fluid
+    radius_um: float = 1.0  # of the robot
 
     def um(self, field: FlowField) -> Raster:
-        """(h, w) at most so far: the map is wrong, and a heading held for a frame cuts every bend."""
+        """(h, w) so far."""
         velocity = field.velocity_um_s.astype(np.float64)
-        return np.asarray(self.seconds * (np.hypot(velocity[..., 0], velocity[..., 1]) + self.speed_um_s))
+        flow = np.hypot(velocity[..., 0], velocity[..., 1])
+        way = self.frame_s * (flow + self.speed_um_s)
+        return np.asarray(self.map_error * self.blind_s * flow + way**2 / (16.0 * self.radius_um))
+
+
+@dataclass(frozen=True, slots=True)
+class Swift:
+    """What makes a flow too swift to be steered in; times are set when a run is resolved, and 0 where nobody did."""
+
+    map_error: float = 0.2  # share of the flow's speed that the map is thought to be wrong by
+    frame_s: float | None = None  # None: the camera's
+    latency_s: float | None = None  # from command to motion; None: the robot's
+
+    def drift(self, robot: Robot, speed_um_s: float) -> Drift:
+        """Of a robot that swims at a speed."""
+        frame_s, latency_s = self.frame_s or 0.0, self.latency_s or 0.0
+        return Drift(self.map_error, frame_s + latency_s, frame_s, speed_um_s, robot.radius)
 
 
 def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift: Drift = Drift()) -> Space:
