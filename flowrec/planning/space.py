@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
@@ -33,6 +33,7 @@ class Space:
     free: NDArray[np.bool_]  # (h, w) where the robot's centre may be: the nodes
     radius: float  # of the robot
     need: float  # clearance of nodes and of long edges
+    least: Raster  # (h, w) that of a node: need, or more where the flow is swift
     vx: Raster  # (h, w)
     vy: Raster  # (h, w)
     um_per_px: float
@@ -115,16 +116,39 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float,
     far_px = float(sum(chip.mask.shape))
     clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
     need = float((radius_um + margin_um) / chip.um_per_px)
-    swept = (radius_um + drift.um(field)) / chip.um_per_px
+    least = np.maximum(need, (radius_um + drift.um(field)) / chip.um_per_px)
     return Space(
         clearance=clearance,
         fluid=np.ascontiguousarray(chip.mask),
-        free=chip.mask & (clearance >= need) & (clearance >= swept),
+        free=chip.mask & (clearance >= least),
         radius=float(radius_um) / chip.um_per_px,
         need=need,
+        least=least,
         vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
         vy=np.ascontiguousarray(field.velocity_um_s[..., 1], np.float64) / chip.um_per_px,
         um_per_px=float(chip.um_per_px),
+    )
+
+
+def finer(space: Space, k: int) -> Space:
+    """The same space with k - 1 points between any two pixels, so that pixel (i, j) is point (k i, k j)."""
+    h, w = space.free.shape
+    rows, columns = np.meshgrid(np.arange((h - 1) * k + 1) / k, np.arange((w - 1) * k + 1) / k, indexing="ij")
+
+    def between(raster: Raster) -> Raster:
+        return np.asarray(map_coordinates(raster, (rows, columns), order=1))
+
+    clearance, least = k * between(space.clearance), k * between(space.least)
+    return Space(
+        clearance=clearance,
+        fluid=clearance > 0.0,
+        free=clearance >= least,
+        radius=k * space.radius,
+        need=k * space.need,
+        least=least,
+        vx=k * between(space.vx),
+        vy=k * between(space.vy),
+        um_per_px=space.um_per_px / k,
     )
 
 
@@ -253,9 +277,9 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
     return column, row
 
 
-def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
-    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: half the radius), half, none."""
-    first = 0.5 * robot.radius if wanted_um is None else wanted_um
+def margins_um(wanted_um: float | None, robot: Robot, usual_radii: float) -> tuple[float, ...]:
+    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: the usual), half of it, none."""
+    first = usual_radii * robot.radius if wanted_um is None else wanted_um
     return tuple(dict.fromkeys((first, 0.5 * first, 0.0)))
 
 
