@@ -371,6 +371,20 @@ def bench_missions(
     _keep(figures, json_file)
 
 
+@bench.command("track")
+def bench_track(
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the ways and the errors.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5,
+) -> None:
+    """The paper's lemniscate in a vortex: how well each control law tracks it."""
+    from flowrec.bench.track import measure, show
+
+    figures = measure(seeds, figure)
+    show(figures)
+    _keep(figures, json_file)
+
+
 @bench.command("solver")
 def bench_solver(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,

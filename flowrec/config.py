@@ -284,6 +284,11 @@ def _refuse_nonsense(config: Config, where: str) -> None:
     for key, value in positive.items():
         if value is not None and not value > 0:
             raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
+    if config.control.method == "policy" and config.plan.method != "time_field":
+        raise UsageError(
+            f"{where}: control.method = 'policy' goes down the time to go, which plan.method = {config.plan.method!r} "
+            "does not know; set plan.method = 'time_field', or control.method = 'vector'"
+        )
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:

@@ -23,7 +23,7 @@ SPIN_PER_S = 0.2  # of the vortex
 A_UM, B_UM = 1800.0, 1500.0
 PERIOD_S = 40.0
 RATE_HZ = 30.0
-_CENTRE_UM = 2500.0  # of chip and vortex
+CENTRE_UM = 2500.0  # of chip and vortex
 _START_UM = (1200.0, 600.0)  # from the centre
 _UM_PER_PX = 50.0  # the vortex is linear, bilinear sampling of it exact
 
@@ -59,7 +59,7 @@ class Flight:
     @property
     def error_um(self) -> NDArray[np.float64]:
         """(n,) distance to the reference."""
-        return np.hypot(*(self.reference_um - self.position_um).T)
+        return np.asarray(np.hypot(*(self.reference_um - self.position_um).T))
 
 
 def lemniscate(turns: int = 2) -> Route:
@@ -68,15 +68,15 @@ def lemniscate(turns: int = 2) -> Route:
     theta = 2.0 * np.pi * time / PERIOD_S
     spread = (1.0 + np.sin(theta) ** 2)[:, None]
     points = np.stack([A_UM * np.cos(theta), B_UM * np.sin(theta) * np.cos(theta)], -1) / spread
-    return Route(0, 1, "lemniscate", True, "", points + _CENTRE_UM, time)
+    return Route(0, 1, "lemniscate", True, "", points + CENTRE_UM, time)
 
 
 def vortex_map(error: float) -> FlowField:
     """The vortex, too strong by a share."""
-    size = round(2 * _CENTRE_UM / _UM_PER_PX) + 1
-    y, x = np.mgrid[0:size, 0:size] * _UM_PER_PX - _CENTRE_UM
-    velocity = (1.0 + error) * SPIN_PER_S * np.stack([-y, x], -1)
-    zero = np.zeros((size, size))
+    size = round(2 * CENTRE_UM / _UM_PER_PX) + 1
+    y, x = np.mgrid[0:size, 0:size] * _UM_PER_PX - CENTRE_UM
+    velocity = ((1.0 + error) * SPIN_PER_S * np.stack([-y, x], -1)).astype(np.float32)
+    zero = np.zeros((size, size), np.float32)
     return FlowField(0, 0, "vortex", _UM_PER_PX, velocity, zero, None, np.zeros(0), 1.0, 1000.0, "")
 
 
@@ -92,7 +92,7 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
     rows = []
     for index in range(round(turns * PERIOD_S * RATE_HZ)):
         stamp = round(index * NS_PER_S / RATE_HZ)
-        seen = np.array([z.real, z.imag]) + _CENTRE_UM + world.noise_um * rng.standard_normal(2)
+        seen = np.array([z.real, z.imag]) + CENTRE_UM + world.noise_um * rng.standard_normal(2)
         track = Track(stamp, True, seen, 1.0, 0, 10.0, np.zeros(4))
         applied = Applied(stamp, 0.0, 0.0, 1.0, np.zeros(3), np.array([turned.real, turned.imag]))
         estimate = observer.estimate(estimate, track, applied, robot, field)
@@ -102,7 +102,7 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
         )
         flow = 1j * SPIN_PER_S * z
         miss = math.hypot(estimate.flow_um_s[0] - flow.real, estimate.flow_um_s[1] - flow.imag)
-        rows.append((seconds(stamp), z.real, z.imag, *(demand.reference_um - _CENTRE_UM), demand.progress_s, miss))
+        rows.append((seconds(stamp), z.real, z.imag, *(demand.reference_um - CENTRE_UM), demand.progress_s, miss))
         rows[-1] += (float(demand.velocity_um_s[0]), float(demand.velocity_um_s[1]))
         now, end = index / RATE_HZ, (index + 1) / RATE_HZ
         coming.append((now + world.delay_s, complex(demand.velocity_um_s[0], demand.velocity_um_s[1])))

@@ -64,8 +64,8 @@ class _Aim:
     heading: Vector | None = None
 
     @staticmethod
-    def at_rest(place_um: Vector, position_um: Vector, progress_s: float = 0.0) -> _Aim:
-        return _Aim(place_um, place_um, np.zeros(2), progress_s, _distance(place_um, position_um))
+    def at_rest(place_um: Vector, position_um: Vector) -> _Aim:
+        return _Aim(place_um, place_um, np.zeros(2), 0.0, _distance(place_um, position_um))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,8 @@ class Controller:
     vector: u = sat(xd_dot - v(x+) + Kp (xd - x+)); x+ is the estimate rolled forward over the demands still on
     their way to the coils.
     policy: u = -V grad T / |grad T| at x+, with V the robot's limit and T the route's time to go; the slope is felt
-    over a radius, or over a frame's way. No reference, and no new plan wherever the robot is blown. Beside the goal, and on a route without T (a survey), vector.
+    over a radius, or over a frame's way. No reference, and no new plan wherever the robot is blown. Beside the goal,
+    and on a route without T (a survey), vector.
     ff_fb: the paper's feedforward-feedback law, made sound, with the map's flow; ff_fb_literal as it is printed,
     ff_fb_no_flow without flow compensation, ff_fb_observer with the observer's flow.
 
@@ -92,8 +93,8 @@ class Controller:
     map_error: float = 0.3  # share of the flow's speed that the map is thought to be wrong by
     observer_lag_s: float = 0.3  # how far behind a changing flow an observer without a map is thought to be
     guard_radii: float = 1.1  # clearance kept from walls, in robot radii; 0: no wall guard
-    guard_per_s: float = 5.0  # how fast the room left above that may be used up
-    hold_radii: float = 0.5  # so near to the goal the policy hands over
+    guard_per_s: float = 12.0  # how fast the room left above that may be used up
+    hold_radii: float = 0.5  # so near to the goal, or a frame's way, the policy hands over to vector
     blind_s: float = 0.5  # while the robot is not seen the demand dies away with this time constant
 
     def control(
@@ -136,7 +137,7 @@ class Controller:
             times = route.time_to_go_s
             # It may have several points to a pixel of the chip (planning.space.finer).
             spacing_um = um_per_px if clearance_um is None else um_per_px * (len(clearance_um) - 1) / (len(times) - 1)
-            aim = self._homing(route, times, estimate, point, robot, spacing_um, limit_um_s * dt_s)
+            aim = self._homing(route, times, estimate, belief.at(point), point, robot, spacing_um, dt_s)
         else:
             aim = self._following(previous, mission, route, estimate, belief, robot, limit_um_s, dt_s)
         demand, cut = np.zeros(2), False
@@ -199,24 +200,30 @@ class Controller:
         route: Route,
         time_to_go_s: NDArray[np.float32],
         estimate: Estimate,
+        flow_um_s: Vector,
         point: Vector,
         robot: Robot,
         um_per_px: float,
-        frame_um: float,
+        dt_s: float,
     ) -> _Aim:
-        """Down the time to go. There is no error but to have left where that is known; `frame_um` is swum a frame."""
+        """Down the time to go, and to rest at its end."""
         goal = route.waypoints_um[-1]
         left_um = _distance(goal, point)
-        if left_um <= max(self.hold_radii * robot.radius, um_per_px):
-            return _Aim.at_rest(goal, estimate.position_um, float(route.arrival_s[-1]))
-        progress_s = nearest_on(route, estimate.position_um)
+        drift = flow_um_s / robot.speed_limit_um_s
+        fastest = 1.0 + _length(drift)  # over ground, as a share of the robot's own speed
+        frame_um = robot.speed_limit_um_s * dt_s
+        hold = left_um <= max(self.hold_radii * robot.radius, um_per_px, fastest * frame_um)
+        progress_s = float(route.arrival_s[-1]) if hold else nearest_on(route, estimate.position_um)
+        # The slope of pixels is felt over two of them; beyond the goal there is nothing to be felt.
+        reach_um = min(max(robot.radius, 2.0 * um_per_px, frame_um), left_um / fastest)
         return _Aim(
-            reference_um=place_on(route, progress_s),
+            reference_um=goal if hold else place_on(route, progress_s),
             reference_then_um=goal,
             moving_um_s=np.zeros(2),
             progress_s=progress_s,
+            # Off the route is no error where a way is known.
             error_um=astray_um(time_to_go_s, um_per_px, estimate.position_um),
-            heading=downhill(time_to_go_s, um_per_px, point, min(max(robot.radius, frame_um), left_um)),
+            heading=None if hold else downhill(time_to_go_s, um_per_px, point, reach_um, drift),
         )
 
     @staticmethod
@@ -272,6 +279,10 @@ def _hurry(robot: Robot) -> float:
 def _quicker(per_s: float, robot: Robot, dt_s: float) -> float:
     """A rate for this robot; what is held for a whole frame must not undo more than a third of an error in one."""
     return max(per_s, min(per_s * _hurry(robot), _LARGEST_SHARE / dt_s)) if dt_s > 0.0 else per_s
+
+
+def _length(vector: Vector) -> float:
+    return math.hypot(vector[0], vector[1])
 
 
 def _distance(a: Vector, b: Vector) -> float:

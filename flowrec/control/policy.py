@@ -18,21 +18,25 @@ Vector = NDArray[np.float64]
 Floats = NDArray[np.float64]
 Raster = NDArray[np.float32]
 _HEADINGS = 64
-_LEAST_REACH_PX = 2.0
 _STEP_PX = 1.5  # places looked at on the way, so that a wall is not jumped
 _ANGLES = np.arange(_HEADINGS) * (2.0 * np.pi / _HEADINGS)
 _WAYS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], -1)
 
 
-def downhill(time_to_go_s: Raster, um_per_px: float, point_um: Vector, reach_um: float) -> Vector:
-    """Unit vector (2,): the way from a point along which T is least after `reach_um`, two pixels at the least.
+def downhill(
+    time_to_go_s: Raster, um_per_px: float, point_um: Vector, reach_um: float, drift: Vector | None = None
+) -> Vector:
+    """Unit vector (2,): the heading from a point after which T is least when `reach_um` have been swum.
 
-    Where no way about has a time, it is the one to the nearest pixel that has.
+    `drift` (2,) is the flow as a share of the robot's speed: it carries the robot meanwhile. With it the heading is
+    exact in uniform flow however far the reach, without it only for a short one.
+    Where no way about has a time, the heading is that to the nearest pixel that has.
     """
     point = point_um / um_per_px
-    reach = max(reach_um / um_per_px, _LEAST_REACH_PX)
-    steps = math.ceil(reach / _STEP_PX)
-    along = point + (reach / steps * np.arange(1, steps + 1))[:, None, None] * _WAYS  # (steps, ways, 2)
+    reach = reach_um / um_per_px
+    ways = _WAYS if drift is None else _WAYS + drift
+    steps = math.ceil(reach * float(np.hypot(*ways.T).max()) / _STEP_PX)
+    along = point + (reach / steps * np.arange(1, steps + 1))[:, None, None] * ways  # (steps, ways, 2)
     times = _between(time_to_go_s, along)
     ends = np.where(np.isfinite(times).all(axis=0), times[-1], np.inf)
     best = int(np.argmin(ends))

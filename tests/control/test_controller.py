@@ -83,7 +83,7 @@ def test_across_a_current_near_its_limit_the_robot_keeps_to_its_course_and_gives
     run = fly(Controller(), route, lambda x, y: (0.0, 220.0), 15.0, (500.0, 2500.0), field, robot=weak)
     assert np.abs(run.position_um[2000:, 1] - 2500.0).max() < 25.0
     assert run.position_um[-1, 0] > 1800.0
-    assert run.demands[200].saturated
+    assert not run.demands[200].saturated, "the reference asks for no more than it can have"
 
 
 @pytest.mark.parametrize("phase", ["start", "refine", "plan"])
