@@ -40,7 +40,7 @@ def draw(path: Path, figures: dict[str, Any]) -> None:
                 mine = [row for row in some if row["policy"] == name]
                 ratios = [row["ratio"] for row in mine if row["ratio"] is not None]
                 if ratios:
-                    middle = min(float(np.median(ratios)), _TOP)
+                    middle = min(float(np.median(np.array(ratios))), _TOP)
                     label = {"down": "with the flow", "up": "against it"}[way] if at == 0 else None
                     ax.plot([at + shift - 0.12, at + shift + 0.12], [middle] * 2, color=colour, lw=2.2, label=label)
                 failed = sum(row["outcome"] not in _GOOD for row in mine)

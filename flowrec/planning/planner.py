@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -56,7 +56,7 @@ class Planner:
     clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: a tenth of it
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
     policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
-    swift: Swift = Swift()  # more is kept where the flow is swift
+    swift: Swift = field(default_factory=Swift)  # more is kept where the flow is swift
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
     refine: bool = True  # the path of time_field and astar_time

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +35,7 @@ class SurveyPlanner:
     share: float | None = None  # None: an eighth; half where several inlets or outlets are to be told apart
     speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
     clearance_margin_um: float | None = None  # None: half of the robot's radius
-    swift: Swift = Swift()  # as the planner's
+    swift: Swift = field(default_factory=Swift)  # as the planner's
     middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
     outlet_gap_radii: float = 3.0  # left between the end of the route and any opening
 
