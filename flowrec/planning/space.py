@@ -62,12 +62,13 @@ class End:
 class Drift:
     """How far a robot may get off its course before that is seen and put right.
 
-    The map's error carries it off all through the blind time, from what the camera sees to its effect. And a heading
-    is held for a frame, so a bend is cut: by w^2 / 8 r for the way w over ground in a frame and a bend of radius r,
-    here the robot's diameter.
+    The map's error carries it off all through the blind time, from what the camera sees to its effect, and it does not
+    roll quite where it is told to. And a heading is held for a frame, so a bend is cut: by w^2 / 8 r for the way w over
+    ground in a frame and a bend of radius r, here the robot's diameter.
     """
 
     map_error: float = 0.0  # share of the flow's speed
+    heading_error_rad: float = 0.0
     blind_s: float = 0.0
     frame_s: float = 0.0
     speed_um_s: float = 0.0  # the robot's own, through the fluid
@@ -78,7 +79,8 @@ class Drift:
         velocity = field.velocity_um_s.astype(np.float64)
         flow = np.hypot(velocity[..., 0], velocity[..., 1])
         way = self.frame_s * (flow + self.speed_um_s)
-        return np.asarray(self.map_error * self.blind_s * flow + way**2 / (16.0 * self.radius_um))
+        astray_um_s = self.map_error * flow + self.heading_error_rad * self.speed_um_s
+        return np.asarray(self.blind_s * astray_um_s + way**2 / (16.0 * self.radius_um))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +88,15 @@ class Swift:
     """What makes a flow too swift to be steered in; times are set when a run is resolved, and 0 where nobody did."""
 
     map_error: float = 0.2  # share of the flow's speed that the map is thought to be wrong by
+    heading_error_rad: float = 0.1  # by which the robot is thought to roll off its heading: three of its sigmas
     frame_s: float | None = None  # None: the camera's
     latency_s: float | None = None  # from command to motion; None: the robot's
 
     def drift(self, robot: Robot, speed_um_s: float) -> Drift:
         """Of a robot that swims at a speed."""
         frame_s, latency_s = self.frame_s or 0.0, self.latency_s or 0.0
-        return Drift(self.map_error, frame_s + latency_s, frame_s, speed_um_s, robot.radius)
+        blind_s = frame_s + latency_s
+        return Drift(self.map_error, self.heading_error_rad, blind_s, frame_s, speed_um_s, robot.radius)
 
 
 def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift: Drift = Drift()) -> Space:
