@@ -377,6 +377,34 @@ def bench_flow(
     _keep(figures, json_file)
 
 
+@bench.command("missions")
+def bench_missions(
+    seeds: Annotated[int, typer.Option(min=1, help="Worlds; every policy flies all of them, both ways.")] = 40,
+    cases: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz) to fly in beside the built-in chips.")
+    ] = None,
+    policies: Annotated[
+        str, typer.Option(metavar="A,B", help="Of policy, vector, astar, plain, paper.")
+    ] = "policy,vector,paper",
+    flow_error: Annotated[float, typer.Option(help="Share by which each true inlet flow is off.")] = 0.1,
+    outlet_error: Annotated[float, typer.Option(help="Same of outlet pressures, of the drop across the chip.")] = 0.0,
+    latency: Annotated[
+        float | None, typer.Option(metavar="S", help="From command to motion; 0.04, less in swift channels.")
+    ] = None,
+    sets: Sets = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw arrival over optimum.")] = None,
+) -> None:
+    """Whole missions in the simulated rig: arrivals, wall contacts, time over the optimum, policies in pairs."""
+    from flowrec.bench.missions import World, measure, show
+
+    world = World(flow_error, outlet_error, latency, tuple(sets or ()))
+    figures = measure(seeds, cases, policies.split(","), world, figure=figure, jobs=jobs)
+    show(figures)
+    _keep(figures, json_file)
+
+
 @bench.command("track")
 def bench_track(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,

@@ -29,6 +29,7 @@ from flowrec.errors import UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
+from flowrec.planning.space import Swift
 from flowrec.refine import Refiner
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.settings import CameraSettings, Simulated
@@ -161,7 +162,10 @@ def resolve(config: Config, chip: Chip) -> Config:
     if camera.rate_hz is None:
         rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), 100.0)
         camera = replace(camera, rate_hz=round(rate, 1))
-    resolved = replace(config, camera=camera, robot=robot)
+    assert camera.rate_hz is not None
+    plan = replace(config.plan, swift=_timed(config.plan.swift, robot, camera.rate_hz))
+    survey = replace(config.survey, swift=_timed(config.survey.swift, robot, camera.rate_hz))
+    resolved = replace(config, camera=camera, robot=robot, plan=plan, survey=survey)
     mission = config.mission
     mission = replace(
         mission,
@@ -170,6 +174,14 @@ def resolve(config: Config, chip: Chip) -> Config:
     )
     _refuse_apart(chip, mission)
     return replace(resolved, mission=mission)
+
+
+def _timed(swift: Swift, robot: Robot, rate_hz: float) -> Swift:
+    return replace(
+        swift,
+        frame_s=round(1.0 / rate_hz, 6) if swift.frame_s is None else swift.frame_s,
+        latency_s=robot.delay if swift.latency_s is None else swift.latency_s,
+    )
 
 
 def calibration_of(config: Config, chip: Chip) -> Calibration:

@@ -138,7 +138,8 @@ class Route(Message):
     reason: str  # why not, when it is not
     waypoints_um: Matrix  # (n, 2), n = 0 when unreachable
     arrival_s: Vector  # (n,) since the start of the route, strictly increasing
-    # (h, w) s from every pixel centre to the goal by the fastest way, inf where there is none; None where the planner
+    # (k (h - 1) + 1, k (w - 1) + 1) s to the goal by the fastest way, from every pixel centre and from k - 1 points
+    # between any two of them; inf where there is none, None where the planner
     # knows it along its path only. Its slope is a policy: -grad T is the best heading anywhere.
     time_to_go_s: Raster | None = None
 

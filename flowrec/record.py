@@ -9,13 +9,18 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
+from flowrec.chip.places import distance_um
 from flowrec.config import Config, resolve
 from flowrec.errors import SessionError, UsageError
+from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import Demand, FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
+from flowrec.planning.space import too_swift
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
 from flowrec.session import length_mm, session_writer
@@ -77,6 +82,7 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
         )
     chip = load_chip(config.chip)
     config = resolve(config, chip)
+    refuse_adrift(config, chip)
     assert config.robot.max_speed_um_s is not None
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:
@@ -98,6 +104,30 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return config, chip, assemble(config, chip)
+
+
+def refuse_adrift(config: Config, chip: Chip) -> None:
+    """Raise UsageError where the flow would have its way with the robot before anything can be planned.
+
+    So it is where it can not be held at the start, or is out of an outlet before the coils are up: their field, and
+    with it the speed that they can drive, grows to all of it in the time of the ramp.
+    """
+    robot, field = config.robot, config.flow.solve(chip)
+    start = np.asarray(config.mission.start, np.float64)
+    limit_um_s = robot.speed_limit_um_s
+    drift = config.plan.swift.drift(robot, limit_um_s)
+    reason = too_swift(chip, field, start, start, robot.radius, drift)
+    if reason:
+        raise UsageError(f"unreachable: the robot can not be held at the start: {reason}")
+    flow_um_s = float(np.hypot(*sample(field, start)))
+    swept_um = flow_um_s * (drift.blind_s + 0.5 * config.coils.ramp_s * min(flow_um_s / limit_um_s, 1.0))
+    for opening in chip.openings:
+        if opening.kind == "outlet" and distance_um(chip, opening, start) < swept_um + robot.radius:
+            raise UsageError(
+                f"unreachable: the start {start[0]:.0f},{start[1]:.0f} um is too near the outlet {opening.side} "
+                f"{opening.first}-{opening.last}: a flow of {flow_um_s:.0f} um/s carries the robot {swept_um:.0f} um "
+                "before the coils are up; start farther in, or shorten coils.ramp_s"
+            )
 
 
 def default_path(config: Config, folder: Path | None = None) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
 from flowrec.chip.chip import Chip, Opening
@@ -36,3 +37,14 @@ def opening_point_um(chip: Chip, name: str, depth_um: float) -> tuple[float, flo
     to_wall = clearance_um(chip.mask, chip.um_per_px)
     row, column = np.unravel_index(np.argmax(np.where(front, to_wall, -np.inf)), chip.mask.shape)
     return float(column * chip.um_per_px), float(row * chip.um_per_px)
+
+
+def distance_um(chip: Chip, opening: Opening, point_um: ArrayLike) -> float:
+    """From a point (2,) um to the nearest place of an opening on the border of the chip."""
+    x, y = np.asarray(point_um, np.float64) / chip.um_per_px
+    height, width = chip.mask.shape
+    if opening.side in ("left", "right"):
+        nearest = (-0.5 if opening.side == "left" else width - 0.5, min(max(y, opening.first), opening.last))
+    else:
+        nearest = (min(max(x, opening.first), opening.last), -0.5 if opening.side == "top" else height - 0.5)
+    return float(np.hypot(x - nearest[0], y - nearest[1])) * chip.um_per_px

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, label
+from scipy.ndimage import distance_transform_edt, label, map_coordinates
 
 from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
@@ -33,6 +33,7 @@ class Space:
     free: NDArray[np.bool_]  # (h, w) where the robot's centre may be: the nodes
     radius: float  # of the robot
     need: float  # clearance of nodes and of long edges
+    least: Raster  # (h, w) that of a node: need, or more where the flow is swift
     vx: Raster  # (h, w)
     vy: Raster  # (h, w)
     um_per_px: float
@@ -57,8 +58,49 @@ class End:
     trouble: str = ""
 
 
-def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float) -> Space:
-    """The space of a robot that keeps a margin from the walls.
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far a robot may get off its course before that is seen and put right.
+
+    The map's error carries it off all through the blind time, from what the camera sees to its effect, and it does not
+    roll quite where it is told to. And a heading is held for a frame, so a bend is cut: by w^2 / 8 r for the way w over
+    ground in a frame and a bend of radius r, here the robot's diameter.
+    """
+
+    map_error: float = 0.0  # share of the flow's speed
+    heading_error_rad: float = 0.0
+    blind_s: float = 0.0
+    frame_s: float = 0.0
+    speed_um_s: float = 0.0  # the robot's own, through the fluid
+    radius_um: float = 1.0  # of the robot
+
+    def um(self, field: FlowField) -> Raster:
+        """(h, w) so far."""
+        velocity = field.velocity_um_s.astype(np.float64)
+        flow = np.hypot(velocity[..., 0], velocity[..., 1])
+        way = self.frame_s * (flow + self.speed_um_s)
+        astray_um_s = self.map_error * flow + self.heading_error_rad * self.speed_um_s
+        return np.asarray(self.blind_s * astray_um_s + way**2 / (16.0 * self.radius_um))
+
+
+@dataclass(frozen=True, slots=True)
+class Swift:
+    """What makes a flow too swift to be steered in; times are set when a run is resolved, and 0 where nobody did."""
+
+    map_error: float = 0.2  # share of the flow's speed that the map is thought to be wrong by
+    heading_error_rad: float = 0.1  # by which the robot is thought to roll off its heading: three of its sigmas
+    frame_s: float | None = None  # None: the camera's
+    latency_s: float | None = None  # from command to motion; None: the robot's
+
+    def drift(self, robot: Robot, speed_um_s: float) -> Drift:
+        """Of a robot that swims at a speed."""
+        frame_s, latency_s = self.frame_s or 0.0, self.latency_s or 0.0
+        blind_s = frame_s + latency_s
+        return Drift(self.map_error, self.heading_error_rad, blind_s, frame_s, speed_um_s, robot.radius)
+
+
+def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift: Drift = Drift()) -> Space:
+    """The space of a robot that keeps a margin from the walls, and as much as it may drift where that is more.
 
     Raises
     ------
@@ -78,15 +120,39 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float)
     far_px = float(sum(chip.mask.shape))
     clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
     need = float((radius_um + margin_um) / chip.um_per_px)
+    least = np.maximum(need, (radius_um + drift.um(field)) / chip.um_per_px)
     return Space(
         clearance=clearance,
         fluid=np.ascontiguousarray(chip.mask),
-        free=chip.mask & (clearance >= need),
+        free=chip.mask & (clearance >= least),
         radius=float(radius_um) / chip.um_per_px,
         need=need,
+        least=least,
         vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
         vy=np.ascontiguousarray(field.velocity_um_s[..., 1], np.float64) / chip.um_per_px,
         um_per_px=float(chip.um_per_px),
+    )
+
+
+def finer(space: Space, k: int) -> Space:
+    """The same space with k - 1 points between any two pixels, so that pixel (i, j) is point (k i, k j)."""
+    h, w = space.free.shape
+    rows, columns = np.meshgrid(np.arange((h - 1) * k + 1) / k, np.arange((w - 1) * k + 1) / k, indexing="ij")
+
+    def between(raster: Raster) -> Raster:
+        return np.asarray(map_coordinates(raster, (rows, columns), order=1))
+
+    clearance, least = k * between(space.clearance), k * between(space.least)
+    return Space(
+        clearance=clearance,
+        fluid=clearance > 0.0,
+        free=clearance >= least,
+        radius=k * space.radius,
+        need=k * space.need,
+        least=least,
+        vx=k * between(space.vx),
+        vy=k * between(space.vy),
+        um_per_px=space.um_per_px / k,
     )
 
 
@@ -112,6 +178,29 @@ def why_apart(space: Space, a: int, b: int) -> str:
     return (
         f"the channel is too narrow at {column * px:.0f},{row * px:.0f} um: half its width there is "
         f"{widest * px:.0f} um and the robot needs {space.need * px:.0f} um"
+    )
+
+
+def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, radius_um: float, drift: Drift) -> str:
+    """Why a robot that geometry lets through can not be steered on its way, '' when it can; names the worst place."""
+    wide = open_space(chip, field, radius_um, 0.0)
+    swept = (radius_um + drift.um(field)) / chip.um_per_px
+    a, b = attach_start(wide, start_um).node, attach_goal(wide, goal_um).node
+    if a < 0 or b < 0 or not _joined(wide.free, a, b):
+        return ""
+    # How many times over there is room: the best way is the one whose worst place has most.
+    room = np.where(wide.free, wide.clearance / swept, -1.0)
+    widest = _bottleneck(room, a, b)
+    if not 0.0 < widest < 1.0:
+        return ""
+    column, row = _narrowest_place(room, widest, a, b)
+    px = wide.um_per_px
+    flow_um_s = float(np.hypot(wide.vx[row, column], wide.vy[row, column])) * px
+    return (
+        f"too swift to be steered at {column * px:.0f},{row * px:.0f} um: in a flow of {flow_um_s:.0f} um/s and with "
+        f"{drift.speed_um_s:.0f} um/s of its own the robot may be {drift.um(field)[row, column]:.0f} um off its course "
+        f"before that is put right, and the walls leave {wide.clearance[row, column] * px - radius_um:.0f} um; less "
+        "latency (robot.delay_s), more frames (camera.rate_hz) or a slower flow would do"
     )
 
 
@@ -192,9 +281,9 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
     return column, row
 
 
-def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
-    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: half the radius), half, none."""
-    first = 0.5 * robot.radius if wanted_um is None else wanted_um
+def margins_um(wanted_um: float | None, robot: Robot, usual_radii: float) -> tuple[float, ...]:
+    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: the usual), half of it, none."""
+    first = usual_radii * robot.radius if wanted_um is None else wanted_um
     return tuple(dict.fromkeys((first, 0.5 * first, 0.0)))
 
 

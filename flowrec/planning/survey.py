@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,11 @@ from flowrec.messages import FlowField, Route
 from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route
-from flowrec.planning.space import Space, attach_start, margin_remark, margins_um, open_space
+from flowrec.planning.space import Space, Swift, attach_start, margin_remark, margins_um, open_space
 from flowrec.robot import Robot
 
 _METHOD = "survey"
+_USUAL_MARGIN = 0.5  # radii
 Raster = NDArray[np.float64]
 
 
@@ -34,6 +35,7 @@ class SurveyPlanner:
     share: float | None = None  # None: an eighth; half where several inlets or outlets are to be told apart
     speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
     clearance_margin_um: float | None = None  # None: half of the robot's radius
+    swift: Swift = field(default_factory=Swift)  # as the planner's
     middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
     outlet_gap_radii: float = 3.0  # left between the end of the route and any opening
 
@@ -52,10 +54,11 @@ class SurveyPlanner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         limit_um = distance_um if distance_um is not None else self.distance_um
         at = np.asarray(start_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot)
+        margins = margins_um(self.clearance_margin_um, robot, _USUAL_MARGIN)
+        drift = self.swift.drift(robot, speed_um_s)
         route = no_route(_METHOD, "")
         for margin_um in margins:
-            space = open_space(chip, field, robot.radius, margin_um)
+            space = open_space(chip, field, robot.radius, margin_um, drift)
             route = self._downstream(space, field, at, chip, speed_um_s, limit_um)
             if route.reachable:
                 lean = margin_remark(margin_um, margins)

@@ -1,0 +1,127 @@
+"""The bench of whole missions: its intervals are the published ones, and its figures those of the ticks themselves."""
+
+import json
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from flowrec.bench import missions
+from flowrec.bench.figure_missions import draw
+from flowrec.bench.missions import World, chip_of, compared, fly, optimum_s, summary
+from flowrec.bench.shares import paired, wilson
+from flowrec.chip import load_chip
+from flowrec.chip.settings import ChipSettings
+from flowrec.errors import UsageError
+from tests.planning.worlds import channel, field_of, open_water, robot
+from tests.planning.worlds import chip_of as made_up
+
+TINY = ("chip.name=straight", "camera.width_px=320", "camera.height_px=80", "mission.goal=[2400.0, 620.0]")
+
+
+@pytest.mark.parametrize(
+    ("successes", "count", "interval"),
+    # Newcombe, Statistics in Medicine 17 (1998), table I, method 3.
+    [(81, 263, (0.2553, 0.3662)), (15, 148, (0.0624, 0.1605)), (0, 20, (0.0, 0.1611)), (1, 29, (0.0061, 0.1718))],
+)
+def test_the_interval_of_a_share_is_wilsons(successes, count, interval):
+    assert wilson(successes, count) == pytest.approx(interval, abs=6e-5)
+    low, high = wilson(count - successes, count)
+    assert (1.0 - high, 1.0 - low) == pytest.approx(interval, abs=6e-5)
+
+
+def test_pairs_are_compared_by_their_ratios():
+    same = paired(np.full(10, 0.8))
+    assert (same["mean"], *same["interval_95"]) == pytest.approx((0.8, 0.8, 0.8))
+    assert same["less"] == 10 and same["sign_p"] == pytest.approx(2 / 2**10)
+    even = paired(np.array([0.5, 2.0, 0.8, 1.25]))
+    assert even["mean"] == pytest.approx(1.0) and even["sign_p"] == 1.0
+    assert even["interval_95"][0] < 1.0 < even["interval_95"][1]
+    assert paired(np.zeros(0)) == {"count": 0}
+
+
+@pytest.mark.parametrize("flow", [0.0, 60.0, -60.0])
+def test_the_optimum_in_a_uniform_flow_is_the_way_less_the_tolerance_at_full_speed(flow):
+    mask = open_water()
+    time_s = optimum_s(field_of(mask, flow), (100.0, 400.0), (900.0, 400.0), 30.0, made_up(mask), robot())
+    assert time_s == pytest.approx((800.0 - 30.0) / (100.0 + flow), rel=2e-3)
+
+
+def test_there_is_no_optimum_against_a_flow_that_is_too_fast():
+    mask = channel()
+    assert optimum_s(field_of(mask, -120.0), (100.0, 200.0), (900.0, 200.0), 10.0, made_up(mask), robot()) is None
+
+
+@pytest.fixture(scope="module")
+def flown():
+    ticks = []
+    row = fly(3, TINY, "down", "assumed", "vector", World(sets=("plan.method=astar_time",)), ticks.append)
+    return row, ticks
+
+
+def test_a_row_says_what_the_ticks_say(flown):
+    row, ticks = flown
+    going = [tick for tick in ticks if tick.mission.phase == "navigate"]
+    done = next(tick for tick in ticks if tick.mission.finished)
+    assert (row.outcome, row.contacts, row.survey_contacts, row.replans) == ("reached", 0, 0, 0)
+    assert ticks[-1].truth.contacts == 0
+    assert row.seconds == pytest.approx((done.stamp_ns - going[0].stamp_ns) * 1e-9)
+    assert row.ratio == row.seconds / row.optimum_s and 0.97 < row.ratio < 1.6
+    errors = [tick.demand.error_um for tick in going]
+    assert row.rms_um == pytest.approx(math.sqrt(np.mean(np.square(errors))))
+    assert math.dist(done.truth.position_um, done.mission.goal_um) < 1.2 * row.radius_um
+    # In the middle of a straight channel nothing is faster than to swim with 1.5 times the mean flow.
+    way_um = math.dist(going[0].truth.position_um, done.mission.goal_um) - row.radius_um
+    true_um_s = row.speed_limit_um_s + ticks[0].true_field.velocity_um_s[..., 0].max()
+    assert row.optimum_s == pytest.approx(way_um / true_um_s, rel=0.02)
+
+
+def test_the_true_flow_is_wrong_by_what_was_asked(flown):
+    _, ticks = flown
+    inlet_um_s = [opening.value for opening in load_chip(ChipSettings("straight")).openings if opening.kind == "inlet"]
+    assert len(inlet_um_s) == 1
+    share = ticks[0].true_field.boundary_values.max() / inlet_um_s[0]
+    assert abs(share - 1.0) == pytest.approx(0.1)
+
+
+def test_a_flow_too_swift_is_refused_before_the_robot_is_let_in():
+    swift = (*TINY, "chip.inlet_speed_um_s=60000")
+    ticks = []
+    row = fly(3, swift, "down", "assumed", "vector", World(sets=("plan.method=astar_time",)), ticks.append)
+    assert row.outcome == "refused" and "too swift to be steered" in row.note
+    assert not ticks
+
+
+def test_a_summary_counts_and_pairs_what_arrived(flown, tmp_path, capsys):
+    row, _ = flown
+    rows = [
+        row,
+        replace(row, policy="paper", seconds=2.0 * row.seconds, ratio=2.0 * row.ratio, contacts=2),
+        replace(row, seed=4, outcome="unreachable", seconds=None, ratio=None),
+        replace(row, seed=4, policy="paper", outcome="timeout", seconds=None, ratio=None),
+    ]
+    ours = summary([made for made in rows if made.policy == "vector"])
+    theirs = summary([made for made in rows if made.policy == "paper"])
+    assert (ours["reached"]["count"], ours["honest"]["count"], ours["without_contact"]["count"]) == (1, 2, 2)
+    assert (theirs["reached"]["count"], theirs["honest"]["count"], theirs["without_contact"]["count"]) == (1, 1, 1)
+    assert ours["ratio"]["median"] == row.ratio and theirs["failed"] == ["straight 4 down assumed: timeout"]
+    pair = compared(rows, "vector", "paper")
+    assert pair["count"] == 1 and pair["mean"] == pytest.approx(0.5)
+    figures = {"seeds": 2, "world": asdict(World()), "rows": [asdict(made) for made in rows], "pairs": {"v / p": pair}}
+    figures["summary"] = {"vector": ours, "paper": theirs}
+    json.dumps(figures)
+    missions.show(figures)
+    assert "vector" in capsys.readouterr().out
+    draw(tmp_path / "a.png", figures)
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_seeds_take_chips_in_turn_and_wrong_requests_are_said_at_once(tmp_path):
+    assert [chip_of(seed, [])[0] for seed in (1, 2, 3)] == [f"chip.name={n}" for n in ("bifurcation", "vessels") * 2][
+        :3
+    ]
+    with pytest.raises(UsageError, match="no policy 'luck'"):
+        missions.measure(1, None, ["luck"])
+    with pytest.raises(UsageError, match="no vessel case"):
+        missions.measure(1, tmp_path, ["vector"])

@@ -1,0 +1,63 @@
+"""Room for what a swift flow may do before it can be put right, and the honest answer where there is none."""
+
+import pytest
+
+from flowrec.planning import Planner, SurveyPlanner
+from flowrec.planning.space import Swift, finer, open_space
+from tests.planning.worlds import PX, channel, chip_of, field_of, poiseuille, robot
+
+SWIFT = Swift(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
+
+
+def lowest_um(route, wall_um=75.0, height_um=390.0):
+    """Least distance of a route to the walls of `channel()`."""
+    y = route.waypoints_um[:, 1]
+    return min(y.min() - wall_um, height_um - wall_um - y.max())
+
+
+def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
+    mask = channel()
+    field, chip = field_of(mask, 600.0), chip_of(mask)
+    ends = (100.0, 195.0), (1000.0, 195.0)
+    calm = open_space(chip, field, 10.0, 1.0)
+    swift = open_space(chip, field, 10.0, 1.0, SWIFT.drift(robot(), 100.0))
+    # The robot's radius, 0.2 x 600 x 0.1 um for the map, 0.1 x 100 x 0.1 for the heading, the rest for the bend.
+    need_um = 10.0 + 12.0 + 1.0 + (0.05 * 700.0) ** 2 / 160.0
+    assert swift.least[20, 50] * PX == pytest.approx(need_um)
+    assert calm.free.sum() > swift.free.sum() > 0
+    assert (swift.clearance[swift.free] * PX >= need_um).all()
+    assert lowest_um(Planner(swift=SWIFT).plan(field, *ends, chip, robot())) >= need_um
+
+
+@pytest.mark.parametrize("method", ["time_field", "astar_time", "astar_length"])
+def test_where_the_drift_fills_the_channel_the_place_and_the_reason_are_named(method):
+    mask = channel()
+    chip = chip_of(mask)
+    plan = Planner(method=method, swift=SWIFT)
+    ends = (100.0, 195.0), (1000.0, 195.0)
+    assert plan.plan(field_of(mask, 500.0), *ends, chip, robot(600.0)).reachable
+    field = field_of(mask, lambda x, y: 500.0 + 2000.0 * ((x > 500.0) & (x < 600.0)))
+    route = plan.plan(field, *ends, chip, robot(600.0))
+    assert not route.reachable and "too swift to be steered at" in route.reason
+    x_um = float(route.reason.split("at ")[1].split(",")[0])
+    assert 500.0 < x_um < 600.0
+    assert Planner(method=method).plan(field, *ends, chip, robot(600.0)).reachable, (
+        "times that nobody set count for nothing"
+    )
+
+
+def test_no_survey_leads_into_what_is_too_swift():
+    mask = channel()
+    field = poiseuille(mask, 20000.0)
+    assert SurveyPlanner().plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
+    assert not SurveyPlanner(swift=SWIFT).plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
+
+
+def test_a_finer_space_agrees_with_the_pixels_and_lets_the_robot_as_near_to_the_wall_as_it_fits():
+    mask = channel()
+    space = open_space(chip_of(mask), poiseuille(mask, 100.0), 11.0, 0.0)
+    fine = finer(space, 4)
+    assert (fine.free[::4, ::4] == space.free).all()
+    assert fine.vx[::4, ::4] == pytest.approx(4.0 * space.vx)
+    assert fine.clearance[fine.free].min() * fine.um_per_px == pytest.approx(12.5)  # of 11.0; 15.0 on the pixels
+    assert space.clearance[space.free].min() * PX == pytest.approx(15.0)
