@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from pathlib import Path
 
 from google.protobuf import descriptor_pb2
@@ -11,9 +12,14 @@ from mcap.records import ChunkIndex, Statistics
 import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.codec import codec_of
-from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
-from flowrec.store.source import Source, Summary
+from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, belongs, header_from
+from flowrec.store.index import Summary
+from flowrec.store.schemas import forms_of
+from flowrec.store.source import ForeignError, Source
 from flowrec.topics import BY_PATH
+
+_METADATA_LIMIT_BYTES = 16 << 20
+_ATTACHMENTS_LIMIT_BYTES = 256 << 20
 
 
 class Contents:
@@ -49,14 +55,14 @@ class Contents:
     def _open(self, summary: Summary | None) -> None:
         path, header = self.source.path, self.source.header
         if header.profile != PROFILE:
-            raise SessionError(
+            raise ForeignError(
                 f"{path}: is an MCAP file of another program (profile {header.profile!r}, library {header.library!r});"
                 " flowrec reads what `flowrec record` has written"
             )
         self._summary = summary if summary is not None else self.source.read_summary()
         metadata = self._metadata()
         if SESSION not in metadata:
-            raise SessionError(
+            raise ForeignError(
                 f"{path}: is an MCAP file without the record {SESSION!r}, so not a session;"
                 " flowrec reads what `flowrec record` has written"
             )
@@ -77,7 +83,10 @@ class Contents:
     @functools.cached_property
     def header(self) -> SessionHeader:
         """Read when asked for: the network's weights may be large."""
-        attachments = {index.name: self.source.attachment(index) for index in self._summary.attachments}
+        # Only what a session is made of: whatever else is attached is not even read.
+        wanted = [index for index in self._summary.attachments if belongs(index.name)]
+        self._bound("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
+        attachments = {index.name: self.source.attachment(index) for index in wanted}
         try:
             return header_from(self._metadata(), attachments)
         except KeyError as error:
@@ -86,7 +95,13 @@ class Contents:
             raise self.source.damaged(0, error) from error
 
     def _metadata(self) -> dict[str, dict[str, str]]:
+        self._bound("metadata", (index.length for index in self._summary.metadata), _METADATA_LIMIT_BYTES)
         return {index.name: self.source.metadata(index) for index in self._summary.metadata}
+
+    def _bound(self, what: str, lengths: Iterable[int], limit: int) -> None:
+        total = sum(lengths)
+        if total > limit:
+            raise self.source.damaged(0, f"{total} bytes of {what}, more than {limit}")
 
     def _check_version(self, version: str) -> None:
         if version == str(FORMAT_VERSION):
@@ -106,6 +121,10 @@ class Contents:
             return
         with self.source.parsing(0):
             theirs, ours = _fields_of(found.data), _fields_of(expected.data)
+        kind = BY_PATH[channel.topic].type
+        added = {f"{kind.__name__}.{form.name}" for form in forms_of(kind) if form.optional}
+        if same_kind and theirs <= ours and {name for name, _ in ours - theirs} <= added:
+            return  # a later flowrec has more to say, which is absent here
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
             f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +19,7 @@ from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
 from flowrec.store.header import SessionHeader
 from flowrec.store.lane import by_time, lane, threads
+from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -132,9 +133,13 @@ class SessionReader:
     def _message(self, record: Record) -> Message:
         field = self._fields[record.channel]
         try:
-            return decode(BY_FIELD[field].type, record.payload, record.sequence)
+            message = decode(BY_FIELD[field].type, record.payload, record.sequence)
+            wrong = misfit(message)
         except SessionError as error:
-            raise DamageError(self.path, f"{BY_FIELD[field].path} at {record.log_ns} ns: {error}") from error
+            wrong = str(error)
+        if wrong:
+            raise DamageError(self.path, f"{BY_FIELD[field].path} at {record.log_ns} ns: {wrong}")
+        return message
 
     def _restored(self, record: Record) -> Message:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
@@ -150,13 +155,25 @@ class SessionReader:
         start = 0 if start_ns is None else start_ns
         state, frames = self._lanes(start)
         wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
+        read = dict.fromkeys(wanted, 0)
         with threads() as executor:
             lanes = [lane(self._source, state, executor)]
             if with_frames:
                 lanes.append(lane(self._source, frames, executor))
             for record in heapq.merge(*lanes, key=by_time):
                 if record.log_ns >= start and record.channel in wanted:
+                    read[record.channel] += 1
                     yield record
+        if start_ns is None:
+            self._compare(read)
+
+    def _compare(self, read: Mapping[int, int]) -> None:
+        """A file that has less in it than it says must not pass for a whole one."""
+        for channel, count in read.items():
+            announced = self._contents.statistics.channel_message_counts.get(channel, 0)
+            if count != announced:
+                path = BY_FIELD[self._fields[channel]].path
+                raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
 
     def _lanes(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
         """Chunks that reach beyond a time: those with anything but frames, and those with frames only."""
