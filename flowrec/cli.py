@@ -256,6 +256,32 @@ def list_directory(
 
 
 @app.command()
+def check(
+    session: Annotated[Path, typer.Argument(metavar="FILE", help="Session (.mcap), or the remains of one (.partial).")],
+    as_json: AsJson = False,
+) -> None:
+    """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
+    from flowrec.check import check as judge
+    from flowrec.status import progress
+
+    try:
+        with progress(f"reading {session.name}", max(session.stat().st_size if session.is_file() else 1, 1)) as done:
+            verdict = judge(session, done)
+    except FlowrecError as error:
+        if not as_json:
+            raise
+        finding = {"level": "bad", "about": "file", "text": str(error)}
+        typer.echo(json.dumps({"session": str(session), "verdict": "bad", "exit_status": 1, "findings": [finding]}))
+        raise typer.Exit(1) from error
+    if as_json:
+        typer.echo(json.dumps(verdict.as_json()))
+    else:
+        for line in verdict.lines():
+            typer.echo(line)
+    raise typer.Exit(verdict.exit_status)
+
+
+@app.command()
 def recover(
     session: Annotated[Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file.")],
     out: Annotated[

@@ -104,7 +104,7 @@ def config_from_toml(text: str, where: str) -> Config:
     """The Config that `to_toml` wrote; `where` names its origin in errors."""
     try:
         return _config_from(tomllib.loads(text), where)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
 
 
@@ -207,7 +207,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path}: no such configuration; examples are in sessions/") from error
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: can not be read as a TOML configuration ({error})") from error
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(f"{path}: not valid TOML ({error}); mend that line") from error
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Self
 
 from google.protobuf import descriptor_pb2
 from mcap.records import ChunkIndex, Statistics
@@ -38,6 +39,7 @@ class Contents:
     statistics : how many there are.
     outcome : how the run ended.
     flowrec_version : of the program that wrote it.
+    channels, attachments, metadata : what else is listed.
 
     Raises
     ------
@@ -70,6 +72,8 @@ class Contents:
         self._check_version(metadata[SESSION].get("format_version", ""))
         self.outcome = metadata.get(OUTCOME, {})
         self.chunks: list[ChunkIndex] = self._summary.chunks
+        self.channels, self.attachments = self._summary.channels, self._summary.attachments
+        self.metadata = self._summary.metadata
         assert self._summary.statistics is not None  # Source or Scan has seen to it
         self.statistics: Statistics = self._summary.statistics
         self.fields = {
@@ -79,6 +83,12 @@ class Contents:
         }
         for channel in self.fields:
             self._check_schema(channel)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.source.close()
 
     @functools.cached_property
     def header(self) -> SessionHeader:
