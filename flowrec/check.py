@@ -382,7 +382,9 @@ def _judge_replay(verdict: Verdict, found: Audit, reading: _Reading) -> None:
     if not reading.ticks:
         verdict.bad("replay", "there is no tick in it, so nothing to replay")
     if reading.inputs_missing:
-        verdict.odd("replay", f"{reading.inputs_missing} of {reading.ticks} ticks lack inputs; a replay leaves them out")
+        verdict.odd(
+            "replay", f"{reading.inputs_missing} of {reading.ticks} ticks lack inputs; a replay leaves them out"
+        )
     if reading.images_alone:
         verdict.odd("replay", f"of {reading.images_alone} ticks there is only the image")
     if reading.unfinished_ticks:

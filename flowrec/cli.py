@@ -208,7 +208,7 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
-    from flowrec.session import describe
+    from flowrec.listing import describe
     from flowrec.status import table
 
     facts, topics = describe(session)
@@ -227,7 +227,7 @@ def list_directory(
     """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
     from dataclasses import asdict
 
-    from flowrec.session import list_sessions
+    from flowrec.listing import list_sessions
     from flowrec.status import say, table
 
     rows = list_sessions(directory)

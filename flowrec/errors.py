@@ -3,7 +3,6 @@
 The command line prints these without a traceback; anything else is a defect of flowrec.
 """
 
-
 import re
 
 # C0, DEL and C1 controls, what turns the direction of writing, line separators, halves of characters.

@@ -85,10 +85,8 @@ class StatusLine:
             self._latency_ms.append(tick.timing.total_ms)
         if tick.event is not None and tick.event is not self._last.event:
             colour = {"warning": "yellow", "error": "red"}.get(tick.event.level, "cyan")
-            console.print(
-                f"[dim]{seconds(tick.stamp_ns):8.2f} s[/dim]  [{colour}]{escape(printable(tick.event.text))}[/{colour}]",
-                soft_wrap=True,
-            )
+            text = escape(printable(tick.event.text))
+            console.print(f"[dim]{seconds(tick.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
         self._last = tick
         if self._live is not None and now - self._shown > 0.12:
             self._shown = now

@@ -186,9 +186,9 @@ def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]
         ("attachments", contents.attachments, found.summary.attachments),
         ("metadata records", contents.metadata, found.summary.metadata),
     ):
-        here, there = {index.offset for index in ours}, {index.offset for index in theirs}
-        if here != there:
-            yield False, f"{len(here ^ there)} {what} are only in the index, or only outside it"
+        apart = {index.offset for index in ours} ^ {index.offset for index in theirs}
+        if apart:
+            yield False, f"{len(apart)} {what} are only in the index, or only outside it"
 
 
 def _first_part(error: SessionError, path: Path) -> str:

@@ -6,7 +6,6 @@ mcap's own records take some 20 us each; a session of hours has ten thousands of
 from __future__ import annotations
 
 import io
-import itertools
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -43,8 +42,10 @@ class Summary:
         """Offset and length of everything that is listed."""
         for chunk in self.chunks:
             yield chunk.chunk_start_offset, chunk.chunk_length
-        for other in itertools.chain(self.attachments, self.metadata):
-            yield other.offset, other.length
+        for attachment in self.attachments:
+            yield attachment.offset, attachment.length
+        for metadata in self.metadata:
+            yield metadata.offset, metadata.length
 
 
 def summary_from(data: bytes, data_start: int, data_end: int) -> Summary:

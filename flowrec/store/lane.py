@@ -83,9 +83,7 @@ def _contents(source: Source, bundle: list[ChunkIndex]) -> list[bytes | memoryvi
     return [source.chunk(chunk) for chunk in bundle]
 
 
-def _sorted_messages(
-    source: Source, bundle: list[ChunkIndex], contents: list[bytes | memoryview]
-) -> Iterator[Record]:
+def _sorted_messages(source: Source, bundle: list[ChunkIndex], contents: list[bytes | memoryview]) -> Iterator[Record]:
     places = [chunk.chunk_start_offset for chunk in bundle]
     records: list[Record] = []
     for place, content in sorted(zip(places, contents, strict=True), key=lambda pair: pair[0]):

@@ -84,8 +84,6 @@ def _float_fields(kind: Any) -> tuple[str, ...]:
     names = _FLOATS.get(kind)
     if names is None:
         arrays = {name for name, dtype in array_fields(kind) if dtype.kind == "f"}
-        names = tuple(
-            name for name, hint in kind.__annotations__.items() if name in arrays or hint in ("float", float)
-        )
+        names = tuple(name for name, hint in kind.__annotations__.items() if name in arrays or hint in ("float", float))
         _FLOATS[kind] = names
     return names

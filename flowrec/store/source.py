@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import zstandard
 from google.protobuf.message import DecodeError
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Footer, Header, Metadata, MetadataIndex
