@@ -382,6 +382,21 @@ def bench_solver(
     _keep(figures, json_file)
 
 
+@bench.command("fuzz")
+def bench_fuzz(
+    files: Annotated[int, typer.Option(min=1, help="How many spoiled sessions.")] = 2000,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first; the others follow it.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+) -> None:
+    """Spoil sessions in every way and read them with every verb; exit status 1 when anything but our errors came."""
+    from flowrec.bench.fuzz import measure, show
+
+    figures = measure(files, seed)
+    show(figures)
+    _keep(figures, json_file)
+    raise typer.Exit(1 if figures["fault_count"] else 0)
+
+
 @bench.command("grid")
 def bench_grid(
     cases: Annotated[Path, typer.Argument(metavar="DIR", help="Vessel cases (*.npz) with a truth on a fine grid.")],

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mcap.records import ChunkIndex
+
 from flowrec.errors import SessionError
 from flowrec.messages import Message
 from flowrec.store.codec import decode, message_stamp
@@ -162,12 +164,15 @@ def _contents_without_index(path: Path) -> Contents:
 
 def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]]:
     """Where the index at the end differs from what was read, and whether the reader stumbles over it."""
-    listed = {chunk.chunk_start_offset for chunk in contents.chunks}
-    seen = {chunk.chunk_start_offset for chunk in found.summary.chunks}
-    if listed - seen:
-        yield True, f"{len(listed - seen)} chunks of the index can not be read"
-    if seen - listed:
-        yield True, f"{len(seen - listed)} chunks are not in the index"
+    listed = {chunk.chunk_start_offset: chunk for chunk in contents.chunks}
+    seen = {chunk.chunk_start_offset: chunk for chunk in found.summary.chunks}
+    if listed.keys() - seen:
+        yield True, f"{len(listed.keys() - seen)} chunks of the index can not be read"
+    if seen.keys() - listed:
+        yield True, f"{len(seen.keys() - listed)} chunks are not in the index"
+    misled = sum(not _describes(listed[place], seen[place]) for place in listed.keys() & seen.keys())
+    if misled:
+        yield True, f"{misled} chunks hold something else than the index tells"
     counts = found.summary.statistics
     assert counts is not None  # scan makes them
     declared = contents.statistics
@@ -189,6 +194,18 @@ def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]
         apart = {index.offset for index in ours} ^ {index.offset for index in theirs}
         if apart:
             yield False, f"{len(apart)} {what} are only in the index, or only outside it"
+
+
+def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
+    """Whether the reader finds in a chunk what the index lets it expect."""
+    return (
+        listed.message_start_time <= seen.message_start_time
+        and seen.message_end_time <= listed.message_end_time
+        and listed.uncompressed_size == seen.uncompressed_size
+        and (
+            not listed.message_index_offsets or seen.message_index_offsets.keys() <= listed.message_index_offsets.keys()
+        )
+    )
 
 
 def _first_part(error: SessionError, path: Path) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -34,6 +34,8 @@ class SessionReader:
     ----------
     path : the session file.
     contents : its index, where the file has none or a wrong one (recovery.py).
+    pass_over : told what is wrong with a message that makes no sense, which is then left out; without it that is
+        an error.
 
     Attributes
     ----------
@@ -48,8 +50,11 @@ class SessionReader:
     SessionError : there is no such file, or it is no session that this flowrec can read; on reading, damage.
     """
 
-    def __init__(self, path: Path | str, contents: Contents | None = None) -> None:
+    def __init__(
+        self, path: Path | str, contents: Contents | None = None, pass_over: Callable[[str], None] | None = None
+    ) -> None:
         self.path = Path(path)
+        self._pass_over = pass_over
         self._contents = contents if contents is not None else Contents(self.path)
         self._source = self._contents.source
         self._fields = self._contents.fields
@@ -91,9 +96,14 @@ class SessionReader:
         """
         tick = Tick() if start_ns is None else self._state_at(start_ns - 1, with_frames=with_frames)
         for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=by_time):
-            news: dict[str, Any] = {self._fields[record.channel]: self._message(record) for record in records}
-            tick = replace(tick, stamp_ns=stamp_ns, **news)
-            yield tick
+            news: dict[str, Any] = {}
+            for record in records:
+                message = self._message(record)
+                if message is not None:
+                    news[self._fields[record.channel]] = message
+            if news:
+                tick = replace(tick, stamp_ns=stamp_ns, **news)
+                yield tick
 
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:
         """The tick at or before a stamp; an empty `Tick()` before the first one.
@@ -116,7 +126,9 @@ class SessionReader:
         with threads() as executor:
             for record in lane(self._source, self._chunks_with(channels), executor):
                 if record.channel in channels:
-                    yield self._message(record)
+                    message = self._message(record)
+                    if message is not None:
+                        yield message
 
     def close(self) -> None:
         """Close the file; forgotten readers close it when they are collected."""
@@ -130,21 +142,27 @@ class SessionReader:
     ) -> None:
         self.close()
 
-    def _message(self, record: Record) -> Message:
+    def _message(self, record: Record) -> Message | None:
         field = self._fields[record.channel]
         try:
             message = decode(BY_FIELD[field].type, record.payload, record.sequence)
             wrong = misfit(message)
         except SessionError as error:
             wrong = str(error)
-        if wrong:
-            raise DamageError(self.path, f"{BY_FIELD[field].path} at {record.log_ns} ns: {wrong}")
-        return message
+        if not wrong:
+            return message
+        wrong = f"{BY_FIELD[field].path} at {record.log_ns} ns: {wrong}"
+        if self._pass_over is None:
+            raise DamageError(self.path, wrong)
+        self._pass_over(wrong)
+        return None
 
-    def _restored(self, record: Record) -> Message:
+    def _restored(self, record: Record) -> Message | None:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (record.channel, record.log_ns)
         message = self._kept.pop(key, None) or self._message(record)
+        if message is None:
+            return None
         self._kept[key] = message
         if len(self._kept) > _KEPT_MESSAGES:
             del self._kept[next(iter(self._kept))]

@@ -87,3 +87,8 @@ def _float_fields(kind: Any) -> tuple[str, ...]:
         names = tuple(name for name, hint in kind.__annotations__.items() if name in arrays or hint in ("float", float))
         _FLOATS[kind] = names
     return names
+
+
+def shapes_of(kind: type[Message]) -> Mapping[str, Shape]:
+    """The shape of each array of a message type."""
+    return _SHAPES[kind]
