@@ -397,6 +397,20 @@ def bench_fuzz(
     raise typer.Exit(1 if figures["fault_count"] else 0)
 
 
+@bench.command("large")
+def bench_large(
+    gigabytes: Annotated[float, typer.Option("--gb", min=0.01, help="Size of the sessions (sparse files).")] = 10.0,
+    folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Where to make them; they are removed.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+) -> None:
+    """Opening a session of many gigabytes, and what is read of it to get at its poses."""
+    from flowrec.bench.large import measure, show
+
+    figures = measure(gigabytes, folder)
+    show(figures)
+    _keep(figures, json_file)
+
+
 @bench.command("grid")
 def bench_grid(
     cases: Annotated[Path, typer.Argument(metavar="DIR", help="Vessel cases (*.npz) with a truth on a fine grid.")],

@@ -72,25 +72,14 @@ class Draft:
         listed: list[tuple[int, bytes]] = []
         counts: dict[int, int] = {}
         span: list[int] = []
-        declared = [part for part in self.head if part[0] in (SCHEMA, CHANNEL)]
-        tallies = {ATTACHMENT: 0, METADATA: 0, CHUNK: 0}
         for opcode, body in self.head:
-            _append(file, listed, tallies, opcode, body)
+            _append(file, listed, opcode, body)
         for piece in self.pieces:
-            _append_piece(file, listed, tallies, counts, span, piece)
+            _append_piece(file, listed, counts, span, piece)
         for opcode, body in self.tail:
-            _append(file, listed, tallies, opcode, body)
+            _append(file, listed, opcode, body)
         file += record(DATA_END, struct.pack("<I", zlib.crc32(file)))
-        schemas = {body[:2] for opcode, body in declared if opcode == SCHEMA}
-        channels = {body[:2] for opcode, body in declared if opcode == CHANNEL}
-        statistics = struct.pack(
-            "<QHIIIIQQ",
-            sum(counts.values()), len(schemas), len(channels), tallies[ATTACHMENT], tallies[METADATA], tallies[CHUNK],
-            min(span, default=0), max(span, default=0),
-        )  # fmt: skip
-        pairs = b"".join(struct.pack("<HQ", channel, count) for channel, count in counts.items())
-        statistics += struct.pack("<I", len(pairs)) + pairs
-        index = [*declared, (STATISTICS, statistics), *listed]
+        index = self.index(listed, counts, span)
         if self.change_index is not None:
             index = self.change_index(index)
         start = len(file)
@@ -98,6 +87,23 @@ class Draft:
         file += struct.pack("<BQQQ", FOOTER, 20, start, 0)
         file += struct.pack("<I", zlib.crc32(file[start:])) + MAGIC
         return bytes(file)
+
+    def index(
+        self, listed: list[tuple[int, bytes]], counts: dict[int, int], span: list[int]
+    ) -> list[tuple[int, bytes]]:
+        """The records of a sound index over what is listed, with so many messages by channel, between these times."""
+        declared = [part for part in self.head if part[0] in (SCHEMA, CHANNEL)]
+        schemas, channels = ({body[:2] for opcode, body in declared if opcode == kind} for kind in (SCHEMA, CHANNEL))
+        attachments, metadata, chunks = (
+            sum(opcode == kind for opcode, _ in listed) for kind in (ATTACHMENT_INDEX, METADATA_INDEX, CHUNK_INDEX)
+        )
+        statistics = struct.pack(
+            "<QHIIIIQQ",
+            sum(counts.values()), len(schemas), len(channels), attachments, metadata, chunks,
+            min(span, default=0), max(span, default=0),
+        )  # fmt: skip
+        pairs = b"".join(struct.pack("<HQ", channel, count) for channel, count in counts.items())
+        return [*declared, (STATISTICS, statistics + struct.pack("<I", len(pairs)) + pairs), *listed]
 
 
 def with_sound_index(data: bytes) -> bytes:
@@ -189,29 +195,29 @@ def _map(pairs: dict[str, str]) -> bytes:
     return struct.pack("<I", len(data)) + data
 
 
-def _append(
-    file: bytearray, listed: list[tuple[int, bytes]], tallies: dict[int, int], opcode: int, body: bytes
-) -> None:
-    whole = record(opcode, body)
+def _append(file: bytearray, listed: list[tuple[int, bytes]], opcode: int, body: bytes) -> None:
+    listed += listing_of(opcode, body, len(file))
+    file += record(opcode, body)
+
+
+def listing_of(opcode: int, body: bytes, offset: int) -> list[tuple[int, bytes]]:
+    """What the index tells of a record that lies at an offset; nothing but of attachments and metadata."""
+    length = 9 + len(body)
     if opcode == METADATA:
         (size,) = struct.unpack_from("<I", body)
-        listed.append((METADATA_INDEX, struct.pack("<QQ", len(file), len(whole)) + body[: 4 + size]))
+        return [(METADATA_INDEX, struct.pack("<QQ", offset, length) + body[: 4 + size])]
     if opcode == ATTACHMENT:
-        _log_ns, _create_ns, size = struct.unpack_from("<QQI", body)
-        after_name = 20 + size
-        (media,) = struct.unpack_from("<I", body, after_name)
-        after_media = after_name + 4 + media
-        place = struct.pack("<QQ", len(file), len(whole)) + body[:16] + body[after_media : after_media + 8]
-        listed.append((ATTACHMENT_INDEX, place + body[16:after_media]))
-    if opcode in tallies:
-        tallies[opcode] += 1
-    file += whole
+        (size,) = struct.unpack_from("<I", body, 16)
+        (media,) = struct.unpack_from("<I", body, 20 + size)
+        after_media = 24 + size + media
+        place = struct.pack("<QQ", offset, length) + body[:16] + body[after_media : after_media + 8]
+        return [(ATTACHMENT_INDEX, place + body[16:after_media])]
+    return []
 
 
 def _append_piece(
     file: bytearray,
     listed: list[tuple[int, bytes]],
-    tallies: dict[int, int],
     counts: dict[int, int],
     span: list[int],
     piece: Piece,
@@ -243,4 +249,3 @@ def _append_piece(
     place = struct.pack("<QQQQI", first_ns, last_ns, start, length, len(offsets)) + offsets
     place += struct.pack("<Q", len(file) - start - length) + text(piece.compression)
     listed.append((CHUNK_INDEX, place + struct.pack("<QQ", len(packed), size)))
-    tallies[CHUNK] += 1
