@@ -8,6 +8,7 @@ resolved configuration, so a replay needs nothing else.
 from __future__ import annotations
 
 import difflib
+import functools
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
@@ -89,6 +90,7 @@ class Config:
 
 
 _ADAPTER = TypeAdapter(Config)
+_hints = functools.cache(get_type_hints)
 
 
 def load_config(path: Path | None = None, sets: Iterable[str] = ()) -> Config:
@@ -275,7 +277,7 @@ def _refuse_nonsense(config: Config, where: str) -> None:
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:
-    hints = get_type_hints(section)
+    hints = _hints(section)
     for key, value in tree.items():
         if key not in hints:
             near = difflib.get_close_matches(prefix + key, list(_all_keys(Config, "")), n=1, cutoff=0.5)
@@ -289,7 +291,7 @@ def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: 
 
 
 def _all_keys(section: type, prefix: str) -> Iterable[str]:
-    for key, inner in get_type_hints(section).items():
+    for key, inner in _hints(section).items():
         yield prefix + key
         if is_dataclass(inner) and isinstance(inner, type):
             yield from _all_keys(inner, f"{prefix}{key}.")

@@ -15,7 +15,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -32,6 +32,7 @@ from flowrec.store import SessionReader, recover
 
 TIME_LIMIT_S = 20.0
 MEMORY_LIMIT_MB = 512.0
+VERBS = ("info", "ls", "open", "middle", "ticks", "check", "recover")
 _FAULTS_KEPT = 50
 
 
@@ -40,10 +41,17 @@ class _TookTooLongError(BaseException):
 
 
 class Campaign:
-    """Spoils one session in many ways; every file is known by its seed."""
+    """Spoils one session in many ways; every file is known by its seed.
 
-    def __init__(self, folder: Path) -> None:
+    Parameters
+    ----------
+    folder : an empty one.
+    verbs : what is done with each file; fewer are quicker.
+    """
+
+    def __init__(self, folder: Path, verbs: Sequence[str] = VERBS) -> None:
         self._folder = folder
+        self._verbs = verbs
         self._work = folder / "work" / "out"
         self._work.mkdir(parents=True)
         self._draft: Draft = small_draft()
@@ -115,15 +123,17 @@ class Campaign:
             ("check", judged),
             ("recover", saved),
         ):
+            if name not in self._verbs:
+                continue
             sound[name], fault = _tried(verb)
             self.ends[f"{name}: {'read' if sound[name] else 'refused'}"] += 1
             if fault:
                 faults.append(f"{name}: {fault}")
-        if sound["ticks"] and blind(kind) and stamps != self._stamps:
+        if sound.get("ticks") and blind(kind) and stamps != self._stamps:
             faults.append(f"{len(stamps)} ticks were read as if they were all")
         if stamps != sorted(set(stamps)):
             faults.append("ticks are not in order of time")
-        if word[0] in ("good", "usable") and not (sound["ticks"] and sound["open"]):
+        if word[0] in ("good", "usable") and not (sound.get("ticks", True) and sound.get("open", True)):
             faults.append(f"check says {word[0]}, but it can not be read")
         return faults
 
