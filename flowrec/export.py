@@ -37,7 +37,7 @@ def write_rrd_of(path: Path, out: Path | None = None) -> Path:
     parent = path.parent / name if name else None
     began = time.perf_counter()
     with progress(f"writing {target.name}", max(reader.duration_s, 1e-3)) as done:
-        if parent is not None and parent.exists():
+        if parent is not None and parent.is_file():
             write_rrd(target, scene, SessionReader(parent).ticks(), reader.ticks(with_frames=False), progress=done)
         else:
             write_rrd(target, scene, reader.ticks(), progress=done)

@@ -201,7 +201,7 @@ def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
     return (
         listed.message_start_time <= seen.message_start_time
         and seen.message_end_time <= listed.message_end_time
-        and listed.uncompressed_size == seen.uncompressed_size
+        and (listed.chunk_length, listed.uncompressed_size) == (seen.chunk_length, seen.uncompressed_size)
         and (
             not listed.message_index_offsets or seen.message_index_offsets.keys() <= listed.message_index_offsets.keys()
         )

@@ -69,7 +69,7 @@ def _bundles(source: Source, chunks: list[ChunkIndex]) -> Iterator[list[ChunkInd
         bundle.append(chunk)
         size += chunk.uncompressed_size  # compared with the chunk before it is unpacked, or at least before it is used
         end_ns = max(end_ns, chunk.message_end_time) if len(bundle) > 1 else chunk.message_end_time
-        if size > CHUNK_LIMIT_BYTES:
+        if size > CHUNK_LIMIT_BYTES and len(bundle) > 1:
             raise source.damaged(chunk.chunk_start_offset, "too many chunks claim the same time")
     if bundle:
         yield bundle
