@@ -22,7 +22,7 @@ from flowrec.messages import Message, array_fields
 from flowrec.session import session_header
 from flowrec.store.codec import encode_record
 from flowrec.store.header import records_of
-from flowrec.store.layout import FRAMES, GROUPS, SLOTS, STATE, declarations
+from flowrec.store.layout import FRAMES, SLOTS, STATE, declarations
 from flowrec.store.shapes import shapes_of
 from flowrec.topics import TOPICS
 
@@ -138,7 +138,7 @@ def small_draft() -> Draft:
     records: list[Any] = [*records_of(replace(said, provenance=facts)), *declarations()]
     head = tuple(_parts(records))
     rng = np.random.default_rng(0)
-    sent: dict[str, list[list[Sent]]] = {group: [] for group in GROUPS}
+    sent: dict[str, list[list[Sent]]] = {group: [] for group in (FRAMES, STATE)}
     for number in range(TICKS):
         stamp_ns = 1_000_000_000 + number * PERIOD_NS
         for chunks in sent.values():
@@ -151,11 +151,8 @@ def small_draft() -> Draft:
             sent[slot.group][-1].append(
                 Sent(slot.channel, number if sequence is None else sequence, stamp_ns, b"".join(payload))
             )
-    order = [group for group in (FRAMES, STATE, *GROUPS) if sent[group][0]]
     pieces = tuple(
-        Piece(tuple(sent[group][number]))
-        for number in range(TICKS // TICKS_PER_CHUNK)
-        for group in dict.fromkeys(order)
+        Piece(tuple(sent[group][number])) for number in range(TICKS // TICKS_PER_CHUNK) for group in (FRAMES, STATE)
     )
     outcome = text("flowrec.outcome") + _map({"outcome": "reached", "ticks": str(TICKS), "dropped_frames": "0"})
     return Draft(head, pieces, ((METADATA, outcome),))

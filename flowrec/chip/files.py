@@ -41,7 +41,7 @@ from flowrec.chip.openings import DEFAULT_INLET_UM_S, check_openings, find_openi
 from flowrec.errors import ChipError
 
 MIN_SIDE_PX = 8
-MAX_PIXELS = 1 << 24
+MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
 _NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um", "inlet_speed_um_s")

@@ -25,8 +25,9 @@ from flowrec.errors import SessionError
 from flowrec.store.index import Summary, records_of, stream_of, summary_from
 from flowrec.store.mcap_file import MAGIC
 
-# Of one chunk before compression: two flow fields on a chip of 2048 x 2048 pixels, or one image of 12000 x 12000.
-CHUNK_LIMIT_BYTES = 160 << 20
+# Of one chunk before compression: a flow field on 1900 x 1900 pixels, or one image of 8500 x 8500. Two of them and two
+# copies on the way to a message are what reading needs at most, which leaves it within 512 MB with the program itself.
+CHUNK_LIMIT_BYTES = 72 << 20
 # Above so many bytes a chunk must have taken at least a thousandth of them: noise, flow and text never pack better.
 _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
 MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
