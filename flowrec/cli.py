@@ -208,7 +208,7 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
-    from flowrec.session import describe
+    from flowrec.listing import describe
     from flowrec.status import table
 
     facts, topics = describe(session)
@@ -227,7 +227,7 @@ def list_directory(
     """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
     from dataclasses import asdict
 
-    from flowrec.session import list_sessions
+    from flowrec.listing import list_sessions
     from flowrec.status import say, table
 
     rows = list_sessions(directory)
@@ -253,6 +253,32 @@ def list_directory(
     for row in rows:
         if row.duration_s is None:
             say(f"{row.name}: {row.note}")
+
+
+@app.command()
+def check(
+    session: Annotated[Path, typer.Argument(metavar="FILE", help="Session (.mcap), or the remains of one (.partial).")],
+    as_json: AsJson = False,
+) -> None:
+    """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
+    from flowrec.check import check as judge
+    from flowrec.status import progress
+
+    try:
+        with progress(f"reading {session.name}", max(session.stat().st_size if session.is_file() else 1, 1)) as done:
+            verdict = judge(session, done)
+    except FlowrecError as error:
+        if not as_json:
+            raise
+        finding = {"level": "bad", "about": "file", "text": str(error)}
+        typer.echo(json.dumps({"session": str(session), "verdict": "bad", "exit_status": 1, "findings": [finding]}))
+        raise typer.Exit(1) from error
+    if as_json:
+        typer.echo(json.dumps(verdict.as_json()))
+    else:
+        for line in verdict.lines():
+            typer.echo(line)
+    raise typer.Exit(verdict.exit_status)
 
 
 @app.command()
@@ -446,6 +472,35 @@ def bench_solver(
     from flowrec.bench.solver import measure, show
 
     figures = measure(quick)
+    show(figures)
+    _keep(figures, json_file)
+
+
+@bench.command("fuzz")
+def bench_fuzz(
+    files: Annotated[int, typer.Option(min=1, help="How many spoiled sessions.")] = 2000,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first; the others follow it.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+) -> None:
+    """Spoil sessions in every way and read them with every verb; exit status 1 when anything but our errors came."""
+    from flowrec.bench.fuzz import measure, show
+
+    figures = measure(files, seed)
+    show(figures)
+    _keep(figures, json_file)
+    raise typer.Exit(1 if figures["fault_count"] else 0)
+
+
+@bench.command("large")
+def bench_large(
+    gigabytes: Annotated[float, typer.Option("--gb", min=0.01, help="Size of the sessions (sparse files).")] = 10.0,
+    folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Where to make them; they are removed.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+) -> None:
+    """Opening a session of many gigabytes, and what is read of it to get at its poses."""
+    from flowrec.bench.large import measure, show
+
+    figures = measure(gigabytes, folder)
     show(figures)
     _keep(figures, json_file)
 

@@ -8,6 +8,7 @@ resolved configuration, so a replay needs nothing else.
 from __future__ import annotations
 
 import difflib
+import functools
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
@@ -93,6 +94,7 @@ class Config:
 
 
 _ADAPTER = TypeAdapter(Config)
+_hints = functools.cache(get_type_hints)
 
 
 def load_config(path: Path | None = None, sets: Iterable[str] = ()) -> Config:
@@ -108,7 +110,7 @@ def config_from_toml(text: str, where: str) -> Config:
     """The Config that `to_toml` wrote; `where` names its origin in errors."""
     try:
         return _config_from(tomllib.loads(text), where)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
 
 
@@ -226,7 +228,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path}: no such configuration; examples are in sessions/") from error
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: can not be read as a TOML configuration ({error})") from error
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise UsageError(f"{path}: not valid TOML ({error}); mend that line") from error
 
 
@@ -300,7 +302,7 @@ def _refuse_nonsense(config: Config, where: str) -> None:
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:
-    hints = get_type_hints(section)
+    hints = _hints(section)
     for key, value in tree.items():
         if key not in hints:
             near = difflib.get_close_matches(prefix + key, list(_all_keys(Config, "")), n=1, cutoff=0.5)
@@ -314,7 +316,7 @@ def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: 
 
 
 def _all_keys(section: type, prefix: str) -> Iterable[str]:
-    for key, inner in get_type_hints(section).items():
+    for key, inner in _hints(section).items():
         yield prefix + key
         if is_dataclass(inner) and isinstance(inner, type):
             yield from _all_keys(inner, f"{prefix}{key}.")

@@ -3,11 +3,24 @@
 The command line prints these without a traceback; anything else is a defect of flowrec.
 """
 
+import re
+
+# C0, DEL and C1 controls, what turns the direction of writing, line separators, halves of characters.
+_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    """Text from a file, safe on a terminal: what is not to be seen but obeyed (ESC, ...) is spelled out."""
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
 
 class FlowrecError(Exception):
     """Something failed that a person can mend. Exit status 1."""
 
     exit_status = 1
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(printable(text))
 
 
 class UsageError(FlowrecError):

@@ -32,10 +32,12 @@ def write_rrd_of(path: Path, out: Path | None = None) -> Path:
     reader, config, chip = open_session(path)
     scene = scene_of(config, chip, assemble(config, chip), path)
     target = out if out is not None else path.with_suffix(".rrd")
-    parent = path.parent / reader.header.parent["file"] if reader.header.parent.get("file") else None
+    # A name only: a session from elsewhere does not say which files of this machine are opened.
+    name = Path(reader.header.parent.get("file", "")).name
+    parent = path.parent / name if name else None
     began = time.perf_counter()
     with progress(f"writing {target.name}", max(reader.duration_s, 1e-3)) as done:
-        if parent is not None and parent.exists():
+        if parent is not None and parent.is_file():
             write_rrd(target, scene, SessionReader(parent).ticks(), reader.ticks(with_frames=False), progress=done)
         else:
             write_rrd(target, scene, reader.ticks(), progress=done)

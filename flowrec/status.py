@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from rich.text import Text
 
+from flowrec.errors import printable
 from flowrec.messages import Tick
 from flowrec.units import seconds
 
@@ -29,12 +30,12 @@ console = Console(stderr=True, highlight=False)
 
 def say(text: str) -> None:
     """One line for the person at the terminal (stderr: stdout is for --json)."""
-    console.print(escape(text), soft_wrap=True)
+    console.print(escape(printable(text)), soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """One line that something is not as it should be."""
-    console.print(f"[yellow]warning:[/yellow] {escape(text)}", soft_wrap=True)
+    console.print(f"[yellow]warning:[/yellow] {escape(printable(text))}", soft_wrap=True)
 
 
 class StatusLine:
@@ -84,10 +85,8 @@ class StatusLine:
             self._latency_ms.append(tick.timing.total_ms)
         if tick.event is not None and tick.event is not self._last.event:
             colour = {"warning": "yellow", "error": "red"}.get(tick.event.level, "cyan")
-            console.print(
-                f"[dim]{seconds(tick.stamp_ns):8.2f} s[/dim]  [{colour}]{escape(tick.event.text)}[/{colour}]",
-                soft_wrap=True,
-            )
+            text = escape(printable(tick.event.text))
+            console.print(f"[dim]{seconds(tick.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
         self._last = tick
         if self._live is not None and now - self._shown > 0.12:
             self._shown = now
@@ -134,10 +133,10 @@ def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table for people on stdout."""
-    shown = Table(title=title, title_justify="left", title_style="bold")
+    shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
     for number, column in enumerate(columns):
         shown.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     for row in rows:
-        shown.add_row(*(escape(cell) for cell in row))
+        shown.add_row(*(escape(printable(cell)) for cell in row))
     # In a log, where rich would take 80 columns, the widest table still keeps a row on a line.
     Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 110).print(shown)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 
 from flowrec.cli import app
 from flowrec.errors import SessionError
-from flowrec.session import list_sessions
+from flowrec.listing import list_sessions
 from flowrec.store import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 

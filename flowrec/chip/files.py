@@ -24,6 +24,7 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import struct
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -40,6 +41,8 @@ from flowrec.chip.openings import DEFAULT_INLET_UM_S, check_openings, find_openi
 from flowrec.errors import ChipError
 
 MIN_SIDE_PX = 8
+MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
+_PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
 _NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um", "inlet_speed_um_s")
 _CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "opening")
@@ -74,7 +77,7 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
     """
     try:
         table = tomllib.loads(toml_text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
     _refuse_unknown(table, _CHIP_KEYS, where)
     number = {key: _number(table, key, where) for key in _NUMBERS}
@@ -159,7 +162,11 @@ def read_png_chip(path: Path, um_per_px: float | None = None) -> Chip:
 
 def _mask(png_bytes: bytes, fluid: str, where: str) -> NDArray[np.bool_]:
     grey = None
-    if png_bytes:
+    if png_bytes.startswith(_PNG_HEAD) and len(png_bytes) >= len(_PNG_HEAD) + 8:
+        # The head is believed before a pixel is there: a small file could ask for gigabytes.
+        width, height = struct.unpack_from(">II", png_bytes, len(_PNG_HEAD))
+        if width * height > MAX_PIXELS:
+            raise ChipError(f"{where}: a mask of {width} x {height} pixels; at most {MAX_PIXELS} are possible")
         try:
             grey = cv2.imdecode(np.frombuffer(png_bytes, np.uint8), cv2.IMREAD_GRAYSCALE)
         except cv2.error:  # a header that promises an impossible image

@@ -1,8 +1,21 @@
+from flowrec.store.audit import Audit, audit
 from flowrec.store.frames import encoding_for
 from flowrec.store.header import SessionHeader
 from flowrec.store.mcap_file import is_growing
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import Recovered, recover
+from flowrec.store.shapes import not_finite
 from flowrec.store.writer import SessionWriter
 
-__all__ = ["Recovered", "SessionHeader", "SessionReader", "SessionWriter", "encoding_for", "is_growing", "recover"]
+__all__ = [
+    "Audit",
+    "Recovered",
+    "SessionHeader",
+    "SessionReader",
+    "SessionWriter",
+    "audit",
+    "encoding_for",
+    "is_growing",
+    "not_finite",
+    "recover",
+]

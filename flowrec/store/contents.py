@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
+from typing import Self
 
 from google.protobuf import descriptor_pb2
 from mcap.records import ChunkIndex, Statistics
@@ -13,9 +15,13 @@ import flowrec
 from flowrec.errors import SessionError
 from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
-from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, header_from
-from flowrec.store.source import Source, Summary
+from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, belongs, header_from
+from flowrec.store.index import Summary
+from flowrec.store.source import ForeignError, Source
 from flowrec.topics import BY_FIELD, BY_PATH
+
+_METADATA_LIMIT_BYTES = 16 << 20
+_ATTACHMENTS_LIMIT_BYTES = 256 << 20
 
 
 class Contents:
@@ -35,6 +41,7 @@ class Contents:
     statistics : how many there are.
     outcome : how the run ended.
     flowrec_version : of the program that wrote it.
+    channels, attachments, metadata : what else is listed.
 
     Raises
     ------
@@ -52,14 +59,14 @@ class Contents:
     def _open(self, summary: Summary | None) -> None:
         path, header = self.source.path, self.source.header
         if header.profile != PROFILE:
-            raise SessionError(
+            raise ForeignError(
                 f"{path}: is an MCAP file of another program (profile {header.profile!r}, library {header.library!r});"
                 " flowrec reads what `flowrec record` has written"
             )
         self._summary = summary if summary is not None else self.source.read_summary()
         metadata = self._metadata()
         if SESSION not in metadata:
-            raise SessionError(
+            raise ForeignError(
                 f"{path}: is an MCAP file without the record {SESSION!r}, so not a session;"
                 " flowrec reads what `flowrec record` has written"
             )
@@ -67,6 +74,8 @@ class Contents:
         self._check_version(metadata[SESSION].get("format_version", ""))
         self.outcome = metadata.get(OUTCOME, {})
         self.chunks: list[ChunkIndex] = self._summary.chunks
+        self.channels, self.attachments = self._summary.channels, self._summary.attachments
+        self.metadata = self._summary.metadata
         assert self._summary.statistics is not None  # Source or Scan has seen to it
         self.statistics: Statistics = self._summary.statistics
         self.fields = {
@@ -84,10 +93,19 @@ class Contents:
         channels = self._summary.channels.values()
         return next((c.metadata.get("encoding", "") for c in channels if c.topic == BY_FIELD["frame"].path), "")
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.source.close()
+
     @functools.cached_property
     def header(self) -> SessionHeader:
         """Read when asked for: the network's weights may be large."""
-        attachments = {index.name: self.source.attachment(index) for index in self._summary.attachments}
+        # Only what a session is made of: whatever else is attached is not even read.
+        wanted = [index for index in self._summary.attachments if belongs(index.name)]
+        self._bound("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
+        attachments = {index.name: self.source.attachment(index) for index in wanted}
         try:
             return header_from(self._metadata(), attachments)
         except KeyError as error:
@@ -96,7 +114,13 @@ class Contents:
             raise self.source.damaged(0, error) from error
 
     def _metadata(self) -> dict[str, dict[str, str]]:
+        self._bound("metadata", (index.length for index in self._summary.metadata), _METADATA_LIMIT_BYTES)
         return {index.name: self.source.metadata(index) for index in self._summary.metadata}
+
+    def _bound(self, what: str, lengths: Iterable[int], limit: int) -> None:
+        total = sum(lengths)
+        if total > limit:
+            raise self.source.damaged(0, f"{total} bytes of {what}, more than {limit}")
 
     def _check_version(self, version: str) -> None:
         if version == str(FORMAT_VERSION):
@@ -118,7 +142,7 @@ class Contents:
         with self.source.parsing(0):
             theirs, ours = _fields_of(found.data), _fields_of(expected.data)
         # A field that has come since is empty in an older file; where the message allows for that, it is read.
-        if same_kind and theirs < ours and {name for name, _ in ours - theirs} <= _may_be_missing(channel.topic):
+        if same_kind and theirs <= ours and {name for name, _ in ours - theirs} <= _may_be_missing(channel.topic):
             return
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(

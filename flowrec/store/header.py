@@ -75,6 +75,11 @@ def header_from(metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[
     )
 
 
+def belongs(name: str) -> bool:
+    """Whether an attachment is part of a session's header."""
+    return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith(_WEIGHTS)
+
+
 def _attachment(name: str, media_type: str, data: bytes) -> Attachment:
     # No time of its own: an attachment's time would stretch the time line of a viewer.
     return Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)

@@ -10,7 +10,7 @@ from operator import attrgetter
 
 from mcap.records import ChunkIndex
 
-from flowrec.store.source import CHUNK_LIMIT_BYTES, Record, Source
+from flowrec.store.source import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, Source
 
 _AHEAD_BYTES = 32 << 20  # decompressed before they are asked for
 _AHEAD_CHUNKS = 16
@@ -42,18 +42,21 @@ def lane(source: Source, chunks: Iterable[ChunkIndex], executor: Executor) -> It
     waiting = deque(
         _bundles(source, sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)))
     )
-    running: deque[tuple[int, Future[list[Record]]]] = deque()
+    running: deque[tuple[list[ChunkIndex], Future[list[bytes | memoryview]]]] = deque()
     ahead_bytes = 0
     while waiting or running:
-        while waiting and len(running) < _AHEAD_CHUNKS and (ahead_bytes < _AHEAD_BYTES or not running):
+        while waiting and len(running) < _AHEAD_CHUNKS:
+            weight = _weight(waiting[0])
+            if ahead_bytes and ahead_bytes + weight > _AHEAD_BYTES:
+                break  # one that is larger than all that may be ahead comes alone
             bundle = waiting.popleft()
-            weight = sum(chunk.uncompressed_size for chunk in bundle)
-            running.append((weight, executor.submit(_sorted_messages, source, bundle)))
+            running.append((bundle, executor.submit(_contents, source, bundle)))
             ahead_bytes += weight
-        weight, future = running.popleft()
-        records = future.result()
-        ahead_bytes -= weight
-        yield from records
+        bundle, future = running.popleft()
+        # A message as an object takes more memory than as bytes: they are made for one bundle at a time.
+        yield from _sorted_messages(source, bundle, future.result())
+        del future
+        ahead_bytes -= _weight(bundle)
 
 
 def _bundles(source: Source, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:
@@ -64,14 +67,33 @@ def _bundles(source: Source, chunks: list[ChunkIndex]) -> Iterator[list[ChunkInd
             yield bundle
             bundle, size = [], 0
         bundle.append(chunk)
-        size += chunk.uncompressed_size
+        size += chunk.uncompressed_size  # compared with the chunk before it is unpacked, or at least before it is used
         end_ns = max(end_ns, chunk.message_end_time) if len(bundle) > 1 else chunk.message_end_time
-        if size > CHUNK_LIMIT_BYTES:
+        if size > CHUNK_LIMIT_BYTES and len(bundle) > 1:
             raise source.damaged(chunk.chunk_start_offset, "too many chunks claim the same time")
     if bundle:
         yield bundle
 
 
-def _sorted_messages(source: Source, bundle: list[ChunkIndex]) -> list[Record]:
-    in_file_order = sorted(bundle, key=lambda chunk: chunk.chunk_start_offset)
-    return sorted((record for chunk in in_file_order for record in source.messages(chunk)), key=by_time)
+def _weight(bundle: list[ChunkIndex]) -> int:
+    return sum(chunk.uncompressed_size for chunk in bundle)
+
+
+def _contents(source: Source, bundle: list[ChunkIndex]) -> list[bytes | memoryview]:
+    return [source.chunk(chunk) for chunk in bundle]
+
+
+def _sorted_messages(source: Source, bundle: list[ChunkIndex], contents: list[bytes | memoryview]) -> Iterator[Record]:
+    places = [chunk.chunk_start_offset for chunk in bundle]
+    records: list[Record] = []
+    for place, content in sorted(zip(places, contents, strict=True), key=lambda pair: pair[0]):
+        records += source.messages_in(content, place)
+        if len(records) > MESSAGES_LIMIT:
+            raise source.damaged(place, "too many messages claim the same time")
+    records.sort(key=by_time)
+    # What comes later is merged by the times of the index; they are not to be trusted either.
+    first_ns = min(chunk.message_start_time for chunk in bundle)
+    last_ns = max(chunk.message_end_time for chunk in bundle)
+    if records and not first_ns <= records[0].log_ns <= records[-1].log_ns <= last_ns:
+        raise source.damaged(places[0], "there are messages of other times than the index tells")
+    return iter(records)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import itertools
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -19,6 +19,7 @@ from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
 from flowrec.store.header import SessionHeader
 from flowrec.store.lane import by_time, lane, threads
+from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -33,6 +34,8 @@ class SessionReader:
     ----------
     path : the session file.
     contents : its index, where the file has none or a wrong one (recovery.py).
+    pass_over : told what is wrong with a message that makes no sense, which is then left out; without it that is
+        an error.
 
     Attributes
     ----------
@@ -47,8 +50,11 @@ class SessionReader:
     SessionError : there is no such file, or it is no session that this flowrec can read; on reading, damage.
     """
 
-    def __init__(self, path: Path | str, contents: Contents | None = None) -> None:
+    def __init__(
+        self, path: Path | str, contents: Contents | None = None, pass_over: Callable[[str], None] | None = None
+    ) -> None:
         self.path = Path(path)
+        self._pass_over = pass_over
         self._contents = contents if contents is not None else Contents(self.path)
         self._source = self._contents.source
         self._fields = self._contents.fields
@@ -90,9 +96,14 @@ class SessionReader:
         """
         tick = Tick() if start_ns is None else self._state_at(start_ns - 1, with_frames=with_frames)
         for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=by_time):
-            news: dict[str, Any] = {self._fields[record.channel]: self._message(record) for record in records}
-            tick = replace(tick, stamp_ns=stamp_ns, **news)
-            yield tick
+            news: dict[str, Any] = {}
+            for record in records:
+                message = self._message(record)
+                if message is not None:
+                    news[self._fields[record.channel]] = message
+            if news:
+                tick = replace(tick, stamp_ns=stamp_ns, **news)
+                yield tick
 
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:
         """The tick at or before a stamp; an empty `Tick()` before the first one.
@@ -115,7 +126,9 @@ class SessionReader:
         with threads() as executor:
             for record in lane(self._source, self._chunks_with(channels), executor):
                 if record.channel in channels:
-                    yield self._message(record)
+                    message = self._message(record)
+                    if message is not None:
+                        yield message
 
     def close(self) -> None:
         """Close the file; forgotten readers close it when they are collected."""
@@ -129,18 +142,28 @@ class SessionReader:
     ) -> None:
         self.close()
 
-    def _message(self, record: Record) -> Message:
+    def _message(self, record: Record) -> Message | None:
         field = self._fields[record.channel]
         try:
             schema = self._contents.schemas[record.channel]
-            return decode(BY_FIELD[field].type, record.payload, record.sequence, schema)
+            message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema)
+            wrong = misfit(message)
         except SessionError as error:
-            raise DamageError(self.path, f"{BY_FIELD[field].path} at {record.log_ns} ns: {error}") from error
+            wrong = str(error)
+        if not wrong:
+            return message
+        wrong = f"{BY_FIELD[field].path} at {record.log_ns} ns: {wrong}"
+        if self._pass_over is None:
+            raise DamageError(self.path, wrong)
+        self._pass_over(wrong)
+        return None
 
-    def _restored(self, record: Record) -> Message:
+    def _restored(self, record: Record) -> Message | None:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (record.channel, record.log_ns)
         message = self._kept.pop(key, None) or self._message(record)
+        if message is None:
+            return None
         self._kept[key] = message
         if len(self._kept) > _KEPT_MESSAGES:
             del self._kept[next(iter(self._kept))]
@@ -151,13 +174,25 @@ class SessionReader:
         start = 0 if start_ns is None else start_ns
         state, frames = self._lanes(start)
         wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
+        read = dict.fromkeys(wanted, 0)
         with threads() as executor:
             lanes = [lane(self._source, state, executor)]
             if with_frames:
                 lanes.append(lane(self._source, frames, executor))
             for record in heapq.merge(*lanes, key=by_time):
                 if record.log_ns >= start and record.channel in wanted:
+                    read[record.channel] += 1
                     yield record
+        if start_ns is None:
+            self._compare(read)
+
+    def _compare(self, read: Mapping[int, int]) -> None:
+        """A file that has less in it than it says must not pass for a whole one."""
+        for channel, count in read.items():
+            announced = self._contents.statistics.channel_message_counts.get(channel, 0)
+            if count != announced:
+                path = BY_FIELD[self._fields[channel]].path
+                raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
 
     def _lanes(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
         """Chunks that reach beyond a time: those with anything but frames, and those with frames only."""

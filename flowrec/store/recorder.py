@@ -11,6 +11,7 @@ from pathlib import Path
 from mcap.records import Metadata
 
 import flowrec
+from flowrec.errors import SessionError
 from flowrec.messages import Frame
 from flowrec.store.backlog import Entry
 from flowrec.store.chunk import ChunkBuilder
@@ -22,11 +23,14 @@ from flowrec.store.layout import FRAMES, GROUPS, SLOTS, STATE, declarations
 from flowrec.store.layout import VIEW as VIEW_GROUP
 from flowrec.store.mcap_file import McapFile
 from flowrec.store.mirrors import Mirrors
+from flowrec.store.source import CHUNK_LIMIT_BYTES
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
 # A chunk is what one needs to read for one message, and what a compressor sees at once.
 _CHUNK_BYTES = {FRAMES: 1 << 20, STATE: 1 << 18, VIEW_GROUP: 1 << 18}
+# Left in the largest chunk that is read for what surrounds a message.
+_CHUNK_ROOM_BYTES = 1 << 20
 _SYNC_POLL_S = 0.05
 
 
@@ -139,6 +143,12 @@ class Recorder:
             sequence = self._sequences[path]
             self._sequences[path] = (sequence + 1) % 2**32
         slot = SLOTS[path]
+        size = sum(map(len, payload))
+        if size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
+            raise SessionError(f"a message of {path} has {size} bytes, more than a chunk may hold; use a smaller chip")
+        builder = self._builders[slot.group]
+        if builder.size and builder.size + size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
+            self._file.add_chunks([builder.seal()])
         # The stamp itself travels in the payload; MCAP knows no time before zero.
         self._builders[slot.group].add(slot.channel, sequence, log_ns, max(0, publish_ns), payload)
 

@@ -50,6 +50,22 @@ class Recovered:
         return not self.lost
 
 
+@dataclass(slots=True)
+class _Nonsense:
+    """Messages that were passed over."""
+
+    count: int = 0
+    first: str = ""
+
+    def add(self, what: str) -> None:
+        self.count += 1
+        self.first = self.first or what
+
+    def told(self) -> Iterator[str]:
+        if self.count:
+            yield f"{self.count} messages that make no sense, the first is {self.first}"
+
+
 def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write everything intact of a session to a new file, from the first tick to the last whole one.
 
@@ -82,8 +98,9 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             return Recovered(target, whole.ticks, whole.duration_s)
         with contextlib.closing(Source(path)) as source:
             found = scan(source)
+        nonsense = _Nonsense()
         contents = Contents(path, found.summary)
-        reader = SessionReader(path, contents)
+        reader = SessionReader(path, contents, nonsense.add)
         _require_head(path, found)
         # Pixels that a JPEG has given are kept as they are: once more through it, they would be others.
         known = ENCODINGS.get(contents.frame_encoding)
@@ -92,7 +109,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     _refuse_if_taken(target)
     draft = target.with_name(f"{target.stem}.recovering{target.suffix}")
     try:
-        ticks, lost = _rewrite(reader, found, end_ns, draft, frames)
+        ticks, lost = _rewrite(reader, found, end_ns, draft, frames, nonsense)
         done = _checked(draft)
         if done is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
@@ -115,8 +132,11 @@ def _checked(path: Path) -> Recovered | None:
     try:
         with SessionReader(path, contents := Contents(path)) as reader:
             _ = reader.header
-            for chunk in contents.chunks:
-                contents.source.messages(chunk)
+            for _tick in reader.ticks():
+                pass
+            for chunk in contents.chunks:  # the rest: views for other programs
+                if contents.fields.keys().isdisjoint(chunk.message_index_offsets):
+                    contents.source.messages(chunk)
             return Recovered(path, reader.counts.get("track", 0), reader.duration_s, changed=False)
     except SessionError:
         return None
@@ -147,7 +167,9 @@ def _channel(found: Scan, topic: str) -> int:
     return next((number for number, channel in found.summary.channels.items() if channel.topic == topic), -1)
 
 
-def _rewrite(reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str) -> tuple[int, str]:
+def _rewrite(
+    reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str, nonsense: _Nonsense
+) -> tuple[int, str]:
     """Write the ticks up to a stamp; their number and what was lost."""
     before = Tick()
     whole = images_missing = images_ahead = dropped = 0
@@ -166,7 +188,7 @@ def _rewrite(reader: SessionReader, found: Scan, end_ns: int, draft: Path, frame
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
             before = tick
-        lost = "; ".join(_losses(reader, found, images_missing - dropped, images_ahead))
+        lost = "; ".join([*_losses(reader, found, images_missing - dropped, images_ahead), *nonsense.told()])
         writer.close(_outcome(reader, lost, before.stamp_ns, dropped))
     return whole, lost
 

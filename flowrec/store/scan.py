@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import (
-    Attachment,
     AttachmentIndex,
     Channel,
     ChunkIndex,
@@ -25,15 +25,20 @@ from mcap.records import (
 
 from flowrec.errors import SessionError
 from flowrec.store.header import OUTCOME
+from flowrec.store.index import Summary, declare
 from flowrec.store.mcap_file import MAGIC
-from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Source, Summary
+from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Record, Source
 
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the content
 _HEAD_BYTES = _CHUNK_HEAD.size + 16
 # The chunks that flowrec writes: a head, then `zstd`, or no name and the size of the content once more.
 _CHUNK_SHAPE = re.compile(rb"(?s)(?=\x06.{24}(.{8}).{4}(?:\x04\x00\x00\x00zstd|\x00\x00\x00\x00\1))")
 _WINDOW_BYTES = 1 << 20
+_TRIES = 8  # how often, on average, a damaged byte may be looked at
 _SEQUENCES = 2**32
+
+
+Visit = Callable[[int, list[Record]], None]
 
 
 class Lost(NamedTuple):
@@ -61,6 +66,7 @@ class Scan:
     gaps : by channel.
     last_ns : time of the last message, by channel.
     ended : the outcome of the run was found, which is written after its last message.
+    visit : told offset and messages of every sound chunk, in file order.
     """
 
     summary: Summary = field(default_factory=Summary)
@@ -68,6 +74,7 @@ class Scan:
     gaps: dict[int, list[Gap]] = field(default_factory=dict)
     last_ns: dict[int, int] = field(default_factory=dict)
     ended: bool = False
+    visit: Visit | None = None
     _counts: dict[int, int] = field(default_factory=dict)
     _sequences: dict[int, int] = field(default_factory=dict)
 
@@ -77,13 +84,15 @@ class Scan:
             if opcode == Opcode.CHUNK:
                 self._take_chunk(source, offset, length)
             elif opcode == Opcode.SCHEMA:
-                schema: Schema = source.record(offset, length, Opcode.SCHEMA, Schema.read)[0]
-                self.summary.schemas[schema.id] = schema
+                schema: Schema = source.record(offset, length, Opcode.SCHEMA, Schema.read)
+                with source.parsing(offset):
+                    declare(self.summary.schemas, schema)
             elif opcode == Opcode.CHANNEL:
-                channel: Channel = source.record(offset, length, Opcode.CHANNEL, Channel.read)[0]
-                self.summary.channels[channel.id] = channel
+                channel: Channel = source.record(offset, length, Opcode.CHANNEL, Channel.read)
+                with source.parsing(offset):
+                    declare(self.summary.channels, channel)
             elif opcode == Opcode.METADATA:
-                metadata: Metadata = source.record(offset, length, Opcode.METADATA, Metadata.read)[0]
+                metadata: Metadata = source.record(offset, length, Opcode.METADATA, Metadata.read)
                 self.summary.metadata.append(MetadataIndex(offset=offset, length=length, name=metadata.name))
                 self.ended = self.ended or metadata.name == OUTCOME
             elif opcode == Opcode.ATTACHMENT:
@@ -127,15 +136,18 @@ class Scan:
             message_start_time=0,
             uncompressed_size=0,
         )
-        records = source.messages(index)
+        content = source.content(offset, length)
+        records = source.messages_in(content, offset)
         if not records:
             return
         # The times in the head of a chunk are under no checksum; those of its messages are.
         index.message_start_time = min(record.log_ns for record in records)
         index.message_end_time = max(record.log_ns for record in records)
         index.message_index_offsets = {record.channel: 0 for record in records}
-        index.uncompressed_size = sum(len(record.payload) for record in records)
+        index.uncompressed_size = len(content)
         self.summary.chunks.append(index)
+        if self.visit is not None:
+            self.visit(offset, records)
         for log_ns, channel, sequence, _ in records:
             missing = (sequence - self._sequences.get(channel, -1) - 1) % _SEQUENCES
             if missing:
@@ -145,36 +157,49 @@ class Scan:
             self.last_ns[channel] = max(log_ns, self.last_ns.get(channel, 0))
 
     def _take_attachment(self, source: Source, offset: int, length: int) -> None:
-        record: Attachment = source.record(offset, length, Opcode.ATTACHMENT, Attachment.read)[0]
-        index = AttachmentIndex(
-            offset=offset,
-            length=length,
-            log_time=record.log_time,
-            create_time=record.create_time,
-            data_size=len(record.data),
-            name=record.name,
-            media_type=record.media_type,
+        found = source.attachment_at(offset, length)
+        self.summary.attachments.append(
+            AttachmentIndex(
+                offset=offset,
+                length=length,
+                log_time=found.log_ns,
+                create_time=found.create_ns,
+                data_size=len(found.data),
+                name=found.name,
+                media_type=found.media_type,
+            )
         )
-        source.attachment(index)  # for its checksum
-        self.summary.attachments.append(index)
 
 
-def scan(source: Source) -> Scan:
+def scan(source: Source, visit: Visit | None = None, progress: Callable[[int], None] | None = None) -> Scan:
     """Read a whole file and note what is intact; one chunk is in memory at a time.
+
+    Parameters
+    ----------
+    visit : told offset and messages of every sound chunk, in file order.
+    progress : told up to which byte the file has been read.
 
     Raises
     ------
     SessionError : the disk does not give the bytes.
     """
-    found = Scan()
+    found = Scan(visit=visit)
     at = len(MAGIC)
+    # What has the shape of a chunk after damage may be none, and lie over the next one: the price of trying is bounded.
+    patience_bytes = _TRIES * source.size + _WINDOW_BYTES
     while at < source.size:
+        if progress is not None:
+            progress(at)
         opcode, end = _extent(source, at)
         if end and found.take(source, opcode, at, end - at):
             if opcode == Opcode.FOOTER:
                 break
             at = end
             continue
+        patience_bytes -= end - at if end else RECORD_HEAD.size
+        if patience_bytes < 0:
+            found.lose(at, source.size - at)
+            break
         # A damaged record between sound ones is passed over; else its length is not to be trusted either.
         sound = end and (end == source.size or _extent(source, end)[1])
         following = end if sound else _next_chunk(source, at + 1)

@@ -7,45 +7,40 @@ errors of several libraries escape. Here every size is checked before it is used
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import struct
 import weakref
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import zstandard
 from google.protobuf.message import DecodeError
-from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import AttachmentIndex, ChunkIndex, Footer, Header, Metadata, MetadataIndex
 
 from flowrec.errors import SessionError
+from flowrec.store.index import Summary, records_of, stream_of, summary_from
 from flowrec.store.mcap_file import MAGIC
 
-CHUNK_LIMIT_BYTES = 1 << 30  # of one chunk before compression
+# Of one chunk before compression: a flow field on 1900 x 1900 pixels, or one image of 8500 x 8500. Two of them and two
+# copies on the way to a message are what reading needs at most, which leaves it within 512 MB with the program itself.
+CHUNK_LIMIT_BYTES = 72 << 20
+# Above so many bytes a chunk must have taken at least a thousandth of them: noise, flow and text never pack better.
+_FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
+MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 _HEADER_LIMIT_BYTES = 1 << 16
-_RECORDS_PER_CHUNK = 1 << 20
+_SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
+_SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
+_ATTACHMENT_LIMIT_BYTES = 256 << 20
 RECORD_HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
+_CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, size and checksum of the content, length of the name
+_ATTACHMENT_HEAD = struct.Struct("<QQI")  # log and create time, length of the name
 _FOOTER_BYTES = 9 + 20
-_CRC = struct.Struct("<I")
+_LONG, _CRC = struct.Struct("<Q"), struct.Struct("<I")
 
 # What the libraries raise on damaged bytes, as found by reading thousands of mutated files.
 _DAMAGE = (
@@ -59,6 +54,14 @@ _DAMAGE = (
     OverflowError,
     MemoryError,
 )
+
+
+class ForeignError(SessionError):
+    """An MCAP file, or none at all, that flowrec has not written."""
+
+
+class UnfinishedError(SessionError):
+    """The end of the file is missing: the run was killed, goes on, or the file is cut off."""
 
 
 class DamageError(SessionError):
@@ -78,16 +81,14 @@ class Record(NamedTuple):
     payload: memoryview
 
 
-@dataclass(slots=True)
-class Summary:
-    """What the end of the file says about the rest."""
+class AttachmentBody(NamedTuple):
+    """One attachment as it lies in the file."""
 
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[ChunkIndex] = field(default_factory=list)
-    attachments: list[AttachmentIndex] = field(default_factory=list)
-    metadata: list[MetadataIndex] = field(default_factory=list)
-    statistics: Statistics | None = None
+    log_ns: int
+    create_ns: int
+    name: str
+    media_type: str
+    data: memoryview
 
 
 class Source:
@@ -146,154 +147,154 @@ class Source:
             raise self.damaged(offset, str(error) or type(error).__name__) from error
 
     def read_summary(self) -> Summary:
-        """The summary section, checksum verified."""
+        """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
         tail = self.read(max(0, self.size - _FOOTER_BYTES - len(MAGIC)), min(self.size, _FOOTER_BYTES + len(MAGIC)))
         if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != _FOOTER_BYTES + len(MAGIC):
-            raise SessionError(
+            raise UnfinishedError(
                 f"{self.path}: was not finished (the run was killed, or the file is cut off);"
                 f" `flowrec recover {self.path}` makes a whole session of it"
             )
         footer_at = self.size - len(tail)
         with self.parsing(footer_at):
-            footer = Footer.read(_stream(tail[9:]))
+            footer = Footer.read(stream_of(tail[9:]))
         if footer.summary_start == 0:
-            raise SessionError(f"{self.path}: has no index; `flowrec recover {self.path}` makes one")
+            raise UnfinishedError(f"{self.path}: has no index; `flowrec recover {self.path}` makes one")
         start = footer.summary_start
+        if footer_at - start > _SUMMARY_LIMIT_BYTES:
+            raise self.damaged(start, f"an index of {footer_at - start} bytes, more than {_SUMMARY_LIMIT_BYTES}")
         data = self.read(start, footer_at - start)
         if footer.summary_crc and zlib.crc32(tail[: _FOOTER_BYTES - 4], zlib.crc32(data)) != footer.summary_crc:
             raise self.damaged(start, "the checksum of the index is wrong")
-        summary = Summary()
         with self.parsing(start):
-            for opcode, at, length in _records(data):
-                _take_in(summary, opcode, data[at : at + length])
-        self._check(summary, start)
-        return summary
+            return summary_from(data, len(MAGIC), start)
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""
-        record: Metadata = self.record(index.offset, index.length, Opcode.METADATA, Metadata.read)[0]
+        body = self.body(index.offset, index.length, Opcode.METADATA)
+        with self.parsing(index.offset):
+            record: Metadata = Metadata.read(stream_of(body))
         return dict(record.metadata)
 
     def attachment(self, index: AttachmentIndex) -> bytes:
         """The content of one attachment, checksum verified."""
-        record, body = self.record(index.offset, index.length, Opcode.ATTACHMENT, Attachment.read)
-        with self.parsing(index.offset):
-            (crc,) = _CRC.unpack(body[-4:])
-        if crc and zlib.crc32(body[:-4]) != crc:
-            raise self.damaged(index.offset, f"the checksum of {record.name!r} is wrong")
-        if len(record.data) != index.data_size:
-            raise self.damaged(index.offset, f"{record.name!r} is shorter than announced")
-        data: bytes = record.data
-        return data
+        found = self.attachment_at(index.offset, index.length)
+        if len(found.data) != index.data_size or found.name != index.name:
+            raise self.damaged(index.offset, f"{found.name!r} is not what the index tells of it")
+        return bytes(found.data)
 
-    def messages(self, index: ChunkIndex) -> list[Record]:
-        """All messages of one chunk, in file order; decompressed within its declared size, checksum verified."""
-        offset = index.chunk_start_offset
-        chunk: Chunk = self.record(offset, index.chunk_length, Opcode.CHUNK, Chunk.read)[0]
+    def attachment_at(self, offset: int, length: int) -> AttachmentBody:
+        """One attachment, checksum verified."""
+        body = self.body(offset, length, Opcode.ATTACHMENT)
         with self.parsing(offset):
-            content = _decompressed(chunk)
-            if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
+            log_ns, create_ns, name_bytes = _ATTACHMENT_HEAD.unpack_from(body)
+            name, at = _text(body, _ATTACHMENT_HEAD.size, name_bytes)
+            media_type, at = _text(body, at + 4, *_CRC.unpack_from(body, at))
+            (size,) = _LONG.unpack_from(body, at)
+            data, at = body[at + 8 : at + 8 + size], at + 8 + size
+            if at + 4 != len(body):
+                raise ValueError(f"{name!r} is not as long as announced")
+            (crc,) = _CRC.unpack_from(body, at)
+            if crc and zlib.crc32(body[:at]) != crc:
+                raise ValueError(f"the checksum of {name!r} is wrong")
+        return AttachmentBody(log_ns, create_ns, name, media_type, data)
+
+    def content(self, offset: int, length: int) -> bytes | memoryview:
+        """What is in a chunk: decompressed within our limits, whatever it announces; checksum verified."""
+        body = self.body(offset, length, Opcode.CHUNK)
+        with self.parsing(offset):
+            _, _, size, crc, name_bytes = _CHUNK_HEAD.unpack_from(body)
+            compression, at = _text(body, _CHUNK_HEAD.size, name_bytes)
+            if _LONG.unpack_from(body, at)[0] != len(body) - at - _LONG.size:
+                raise ValueError("the chunk is not as long as announced")
+            content = _decompressed(body[at + _LONG.size :], compression, size)
+            if crc and zlib.crc32(content) != crc:
                 raise ValueError("the checksum of the chunk is wrong")
-            view = memoryview(content)
-            found: list[Record] = []
-            for opcode, at, length in _records(content):
+        return content
+
+    def chunk(self, index: ChunkIndex) -> bytes | memoryview:
+        """`content` of a chunk of the index, of the size that the index tells."""
+        content = self.content(index.chunk_start_offset, index.chunk_length)
+        if len(content) != index.uncompressed_size:
+            raise self.damaged(index.chunk_start_offset, "the chunk has another size than the index tells")
+        return content
+
+    def messages_in(self, content: bytes | memoryview, offset: int) -> list[Record]:
+        """The messages in the content of the chunk at an offset, in file order."""
+        view = memoryview(content)
+        found: list[Record] = []
+        with self.parsing(offset):
+            for opcode, at, length in records_of(content):
                 if opcode == Opcode.MESSAGE:
-                    if len(found) == _RECORDS_PER_CHUNK:
-                        raise ValueError(f"more than {_RECORDS_PER_CHUNK} messages in one chunk")
+                    if len(found) == MESSAGES_LIMIT:
+                        raise ValueError(f"more than {MESSAGES_LIMIT} messages in one chunk")
+                    if length < _MESSAGE_HEAD.size:
+                        raise ValueError(f"a message of {length} bytes")
                     channel, sequence, log_ns, _publish_ns = _MESSAGE_HEAD.unpack_from(content, at)
                     payload = view[at + _MESSAGE_HEAD.size : at + length]
                     found.append(Record(log_ns, channel, sequence, payload))
         return found
 
+    def messages(self, index: ChunkIndex) -> list[Record]:
+        """All messages of one chunk, in file order."""
+        return self.messages_in(self.chunk(index), index.chunk_start_offset)
+
     def _read_header(self) -> Header:
         if self.size == 0:
-            raise SessionError(f"{self.path}: is empty; nothing was recorded into it")
+            raise ForeignError(f"{self.path}: is empty; nothing was recorded into it")
         if self.read(0, min(self.size, len(MAGIC))) != MAGIC:
-            raise SessionError(f"{self.path}: is not an MCAP file; flowrec reads what `flowrec record` has written")
+            raise ForeignError(f"{self.path}: is not an MCAP file; flowrec reads what `flowrec record` has written")
         data = self.read(len(MAGIC), min(self.size - len(MAGIC), _HEADER_LIMIT_BYTES))
         with self.parsing(len(MAGIC)):
             opcode, length = RECORD_HEAD.unpack_from(data)
             if opcode != Opcode.HEADER or length > len(data) - RECORD_HEAD.size:
                 raise ValueError("no header record")
-            header: Header = Header.read(_stream(data[RECORD_HEAD.size :][:length]))
+            header: Header = Header.read(stream_of(data[RECORD_HEAD.size :][:length]))
         return header
 
-    def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> tuple[Any, bytes]:
-        """One record of that kind and size, parsed, and its body."""
+    def body(self, offset: int, length: int, opcode: Opcode) -> memoryview:
+        """What follows the head of a record of that kind and whole length."""
+        limit = _LIMIT_BYTES.get(opcode, _SMALL_LIMIT_BYTES)
+        if length > limit:
+            raise self.damaged(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
         data = self.read(offset, length)
         with self.parsing(offset):
             found, size = RECORD_HEAD.unpack_from(data)
             if found != opcode or size != length - RECORD_HEAD.size:
                 raise ValueError(f"no {opcode.name.lower()} of {length} bytes here")
-            body = data[RECORD_HEAD.size :]
-            return parse(_stream(body)), body
+        return memoryview(data)[RECORD_HEAD.size :]
 
-    def _check(self, summary: Summary, start: int) -> None:
-        counts = summary.statistics
-        if counts is None:
-            raise self.damaged(start, "the index has no statistics")
-        pairs = (
-            ("chunks", counts.chunk_count, len(summary.chunks)),
-            ("channels", counts.channel_count, len(summary.channels)),
-            ("attachments", counts.attachment_count, len(summary.attachments)),
-            ("metadata records", counts.metadata_count, len(summary.metadata)),
-        )
-        for what, announced, listed in pairs:
-            if announced != listed:
-                raise self.damaged(start, f"{announced} {what} are announced, {listed} are listed")
-        for channel in summary.channels.values():
-            if channel.schema_id not in summary.schemas:
-                raise self.damaged(start, f"channel {channel.topic} has no schema")
+    def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> Any:
+        """One small record of that kind and whole length, parsed."""
+        body = self.body(offset, length, opcode)
+        with self.parsing(offset):
+            return parse(stream_of(body))
 
 
-def _stream(data: bytes) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(data))
+_LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: _ATTACHMENT_LIMIT_BYTES}
 
 
-def _records(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, start and length of the body of each record."""
-    at, end = 0, len(data)
-    while at < end:
-        opcode, length = RECORD_HEAD.unpack_from(data, at)
-        at += RECORD_HEAD.size
-        if length > end - at:
-            raise ValueError(f"a record of {length} bytes where {end - at} are left")
-        yield opcode, at, length
-        at += length
+def _text(body: memoryview, at: int, nbytes: int) -> tuple[str, int]:
+    """Text at a place, and the place after it."""
+    if nbytes > len(body) - at:
+        raise ValueError(f"a text of {nbytes} bytes where {len(body) - at} are left")
+    return str(body[at : at + nbytes], "utf-8"), at + nbytes
 
 
-def _decompressed(chunk: Chunk) -> bytes:
-    size = chunk.uncompressed_size
+def _decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
     if size > CHUNK_LIMIT_BYTES:
         raise ValueError(f"a chunk of {size} bytes, more than {CHUNK_LIMIT_BYTES}")
-    if chunk.compression == "":
-        content: bytes = chunk.data
-    elif chunk.compression == "zstd":
+    if size > _FREE_BYTES and size > _RATIO_LIMIT * len(data):
+        raise ValueError(f"a chunk that unpacks {len(data)} bytes to {size}")
+    if compression == "":
+        content: bytes | memoryview = data
+    elif compression == "zstd":
         # The size in zstd's own header is what the library allocates, whatever limit it is given.
-        if zstandard.frame_content_size(chunk.data) not in (-1, size):
+        if zstandard.frame_content_size(data) not in (-1, size):
             raise ValueError("zstd announces another size than the chunk")
         # A new one each time: they are cheap, and may not be shared between threads.
-        content = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size) if size else b""
+        content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
     else:
-        raise ValueError(f"compression {chunk.compression!r} is not known to flowrec")
+        raise ValueError(f"compression {compression!r} is not known to flowrec")
     if len(content) != size:
         raise ValueError(f"{len(content)} bytes where {size} are announced")
     return content
-
-
-def _take_in(summary: Summary, opcode: int, body: bytes) -> None:
-    stream = _stream(body)
-    if opcode == Opcode.SCHEMA:
-        schema = Schema.read(stream)
-        summary.schemas[schema.id] = schema
-    elif opcode == Opcode.CHANNEL:
-        channel = Channel.read(stream)
-        summary.channels[channel.id] = channel
-    elif opcode == Opcode.CHUNK_INDEX:
-        summary.chunks.append(ChunkIndex.read(stream))
-    elif opcode == Opcode.ATTACHMENT_INDEX:
-        summary.attachments.append(AttachmentIndex.read(stream))
-    elif opcode == Opcode.METADATA_INDEX:
-        summary.metadata.append(MetadataIndex.read(stream))
-    elif opcode == Opcode.STATISTICS:
-        summary.statistics = Statistics.read(stream)

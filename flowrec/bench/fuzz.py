@@ -1,0 +1,237 @@
+"""Thousands of spoiled sessions, each opened, described, read, checked and recovered: what may not happen is counted.
+
+What may happen: it is read, or refused with one of our errors in one line. What may not: another exception, a hang,
+memory beyond a limit, a file anywhere but where one was asked for, less than everything passed for everything, or a
+verdict that the reader does not share.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from flowrec.bench.draft import Draft, small_draft
+from flowrec.bench.memory import peak_mb
+from flowrec.bench.mutate import blind, spoil
+from flowrec.check import check
+from flowrec.errors import FlowrecError, printable
+from flowrec.listing import describe, list_sessions
+from flowrec.session import open_session
+from flowrec.status import progress, table
+from flowrec.store import SessionReader, recover
+
+TIME_LIMIT_S = 20.0
+MEMORY_LIMIT_MB = 270.0  # besides the 240 MB of the program itself: together less than 512
+VERBS = ("info", "ls", "open", "middle", "ticks", "check", "recover")
+_FAULTS_KEPT = 50
+
+
+class _TookTooLongError(BaseException):
+    """Not an Exception: nobody in between may catch it."""
+
+
+class Campaign:
+    """Spoils one session in many ways; every file is known by its seed.
+
+    Parameters
+    ----------
+    folder : an empty one.
+    verbs : what is done with each file; fewer are quicker.
+    """
+
+    def __init__(self, folder: Path, verbs: Sequence[str] = VERBS) -> None:
+        self._folder = folder
+        self._verbs = verbs
+        self._work = folder / "work" / "out"
+        self._work.mkdir(parents=True)
+        self._draft: Draft = small_draft()
+        self._whole = self._draft.build()
+        path = self._work / "whole.mcap"
+        path.write_bytes(self._whole)
+        with SessionReader(path) as reader:
+            self._stamps = [tick.stamp_ns for tick in reader.ticks()]
+        if check(path).word != "good":
+            raise FlowrecError(f"{path}: the session to be spoiled is not good; mend bench/draft.py first")
+        path.unlink()
+        _forget_peak()
+        self._base_mb = peak_mb()
+        self.kinds: Counter[str] = Counter()
+        self.ends: Counter[str] = Counter()
+        self.faults: list[dict[str, Any]] = []
+        self.worst_s = self.worst_mb = 0.0
+
+    def run(self, seed: int) -> list[str]:
+        """Spoil and read one file; what may not happen and has."""
+        kind, data = spoil(self._draft, self._whole, seed)
+        self.kinds[kind] += 1
+        path = self._work / ("case.mcap.partial" if seed % 5 == 0 else "case.mcap")
+        path.write_bytes(data)
+        _forget_peak()
+        began = time.perf_counter()
+        faults = self._read(path, kind)
+        self.worst_s = max(self.worst_s, time.perf_counter() - began)
+        memory_mb = peak_mb()
+        self.worst_mb = max(self.worst_mb, memory_mb)
+        if memory_mb - self._base_mb > MEMORY_LIMIT_MB:
+            faults.append(f"{memory_mb - self._base_mb:.0f} MB more than before")
+        faults += self._strays()
+        self.faults += [{"seed": seed, "kind": kind, "fault": fault} for fault in faults][:_FAULTS_KEPT]
+        return faults
+
+    def _read(self, path: Path, kind: str) -> list[str]:
+        faults: list[str] = []
+        stamps: list[int] = []
+        word = [""]
+
+        def ticks() -> None:
+            with SessionReader(path) as reader:
+                stamps.extend(tick.stamp_ns for tick in reader.ticks())
+
+        def middle() -> None:
+            with SessionReader(path) as reader:
+                reader.tick_before(self._stamps[3], with_frames=False)
+                next(reader.ticks(self._stamps[2]), None)
+                sum(1 for _ in reader.messages("estimate"))
+
+        def judged() -> None:
+            verdict = check(path)
+            word[0] = verdict.word
+            if any(printable(line) != line for line in verdict.lines()):
+                raise AssertionError("the verdict is not safe on a terminal")
+
+        def saved() -> None:
+            done = recover(path, self._work / "saved.mcap")
+            with SessionReader(done.path) as reader:
+                if sum(1 for _ in reader.ticks()) < min(done.ticks, 1):
+                    raise AssertionError("what was recovered can not be read")
+
+        sound = {}
+        for name, verb in (
+            ("info", lambda: describe(path)),
+            ("ls", lambda: list_sessions(self._work)),
+            ("open", lambda: open_session(path)[0].close()),
+            ("middle", middle),
+            ("ticks", ticks),
+            ("check", judged),
+            ("recover", saved),
+        ):
+            if name not in self._verbs:
+                continue
+            sound[name], fault = _tried(verb)
+            self.ends[f"{name}: {'read' if sound[name] else 'refused'}"] += 1
+            if fault:
+                faults.append(f"{name}: {fault}")
+        if sound.get("ticks") and blind(kind) and stamps != self._stamps:
+            faults.append(f"{len(stamps)} ticks were read as if they were all")
+        if stamps != sorted(set(stamps)):
+            faults.append("ticks are not in order of time")
+        if word[0] in ("good", "usable") and not (sound.get("ticks", True) and sound.get("open", True)):
+            faults.append(f"check says {word[0]}, but it can not be read")
+        return faults
+
+    def _strays(self) -> list[str]:
+        """Files where none was asked for; the ones that were are removed."""
+        for path in self._work.iterdir():
+            if path.name in ("case.mcap", "case.mcap.partial", "saved.mcap"):
+                path.unlink()
+        strays = [str(path.relative_to(self._folder)) for path in self._folder.rglob("*") if not path.is_dir()]
+        return [f"wrote {stray}" for stray in strays]
+
+
+def measure(files: int = 2000, seed: int = 0) -> dict[str, Any]:
+    """Read so many spoiled files, with the seeds from `seed` on; figures, and faults with their seeds."""
+    folder = Path(tempfile.mkdtemp(prefix="flowrec-fuzz-"))
+    began, cpu = time.perf_counter(), time.process_time()
+    try:
+        with _without_waiting_for_the_disk(), progress("spoiling and reading", files) as done:
+            campaign = Campaign(folder)
+            base_mb = peak_mb()
+            for number in range(files):
+                campaign.run(seed + number)
+                done(number + 1)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return {
+        "files": files,
+        "first_seed": seed,
+        "kinds": dict(campaign.kinds),
+        "ends": dict(sorted(campaign.ends.items())),
+        "fault_count": len(campaign.faults),
+        "faults": campaign.faults[:_FAULTS_KEPT],
+        "worst_file_s": campaign.worst_s,
+        "peak_memory_mb": campaign.worst_mb,
+        "memory_before_mb": base_mb,
+        "wall_s": time.perf_counter() - began,
+        "cpu_s": time.process_time() - cpu,
+    }
+
+
+def show(figures: dict[str, Any]) -> None:
+    """Print what happened."""
+    rows = [
+        ("files", str(figures["files"])),
+        ("seeds", f"{figures['first_seed']} to {figures['first_seed'] + figures['files'] - 1}"),
+        *((name, str(count)) for name, count in figures["ends"].items()),
+        ("slowest file, all verbs", f"{figures['worst_file_s']:.2f} s"),
+        ("peak memory", f"{figures['peak_memory_mb']:.0f} MB ({figures['memory_before_mb']:.0f} MB before)"),
+        ("faults", str(figures["fault_count"])),
+        *((f"seed {fault['seed']} ({fault['kind']})", fault["fault"]) for fault in figures["faults"][:20]),
+    ]
+    table("Spoiled sessions", ("", "value"), rows)
+
+
+def _tried(verb: Callable[[], object]) -> tuple[bool, str]:
+    """Whether it worked, and what happened that may not."""
+    try:
+        with _time_limit():
+            verb()
+    except FlowrecError as error:
+        said = str(error)
+        return False, "" if said and printable(said) == said else f"an error in more than a line: {said!r}"
+    except _TookTooLongError:
+        return False, f"longer than {TIME_LIMIT_S:g} s"
+    except Exception as error:  # noqa: BLE001 - whatever it is, it is a fault
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        return False, f"{type(error).__name__} in {Path(where.filename).name}:{where.lineno}: {error}"[:300]
+    return True, ""
+
+
+@contextlib.contextmanager
+def _time_limit() -> Iterator[None]:
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        raise _TookTooLongError
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, TIME_LIMIT_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@contextlib.contextmanager
+def _without_waiting_for_the_disk() -> Iterator[None]:
+    """A recovery has each file kept by the disk; here that would be most of the time."""
+    fsync = os.fsync
+    os.fsync = lambda fd: None
+    try:
+        yield
+    finally:
+        os.fsync = fsync
+
+
+def _forget_peak() -> None:
+    """Let the peak of memory begin anew (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")

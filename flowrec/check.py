@@ -1,0 +1,397 @@
+"""`flowrec check`: whether a session is whole, what it lacks, and whether it can be replayed."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import flowrec
+from flowrec.chip import chip_from_files
+from flowrec.config import Config, config_from_toml
+from flowrec.errors import FlowrecError, printable
+from flowrec.messages import Frame, Message, Timing
+from flowrec.store import Audit, audit, is_growing, not_finite
+from flowrec.topics import BY_FIELD
+from flowrec.units import NS_PER_S, seconds
+
+GAP_PERIODS = 1.5
+_GAPS_KEPT = 100  # the longest ones
+_GAPS_TOLD = 4
+_PENDING = 100_000  # ticks whose image and state are not both read yet; in our own files half a second of them
+_STEP_NS = 10_000  # intervals are told apart by so much
+_INTERVALS = 100_000  # different ones that are counted
+_RATE_TOLERANCE = 0.05
+_CLOCK_JUMP_S = 1.0
+_FRAME, _APPLIED, _TRACK = 1, 2, 4
+_BITS = {"frame": _FRAME, "applied": _APPLIED, "track": _TRACK}
+
+Level = Literal["odd", "bad"]
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A time without a frame."""
+
+    at_s: float  # of its beginning, since the first tick
+    length_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is not as it should be: `odd` does not keep one from using the session, `bad` does."""
+
+    level: Level
+    about: str
+    text: str
+
+
+@dataclass(slots=True)
+class Verdict:
+    """What `flowrec check` says.
+
+    Attributes
+    ----------
+    path : the file.
+    findings : what is not as it should be.
+    facts : what was looked at, for people, by name.
+    topics : messages read, by topic.
+    gaps : the longest times without a frame, in order of time; `gap_count` has all of them.
+    """
+
+    path: Path
+    findings: list[Finding] = field(default_factory=list)
+    facts: dict[str, str] = field(default_factory=dict)
+    topics: dict[str, int] = field(default_factory=dict)
+    gaps: list[Gap] = field(default_factory=list)
+    gap_count: int = 0
+
+    @property
+    def word(self) -> Literal["good", "usable", "bad"]:
+        """The verdict."""
+        levels = {finding.level for finding in self.findings}
+        return "bad" if "bad" in levels else "usable" if levels else "good"
+
+    @property
+    def exit_status(self) -> int:
+        """0 good, 3 usable but something was lost or is odd, 1 not readable or not to be replayed."""
+        return {"good": 0, "usable": 3, "bad": 1}[self.word]
+
+    def odd(self, about: str, text: str) -> None:
+        """Something was lost, or is odd."""
+        self.findings.append(Finding("odd", about, printable(text)))
+
+    def bad(self, about: str, text: str) -> None:
+        """Something keeps one from replaying the session."""
+        self.findings.append(Finding("bad", about, printable(text)))
+
+    def fact(self, about: str, text: str) -> None:
+        """Something was looked at."""
+        self.facts[about] = printable(text)
+
+    def lines(self) -> list[str]:
+        """For people, the verdict first."""
+        said = {
+            "good": "GOOD: whole, and can be replayed",
+            "usable": "USABLE: can be replayed, but something was lost or is odd",
+            "bad": "NOT USABLE as it is",
+        }[self.word]
+        lines = [printable(f"{self.path.name}: {said}")]
+        for level in ("bad", "odd"):
+            lines += [f"  {'!!' if level == 'bad' else '! '} {f.text}" for f in self.findings if f.level == level]
+        width = max((len(name) for name in self.facts), default=0)
+        return [*lines, *(f"  {name:{width}s}  {text}" for name, text in self.facts.items())]
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "session": str(self.path),
+            "verdict": self.word,
+            "exit_status": self.exit_status,
+            "findings": [{"level": f.level, "about": f.about, "text": f.text} for f in self.findings],
+            "facts": self.facts,
+            "topics": self.topics,
+            "gap_count": self.gap_count,
+            "gaps": [{"at_s": gap.at_s, "length_s": gap.length_s} for gap in self.gaps],
+        }
+
+
+def check(path: Path, progress: Callable[[int], None] | None = None) -> Verdict:
+    """Read a whole session, finished or not, and judge it. Memory does not grow with the file.
+
+    Parameters
+    ----------
+    progress : told up to which byte the file has been read.
+
+    Raises
+    ------
+    SessionError : it is no session that this flowrec can read; its text says what it is.
+    """
+    reading = _Reading()
+    found = audit(path, reading.see, progress)
+    reading.close()
+    verdict = Verdict(path)
+    verdict.topics = {BY_FIELD[name].path: count for name, count in found.counts.items()}
+    config = _judge_head(verdict, found)
+    _judge_end(verdict, found)
+    _judge_content(verdict, found)
+    _judge_times(verdict, found, reading, config)
+    _judge_images(verdict, found, reading)
+    _judge_numbers(verdict, reading)
+    _judge_clocks(verdict, found)
+    _judge_replay(verdict, found, reading)
+    return verdict
+
+
+class _Reading:
+    """The tally of one pass over the messages, which come in file order: those of a tick not one after the other."""
+
+    def __init__(self) -> None:
+        self.not_finite: Counter[str] = Counter()
+        self.dropped = 0  # images, as the writer counted them
+        self.index_steps = 0  # numbers of images that were left out
+        self.index_backwards = 0
+        self.ticks = 0
+        self.images_missing = 0  # ticks with state but without an image
+        self.inputs_missing = 0  # ticks that can not be replayed: no report of the coils, or neither image nor track
+        self.images_alone = 0
+        self.unfinished_ticks = 0  # inputs that no stage has answered
+        self._intervals: Counter[int] = Counter()
+        self._longest: list[tuple[int, int]] = []  # a heap of length and beginning
+        self._last_ns: int | None = None
+        self._last_index: int | None = None
+        self._pending: dict[int, int] = {}
+
+    def see(self, name: str, log_ns: int, message: Message) -> None:
+        """Take note of one message."""
+        for wrong in not_finite(message):
+            self.not_finite[f"{BY_FIELD[name].path} {wrong}"] += 1
+        bit = _BITS.get(name)
+        if bit is not None:
+            bits = self._pending.pop(log_ns, 0) | bit
+            if bits == _FRAME | _APPLIED | _TRACK:
+                self._count(bits)
+            else:
+                self._pending[log_ns] = bits
+                if len(self._pending) > _PENDING:
+                    self._count(self._pending.pop(next(iter(self._pending))))
+        if name == "applied":
+            self._take_interval(log_ns)
+        if isinstance(message, Frame):
+            step = message.index - self._last_index - 1 if self._last_index is not None else 0
+            self.index_steps += max(step, 0)
+            self.index_backwards += step < 0
+            self._last_index = message.index
+        elif isinstance(message, Timing):
+            self.dropped = max(self.dropped, message.dropped_frames)
+
+    def close(self) -> None:
+        """Count what has not become complete."""
+        for bits in self._pending.values():
+            self._count(bits)
+        self._pending.clear()
+
+    @property
+    def period_ns(self) -> int:
+        """Median time from tick to tick, 0 when there are fewer than two."""
+        half = (self._intervals.total() + 1) // 2
+        for interval, count in sorted(self._intervals.items()):
+            half -= count
+            if half <= 0:
+                return interval
+        return 0
+
+    def gaps(self, first_ns: int) -> tuple[list[Gap], int]:
+        """The longest gaps in order of time, and the number of all."""
+        limit = GAP_PERIODS * self.period_ns
+        count = sum(count for interval, count in self._intervals.items() if interval > limit)
+        longest = sorted((begin, length) for length, begin in self._longest if length > limit + _STEP_NS / 2)
+        return [Gap(seconds(begin - first_ns), seconds(length)) for begin, length in longest], count
+
+    def _take_interval(self, log_ns: int) -> None:
+        last_ns, self._last_ns = self._last_ns, log_ns
+        if last_ns is None or log_ns <= last_ns:
+            return
+        interval = round((log_ns - last_ns) / _STEP_NS) * _STEP_NS
+        if interval in self._intervals or len(self._intervals) < _INTERVALS:
+            self._intervals[interval] += 1
+        entry = (log_ns - last_ns, last_ns)
+        if len(self._longest) < _GAPS_KEPT:
+            heapq.heappush(self._longest, entry)
+        elif entry > self._longest[0]:
+            heapq.heapreplace(self._longest, entry)
+
+    def _count(self, bits: int) -> None:
+        if bits == _FRAME:
+            self.images_alone += 1
+            return
+        self.ticks += 1
+        self.unfinished_ticks += bits == _FRAME | _APPLIED
+        self.images_missing += bits == _APPLIED | _TRACK
+        self.inputs_missing += not bits & _APPLIED or bits == _APPLIED
+
+
+def _judge_head(verdict: Verdict, found: Audit) -> Config | None:
+    written = f"by flowrec {found.flowrec_version}"
+    if found.flowrec_version != flowrec.__version__:
+        written += f" (this is {flowrec.__version__}: flowrec replay --verify tells whether it still does the same)"
+    verdict.fact("written", written)
+    if found.header is None:
+        verdict.bad("head", f"its head is not whole: {found.header_fault}")
+        return None
+    try:
+        config = config_from_toml(found.header.config_toml, "its configuration")
+    except FlowrecError as error:
+        verdict.bad("head", str(error))
+        return None
+    try:
+        chip_from_files(found.header.chip_png, found.header.chip_toml, "its chip")
+    except FlowrecError as error:
+        verdict.bad("head", str(error))
+    return config
+
+
+def _judge_end(verdict: Verdict, found: Audit) -> None:
+    how = found.outcome.get("outcome", "")
+    note = found.outcome.get("note") or found.outcome.get("reason", "")
+    told = f" ({note})" if note and how != "cut" else ""  # of a cut one the findings tell
+    verdict.fact("outcome", (how or "not recorded") + told)
+    if not found.finished:
+        if is_growing(found.path):
+            verdict.bad("end", "it is being recorded just now; stop that run with Ctrl-C, then check again")
+        else:
+            verdict.bad("end", f"it {_sentence(found.why_not)}; `flowrec recover {found.path}` saves what is whole")
+    elif not how:
+        verdict.odd("end", "how the run ended was not recorded")
+    elif how == "failed":
+        verdict.odd("end", f"the run failed: {note or 'for a reason that was not recorded'}")
+    if "recovered_from" in found.outcome:
+        text = f"it was recovered from {found.outcome['recovered_from']}"
+        if how == "cut":
+            verdict.odd("end", f"{text}; {note}")
+        else:
+            verdict.fact("recovered", f"from {found.outcome['recovered_from']}, without a loss")
+
+
+def _sentence(why_not: str) -> str:
+    return why_not if why_not.startswith(("was ", "has ")) else f"is damaged: {why_not}"
+
+
+def _judge_content(verdict: Verdict, found: Audit) -> None:
+    if found.lost:
+        text = f"{found.lost} bytes are damaged, the first at {found.first_lost}"
+        if found.finished:
+            verdict.bad("content", f"{text}; `flowrec recover {found.path}` saves what is whole")
+        else:
+            verdict.odd("content", text)
+    for text in found.contradictions:
+        verdict.bad("index", f"{text}; `flowrec recover {found.path}` makes a new index")
+    for text in found.disagreements:
+        verdict.odd("index", text)
+    bad = found.undecodable.total()
+    if bad:
+        verdict.bad("content", f"{bad} messages make no sense, the first is {found.first_undecodable}")
+    for name, count in found.missing.items():
+        if count:
+            verdict.odd("content", f"{count} messages of {BY_FIELD[name].path} are missing on the way")
+    count = found.counts.total()
+    agrees = found.finished and not (found.contradictions or found.disagreements or found.lost)
+    verdict.fact(
+        "content",
+        f"{count} messages on {len(found.counts)} topics in {found.size_bytes / 1e6:.1f} MB"
+        + ("; index and statistics agree with what was read" if agrees else ""),
+    )
+
+
+def _judge_times(verdict: Verdict, found: Audit, reading: _Reading, config: Config | None) -> None:
+    rate_hz = NS_PER_S / reading.period_ns if reading.period_ns else math.nan
+    rate = f", {rate_hz:.1f} Hz" if reading.period_ns else ""
+    verdict.fact("length", f"{found.duration_s:.2f} s, {reading.ticks} ticks{rate}")
+    if not (found.backwards.total() or found.stamps_backwards.total() or reading.index_backwards):
+        verdict.fact("time", "in order on every topic")
+    for name, count in found.backwards.items():
+        if count:
+            verdict.odd("time", f"time goes backwards {count} times in {BY_FIELD[name].path}")
+    for name, count in found.stamps_backwards.items():
+        if count and not found.backwards[name]:
+            verdict.odd("time", f"the source of {BY_FIELD[name].path} stamped {count} messages back in time")
+    if reading.index_backwards:
+        verdict.odd("time", f"the numbers of the images go backwards {reading.index_backwards} times")
+    verdict.gaps, verdict.gap_count = reading.gaps(found.first_ns)
+    if verdict.gap_count:
+        longest = sorted(verdict.gaps, key=lambda gap: -gap.length_s)[:_GAPS_TOLD]
+        told = ", ".join(f"{gap.length_s:.3f} s at {gap.at_s:.2f} s" for gap in longest)
+        verdict.odd("gaps", f"{verdict.gap_count} times more than {GAP_PERIODS} periods without a frame: {told}"
+                    + (", ..." if verdict.gap_count > len(longest) else ""))  # fmt: skip
+    wanted_hz = config.camera.rate_hz if config is not None else None
+    if wanted_hz and reading.period_ns and abs(rate_hz / wanted_hz - 1.0) > _RATE_TOLERANCE:
+        verdict.odd("rate", f"{rate_hz:.1f} frames a second where {wanted_hz:g} were asked for")
+
+
+def _judge_images(verdict: Verdict, found: Audit, reading: _Reading) -> None:
+    images = found.counts["frame"]
+    elsewhere = not images and found.header is not None and bool(found.header.parent)
+    if elsewhere:
+        verdict.fact("images", "none: a replay, the recorded tracks stand in")
+        return
+    dropped = max(reading.dropped, _whole(found.outcome, "dropped_frames"), _whole(found.outcome, "frames_dropped"))
+    verdict.fact("images", f"{images} for {reading.ticks} ticks; {dropped} dropped by the writer")
+    if dropped:
+        verdict.odd("drops", f"{dropped} images were dropped because the disk was too slow (counted by the writer)")
+    if reading.images_missing > dropped:
+        verdict.odd("drops", f"{reading.images_missing - dropped} images are missing without having been counted")
+    unseen = reading.index_steps - reading.images_missing
+    if unseen > 0:
+        verdict.odd("drops", f"{unseen} images of the camera never arrived, told by their numbers")
+
+
+def _whole(outcome: Mapping[str, str], key: str) -> int:
+    text = outcome.get(key, "")
+    return int(text) if text.isdecimal() and len(text) < 20 else 0
+
+
+def _judge_numbers(verdict: Verdict, reading: _Reading) -> None:
+    for what, count in reading.not_finite.most_common(_GAPS_TOLD):
+        verdict.odd("numbers", f"NaN or infinity in {what}, {count} times")
+    if not reading.not_finite:
+        verdict.fact("numbers", "finite wherever they must be")
+
+
+def _judge_clocks(verdict: Verdict, found: Audit) -> None:
+    """Stamps are of one monotonic clock; the wall clock is noted beside it, and may jump."""
+    said = dict(found.header.provenance) if found.header is not None else {}
+    began = {name: _whole(said, name) for name in ("wall_ns", "monotonic_ns")}
+    ended = {name: _whole(found.outcome, name) for name in ("wall_ns", "monotonic_ns")}
+    moment = said.get("wall_time", "")[:19].replace("T", " ")
+    if not all(began.values()):
+        verdict.fact("clocks", "no reading of the wall clock beside the monotonic one")
+        return
+    verdict.fact("clocks", f"wall and monotonic read at {moment} UTC")
+    if all(ended.values()):
+        jump_s = seconds((ended["wall_ns"] - began["wall_ns"]) - (ended["monotonic_ns"] - began["monotonic_ns"]))
+        verdict.facts["clocks"] += f" and at the end, {1e3 * jump_s:+.0f} ms apart by then"
+        if abs(jump_s) > _CLOCK_JUMP_S:
+            verdict.odd("clocks", f"the wall clock was set by {jump_s:+.1f} s during the run; stamps are not affected")
+
+
+def _judge_replay(verdict: Verdict, found: Audit, reading: _Reading) -> None:
+    if not reading.ticks:
+        verdict.bad("replay", "there is no tick in it, so nothing to replay")
+    if reading.inputs_missing:
+        verdict.odd(
+            "replay", f"{reading.inputs_missing} of {reading.ticks} ticks lack inputs; a replay leaves them out"
+        )
+    if reading.images_alone:
+        verdict.odd("replay", f"of {reading.images_alone} ticks there is only the image")
+    if reading.unfinished_ticks:
+        verdict.odd("replay", f"{reading.unfinished_ticks} ticks were not worked on to their end")
+    if verdict.word == "bad":
+        verdict.fact("replay", "no")
+    elif reading.inputs_missing or reading.images_alone or found.missing.total():
+        verdict.fact("replay", "yes, but not exact after what is missing")
+    else:
+        verdict.fact("replay", "yes: configuration, chip, and the inputs of every tick")

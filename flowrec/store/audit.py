@@ -1,0 +1,213 @@
+"""A file read from its first byte to its last, whatever state it is in, and compared with what it says of itself."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mcap.records import ChunkIndex
+
+from flowrec.errors import SessionError
+from flowrec.messages import Message
+from flowrec.store.codec import decode, message_stamp
+from flowrec.store.contents import Contents
+from flowrec.store.header import SessionHeader
+from flowrec.store.scan import Scan, scan
+from flowrec.store.shapes import misfit
+from flowrec.store.source import DamageError, Record, Source, UnfinishedError
+from flowrec.topics import BY_FIELD
+from flowrec.units import seconds
+
+See = Callable[[str, int, Message], None]  # field of Tick, time of the tick in ns, message
+
+
+@dataclass(slots=True)
+class Audit:
+    """What was found; texts for people, without advice.
+
+    Attributes
+    ----------
+    path, size_bytes : the file.
+    finished : it has an end, so that other verbs open it.
+    why_not : else, what is wrong with the end.
+    flowrec_version : of the program that wrote it.
+    header : configuration, chip and origin; None where they are not whole, see `header_fault`.
+    outcome : how the run ended; may be empty.
+    counts : messages read, by field of Tick.
+    first_ns, last_ns : times of the first and the last message of a known topic; both 0 without any.
+    contradictions : where the index is not what was read, so that reading by it fails.
+    disagreements : where it is not, and that does no harm.
+    lost : damaged bytes that had to be passed over.
+    first_lost : offset of the first of them.
+    backwards : by field, how often the time of a tick was before that of the message before.
+    stamps_backwards : the same of the stamps that the source itself gave.
+    undecodable : by field, messages that make no sense; `first_undecodable` says why.
+    missing : by field, messages that should be between others, told by their numbers; not of images.
+    """
+
+    path: Path
+    size_bytes: int
+    finished: bool = True
+    why_not: str = ""
+    flowrec_version: str = "?"
+    header: SessionHeader | None = None
+    header_fault: str = ""
+    outcome: dict[str, str] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    first_ns: int = 0
+    last_ns: int = 0
+    contradictions: list[str] = field(default_factory=list)
+    disagreements: list[str] = field(default_factory=list)
+    lost: int = 0
+    first_lost: int = 0
+    backwards: Counter[str] = field(default_factory=Counter)
+    stamps_backwards: Counter[str] = field(default_factory=Counter)
+    undecodable: Counter[str] = field(default_factory=Counter)
+    first_undecodable: str = ""
+    missing: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first message to the last, in s."""
+        return seconds(self.last_ns - self.first_ns)
+
+
+def audit(path: Path, see: See, progress: Callable[[int], None] | None = None) -> Audit:
+    """Read everything that can be read, in file order; one chunk is in memory at a time.
+
+    Parameters
+    ----------
+    see : told every message that can be decoded; those of one tick need not follow each other.
+    progress : told up to which byte the file has been read.
+
+    Raises
+    ------
+    SessionError : it is no session, or none that this flowrec can read; its text says what it is.
+    """
+    try:
+        contents = Contents(path)
+        found = Audit(path, contents.source.size)
+    except (UnfinishedError, DamageError) as error:
+        contents = _contents_without_index(path)
+        found = Audit(path, contents.source.size, finished=False)
+        found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
+    with contents:
+        found.flowrec_version, found.outcome = contents.flowrec_version, contents.outcome
+        try:
+            found.header = contents.header
+        except SessionError as error:
+            found.header_fault = error.what if isinstance(error, DamageError) else _first_part(error, path)
+        reading = _Reading(found, contents, see)
+        scanned = scan(contents.source, reading.take, progress)
+        found.lost = sum(lost.nbytes for lost in scanned.lost)
+        found.first_lost = scanned.lost[0].offset if scanned.lost else 0
+        for channel, name in contents.fields.items():
+            if name != "frame" and channel in scanned.gaps:  # the number of an image is given by the camera
+                gaps = [gap for gap in scanned.gaps[channel] if gap.before_ns > found.first_ns]
+                found.missing[name] += sum(gap.messages for gap in gaps)
+        if found.finished:
+            for fatal, text in _disagreements(contents, scanned):
+                (found.contradictions if fatal else found.disagreements).append(text)
+    return found
+
+
+class _Reading:
+    """Decodes chunk after chunk and keeps the tally."""
+
+    def __init__(self, found: Audit, contents: Contents, see: See) -> None:
+        self._found = found
+        self._fields = contents.fields
+        self._schemas = contents.schemas
+        self._see = see
+        self._last_ns: dict[str, int] = {}
+        self._last_stamp_ns: dict[str, int] = {}
+        self._any = False
+
+    def take(self, offset: int, records: list[Record]) -> None:
+        found = self._found
+        for record in records:
+            name = self._fields.get(record.channel)
+            if name is None:
+                continue
+            found.counts[name] += 1
+            found.first_ns = min(found.first_ns, record.log_ns) if self._any else record.log_ns
+            found.last_ns = max(found.last_ns, record.log_ns)
+            self._any = True
+            found.backwards[name] += record.log_ns < self._last_ns.get(name, record.log_ns)
+            self._last_ns[name] = record.log_ns
+            try:
+                message = decode(BY_FIELD[name].type, record.payload, record.sequence, self._schemas[record.channel])
+                wrong = misfit(message)
+            except SessionError as error:
+                wrong = str(error)
+            if wrong:
+                found.undecodable[name] += 1
+                said = f"{BY_FIELD[name].path} in the chunk at byte {offset}: {wrong}"
+                found.first_undecodable = found.first_undecodable or said
+                continue
+            stamp_ns = message_stamp(message)
+            found.stamps_backwards[name] += stamp_ns < self._last_stamp_ns.get(name, stamp_ns)
+            self._last_stamp_ns[name] = stamp_ns
+            self._see(name, record.log_ns, message)
+
+
+def _contents_without_index(path: Path) -> Contents:
+    """What a file says about itself, found by reading it."""
+    source = Source(path)
+    try:
+        found = scan(source)
+    finally:
+        source.close()
+    return Contents(path, found.summary)
+
+
+def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]]:
+    """Where the index at the end differs from what was read, and whether the reader stumbles over it."""
+    listed = {chunk.chunk_start_offset: chunk for chunk in contents.chunks}
+    seen = {chunk.chunk_start_offset: chunk for chunk in found.summary.chunks}
+    if listed.keys() - seen:
+        yield True, f"{len(listed.keys() - seen)} chunks of the index can not be read"
+    if seen.keys() - listed:
+        yield True, f"{len(seen.keys() - listed)} chunks are not in the index"
+    misled = sum(not _describes(listed[place], seen[place]) for place in listed.keys() & seen.keys())
+    if misled:
+        yield True, f"{misled} chunks hold something else than the index tells"
+    counts = found.summary.statistics
+    assert counts is not None  # scan makes them
+    declared = contents.statistics
+    for channel in sorted(contents.channels.keys() | counts.channel_message_counts.keys()):
+        announced = declared.channel_message_counts.get(channel, 0)
+        read = counts.channel_message_counts.get(channel, 0)
+        if announced != read:
+            known = contents.channels.get(channel)
+            topic = known.topic if known is not None else f"an undeclared channel {channel}"
+            yield channel in contents.fields, f"{announced} messages of {topic} are announced, {read} were read"
+    for channel, known in contents.channels.items():
+        there = found.summary.channels.get(channel)
+        if there is not None and (there.topic, there.schema_id) != (known.topic, known.schema_id):
+            yield True, f"channel {channel} is {there.topic} in the file and {known.topic} in its index"
+    for what, ours, theirs in (
+        ("attachments", contents.attachments, found.summary.attachments),
+        ("metadata records", contents.metadata, found.summary.metadata),
+    ):
+        apart = {index.offset for index in ours} ^ {index.offset for index in theirs}
+        if apart:
+            yield False, f"{len(apart)} {what} are only in the index, or only outside it"
+
+
+def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
+    """Whether the reader finds in a chunk what the index lets it expect."""
+    return (
+        listed.message_start_time <= seen.message_start_time
+        and seen.message_end_time <= listed.message_end_time
+        and (listed.chunk_length, listed.uncompressed_size) == (seen.chunk_length, seen.uncompressed_size)
+        and (
+            not listed.message_index_offsets or seen.message_index_offsets.keys() <= listed.message_index_offsets.keys()
+        )
+    )
+
+
+def _first_part(error: SessionError, path: Path) -> str:
+    return str(error).removeprefix(f"{path}: ").split("; ")[0]
