@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.planning.jit import compiled
-from flowrec.planning.zermelo import lowest_clearance, segment_time
+from flowrec.planning.zermelo import bilinear, lowest_clearance, segment_cost
 
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
@@ -21,8 +21,19 @@ _WIDTHS = np.array([32, 16, 8, 4, 2, 1], np.int64)  # of bumps, in points of the
 _SWEEPS = 12
 
 
-def relax(path: Points, clearance: Raster, need: float, vx: Raster, vy: Raster, weight: Raster, speed: float) -> Points:
+def relax(
+    path: Points,
+    clearance: Raster,
+    need: float,
+    vx: Raster,
+    vy: Raster,
+    weight: Raster,
+    speed: Raster,
+    idle: float = -1.0,
+) -> Points:
     """A path (n, 2) in px with the same ends that takes less weighted time, its points about 1.5 px apart.
+
+    `speed` (h, w) is the robot's through the fluid; with `idle` > 0 it takes less energy instead (`step_energy`).
 
     Every part of it keeps the clearance `need` (px), or, where the given path did not, at least that of the given one.
     """
@@ -33,7 +44,7 @@ def relax(path: Points, clearance: Raster, need: float, vx: Raster, vy: Raster, 
         return path[:1]
     at = np.linspace(0.0, along[-1], max(3, math.ceil(along[-1] / _SPACING_PX) + 1))
     points = np.column_stack([np.interp(at, along, path[keep, 0]), np.interp(at, along, path[keep, 1])])
-    return _bumps(points, clearance, need, vx, vy, weight, speed, _WIDTHS, _SWEEPS)
+    return _bumps(points, clearance, need, vx, vy, weight, speed, idle, _WIDTHS, _SWEEPS)
 
 
 @compiled
@@ -44,7 +55,8 @@ def _bumps(
     vx: Raster,
     vy: Raster,
     weight: Raster,
-    speed: float,
+    speed: Raster,
+    idle: float,
     widths: NDArray[np.int64],
     sweeps: int,
 ) -> Points:
@@ -55,7 +67,7 @@ def _bumps(
     floors = np.empty(n - 1)
     for k in range(n - 1):
         x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
-        times[k] = segment_time(vx, vy, weight, x0, y0, x1, y1, speed)
+        times[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(vx, vy, speed, x0, y0, x1, y1, idle, 1.0)
         floors[k] = min(need, lowest_clearance(clearance, x0, y0, x1, y1))
     moved = np.empty((2 * widths.max() + 1, 2))
     taken = np.empty(2 * widths.max())
@@ -92,7 +104,7 @@ def _bumps(
                     after = 0.0
                     for k in range(last - first):
                         x0, y0, x1, y1 = moved[k, 0], moved[k, 1], moved[k + 1, 0], moved[k + 1, 1]
-                        taken[k] = segment_time(vx, vy, weight, x0, y0, x1, y1, speed)
+                        taken[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(vx, vy, speed, x0, y0, x1, y1, idle, 1.0)
                         after += taken[k]
                         if after >= before * (1.0 - 1e-7):
                             good = False
