@@ -174,7 +174,7 @@ class Planner:
         nodes = self._search(space, self.method, start.node, goal.node, speed_um_s / px)
         if nodes is None:
             if self.method.startswith("rrt"):
-                return no_route(self.method, f"{self.method} found no way with {self.rrt.samples} samples")
+                return no_route(self.method, f"{self.method} found no way in {self.rrt.iterations} iterations")
             return self._too_fast(space, field, start, goal, speed_um_s)
         path = _between(space, nodes, start, goal)
         if self.method == "astar_time":

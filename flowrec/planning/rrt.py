@@ -3,12 +3,14 @@
     rrt       LaValle's, the first way that is found, as in the paper's comparison
     rrt_star  Karaman and Frazzoli's, with the travel time in the flow as its cost, until the samples are used up
 
-OMPL's own random numbers can be seeded once per process only; the samples are therefore drawn here, goal bias
-included, and a plan is the same wherever and whenever it is made.
+The number of iterations is limited, not the time, and every plan seeds OMPL anew: the same request has the same
+answer, on any machine. OMPL stays the judge of what it does; flow, walls and cost are asked of the same kernels as
+every other planner's.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -28,19 +30,21 @@ class Rrt:
     """Settings of both trees."""
 
     seed: int = 0
-    samples: int = 20000  # that are drawn at most; rrt stops at its first way
+    iterations: int = 20000  # at most; rrt stops at its first way
     range_px: float = 12.0  # longest branch
     goal_bias: float = 0.05  # share of the samples that are the goal itself
 
     def search(self, space: Space, start: Points, goal: Points, speed: float | None) -> Points | None:
-        """(n, 2) px from start to goal, None when the samples do not suffice; fastest at a `speed` in px/s, if given.
+        """(n, 2) px from start to goal, None when the iterations do not suffice; fastest at a `speed` in px/s, if given.
 
         Raises
         ------
         UsageError
             If OMPL is not installed.
         """
-        base, geometric = _ompl()
+        base, geometric, util = _ompl()
+        # OMPL warns that what was made before goes on as before; nothing that was is used again.
+        util.RNG.setSeed(self.seed + 1)  # it takes 0 for no seed
         h, w = space.free.shape
         plane = base.RealVectorStateSpace(2)
         bounds = base.RealVectorBounds(2)
@@ -48,19 +52,6 @@ class Rrt:
             bounds.setLow(axis, -0.5)
             bounds.setHigh(axis, size - 0.5)
         plane.setBounds(bounds)
-        samples = _Samples(space, goal, self)
-
-        class Sampler(base.StateSampler):  # type: ignore[misc]
-            def sampleUniform(self, state: Any) -> None:  # noqa: N802 - OMPL's name
-                state[0], state[1] = samples.draw()
-
-            def sampleUniformNear(self, state: Any, near: Any, distance: float) -> None:  # noqa: N802
-                self.sampleUniform(state)
-
-            def sampleGaussian(self, state: Any, mean: Any, deviation: float) -> None:  # noqa: N802
-                self.sampleUniform(state)
-
-        plane.setStateSamplerAllocator(Sampler)
         information = base.SpaceInformation(plane)
 
         class Motion(base.MotionValidator):  # type: ignore[misc]
@@ -83,32 +74,15 @@ class Rrt:
             problem.setOptimizationObjective(_travel_time(base, information, space, speed))
             planner = geometric.RRTstar(information)
         planner.setRange(self.range_px)
-        planner.setGoalBias(0.0)
+        planner.setGoalBias(self.goal_bias)
         planner.setProblemDefinition(problem)
         planner.setup()
-        planner.solve(base.PlannerTerminationCondition(lambda: samples.drawn >= self.samples))
+        counted = itertools.count()
+        planner.solve(base.PlannerTerminationCondition(lambda: next(counted) >= self.iterations))
         if not problem.hasExactSolution():
             return None
         states = problem.getSolutionPath().getStates()
         return np.array([[state[0], state[1]] for state in states], np.float64)
-
-
-class _Samples:
-    """Places in the free space, now and then the goal; the same for the same seed."""
-
-    def __init__(self, space: Space, goal: Points, settings: Rrt) -> None:
-        self._random = np.random.default_rng(settings.seed)
-        self._free = np.argwhere(space.free)[:, ::-1].astype(np.float64)
-        self._goal = goal
-        self._bias = settings.goal_bias
-        self.drawn = 0
-
-    def draw(self) -> tuple[float, float]:
-        self.drawn += 1
-        if self._random.random() < self._bias:
-            return float(self._goal[0]), float(self._goal[1])
-        x, y = self._free[self._random.integers(len(self._free))] + self._random.uniform(-0.5, 0.5, 2)
-        return float(x), float(y)
 
 
 def _passable(space: Space, x0: float, y0: float, x1: float, y1: float) -> bool:
@@ -138,8 +112,8 @@ def _travel_time(base: Any, information: Any, space: Space, speed: float) -> Any
     return TravelTime(information)
 
 
-def _ompl() -> tuple[Any, Any]:
-    """OMPL's base and geometric parts, quiet.
+def _ompl() -> tuple[Any, Any, Any]:
+    """OMPL's base, geometric and util parts, quiet.
 
     Raises
     ------
@@ -151,4 +125,4 @@ def _ompl() -> tuple[Any, Any]:
     except ImportError as error:
         raise UsageError("plan: rrt and rrt_star need OMPL 2: pip install 'flowrec[ompl]'") from error
     util.setLogLevel(util.LogLevel.LOG_NONE)
-    return base, geometric
+    return base, geometric, util
