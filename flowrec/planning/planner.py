@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,7 +14,7 @@ from flowrec.errors import UsageError
 from flowrec.messages import FlowField, Route
 from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.paper import adjacency, search_paper
-from flowrec.planning.relax import relax
+from flowrec.planning.relax import SPACING_PX, relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
 from flowrec.planning.space import (
     End,
@@ -36,7 +37,7 @@ Cost = Literal["time", "energy"]
 Points = NDArray[np.float64]
 
 _LEAST_SHARE = 0.02
-_ENOUGH_PX = 16000  # free pixels; a space of fewer is looked at twice as closely
+_ENOUGH_PX = 80000  # free pixels: of fewer, each is looked at up to four times as closely
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +120,7 @@ class Planner:
         idle_um_s = None
         if self.cost == "energy":
             idle_um_s = 0.5 * speed_um_s if self.idle_speed_um_s is None else float(self.idle_speed_um_s)
-        closer = 2 if int(space.free.sum()) < _ENOUGH_PX else 1
+        closer = min(max(math.isqrt(_ENOUGH_PX // int(space.free.sum())), 1), 4)
         first, last = _place(space, start.node), _place(space, goal.node)
         target = last if goal.point is None else goal.point
         deviation = deviation_px_s(field, self.flow_error_share)
@@ -137,7 +138,7 @@ class Planner:
                     continue
             else:
                 path = path / closer
-            route = self._refined(terrain, field, _between(space, path, start, goal), speed_um_s, idle_um_s)
+            route = self._refined(terrain, field, _between(space, path, start, goal), speed_um_s, idle_um_s, closer)
             if not route.reachable:
                 continue
             if deviations < tries[0]:
@@ -156,13 +157,19 @@ class Planner:
         return self._too_fast(space, field, start, goal, speed_um_s)
 
     def _refined(
-        self, terrain: Terrain, field: FlowField, path: Points, speed_um_s: float, idle_um_s: float | None
+        self,
+        terrain: Terrain,
+        field: FlowField,
+        path: Points,
+        speed_um_s: float,
+        idle_um_s: float | None,
+        closer: int = 1,
     ) -> Route:
         """The timed route along a path (n, 2) px after its refinement, or before it where that can not be done."""
         px = field.um_per_px
         if self.refine:
             even = np.ones_like(terrain.clearance)
-            flow = (terrain.clearance, terrain.need, terrain.vx, terrain.vy, even, terrain.speed, terrain.idle)
+            flow = (terrain.clearance, terrain.need, terrain.vx, terrain.vy, even, terrain.speed, terrain.idle, SPACING_PX / closer)
             route = timed_route(self.method, field, relax(path, *flow) * px, speed_um_s, "", idle_um_s)
             if route.reachable:
                 return route

@@ -16,8 +16,8 @@ from flowrec.planning.zermelo import bilinear, lowest_clearance, segment_cost
 
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
-_SPACING_PX = 1.5
-_WIDTHS = np.array([32, 16, 8, 4, 2, 1], np.int64)  # of bumps, in points of the path
+SPACING_PX = 1.5  # of the points of a path
+_WIDEST_PX = 48.0  # half of the widest bump
 _SWEEPS = 12
 
 
@@ -30,21 +30,29 @@ def relax(
     weight: Raster,
     speed: Raster,
     idle: float = -1.0,
+    spacing: float = SPACING_PX,
 ) -> Points:
-    """A path (n, 2) in px with the same ends that takes less weighted time, its points about 1.5 px apart.
+    """A path (n, 2) in px with the same ends that takes less weighted time, its points at most `spacing` px apart.
 
     `speed` (h, w) is the robot's through the fluid; with `idle` > 0 it takes less energy instead (`step_energy`).
 
     Every part of it keeps the clearance `need` (px), or, where the given path did not, at least that of the given one.
     """
     lengths = np.hypot(*np.diff(path, axis=0).T)
-    keep = np.concatenate([[True], lengths > 1e-9])
-    along = np.concatenate([[0.0], np.cumsum(lengths)])[keep]
-    if keep.sum() < 2:
-        return path[:1]
-    at = np.linspace(0.0, along[-1], max(3, math.ceil(along[-1] / _SPACING_PX) + 1))
-    points = np.column_stack([np.interp(at, along, path[keep, 0]), np.interp(at, along, path[keep, 1])])
-    return _bumps(points, clearance, need, vx, vy, weight, speed, idle, _WIDTHS, _SWEEPS)
+    path = path[np.concatenate([[True], lengths > 1e-9])]
+    if len(path) < 2:
+        return path
+    # No vertex is left out, which would cut the corners of walls.
+    lengths = np.hypot(*np.diff(path, axis=0).T)
+    counts = np.maximum(1, np.ceil(lengths / spacing - 1e-9)).astype(np.int64)
+    if len(counts) == 1:
+        counts = np.maximum(counts, 2)  # a single step has nothing to move
+    leg = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(counts.sum()) - (np.cumsum(counts) - counts)[leg]) / counts[leg]
+    points = np.concatenate([path[leg] + share[:, None] * np.diff(path, axis=0)[leg], path[-1:]])
+    widest = math.ceil(_WIDEST_PX / spacing)
+    widths = widest // 2 ** np.arange(widest.bit_length())
+    return _bumps(points, clearance, need, vx, vy, weight, speed, idle, spacing, widths, _SWEEPS)
 
 
 @compiled
@@ -57,6 +65,7 @@ def _bumps(
     weight: Raster,
     speed: Raster,
     idle: float,
+    spacing: float,
     widths: NDArray[np.int64],
     sweeps: int,
 ) -> Points:
@@ -72,7 +81,7 @@ def _bumps(
     moved = np.empty((2 * widths.max() + 1, 2))
     taken = np.empty(2 * widths.max())
     for width in widths:
-        height = 0.25 * width
+        height = 0.17 * width * spacing
         stride = max(1, width // 2)
         for _ in range(sweeps):
             accepted = 0
