@@ -82,6 +82,15 @@ def worlds(side_px: int, seed: int = 0) -> Iterator[World]:
             yield made
 
 
+def magnified(world: World) -> World | None:
+    """The same chip as a camera of twice the resolution sees it; the robot is as big as before, in um."""
+    mask = world.chip.mask.repeat(2, axis=0).repeat(2, axis=1)
+    openings = tuple(replace(o, first=2 * o.first, last=2 * o.last + 1) for o in world.chip.openings)
+    chip = replace(world.chip, mask=mask, openings=openings, um_per_px=0.5 * world.chip.um_per_px)
+    made = _world(chip, k=1)
+    return None if made is None else replace(made, robot=world.robot)
+
+
 def worlds_of(folder: Path) -> Iterator[World]:
     """The vessel cases of a folder, by their assumed boundary values."""
     for path in sorted(folder.glob("*.npz")):

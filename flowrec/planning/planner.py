@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from dataclasses import field as setting
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.paper import adjacency, search_paper
 from flowrec.planning.relax import SPACING_PX, relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
+from flowrec.planning.rrt import Rrt
 from flowrec.planning.space import (
     End,
     Space,
@@ -26,7 +28,6 @@ from flowrec.planning.space import (
     open_space,
     why_apart,
 )
-from flowrec.planning.rrt import Rrt
 from flowrec.planning.terrain import Terrain
 from flowrec.planning.time_field import descend, time_field, with_band
 from flowrec.planning.zermelo import line_is_clear
@@ -67,7 +68,7 @@ class Planner:
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
     refine: bool = True  # the path of time_field and astar_time
-    rrt: Rrt = Rrt()
+    rrt: Rrt = setting(default_factory=Rrt)
 
     def plan(self, field: FlowField, start_um: ArrayLike, goal_um: ArrayLike, chip: Chip, robot: Robot) -> Route:
         """Route from start to goal, both (2,) um; stamp and request are 0.
@@ -152,7 +153,10 @@ class Planner:
                 times = time_field(fine, closer * target)
             coarse = np.where(space.free, times[::closer, ::closer], np.inf)
             return replace(
-                route, time_to_go_s=with_band(coarse, space.free, space.fluid, speed_um_s / px).astype(np.float32)
+                route,
+                time_to_go_s=with_band(coarse, space.free, space.clearance, space.need, speed_um_s / px).astype(
+                    np.float32
+                ),
             )
         return self._too_fast(space, field, start, goal, speed_um_s)
 
@@ -169,7 +173,16 @@ class Planner:
         px = field.um_per_px
         if self.refine:
             even = np.ones_like(terrain.clearance)
-            flow = (terrain.clearance, terrain.need, terrain.vx, terrain.vy, even, terrain.speed, terrain.idle, SPACING_PX / closer)
+            flow = (
+                terrain.clearance,
+                terrain.need,
+                terrain.vx,
+                terrain.vy,
+                even,
+                terrain.speed,
+                terrain.idle,
+                SPACING_PX / closer,
+            )
             route = timed_route(self.method, field, relax(path, *flow) * px, speed_um_s, "", idle_um_s)
             if route.reachable:
                 return route

@@ -76,7 +76,9 @@ def _bumps(
     floors = np.empty(n - 1)
     for k in range(n - 1):
         x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
-        times[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(vx, vy, speed, x0, y0, x1, y1, idle, 1.0)
+        times[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
+            vx, vy, speed, x0, y0, x1, y1, idle, 1.0
+        )
         floors[k] = min(need, lowest_clearance(clearance, x0, y0, x1, y1))
     moved = np.empty((2 * widths.max() + 1, 2))
     taken = np.empty(2 * widths.max())
@@ -113,7 +115,9 @@ def _bumps(
                     after = 0.0
                     for k in range(last - first):
                         x0, y0, x1, y1 = moved[k, 0], moved[k, 1], moved[k + 1, 0], moved[k + 1, 1]
-                        taken[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(vx, vy, speed, x0, y0, x1, y1, idle, 1.0)
+                        taken[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
+                            vx, vy, speed, x0, y0, x1, y1, idle, 1.0
+                        )
                         after += taken[k]
                         if after >= before * (1.0 - 1e-7):
                             good = False

@@ -35,7 +35,7 @@ class Rrt:
     goal_bias: float = 0.05  # share of the samples that are the goal itself
 
     def search(self, space: Space, start: Points, goal: Points, speed: float | None) -> Points | None:
-        """(n, 2) px from start to goal, None when the iterations do not suffice; fastest at a `speed` in px/s, if given.
+        """(n, 2) px from start to goal, None when the iterations do not suffice; the fastest at a `speed` (px/s).
 
         Raises
         ------

@@ -105,7 +105,9 @@ class SurveyPlanner:
         end = _best(work, central if central.any() else allowed)
         nodes = backtrack(parent, end, space.width)
         path = nodes if start.point is None else np.concatenate([start.point[None], nodes])
-        smooth = relax(path, space.clearance, space.need, space.vx, space.vy, weight, np.full_like(weight, speed_um_s / px))
+        smooth = relax(
+            path, space.clearance, space.need, space.vx, space.vy, weight, np.full_like(weight, speed_um_s / px)
+        )
         for candidate in (smooth, path):
             route = timed_route(_METHOD, field, candidate * px, speed_um_s, start.remark)
             if route.reachable:

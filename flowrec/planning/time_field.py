@@ -30,9 +30,10 @@ _EXACT_PX = 3.0  # around the goal, where the front is too curved for triangles,
 _RING_X = np.array([1, 1, 0, -1, -1, -1, 0, 1], np.int64)
 _RING_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)
 
-# In the band that is nearer to the walls than the robot should be, a pixel outward costs so many times what it takes
-# to swim in still fluid: there -grad T leads out of the band, at less than some 20 degrees to the shortest way.
+# In the band that is nearer to the walls than the robot should be, a pixel of clearance that is lacking costs so many
+# times what a pixel takes in still fluid: there -grad T leads out of the band, within some 20 degrees of straight.
 _BAND_TOLL = 3.0
+_LEAST_TOLL = 0.05  # px
 # A step between neighbours that costs more than swimming so many pixels lies between two places that only a
 # passage too narrow for the robot connects.
 _TORN_PX = 30.0
@@ -60,14 +61,15 @@ def time_field(terrain: Terrain, goal: Points) -> Raster:
     return times
 
 
-def with_band(times: Raster, free: Mask, fluid: Mask, speed: float) -> Raster:
+def with_band(times: Raster, free: Mask, clearance: Raster, need: float, speed: float) -> Raster:
     """The same times (h, w) with the fluid nearer to the walls than `free`, where -grad T leads back to `free`.
 
-    Layer by layer from the free pixels: the worst of the neighbours one layer nearer to them, plus a toll. So no
-    way through the band is ever worth it, and where two free regions meet in a passage too narrow it is closed.
+    Layer by layer from the free pixels: the worst of the neighbours one layer nearer to them, plus a toll for every
+    pixel of clearance that is lacking. So no way through the band is ever worth it, and where two free regions meet
+    in a passage too narrow it is closed.
     """
     band = times.copy()
-    _fill_band(band, free, fluid, _BAND_TOLL / speed, _TORN_PX / speed)
+    _fill_band(band, free, clearance, need, _BAND_TOLL / speed, _TORN_PX / speed)
     return band
 
 
@@ -290,7 +292,9 @@ def _march(
             wx = vx[b, a]
             wy = vy[b, a]
             own = speed[b, a]
-            best = key + step_cost(ax, ay, 0.5 * (wx + vx[j, i]), 0.5 * (wy + vy[j, i]), 0.5 * (own + speed[j, i]), idle)
+            best = key + step_cost(
+                ax, ay, 0.5 * (wx + vx[j, i]), 0.5 * (wy + vy[j, i]), 0.5 * (own + speed[j, i]), idle
+            )
             for turn in range(2):
                 other = (back + 1) & 7 if turn == 0 else (back + 7) & 7
                 c = a + _RING_X[other]
@@ -335,8 +339,9 @@ def _march(
 
 
 @compiled
-def _fill_band(times: Raster, free: Mask, fluid: Mask, toll: float, torn: float) -> None:
+def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: float, torn: float) -> None:
     h, w = free.shape
+    fluid = clearance > 0.0
     layer = np.full(h * w, -1, np.int64)
     queue = np.empty(h * w, np.int64)
     tail = 0
@@ -376,15 +381,20 @@ def _fill_band(times: Raster, free: Mask, fluid: Mask, toll: float, torn: float)
         node = queue[m]
         j = node // w
         i = node - j * w
-        worst = 0.0
-        for k in range(8):
-            a = i + _RING_X[k]
-            b = j + _RING_Y[k]
-            if a < 0 or b < 0 or a >= w or b >= h or layer[b * w + a] != layer[node] - 1:
-                continue
-            if (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
-                worst = max(worst, times[b, a])
-        times[j, i] = worst + toll
+        # Neighbours along the axes first: a diagonal one is also farther up or down the channel.
+        for diagonal in range(2):
+            worst = -1.0
+            for k in range(diagonal, 8, 2):
+                a = i + _RING_X[k]
+                b = j + _RING_Y[k]
+                if a < 0 or b < 0 or a >= w or b >= h or layer[b * w + a] != layer[node] - 1:
+                    continue
+                if (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
+                    deeper = max(min(clearance[b, a], need) - clearance[j, i], _LEAST_TOLL)
+                    worst = max(worst, times[b, a] + toll * deeper)
+            if worst >= 0.0:
+                times[j, i] = worst
+                break
     closed = np.zeros(tail, np.bool_)
     for m in range(border, tail):
         node = queue[m]
