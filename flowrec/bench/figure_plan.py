@@ -37,7 +37,7 @@ def draw(path: Path, shown: list[tuple[World, Trip, dict[str, Route]]], rows: li
 
     figure = Figure(figsize=(12.0, 10.5), layout="constrained", dpi=150)
     FigureCanvasAgg(figure)
-    above, below = figure.subfigures(2, 1, height_ratios=[1.1, 1.0])
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.1, 1.0])[:, 0]
     for ax, (world, trip, routes) in zip(above.subplots(1, 2, squeeze=False)[0], shown, strict=False):
         _paths(ax, world, trip, routes)
     columns = list(dict.fromkeys((row["ratio"], row["direction"]) for row in rows))

@@ -54,7 +54,7 @@ class Rrt:
         plane.setBounds(bounds)
         information = base.SpaceInformation(plane)
 
-        class Motion(base.MotionValidator):  # type: ignore[misc]
+        class Motion(base.MotionValidator):  # type: ignore[misc,name-defined]
             def checkMotion(self, a: Any, b: Any, *_: Any) -> bool:  # noqa: N802
                 return _passable(space, a[0], a[1], b[0], b[1])
 

@@ -70,6 +70,10 @@ def with_band(times: Raster, free: Mask, clearance: Raster, need: float, speed: 
     """
     band = times.copy()
     _fill_band(band, free, clearance, need, _BAND_TOLL / speed, _TORN_PX / speed)
+    # Beyond the border nothing is known, and no camera looks: half a pixel of it counts as lacking.
+    half = 0.5 * _BAND_TOLL / speed
+    for edge, inner in ((band[0], band[1]), (band[-1], band[-2]), (band[:, 0], band[:, 1]), (band[:, -1], band[:, -2])):
+        np.maximum(edge, inner + half, out=edge, where=np.isfinite(edge) & np.isfinite(inner))
     return band
 
 
