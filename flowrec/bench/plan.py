@@ -74,11 +74,11 @@ def measure(
     side_px: int = SIDE_PX,
     methods: Sequence[str] | None = None,
     seed: int = 0,
-    with_speed: bool = True,
+    quick: bool = False,
 ) -> dict[str, Any]:
     """Rows per trip, flow, direction and planner, their summaries, robustness, policy and speed.
 
-    rrt and rrt_star plan in the first `tree_channels` channels only.
+    rrt and rrt_star plan in the first `tree_channels` channels only. `quick` leaves out robustness, policy and speed.
 
     Raises
     ------
@@ -96,10 +96,9 @@ def measure(
     policy: list[dict[str, Any]] = []
     shown: list[tuple[World, Trip, dict[str, Route]]] = []
     with progress("planning", trips) as done:
-        for number, world in enumerate(itertools.islice(source, trips)):
-            trip = draw_trip(world, np.random.default_rng([number, seed, 5]))
-            if trip is None:
-                continue
+        drawn = ((world, draw_trip(world, np.random.default_rng([k, seed, 5]))) for k, world in enumerate(source))
+        fits = ((world, trip) for world, trip in drawn if trip is not None)
+        for number, (world, trip) in enumerate(itertools.islice(fits, trips)):
             for ratio, direction in itertools.product(RATIOS, DIRECTIONS):
                 field = world.field(ratio)
                 ends = trip.ends(direction)
@@ -115,6 +114,8 @@ def measure(
                     rows.append(row)
                 if ratio == 0.9 and direction == "up":
                     shown.append((world, trip, found))
+                if quick:
+                    continue
                 robust += _robust(world, ratio, direction, ends)
                 policy += _policy(world, ratio, direction, ends, optimum)
             done(number + 1)
@@ -127,7 +128,7 @@ def measure(
         "ratios": _ratios(rows, chosen),
         "robust": _share_of(robust),
         "policy": _policy_table(policy),
-        "speed": _speed() if with_speed else None,
+        "speed": None if quick else _speed(),
     }
     if figure is not None:
         from flowrec.bench.figure_plan import draw
@@ -397,6 +398,17 @@ def show(figures: dict[str, Any]) -> None:
             for method, line in figures["ratios"].items()
         ],
     )
+    if figures["robust"]:
+        _show_reserves(figures, regimes)
+    for line in figures["speed"] or ():
+        say(
+            f"512 x 512 pixels, {line['free']} of them free: a full plan takes {line['plan_ms']:.0f} ms of CPU, "
+            f"{line['plan_over_two_dijkstra']:.2f} times two runs of scipy's Dijkstra with their graph "
+            f"({line['dijkstra_ms']:.0f} ms each)"
+        )
+
+
+def _show_reserves(figures: dict[str, Any], regimes: list[str]) -> None:
     table(
         f"Planned with some flow to spare: cost in the right flow, ways kept when it is {FASTER:g} times as fast",
         ("setting", *regimes),
@@ -437,9 +449,3 @@ def show(figures: dict[str, Any]) -> None:
             for setting, flow in dict.fromkeys((line["setting"], line["flow"]) for line in figures["policy"])
         ],
     )
-    for line in figures["speed"] or ():
-        say(
-            f"512 x 512 pixels, {line['free']} of them free: a full plan takes {line['plan_ms']:.0f} ms of CPU, "
-            f"{line['plan_over_two_dijkstra']:.2f} times two runs of scipy's Dijkstra with their graph "
-            f"({line['dijkstra_ms']:.0f} ms each)"
-        )

@@ -35,7 +35,7 @@ def test_in_a_uniform_flow_the_time_to_go_is_zermelos_everywhere(flow):
     times = time_field(water(flow), np.array([60.0, 60.0]))
     exact, away = zermelo(flow)
     error = times / np.where(away > 0.0, exact, 1.0) - 1.0
-    assert np.abs(error[away > 5.0]).max() < 0.05 and np.median(error) < 0.006
+    assert np.abs(error[away > 5.0]).max() < 0.06 and np.median(error) < 0.006
     assert (error[away > 0.0] > -1e-9).all(), "never faster than is possible"
 
 
