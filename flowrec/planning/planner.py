@@ -124,7 +124,7 @@ class Planner:
         closer = min(max(math.isqrt(_ENOUGH_PX // int(space.free.sum())), 1), 4)
         first, last = _place(space, start.node), _place(space, goal.node)
         target = last if goal.point is None else goal.point
-        deviation = deviation_px_s(field, self.flow_error_share)
+        deviation = _deviation(space, field, self.flow_error_share)
         tries = tuple(dict.fromkeys((self.robust_deviations, 0.5 * self.robust_deviations, 0.0)))
         for deviations in tries:
             terrain = _terrain(space, speed_um_s / px, deviations * deviation, idle_um_s)
@@ -244,12 +244,11 @@ def _terrain(space: Space, speed: float, deviation: NDArray[np.float64] | float,
     return Terrain(space.free, space.clearance, space.need, space.vx, space.vy, left, idle)
 
 
-def deviation_px_s(field: FlowField, flow_error_share: float) -> NDArray[np.float64]:
+def _deviation(space: Space, field: FlowField, flow_error_share: float) -> NDArray[np.float64]:
     """(h, w) px/s one standard deviation of the flow in its worst direction, as the field states it, else a share."""
     if field.std_um_s is not None:
         return np.asarray(field.std_um_s.max(axis=-1) / field.um_per_px, np.float64)
-    velocity = field.velocity_um_s.astype(np.float64)
-    return np.asarray(flow_error_share / field.um_per_px * np.hypot(velocity[..., 0], velocity[..., 1]))
+    return flow_error_share * np.sqrt(space.vx * space.vx + space.vy * space.vy)
 
 
 def _place(space: Space, node: int) -> Points:
