@@ -23,6 +23,7 @@ from flowrec.planning.space import (
     Space,
     attach_goal,
     attach_start,
+    joined_ends,
     margin_remark,
     margins_um,
     open_space,
@@ -30,7 +31,6 @@ from flowrec.planning.space import (
 )
 from flowrec.planning.terrain import Terrain
 from flowrec.planning.time_field import descend, time_field, with_band
-from flowrec.planning.zermelo import line_is_clear
 from flowrec.robot import Robot
 
 Method = Literal["time_field", "astar_time", "astar_paper", "astar_length", "rrt", "rrt_star"]
@@ -122,8 +122,10 @@ class Planner:
         if self.cost == "energy":
             idle_um_s = 0.5 * speed_um_s if self.idle_speed_um_s is None else float(self.idle_speed_um_s)
         closer = min(max(math.isqrt(_ENOUGH_PX // int(space.free.sum())), 1), 4)
-        first, last = _place(space, start.node), _place(space, goal.node)
-        target = last if goal.point is None else goal.point
+        target = _place(space, goal.node) if goal.point is None else goal.point
+        first = _place(space, start.node)
+        if start.point is not None and space.clearance_at(start.point) >= space.need:
+            first = start.point
         deviation = _deviation(space, field, self.flow_error_share)
         tries = tuple(dict.fromkeys((self.robust_deviations, 0.5 * self.robust_deviations, 0.0)))
         for deviations in tries:
@@ -132,14 +134,14 @@ class Planner:
             times = time_field(fine, closer * target)
             path = None
             if np.isfinite(times[::closer, ::closer].ravel()[start.node]):
-                path = descend(fine, times, closer * first, closer * last)
+                path = descend(fine, times, closer * first, closer * target)
             if path is None:
                 path = self._search(space, "astar_time", start.node, goal.node, speed_um_s / px)
                 if path is None or deviations > 0.0:
                     continue
             else:
                 path = path / closer
-            route = self._refined(terrain, field, _between(space, path, start, goal), speed_um_s, idle_um_s, closer)
+            route = self._refined(terrain, field, joined_ends(space, path, start, goal), speed_um_s, idle_um_s, closer)
             if not route.reachable:
                 continue
             if deviations < tries[0]:
@@ -196,7 +198,7 @@ class Planner:
             if self.method.startswith("rrt"):
                 return no_route(self.method, f"{self.method} found no way in {self.rrt.iterations} iterations")
             return self._too_fast(space, field, start, goal, speed_um_s)
-        path = _between(space, nodes, start, goal)
+        path = joined_ends(space, nodes, start, goal)
         if self.method == "astar_time":
             return self._refined(_terrain(space, speed_um_s / px, 0.0, None), field, path, speed_um_s, None)
         return timed_route(self.method, field, path * px, speed_um_s, "")
@@ -254,16 +256,3 @@ def _deviation(space: Space, field: FlowField, flow_error_share: float) -> NDArr
 def _place(space: Space, node: int) -> Points:
     """(2,) px of a node."""
     return np.array([node % space.width, node // space.width], np.float64)
-
-
-def _between(space: Space, nodes: Points, start: End, goal: End) -> Points:
-    """The path (n, 2) px with its true ends, each in the place of its node where it sees the next one."""
-    path = nodes
-    for end in (start, goal):
-        if end.point is not None:
-            beyond = path[1] if len(path) > 1 else end.point
-            (x0, y0), (x1, y1) = end.point, beyond
-            sees = line_is_clear(space.clearance, x0, y0, x1, y1, space.need)
-            path = np.concatenate([end.point[None], path[1:] if sees else path])
-        path = path[::-1]
-    return path

@@ -21,6 +21,7 @@ Raster = NDArray[np.float64]
 
 # A mask can not tell more closely than this where a wall is; ends of a route are not refused for less.
 _SLACK_PX = 0.5
+_NEAR_PX = 2.0
 _EIGHT = np.ones((3, 3), np.int64)
 
 
@@ -98,6 +99,34 @@ def attach_start(space: Space, point_um: Points) -> End:
 def attach_goal(space: Space, point_um: Points) -> End:
     """Join the goal to the nodes; a robot that can not stand there must come within its own radius of it."""
     return _attach(space, "goal", point_um, max(space.radius, 1.0))
+
+
+def joined_ends(space: Space, nodes: Points, start: End, goal: End | None) -> Points:
+    """The path (n, 2) px with its true ends instead of the nodes that are nearest to them.
+
+    An end takes the place of all nodes so near to it that going there first would only be a detour, which a flow
+    faster than the robot may even forbid; as long as it sees the one after them.
+    """
+    path = nodes
+    for end in (start, goal):
+        if end is not None and end.point is not None:
+            path = np.concatenate([end.point[None], path[_first_needed(space, path, end.point) :]])
+        path = path[::-1]
+    return path
+
+
+def _first_needed(space: Space, path: Points, point: Points) -> int:
+    """Number of the place on a path (n, 2) to which an end goes first."""
+    chosen = 0
+    if np.allclose(path[0], point):
+        return min(1, len(path) - 1)
+    for k in range(1, len(path)):
+        if np.hypot(*(path[k - 1] - point)) > _NEAR_PX:
+            break
+        x, y = path[k]
+        if line_is_clear(space.clearance, float(point[0]), float(point[1]), float(x), float(y), space.need):
+            chosen = k
+    return chosen
 
 
 def why_apart(space: Space, a: int, b: int) -> str:
