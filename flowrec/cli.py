@@ -532,6 +532,28 @@ def bench_train(
     show(train(lessons, out, Training(network, count, steps, device=device, seed=seed)))
 
 
+@bench.command("plan")
+def bench_plan(
+    cases: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz); made up when left out.")
+    ] = None,
+    trips: Annotated[int, typer.Option(min=1, help="Channels, one trip through each, down and up.")] = 40,
+    methods: Annotated[str | None, typer.Option(metavar="A,B", help="Which planners; all when left out.")] = None,
+    trees: Annotated[int, typer.Option(help="Channels in which rrt and rrt_star plan.")] = 10,
+    iterations: Annotated[int, typer.Option(min=1, help="Of rrt and rrt_star.")] = 4000,
+    seed: Annotated[int, typer.Option(min=0, help="Of channels and trips.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+    figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw two channels, and all trips.")] = None,
+) -> None:
+    """Path length and travel time of every planner, up and down, beside the least time that is possible."""
+    from flowrec.bench.plan import measure, show
+
+    chosen = methods.split(",") if methods is not None else None
+    figures = measure(cases, trips, trees, iterations, figure, methods=chosen, seed=seed)
+    show(figures)
+    _keep(figures, json_file)
+
+
 def _keep(figures: dict[str, Any], json_file: Path | None) -> None:
     """Write the figures of a bench where they are wanted."""
     if json_file is not None:

@@ -138,10 +138,11 @@ class Route(Message):
     reason: str  # why not, when it is not
     waypoints_um: Matrix  # (n, 2), n = 0 when unreachable
     arrival_s: Vector  # (n,) since the start of the route, strictly increasing
-    # (k (h - 1) + 1, k (w - 1) + 1) s to the goal by the fastest way, from every pixel centre and from k - 1 points
-    # between any two of them; inf where there is none, None where the planner
-    # knows it along its path only. Its slope is a policy: -grad T is the best heading anywhere.
+    # (h, w) s to the goal by the fastest way, the first from the centre of the chip's first pixel; inf where there is
+    # none, None where the planner knows it along its path only. Its slope is a policy: -grad T is the best heading
+    # anywhere. Where channels are narrow there are several points to a pixel.
     time_to_go_s: Raster | None = None
+    time_to_go_um_per_px: float = 0.0  # from point to point; 0: as the chip's pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)

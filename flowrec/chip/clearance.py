@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt
 
 from flowrec.chip.chip import Chip
 from flowrec.errors import ChipError
@@ -20,10 +20,18 @@ def clearance_um(mask: NDArray[np.bool_], um_per_px: float) -> NDArray[np.float3
         return np.full(mask.shape, np.inf, np.float32)
     pad = 16
     padded = np.pad(mask, pad, mode="edge")
-    inside = distance_transform_edt(padded)
-    outside = distance_transform_edt(~padded)
-    signed = np.where(padded, inside - 0.5, 0.5 - outside)[pad:-pad, pad:-pad]
+    signed = np.where(padded, _distance(padded) - 0.5, 0.5 - _distance(~padded))[pad:-pad, pad:-pad]
     return np.ascontiguousarray(signed * um_per_px, np.float32)
+
+
+def _distance(inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Distance (h, w) in px of each pixel to the nearest one outside; 0 there.
+
+    OpenCV takes a tenth of scipy's time, in single precision; squares of distances are whole numbers, so rounding
+    them gives the exact ones back.
+    """
+    rough = cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
+    return np.sqrt(np.rint(rough * rough))
 
 
 def half_widths_um(chip: Chip) -> NDArray[np.float64]:

@@ -134,10 +134,8 @@ class Controller:
             place = self._place(previous, mission, estimate, point)
             aim = _Aim.at_rest(place, estimate.position_um)
         elif self.method == "policy" and route.time_to_go_s is not None:
-            times = route.time_to_go_s
-            # It may have several points to a pixel of the chip (planning.space.finer).
-            spacing_um = um_per_px if clearance_um is None else um_per_px * (len(clearance_um) - 1) / (len(times) - 1)
-            aim = self._homing(route, times, estimate, belief.at(point), point, robot, spacing_um, dt_s)
+            spacing_um = route.time_to_go_um_per_px or um_per_px
+            aim = self._homing(route, route.time_to_go_s, estimate, belief.at(point), point, robot, spacing_um, dt_s)
         else:
             aim = self._following(previous, mission, route, estimate, belief, robot, limit_um_s, dt_s)
         demand, cut = np.zeros(2), False

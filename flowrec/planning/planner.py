@@ -3,42 +3,48 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from dataclasses import field as setting
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.chip.chip import Chip
+from flowrec.errors import UsageError
 from flowrec.messages import FlowField, Route
 from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.paper import adjacency, search_paper
-from flowrec.planning.relax import relax
+from flowrec.planning.relax import SPACING_PX, relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
+from flowrec.planning.rrt import Rrt
 from flowrec.planning.space import (
     End,
     Space,
     Swift,
     attach_goal,
     attach_start,
-    finer,
+    joined_ends,
     margin_remark,
     margins_um,
     open_space,
     too_swift,
     why_apart,
 )
+from flowrec.planning.terrain import Terrain, interpolated
 from flowrec.planning.time_field import descend, time_field, with_band
-from flowrec.planning.zermelo import line_is_clear
 from flowrec.robot import Robot
 
-Method = Literal["time_field", "astar_time", "astar_paper", "astar_length"]
+Method = Literal["time_field", "astar_time", "astar_paper", "astar_length", "rrt", "rrt_star"]
+Cost = Literal["time", "energy"]
 Points = NDArray[np.float64]
+
 # In radii. Against the flow the fastest way is along the wall, so every micrometre costs: half a radius cost a tenth
 # of the time, and kept no robot off a wall that a tenth, with the swift places left out, did not.
 _USUAL_MARGIN = 0.1
-_POINTS_PER_RADIUS = 3.0
-_FINEST = 4
+_LEAST_SHARE = 0.02
+_ENOUGH_PX = 80000  # free pixels: of fewer, each is looked at up to four times as closely,
+_LARGEST_PX = 2_000_000  # as long as all of the chip has no more than these
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,18 +54,28 @@ class Planner:
     time_field: the time to go from everywhere, the way down it, then a local refinement of the path. The route keeps
         the field: its slope is a policy, -grad T the best heading wherever the robot is pushed.
     astar_time: exact travel time on the pixels, admissible heuristic, then a local refinement of the path.
-    astar_paper: cost and heuristic as the paper prints them, neighbours by K-D tree.
+    astar_paper: cost and heuristic as the paper prints them, neighbours by K-D tree; with paper_radius_px = 1.5 they
+        are the 8 around a pixel.
     astar_length: the shortest way, blind to the flow.
+    rrt, rrt_star: OMPL's, the first for any way, as in the paper, the second for the fastest.
+
+    Energy as the cost, a wider berth around flow that may be faster than believed, and a time to go belong to
+    time_field.
     """
 
-    method: Method = "astar_time"
+    method: Method = "time_field"
+    cost: Cost = "time"
+    idle_speed_um_s: float | None = None  # swimming at this speed takes as much power as being there; None: half of V
     clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: a tenth of it
+    swift: Swift = setting(default_factory=Swift)  # more is kept where the flow is swift
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
-    policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
-    swift: Swift = field(default_factory=Swift)  # more is kept where the flow is swift
+    policy_share: float | None = None  # the same for the time to go alone; None: as the path
+    robust_deviations: float = 1.0  # of the flow, by which it may be worse than believed; fewer where no way is left
+    flow_error_share: float = 0.05  # one deviation of a flow that does not know its own, as a share of its speed
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
     refine: bool = True  # the path of time_field and astar_time
+    rrt: Rrt = setting(default_factory=Rrt)
 
     def plan(self, field: FlowField, start_um: ArrayLike, goal_um: ArrayLike, chip: Chip, robot: Robot) -> Route:
         """Route from start to goal, both (2,) um; stamp and request are 0.
@@ -70,11 +86,12 @@ class Planner:
         Raises
         ------
         UsageError
-            If the robot has no speed, or field and chip do not fit together.
+            If the robot has no speed, a setting makes no sense, or field and chip do not fit together.
         FlowError
             If the field is not finite.
         """
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
+        self._check()
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
         margins = margins_um(self.clearance_margin_um, robot, _USUAL_MARGIN)
         drift = self.swift.drift(robot, robot.speed_limit_um_s)
@@ -84,61 +101,124 @@ class Planner:
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
-                route = self._through(space, field, start, goal, speed_um_s)
-                if self.method == "time_field" and route.reachable:
-                    route = replace(route, time_to_go_s=self._time_to_go(space, goal, robot))
+                if self.method == "time_field":
+                    route = self._by_time_field(space, field, start, goal, speed_um_s, robot)
+                else:
+                    route = self._by_nodes(space, field, start, goal, speed_um_s)
                 lean = margin_remark(margin_um, margins)
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
         swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift)
         return no_route(self.method, swift or trouble)
 
-    def _through(self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float) -> Route:
-        """The route between two ends that geometry connects."""
+    def _check(self) -> None:
+        if self.cost == "energy" and self.method != "time_field":
+            raise UsageError(f"plan: {self.method} knows no energy; cost = 'energy' goes with method = 'time_field'")
+        if self.idle_speed_um_s is not None and not self.idle_speed_um_s > 0.0:
+            raise UsageError(
+                f"plan: idle_speed_um_s is {self.idle_speed_um_s:g} and must be more than zero: a robot that needs no "
+                "power to be there would never arrive"
+            )
+        if self.robust_deviations < 0.0 or self.flow_error_share < 0.0:
+            raise UsageError("plan: robust_deviations and flow_error_share must not be negative")
+
+    def _by_time_field(
+        self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float, robot: Robot
+    ) -> Route:
+        """The route between two ends that geometry connects, with as many deviations to spare as leave a way."""
+        px = space.um_per_px
+        idle_um_s = None
+        if self.cost == "energy":
+            idle_um_s = 0.5 * speed_um_s if self.idle_speed_um_s is None else float(self.idle_speed_um_s)
+        most = min(_ENOUGH_PX // int(space.free.sum()), _LARGEST_PX // space.free.size)
+        closer = min(max(math.isqrt(most), 1), 4)
+        target = _place(space, goal.node) if goal.point is None else goal.point
+        first = _place(space, start.node)
+        if start.point is not None and space.room_at(start.point) >= space.need:
+            first = start.point
+        deviation = _deviation(space, field, self.flow_error_share)
+        tries = tuple(dict.fromkeys((self.robust_deviations, 0.5 * self.robust_deviations, 0.0)))
+        for deviations in tries:
+            terrain = _terrain(space, speed_um_s / px, deviations * deviation, idle_um_s)
+            fine = terrain.finer(closer)
+            times = time_field(fine, closer * target)
+            path = None
+            if np.isfinite(times[::closer, ::closer].ravel()[start.node]):
+                path = descend(fine, times, closer * first, closer * target)
+            if path is None:
+                path = self._search(space, "astar_time", start.node, goal.node, speed_um_s / px)
+                if path is None or deviations > 0.0:
+                    continue
+            else:
+                path = path / closer
+            route = self._refined(terrain, field, joined_ends(space, path, start, goal), speed_um_s, idle_um_s, closer)
+            if not route.reachable:
+                continue
+            if deviations < tries[0]:
+                spared = f"{deviations:g} of {tries[0]:g} deviations of the flow to spare" if deviations else "nothing"
+                route = replace(route, reason=f"the flow leaves no way with more to spare: planned with {spared}")
+            if self.cost == "energy":
+                return route
+            if self.policy_share is not None:
+                speed = planning_speed_um_s(self.policy_share, robot) / px
+                fine = _terrain(space, speed, deviations * deviation, None).finer(closer)
+                times = time_field(fine, closer * target)
+            policy = _policy(space, fine, times, closer, speed_um_s / px)
+            return replace(route, time_to_go_s=policy, time_to_go_um_per_px=px / closer)
+        return self._too_fast(space, field, start, goal, speed_um_s)
+
+    def _refined(
+        self,
+        terrain: Terrain,
+        field: FlowField,
+        path: Points,
+        speed_um_s: float,
+        idle_um_s: float | None,
+        closer: int = 1,
+    ) -> Route:
+        """The timed route along a path (n, 2) px after its refinement, or before it where that can not be done."""
+        px = field.um_per_px
+        if self.refine:
+            even = np.ones_like(terrain.clearance)
+            flow = (
+                terrain.clearance,
+                terrain.need,
+                terrain.vx,
+                terrain.vy,
+                even,
+                terrain.speed,
+                terrain.idle,
+                SPACING_PX / closer,
+            )
+            route = timed_route(self.method, field, relax(path, *flow) * px, speed_um_s, "", idle_um_s)
+            if route.reachable:
+                return route
+        return timed_route(self.method, field, path * px, speed_um_s, "", idle_um_s)
+
+    def _by_nodes(self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float) -> Route:
+        """The route between two ends that geometry connects, by one of the methods it is compared with."""
         px = space.um_per_px
         nodes = self._search(space, self.method, start.node, goal.node, speed_um_s / px)
         if nodes is None:
-            shortest = self._search(space, "astar_length", start.node, goal.node, 1.0)
-            assert shortest is not None, "free pixels that touch are joined by edges"
-            return no_route(self.method, too_fast(field, shortest * px, speed_um_s))
-        path = _between(space, nodes, start, goal)
-        if self.method in ("time_field", "astar_time") and self.refine:
-            even = np.ones_like(space.clearance)
-            refined = relax(path, space.clearance, space.need, space.vx, space.vy, even, speed_um_s / px)
-            route = timed_route(self.method, field, refined * px, speed_um_s, "")
-            if route.reachable:
-                return route
+            if self.method.startswith("rrt"):
+                return no_route(self.method, f"{self.method} found no way in {self.rrt.iterations} iterations")
+            return self._too_fast(space, field, start, goal, speed_um_s)
+        path = joined_ends(space, nodes, start, goal)
+        if self.method == "astar_time":
+            return self._refined(_terrain(space, speed_um_s / px, 0.0, None), field, path, speed_um_s, None)
         return timed_route(self.method, field, path * px, speed_um_s, "")
 
-    def _time_to_go(self, space: Space, goal: End, robot: Robot) -> NDArray[np.float32]:
-        """The policy (s), also where the robot is nearer to the walls than the route.
-
-        In a channel of few pixels the way along the wall, which is the fastest against the flow, lies between them: so
-        there are k points to a pixel, as many as make the robot's radius three, and four at most.
-        """
-        k = min(max(math.ceil(_POINTS_PER_RADIUS / space.radius), 1), _FINEST)
-        at = k * (_place(space, goal.node) if goal.point is None else goal.point)
-        fine = finer(space, k)
-        speed = planning_speed_um_s(self.policy_share, robot) / fine.um_per_px
-        every = np.full_like(fine.clearance, speed)
-        times = time_field(fine.free, fine.clearance, fine.need, fine.vx, fine.vy, every, at)
-        return with_band(times, fine.free, fine.fluid, speed).astype(np.float32)
-
-    def _down(self, space: Space, start: int, goal: int, speed: float) -> Points | None:
-        """(n, 2) the way down the time to go; None where that is infinite."""
-        every = np.full_like(space.clearance, speed)
-        flow = (space.clearance, space.need, space.vx, space.vy, every)
-        first, last = _place(space, start), _place(space, goal)
-        times = time_field(space.free, *flow, last, start)
-        if not np.isfinite(times.ravel()[start]):
-            return None
-        path = descend(times, *flow, first, last)
-        return self._search(space, "astar_time", start, goal, speed) if path is None else path
+    def _too_fast(self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float) -> Route:
+        shortest = self._search(space, "astar_length", start.node, goal.node, 1.0)
+        assert shortest is not None, "free pixels that touch are joined by edges"
+        return no_route(self.method, too_fast(field, shortest * space.um_per_px, speed_um_s))
 
     def _search(self, space: Space, method: Method, start: int, goal: int, speed: float) -> Points | None:
         """(n, 2) points from node to node, None when the search finds no way; speed in px/s."""
-        if method == "time_field":
-            return self._down(space, start, goal, speed)
+        if method in ("rrt", "rrt_star"):
+            return self.rrt.search(
+                space, _place(space, start), _place(space, goal), speed if method == "rrt_star" else None
+            )
         if method == "astar_paper":
             rows, columns = np.nonzero(space.free)
             nodes = np.column_stack([columns, rows]).astype(np.float64)
@@ -158,24 +238,35 @@ class Planner:
             start,
             goal,
             speed,
-            method != "astar_length",
+            method == "astar_time",
         )
         return backtrack(parent, goal, space.width) if np.isfinite(cost[goal]) else None
+
+
+def _terrain(space: Space, speed: float, deviation: NDArray[np.float64] | float, idle_um_s: float | None) -> Terrain:
+    """What time_field searches: the space for a robot whose speed (px/s) must also outdo so much of the flow."""
+    # Where the flow is not known to within the robot's speed, a little is left: nothing is known against drifting.
+    left = np.maximum(np.full_like(space.clearance, speed) - deviation, _LEAST_SHARE * speed)
+    idle = -1.0 if idle_um_s is None else idle_um_s / space.um_per_px
+    return Terrain(space.free, space.room, space.need, space.vx, space.vy, left, idle)
+
+
+def _policy(space: Space, fine: Terrain, times: NDArray[np.float64], closer: int, speed: float) -> NDArray[np.float32]:
+    """The time to go (s) also where the robot is nearer to the walls than the route, with `closer` points to a pixel.
+
+    In a channel of few pixels the way along the wall, which is the fastest against the flow, lies between them.
+    """
+    clearance = closer * interpolated(space.clearance, closer)
+    return with_band(times, fine.free, clearance, fine.need, closer * speed).astype(np.float32)
+
+
+def _deviation(space: Space, field: FlowField, flow_error_share: float) -> NDArray[np.float64]:
+    """(h, w) px/s one standard deviation of the flow in its worst direction, as the field states it, else a share."""
+    if field.std_um_s is not None:
+        return np.asarray(field.std_um_s.max(axis=-1) / field.um_per_px, np.float64)
+    return flow_error_share * np.sqrt(space.vx * space.vx + space.vy * space.vy)
 
 
 def _place(space: Space, node: int) -> Points:
     """(2,) px of a node."""
     return np.array([node % space.width, node // space.width], np.float64)
-
-
-def _between(space: Space, nodes: Points, start: End, goal: End) -> Points:
-    """The path (n, 2) px with its true ends, each in the place of its node where it sees the next one."""
-    path = nodes
-    for end in (start, goal):
-        if end.point is not None:
-            beyond = path[1] if len(path) > 1 else end.point
-            (x0, y0), (x1, y1) = end.point, beyond
-            sees = line_is_clear(space.clearance, x0, y0, x1, y1, space.need)
-            path = np.concatenate([end.point[None], path[1:] if sees else path])
-        path = path[::-1]
-    return path

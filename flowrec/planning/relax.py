@@ -12,28 +12,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.planning.jit import compiled
-from flowrec.planning.zermelo import lowest_clearance, segment_time
+from flowrec.planning.zermelo import bilinear, lowest_clearance, segment_cost
 
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
-_SPACING_PX = 1.5
-_WIDTHS = np.array([32, 16, 8, 4, 2, 1], np.int64)  # of bumps, in points of the path
+SPACING_PX = 1.5  # of the points of a path
+_WIDEST_PX = 48.0  # half of the widest bump
 _SWEEPS = 12
 
 
-def relax(path: Points, clearance: Raster, need: float, vx: Raster, vy: Raster, weight: Raster, speed: float) -> Points:
-    """A path (n, 2) in px with the same ends that takes less weighted time, its points about 1.5 px apart.
+def relax(
+    path: Points,
+    clearance: Raster,
+    need: float,
+    vx: Raster,
+    vy: Raster,
+    weight: Raster,
+    speed: Raster,
+    idle: float = -1.0,
+    spacing: float = SPACING_PX,
+) -> Points:
+    """A path (n, 2) in px with the same ends that takes less weighted time, its points at most `spacing` px apart.
+
+    `speed` (h, w) is the robot's through the fluid; with `idle` > 0 it takes less energy instead (`step_energy`).
 
     Every part of it keeps the clearance `need` (px), or, where the given path did not, at least that of the given one.
     """
     lengths = np.hypot(*np.diff(path, axis=0).T)
-    keep = np.concatenate([[True], lengths > 1e-9])
-    along = np.concatenate([[0.0], np.cumsum(lengths)])[keep]
-    if keep.sum() < 2:
-        return path[:1]
-    at = np.linspace(0.0, along[-1], max(3, math.ceil(along[-1] / _SPACING_PX) + 1))
-    points = np.column_stack([np.interp(at, along, path[keep, 0]), np.interp(at, along, path[keep, 1])])
-    return _bumps(points, clearance, need, vx, vy, weight, speed, _WIDTHS, _SWEEPS)
+    path = path[np.concatenate([[True], lengths > 1e-9])]
+    if len(path) < 2:
+        return path
+    # No vertex is left out, which would cut the corners of walls.
+    lengths = np.hypot(*np.diff(path, axis=0).T)
+    counts = np.maximum(1, np.ceil(lengths / spacing - 1e-9)).astype(np.int64)
+    if len(counts) == 1:
+        counts = np.maximum(counts, 2)  # a single step has nothing to move
+    leg = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(counts.sum()) - (np.cumsum(counts) - counts)[leg]) / counts[leg]
+    points = np.concatenate([path[leg] + share[:, None] * np.diff(path, axis=0)[leg], path[-1:]])
+    widest = math.ceil(_WIDEST_PX / spacing)
+    widths = widest // 2 ** np.arange(widest.bit_length())
+    return _bumps(points, clearance, need, vx, vy, weight, speed, idle, spacing, widths, _SWEEPS)
 
 
 @compiled
@@ -44,7 +63,9 @@ def _bumps(
     vx: Raster,
     vy: Raster,
     weight: Raster,
-    speed: float,
+    speed: Raster,
+    idle: float,
+    spacing: float,
     widths: NDArray[np.int64],
     sweeps: int,
 ) -> Points:
@@ -55,12 +76,14 @@ def _bumps(
     floors = np.empty(n - 1)
     for k in range(n - 1):
         x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
-        times[k] = segment_time(vx, vy, weight, x0, y0, x1, y1, speed)
+        times[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
+            vx, vy, speed, x0, y0, x1, y1, idle, 1.0
+        )
         floors[k] = min(need, lowest_clearance(clearance, x0, y0, x1, y1))
     moved = np.empty((2 * widths.max() + 1, 2))
     taken = np.empty(2 * widths.max())
     for width in widths:
-        height = 0.25 * width
+        height = 0.17 * width * spacing
         stride = max(1, width // 2)
         for _ in range(sweeps):
             accepted = 0
@@ -92,7 +115,9 @@ def _bumps(
                     after = 0.0
                     for k in range(last - first):
                         x0, y0, x1, y1 = moved[k, 0], moved[k, 1], moved[k + 1, 0], moved[k + 1, 1]
-                        taken[k] = segment_time(vx, vy, weight, x0, y0, x1, y1, speed)
+                        taken[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
+                            vx, vy, speed, x0, y0, x1, y1, idle, 1.0
+                        )
                         after += taken[k]
                         if after >= before * (1.0 - 1e-7):
                             good = False

@@ -37,10 +37,15 @@ def no_route(method: str, reason: str) -> Route:
     return Route(0, 0, method, False, reason, np.zeros((0, 2)), np.zeros(0))
 
 
-def timed_route(method: str, field: FlowField, path_um: Points, speed_um_s: float, remark: str) -> Route:
-    """The route along a path (n, 2), waypoints at most a pixel apart, or none where the flow forbids it."""
+def timed_route(
+    method: str, field: FlowField, path_um: Points, speed_um_s: float, remark: str, idle_um_s: float | None = None
+) -> Route:
+    """The route along a path (n, 2), waypoints at most a pixel apart, or none where the flow forbids it.
+
+    With `idle_um_s` the robot swims as slowly as saves the most energy.
+    """
     waypoints = _dense(path_um, field.um_per_px)
-    arrival, feasible = travel_time(field, waypoints, speed_um_s)
+    arrival, feasible = travel_time(field, waypoints, speed_um_s, idle_um_s)
     if not feasible:
         return no_route(method, too_fast(field, waypoints, speed_um_s))
     return Route(0, 0, method, True, remark, waypoints, arrival)

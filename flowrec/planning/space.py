@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, label, map_coordinates
+from scipy.ndimage import distance_transform_edt, label
 
 from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
@@ -21,6 +21,7 @@ Raster = NDArray[np.float64]
 
 # A mask can not tell more closely than this where a wall is; ends of a route are not refused for less.
 _SLACK_PX = 0.5
+_NEAR_PX = 2.0
 _EIGHT = np.ones((3, 3), np.int64)
 
 
@@ -33,7 +34,7 @@ class Space:
     free: NDArray[np.bool_]  # (h, w) where the robot's centre may be: the nodes
     radius: float  # of the robot
     need: float  # clearance of nodes and of long edges
-    least: Raster  # (h, w) that of a node: need, or more where the flow is swift
+    room: Raster  # (h, w) the clearance that counts: less by what the robot may drift beyond its margin
     vx: Raster  # (h, w)
     vy: Raster  # (h, w)
     um_per_px: float
@@ -42,6 +43,10 @@ class Space:
     def width(self) -> int:
         """Columns."""
         return int(self.free.shape[1])
+
+    def room_at(self, point: Points) -> float:
+        """What counts of the clearance (px) at a point (x, y) in px."""
+        return bilinear(self.room, float(point[0]), float(point[1]))
 
     def clearance_at(self, point: Points) -> float:
         """Clearance (px) at a point (x, y) in px."""
@@ -120,39 +125,18 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float,
     far_px = float(sum(chip.mask.shape))
     clearance = np.minimum(clearance_um(chip.mask, chip.um_per_px).astype(np.float64) / chip.um_per_px, far_px)
     need = float((radius_um + margin_um) / chip.um_per_px)
-    least = np.maximum(need, (radius_um + drift.um(field)) / chip.um_per_px)
+    swept = (radius_um + drift.um(field)) / chip.um_per_px
+    room = clearance - np.maximum(swept - need, 0.0)
     return Space(
         clearance=clearance,
         fluid=np.ascontiguousarray(chip.mask),
-        free=chip.mask & (clearance >= least),
+        free=chip.mask & (room >= need),
         radius=float(radius_um) / chip.um_per_px,
         need=need,
-        least=least,
+        room=room,
         vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
         vy=np.ascontiguousarray(field.velocity_um_s[..., 1], np.float64) / chip.um_per_px,
         um_per_px=float(chip.um_per_px),
-    )
-
-
-def finer(space: Space, k: int) -> Space:
-    """The same space with k - 1 points between any two pixels, so that pixel (i, j) is point (k i, k j)."""
-    h, w = space.free.shape
-    rows, columns = np.meshgrid(np.arange((h - 1) * k + 1) / k, np.arange((w - 1) * k + 1) / k, indexing="ij")
-
-    def between(raster: Raster) -> Raster:
-        return np.asarray(map_coordinates(raster, (rows, columns), order=1))
-
-    clearance, least = k * between(space.clearance), k * between(space.least)
-    return Space(
-        clearance=clearance,
-        fluid=clearance > 0.0,
-        free=clearance >= least,
-        radius=k * space.radius,
-        need=k * space.need,
-        least=least,
-        vx=k * between(space.vx),
-        vy=k * between(space.vy),
-        um_per_px=space.um_per_px / k,
     )
 
 
@@ -164,6 +148,34 @@ def attach_start(space: Space, point_um: Points) -> End:
 def attach_goal(space: Space, point_um: Points) -> End:
     """Join the goal to the nodes; a robot that can not stand there must come within its own radius of it."""
     return _attach(space, "goal", point_um, max(space.radius, 1.0))
+
+
+def joined_ends(space: Space, nodes: Points, start: End, goal: End | None) -> Points:
+    """The path (n, 2) px with its true ends instead of the nodes that are nearest to them.
+
+    An end takes the place of all nodes so near to it that going there first would only be a detour, which a flow
+    faster than the robot may even forbid; as long as it sees the one after them.
+    """
+    path = nodes
+    for end in (start, goal):
+        if end is not None and end.point is not None:
+            path = np.concatenate([end.point[None], path[_first_needed(space, path, end.point) :]])
+        path = path[::-1]
+    return path
+
+
+def _first_needed(space: Space, path: Points, point: Points) -> int:
+    """Number of the place on a path (n, 2) to which an end goes first."""
+    chosen = 0
+    if np.allclose(path[0], point):
+        return min(1, len(path) - 1)
+    for k in range(1, len(path)):
+        if np.hypot(*(path[k - 1] - point)) > _NEAR_PX:
+            break
+        x, y = path[k]
+        if line_is_clear(space.clearance, float(point[0]), float(point[1]), float(x), float(y), space.need):
+            chosen = k
+    return chosen
 
 
 def why_apart(space: Space, a: int, b: int) -> str:

@@ -13,7 +13,7 @@ from flowrec.messages import FlowField, Route
 from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route
-from flowrec.planning.space import Space, Swift, attach_start, margin_remark, margins_um, open_space
+from flowrec.planning.space import Space, Swift, attach_start, joined_ends, margin_remark, margins_um, open_space
 from flowrec.robot import Robot
 
 _METHOD = "survey"
@@ -107,8 +107,10 @@ class SurveyPlanner:
         central = allowed & _middle(space.clearance).ravel()
         end = _best(work, central if central.any() else allowed)
         nodes = backtrack(parent, end, space.width)
-        path = nodes if start.point is None else np.concatenate([start.point[None], nodes])
-        smooth = relax(path, space.clearance, space.need, space.vx, space.vy, weight, speed_um_s / px)
+        path = joined_ends(space, nodes, start, None)
+        smooth = relax(
+            path, space.clearance, space.need, space.vx, space.vy, weight, np.full_like(weight, speed_um_s / px)
+        )
         for candidate in (smooth, path):
             route = timed_route(_METHOD, field, candidate * px, speed_um_s, start.remark)
             if route.reachable:

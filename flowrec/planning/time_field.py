@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.planning.jit import compiled
-from flowrec.planning.zermelo import bilinear, line_is_clear, step_time
+from flowrec.planning.terrain import Terrain
+from flowrec.planning.zermelo import bilinear, line_is_clear, segment_cost, step_cost, step_energy
 
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
@@ -29,55 +30,71 @@ _EXACT_PX = 3.0  # around the goal, where the front is too curved for triangles,
 _RING_X = np.array([1, 1, 0, -1, -1, -1, 0, 1], np.int64)
 _RING_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)
 
-# In the band that is nearer to the walls than the robot should be, a pixel outward costs so many times what it takes
-# to swim in still fluid: there -grad T leads out of the band, at less than some 20 degrees to the shortest way.
+# In the band that is nearer to the walls than the robot should be, a pixel of clearance that is lacking costs so many
+# times what a pixel takes in still fluid: there -grad T leads out of the band, within some 20 degrees of straight.
 _BAND_TOLL = 3.0
+_LEAST_TOLL = 0.05  # px
 # A step between neighbours that costs more than swimming so many pixels lies between two places that only a
 # passage too narrow for the robot connects.
 _TORN_PX = 30.0
 
 
-def time_field(
-    free: Mask, clearance: Raster, need: float, vx: Raster, vy: Raster, speed: Raster, goal: Points, start: int = -1
-) -> Raster:
+def time_field(terrain: Terrain, goal: Points) -> Raster:
     """(h, w) seconds from each free pixel to a goal (2,) in px; inf where it can not be reached.
 
-    `speed` (h, w) in px/s is the robot's through the fluid. With a `start` (flat index) the march ends when that
-    pixel is known, and pixels farther away in time are not to be relied on.
+    Where energy counts it is energy, px2/s, by the same march with its own cost (`zermelo.step_energy`).
     """
-    times = np.full(free.shape, np.inf)
-    _march(free, clearance, need, vx, vy, speed, float(goal[0]), float(goal[1]), start, _EXACT_PX, times)
+    times = np.full(terrain.free.shape, np.inf)
+    _march(
+        terrain.free,
+        terrain.clearance,
+        terrain.need,
+        terrain.vx,
+        terrain.vy,
+        terrain.speed,
+        terrain.idle,
+        float(goal[0]),
+        float(goal[1]),
+        _EXACT_PX,
+        times,
+    )
     return times
 
 
-def with_band(times: Raster, free: Mask, fluid: Mask, speed: float) -> Raster:
+def with_band(times: Raster, free: Mask, clearance: Raster, need: float, speed: float) -> Raster:
     """The same times (h, w) with the fluid nearer to the walls than `free`, where -grad T leads back to `free`.
 
-    Layer by layer from the free pixels: the worst of the neighbours one layer nearer to them, plus a toll. So no
-    way through the band is ever worth it, and where two free regions meet in a passage too narrow it is closed.
+    Layer by layer from the free pixels: the worst of the neighbours one layer nearer to them, plus a toll for every
+    pixel of clearance that is lacking. So no way through the band is ever worth it, and where two free regions meet
+    in a passage too narrow it is closed.
     """
     band = times.copy()
-    _fill_band(band, free, fluid, _BAND_TOLL / speed, _TORN_PX / speed)
+    _fill_band(band, free, clearance, need, _BAND_TOLL / speed, _TORN_PX / speed)
+    # Beyond the border nothing is known, and no camera looks: half a pixel of it counts as lacking.
+    half = 0.5 * _BAND_TOLL / speed
+    for edge, inner in ((band[0], band[1]), (band[-1], band[-2]), (band[:, 0], band[:, 1]), (band[:, -1], band[:, -2])):
+        np.maximum(edge, inner + half, out=edge, where=np.isfinite(edge) & np.isfinite(inner))
     return band
 
 
-def descend(
-    times: Raster,
-    clearance: Raster,
-    need: float,
-    vx: Raster,
-    vy: Raster,
-    speed: Raster,
-    start: Points,
-    goal: Points,
-) -> Points | None:
+def descend(terrain: Terrain, times: Raster, start: Points, goal: Points) -> Points | None:
     """(n, 2) the fastest way from a start (2,) to the goal (2,) of `times`, px, steps of 1.5; None if it gets stuck.
 
     Each step is the one on a circle after which, with the time it takes, the least time is left: it also crosses
     the kinks of T, where slopes mislead.
     """
     path = _descend(
-        times, clearance, need, vx, vy, speed, float(start[0]), float(start[1]), float(goal[0]), float(goal[1])
+        times,
+        terrain.clearance,
+        terrain.need,
+        terrain.vx,
+        terrain.vy,
+        terrain.speed,
+        terrain.idle,
+        float(start[0]),
+        float(start[1]),
+        float(goal[0]),
+        float(goal[1]),
     )
     return path if len(path) else None
 
@@ -180,19 +197,48 @@ def _pop(keys: NDArray[np.float64], nodes: NDArray[np.int64], size: int) -> int:
 
 
 @compiled
-def _straight_time(vx: Raster, vy: Raster, speed: Raster, x0: float, y0: float, x1: float, y1: float) -> float:
-    """Time along a short straight way, by midpoints a quarter of a pixel apart."""
-    n = max(1, math.ceil(4.0 * math.hypot(x1 - x0, y1 - y0)))
-    dx = (x1 - x0) / n
-    dy = (y1 - y0) / n
-    total = 0.0
-    if dx == 0.0 and dy == 0.0:
-        return total
-    for k in range(n):
-        x = x0 + (k + 0.5) * dx
-        y = y0 + (k + 0.5) * dy
-        total += step_time(dx, dy, bilinear(vx, x, y), bilinear(vy, x, y), bilinear(speed, x, y))
-    return total
+def _searched_triangle(
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    cost_a: float,
+    cost_b: float,
+    wx: float,
+    wy: float,
+    speed: float,
+    idle: float,
+) -> float:
+    """The same for energy, which has no closed form at the speed limit: golden section over the far side.
+
+    The cost of a displacement is convex in it, so there is one least value.
+    """
+    golden = 0.6180339887498949
+    low = 0.0
+    high = 1.0
+    s = high - golden
+    t = low + golden
+    at_s = cost_a + s * (cost_b - cost_a) + step_energy(ax + s * (bx - ax), ay + s * (by - ay), wx, wy, speed, idle)
+    at_t = cost_a + t * (cost_b - cost_a) + step_energy(ax + t * (bx - ax), ay + t * (by - ay), wx, wy, speed, idle)
+    for _ in range(12):
+        # Where both are impossible the far end is nearer to what is possible: the near one is tried on its own.
+        if at_s < at_t:
+            high = t
+            t = s
+            at_t = at_s
+            s = high - golden * (high - low)
+            x = ax + s * (bx - ax)
+            y = ay + s * (by - ay)
+            at_s = cost_a + s * (cost_b - cost_a) + step_energy(x, y, wx, wy, speed, idle)
+        else:
+            low = s
+            s = t
+            at_s = at_t
+            t = low + golden * (high - low)
+            x = ax + t * (bx - ax)
+            y = ay + t * (by - ay)
+            at_t = cost_a + t * (cost_b - cost_a) + step_energy(x, y, wx, wy, speed, idle)
+    return min(at_s, at_t)
 
 
 @compiled
@@ -203,9 +249,9 @@ def _march(
     vx: Raster,
     vy: Raster,
     speed: Raster,
+    idle: float,
     goal_x: float,
     goal_y: float,
-    start: int,
     exact: float,
     times: Raster,
 ) -> None:
@@ -223,11 +269,10 @@ def _march(
                 and math.hypot(a - goal_x, b - goal_y) <= exact
                 and line_is_clear(clearance, float(a), float(b), goal_x, goal_y, near)
             ):
-                t = _straight_time(vx, vy, speed, float(a), float(b), goal_x, goal_y)
+                t = segment_cost(vx, vy, speed, float(a), float(b), goal_x, goal_y, idle, 0.25)
                 if t < math.inf:
                     times[b, a] = t
                     size = _push(keys, nodes, size, t, b * w + a)
-    enough = math.inf
     while size > 0:
         key = keys[0]
         node = nodes[0]
@@ -236,10 +281,6 @@ def _march(
         i = node - j * w
         if key > times[j, i]:
             continue
-        if key > enough:
-            break
-        if node == start:
-            enough = key * 1.02
         for k in range(8):
             a = i + _RING_X[k]
             b = j + _RING_Y[k]
@@ -255,7 +296,9 @@ def _march(
             wx = vx[b, a]
             wy = vy[b, a]
             own = speed[b, a]
-            best = key + step_time(ax, ay, 0.5 * (wx + vx[j, i]), 0.5 * (wy + vy[j, i]), 0.5 * (own + speed[j, i]))
+            best = key + step_cost(
+                ax, ay, 0.5 * (wx + vx[j, i]), 0.5 * (wy + vy[j, i]), 0.5 * (own + speed[j, i]), idle
+            )
             for turn in range(2):
                 other = (back + 1) & 7 if turn == 0 else (back + 7) & 7
                 c = a + _RING_X[other]
@@ -266,6 +309,13 @@ def _march(
                 if beside >= min(best, known):
                     continue
                 mean = 0.5 * own + 0.25 * (speed[j, i] + speed[d, c])
+                mx = 0.5 * wx + 0.25 * (vx[j, i] + vx[d, c])
+                my = 0.5 * wy + 0.25 * (vy[j, i] + vy[d, c])
+                if idle > 0.0:
+                    bx = float(_RING_X[other])
+                    by = float(_RING_Y[other])
+                    best = min(best, _searched_triangle(ax, ay, bx, by, key, beside, mx, my, mean, idle))
+                    continue
                 t = _through_triangle(
                     1.0 if turn == 0 else -1.0,
                     ax,
@@ -274,8 +324,8 @@ def _march(
                     float(_RING_Y[other]),
                     key,
                     beside,
-                    0.5 * wx + 0.25 * (vx[j, i] + vx[d, c]),
-                    0.5 * wy + 0.25 * (vy[j, i] + vy[d, c]),
+                    mx,
+                    my,
                     mean * mean,
                 )
                 best = min(best, t)
@@ -293,8 +343,9 @@ def _march(
 
 
 @compiled
-def _fill_band(times: Raster, free: Mask, fluid: Mask, toll: float, torn: float) -> None:
+def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: float, torn: float) -> None:
     h, w = free.shape
+    fluid = clearance > 0.0
     layer = np.full(h * w, -1, np.int64)
     queue = np.empty(h * w, np.int64)
     tail = 0
@@ -334,15 +385,20 @@ def _fill_band(times: Raster, free: Mask, fluid: Mask, toll: float, torn: float)
         node = queue[m]
         j = node // w
         i = node - j * w
-        worst = 0.0
-        for k in range(8):
-            a = i + _RING_X[k]
-            b = j + _RING_Y[k]
-            if a < 0 or b < 0 or a >= w or b >= h or layer[b * w + a] != layer[node] - 1:
-                continue
-            if (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
-                worst = max(worst, times[b, a])
-        times[j, i] = worst + toll
+        # Neighbours along the axes first: a diagonal one is also farther up or down the channel.
+        for diagonal in range(2):
+            worst = -1.0
+            for k in range(diagonal, 8, 2):
+                a = i + _RING_X[k]
+                b = j + _RING_Y[k]
+                if a < 0 or b < 0 or a >= w or b >= h or layer[b * w + a] != layer[node] - 1:
+                    continue
+                if (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
+                    deeper = max(min(clearance[b, a], need) - clearance[j, i], _LEAST_TOLL)
+                    worst = max(worst, times[b, a] + toll * deeper)
+            if worst >= 0.0:
+                times[j, i] = worst
+                break
     closed = np.zeros(tail, np.bool_)
     for m in range(border, tail):
         node = queue[m]
@@ -389,6 +445,7 @@ def _descend(
     vx: Raster,
     vy: Raster,
     speed: Raster,
+    idle: float,
     x: float,
     y: float,
     goal_x: float,
@@ -408,7 +465,7 @@ def _descend(
         if (
             math.hypot(goal_x - x, goal_y - y) <= 2.0 * radius
             and line_is_clear(clearance, x, y, goal_x, goal_y, near)
-            and math.isfinite(_straight_time(vx, vy, speed, x, y, goal_x, goal_y))
+            and math.isfinite(segment_cost(vx, vy, speed, x, y, goal_x, goal_y, idle, 0.25))
         ):
             points[n, 0] = goal_x
             points[n, 1] = goal_y
@@ -433,7 +490,7 @@ def _descend(
                 continue
             mx = x + 0.5 * dx
             my = y + 0.5 * dy
-            t += step_time(dx, dy, bilinear(vx, mx, my), bilinear(vy, mx, my), bilinear(speed, mx, my))
+            t += step_cost(dx, dy, bilinear(vx, mx, my), bilinear(vy, mx, my), bilinear(speed, mx, my), idle)
             if t < best and line_is_clear(clearance, x, y, x + dx, y + dy, need):
                 best = t
                 angle = tried
@@ -447,13 +504,7 @@ def _descend(
                     dy = b - y
                     if times[b, a] >= left or math.hypot(dx, dy) < 0.5:
                         continue
-                    t = times[b, a] + step_time(
-                        dx,
-                        dy,
-                        bilinear(vx, x + 0.5 * dx, y + 0.5 * dy),
-                        bilinear(vy, x + 0.5 * dx, y + 0.5 * dy),
-                        bilinear(speed, x + 0.5 * dx, y + 0.5 * dy),
-                    )
+                    t = times[b, a] + segment_cost(vx, vy, speed, x, y, float(a), float(b), idle, 0.75)
                     if t < best:
                         best = t
                         next_x = float(a)

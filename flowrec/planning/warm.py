@@ -24,5 +24,5 @@ def warm_up() -> None:
     )
     robot = Robot(radius_um=0.5, max_speed_um_s=5.0, step_out_hz=10.0)
     SurveyPlanner().plan(field, (2.0, 4.0), chip, robot)
-    for planner in (Planner(), Planner(method="time_field"), Planner(method="astar_paper")):
+    for planner in (Planner(), Planner(method="astar_time"), Planner(method="astar_paper")):
         planner.plan(field, (2.0, 4.0), (20.0, 4.0), chip, robot)

@@ -114,8 +114,11 @@ class FlowLogger:
                 self._pen.log(entity, rr.Clear(recursive=False))
             return
         self._present.add("time to go")
-        scale = maps.scale_of(np.where(self._scene.chip.mask, route.time_to_go_s, np.nan), "time")
-        self._pen.log(e.TIME_TO_GO, maps.wave_fronts(route.time_to_go_s, self._scene.chip.mask, scale))
+        chip = self._scene.chip
+        closer = round(chip.um_per_px / (route.time_to_go_um_per_px or chip.um_per_px))
+        time_s = route.time_to_go_s[::closer, ::closer]
+        scale = maps.scale_of(np.where(chip.mask, time_s, np.nan), "time")
+        self._pen.log(e.TIME_TO_GO, maps.wave_fronts(time_s, chip.mask, scale))
         self._log_scale(e.TIME_TO_GO_SCALE, scale)
 
 

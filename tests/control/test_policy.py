@@ -95,7 +95,7 @@ def test_from_wherever_a_way_is_known_the_goal_is_reached_in_about_that_time_and
     route = routes[way]
     goal, px = route.waypoints_um[-1], chip.um_per_px
     walls = clearance_um(chip.mask, px)
-    k = (len(route.time_to_go_s) - 1) // (len(walls) - 1)
+    k = round(px / route.time_to_go_um_per_px)
     times = route.time_to_go_s[::k, ::k]  # at the pixels
     roomy = np.argwhere(np.isfinite(times) & (walls > 1.6 * robot.radius))
     for row, column in np.random.default_rng(way).choice(roomy, 4, replace=False):

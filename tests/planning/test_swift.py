@@ -3,7 +3,7 @@
 import pytest
 
 from flowrec.planning import Planner, SurveyPlanner
-from flowrec.planning.space import Swift, finer, open_space
+from flowrec.planning.space import Swift, open_space
 from tests.planning.worlds import PX, channel, chip_of, field_of, poiseuille, robot
 
 SWIFT = Swift(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
@@ -23,7 +23,7 @@ def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
     swift = open_space(chip, field, 10.0, 1.0, SWIFT.drift(robot(), 100.0))
     # The robot's radius, 0.2 x 600 x 0.1 um for the map, 0.1 x 100 x 0.1 for the heading, the rest for the bend.
     need_um = 10.0 + 12.0 + 1.0 + (0.05 * 700.0) ** 2 / 160.0
-    assert swift.least[20, 50] * PX == pytest.approx(need_um)
+    assert (swift.clearance - swift.room + swift.need)[20, 50] * PX == pytest.approx(need_um)
     assert calm.free.sum() > swift.free.sum() > 0
     assert (swift.clearance[swift.free] * PX >= need_um).all()
     assert lowest_um(Planner(swift=SWIFT).plan(field, *ends, chip, robot())) >= need_um
@@ -53,11 +53,10 @@ def test_no_survey_leads_into_what_is_too_swift():
     assert not SurveyPlanner(swift=SWIFT).plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
 
 
-def test_a_finer_space_agrees_with_the_pixels_and_lets_the_robot_as_near_to_the_wall_as_it_fits():
+def test_the_time_to_go_lets_the_robot_as_near_to_the_wall_as_it_fits_between_the_pixels():
     mask = channel()
-    space = open_space(chip_of(mask), poiseuille(mask, 100.0), 11.0, 0.0)
-    fine = finer(space, 4)
-    assert (fine.free[::4, ::4] == space.free).all()
-    assert fine.vx[::4, ::4] == pytest.approx(4.0 * space.vx)
-    assert fine.clearance[fine.free].min() * fine.um_per_px == pytest.approx(12.5)  # of 11.0; 15.0 on the pixels
-    assert space.clearance[space.free].min() * PX == pytest.approx(15.0)
+    plan = Planner(clearance_margin_um=0.0, robust_deviations=0.0, speed_share=1.0)
+    route = plan.plan(poiseuille(mask, 90.0), (1000.0, 195.0), (100.0, 195.0), chip_of(mask), robot(100.0, 11.0))
+    to_wall_um = route.waypoints_um[:, 1].min() - 75.0
+    assert 11.0 - 1e-6 <= to_wall_um < 13.0  # pixels with room for it are 15 um away
+    assert (len(route.time_to_go_s) - 1) % (len(mask) - 1) == 0 and len(route.time_to_go_s) > len(mask)

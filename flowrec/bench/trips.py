@@ -1,0 +1,152 @@
+"""Trips through made-up vessels, and the time that nobody can beat on them: what planners are measured by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from flowrec.bench.vessels import draw_mask
+from flowrec.chip.chip import Chip
+from flowrec.chip.openings import find_openings
+from flowrec.chip.vessel_case import read_vessel_case
+from flowrec.errors import FlowrecError
+from flowrec.flow import FlowSolver
+from flowrec.messages import FlowField
+from flowrec.planning.relax import relax
+from flowrec.planning.space import open_space
+from flowrec.planning.terrain import Terrain
+from flowrec.planning.time_field import descend, time_field
+from flowrec.planning.timing import travel_time
+from flowrec.robot import Robot
+
+SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it
+UM_PER_PX = 20.0
+FINER = 4  # the reference's pixels per pixel side
+_EIGHT = np.ones((3, 3), np.int64)
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class World:
+    """A chip, the flow through it with a peak of 1 um/s, and a robot of SPEED_UM_S that fits through."""
+
+    name: str
+    chip: Chip
+    flow: FlowField
+    robot: Robot
+
+    def field(self, ratio: float) -> FlowField:
+        """The flow with a peak of `ratio` times the robot's speed."""
+        return replace(self.flow, velocity_um_s=self.flow.velocity_um_s * np.float32(ratio * SPEED_UM_S))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trip:
+    """From higher to lower pressure: downstream as it is, upstream the other way round."""
+
+    upper_um: Points
+    lower_um: Points
+
+    def ends(self, direction: str) -> tuple[Points, Points]:
+        """Start and goal, `down` or `up`."""
+        return (self.upper_um, self.lower_um) if direction == "down" else (self.lower_um, self.upper_um)
+
+
+def worlds(side_px: int, seed: int = 0) -> Iterator[World]:
+    """Made-up vessels, one after the other, those that are no use left out."""
+    while True:
+        rng = np.random.default_rng([seed, side_px, 0x7219])
+        seed += 1
+        mask = draw_mask(rng, side_px)
+        parts, count = label(mask)
+        if count > 1:
+            mask = parts == 1 + int(np.argmax(np.bincount(parts.ravel())[1:]))
+        openings = list(find_openings(mask))
+        if len(openings) < 2:
+            continue
+        inlet = int(np.argmax([opening.width_px for opening in openings]))
+        openings = [
+            replace(opening, kind="inlet", value=100.0)
+            if number == inlet
+            else replace(opening, kind="outlet", value=0.0)
+            for number, opening in enumerate(openings)
+        ]
+        chip = Chip(f"vessels {seed - 1}", mask, UM_PER_PX, tuple(openings), 1.0, 1000.0)
+        made = _world(chip, k=1 if side_px > 128 else 2)
+        if made is not None:
+            yield made
+
+
+def magnified(world: World) -> World | None:
+    """The same chip as a camera of twice the resolution sees it; the robot is as big as before, in um."""
+    mask = world.chip.mask.repeat(2, axis=0).repeat(2, axis=1)
+    openings = tuple(replace(o, first=2 * o.first, last=2 * o.last + 1) for o in world.chip.openings)
+    chip = replace(world.chip, mask=mask, openings=openings, um_per_px=0.5 * world.chip.um_per_px)
+    made = _world(chip, k=1)
+    return None if made is None else replace(made, robot=world.robot)
+
+
+def worlds_of(folder: Path) -> Iterator[World]:
+    """The vessel cases of a folder, by their assumed boundary values."""
+    for path in sorted(folder.glob("*.npz")):
+        made = _world(replace(read_vessel_case(path), name=path.stem), k=2)
+        if made is not None:
+            yield made
+
+
+def _world(chip: Chip, k: int) -> World | None:
+    try:
+        field = FlowSolver(k).solve(chip)
+    except FlowrecError:
+        return None
+    peak = float(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]).max())
+    flow = replace(field, velocity_um_s=field.velocity_um_s / np.float32(peak))
+    return World(chip.name, chip, flow, Robot(chip.um_per_px, 25.0, SPEED_UM_S, 1e6, 1.0))
+
+
+def draw_trip(world: World, rng: np.random.Generator, least_share: float = 0.4) -> Trip | None:
+    """Two places with room for the robot, at least a share of the chip's size apart; None where none is found."""
+    space = open_space(world.chip, world.flow, world.robot.radius, 0.5 * world.robot.radius)
+    parts = label(space.free, _EIGHT)[0]
+    rows, columns = np.nonzero(space.free)
+    for _ in range(400 if len(rows) else 0):
+        a, b = (int(k) for k in rng.integers(len(rows), size=2))
+        apart = np.hypot(rows[a] - rows[b], columns[a] - columns[b])
+        if parts[rows[a], columns[a]] != parts[rows[b], columns[b]] or apart < least_share * max(space.free.shape):
+            continue
+        pressure = world.flow.pressure_pa
+        if pressure[rows[a], columns[a]] < pressure[rows[b], columns[b]]:
+            a, b = b, a
+        ends = np.array([[columns[a], rows[a]], [columns[b], rows[b]]], np.float64) * space.um_per_px
+        return Trip(ends[0], ends[1])
+    return None
+
+
+def best_time(
+    world: World, field: FlowField, start_um: Points, goal_um: Points, speed_um_s: float, finer: int = FINER
+) -> tuple[float, float]:
+    """Travel time of the best path on a finer grid, and that grid's own time to go: both close to the optimum.
+
+    Flow and clearance are the same bilinear ones, looked at more closely. inf where there is no way.
+    """
+    space = open_space(world.chip, field, world.robot.radius, 0.5 * world.robot.radius)
+    px = space.um_per_px
+    even = np.full_like(space.clearance, speed_um_s / px)
+    terrain = Terrain(space.free, space.clearance, space.need, space.vx, space.vy, even).finer(finer)
+    px = px / finer
+    start, goal = np.rint(start_um / px), np.rint(goal_um / px)
+    times = time_field(terrain, goal)
+    least = float(times[int(start[1]), int(start[0])])
+    if not np.isfinite(least):
+        return np.inf, np.inf
+    path = descend(terrain, times, start, goal)
+    if path is None:
+        return least, least
+    ones = np.ones_like(terrain.speed)
+    fine = relax(path, terrain.clearance, terrain.need, terrain.vx, terrain.vy, ones, terrain.speed)
+    return min(float(travel_time(field, points * px, speed_um_s)[0][-1]) for points in (fine, path)), least
