@@ -17,7 +17,7 @@ from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField
-from flowrec.planning.relax import relax
+from flowrec.planning.relax import SPACING_PX, relax
 from flowrec.planning.space import open_space
 from flowrec.planning.terrain import Terrain
 from flowrec.planning.time_field import descend, time_field
@@ -147,6 +147,6 @@ def best_time(
     path = descend(terrain, times, start, goal)
     if path is None:
         return least, least
-    ones = np.ones_like(terrain.speed)
-    fine = relax(path, terrain.clearance, terrain.need, terrain.vx, terrain.vy, ones, terrain.speed)
-    return min(float(travel_time(field, points * px, speed_um_s)[0][-1]) for points in (fine, path)), least
+    wide = (space.clearance, space.need, space.vx, space.vy, np.ones_like(even), even, -1.0, SPACING_PX / finer)
+    ways = (relax(path / finer, *wide) * space.um_per_px, path * px)
+    return min(float(travel_time(field, points, speed_um_s)[0][-1]) for points in ways), least
