@@ -38,7 +38,7 @@ Cost = Literal["time", "energy"]
 Points = NDArray[np.float64]
 
 _LEAST_SHARE = 0.02
-_ENOUGH_PX = 12000  # free pixels: of fewer, each is looked at twice as closely
+_CLOSER = ((2500, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class Planner:
         idle_um_s = None
         if self.cost == "energy":
             idle_um_s = 0.5 * speed_um_s if self.idle_speed_um_s is None else float(self.idle_speed_um_s)
-        closest = 2 if int(space.free.sum()) < _ENOUGH_PX else 1
+        closest = next((closer for few, closer in _CLOSER if int(space.free.sum()) < few), 1)
         target = _place(space, goal.node) if goal.point is None else goal.point
         first = _place(space, start.node)
         if start.point is not None and space.clearance_at(start.point) >= space.need:
