@@ -17,7 +17,8 @@ from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField
-from flowrec.planning.relax import relax
+from flowrec.planning.planner import USUAL_MARGIN_RADII
+from flowrec.planning.relax import SPACING_PX, relax
 from flowrec.planning.space import open_space
 from flowrec.planning.terrain import Terrain
 from flowrec.planning.time_field import descend, time_field
@@ -26,7 +27,7 @@ from flowrec.robot import Robot
 
 SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it
 UM_PER_PX = 20.0
-FINER = 4  # the reference's pixels per pixel side
+FINER = 8  # the reference's pixels per pixel side: four times as fine as what time_field looks at
 _EIGHT = np.ones((3, 3), np.int64)
 Points = NDArray[np.float64]
 
@@ -111,7 +112,7 @@ def _world(chip: Chip, k: int) -> World | None:
 
 def draw_trip(world: World, rng: np.random.Generator, least_share: float = 0.4) -> Trip | None:
     """Two places with room for the robot, at least a share of the chip's size apart; None where none is found."""
-    space = open_space(world.chip, world.flow, world.robot.radius, 0.5 * world.robot.radius)
+    space = open_space(world.chip, world.flow, world.robot.radius, USUAL_MARGIN_RADII * world.robot.radius)
     parts = label(space.free, _EIGHT)[0]
     rows, columns = np.nonzero(space.free)
     for _ in range(400 if len(rows) else 0):
@@ -134,7 +135,7 @@ def best_time(
 
     Flow and clearance are the same bilinear ones, looked at more closely. inf where there is no way.
     """
-    space = open_space(world.chip, field, world.robot.radius, 0.5 * world.robot.radius)
+    space = open_space(world.chip, field, world.robot.radius, USUAL_MARGIN_RADII * world.robot.radius)
     px = space.um_per_px
     even = np.full_like(space.clearance, speed_um_s / px)
     terrain = Terrain(space.free, space.clearance, space.need, space.vx, space.vy, even).finer(finer)
@@ -147,6 +148,6 @@ def best_time(
     path = descend(terrain, times, start, goal)
     if path is None:
         return least, least
-    ones = np.ones_like(terrain.speed)
-    fine = relax(path, terrain.clearance, terrain.need, terrain.vx, terrain.vy, ones, terrain.speed)
-    return min(float(travel_time(field, points * px, speed_um_s)[0][-1]) for points in (fine, path)), least
+    wide = (space.clearance, space.need, space.vx, space.vy, np.ones_like(even), even, -1.0, SPACING_PX / finer)
+    ways = (relax(path / finer, *wide) * space.um_per_px, path * px)
+    return min(float(travel_time(field, points, speed_um_s)[0][-1]) for points in ways), least

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import itertools
 from dataclasses import dataclass, replace
 from dataclasses import field as setting
 from typing import Literal
@@ -39,11 +39,11 @@ Method = Literal["time_field", "astar_time", "astar_paper", "astar_length", "rrt
 Cost = Literal["time", "energy"]
 Points = NDArray[np.float64]
 
-# In radii. Against the flow the fastest way is along the wall, so every micrometre costs: half a radius cost a tenth
+# Against the flow the fastest way is along the wall, so every micrometre costs: half a radius cost a tenth
 # of the time, and kept no robot off a wall that a tenth, with the swift places left out, did not.
-_USUAL_MARGIN = 0.1
+USUAL_MARGIN_RADII = 0.1
 _LEAST_SHARE = 0.02
-_ENOUGH_PX = 80000  # free pixels: of fewer, each is looked at up to four times as closely,
+_CLOSER = ((2500, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely,
 _LARGEST_PX = 2_000_000  # as long as all of the chip has no more than these
 
 
@@ -93,7 +93,7 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         self._check()
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot, _USUAL_MARGIN)
+        margins = margins_um(self.clearance_margin_um, robot, USUAL_MARGIN_RADII)
         drift = self.swift.drift(robot, robot.speed_limit_um_s)
         trouble = ""
         for margin_um in margins:
@@ -130,34 +130,36 @@ class Planner:
         idle_um_s = None
         if self.cost == "energy":
             idle_um_s = 0.5 * speed_um_s if self.idle_speed_um_s is None else float(self.idle_speed_um_s)
-        most = min(_ENOUGH_PX // int(space.free.sum()), _LARGEST_PX // space.free.size)
-        closer = min(max(math.isqrt(most), 1), 4)
+        area = int(space.free.sum())
+        closest = next((k for few, k in _CLOSER if area < few and k * k * space.free.size <= _LARGEST_PX), 1)
         target = _place(space, goal.node) if goal.point is None else goal.point
         first = _place(space, start.node)
         if start.point is not None and space.room_at(start.point) >= space.need:
             first = start.point
         deviation = _deviation(space, field, self.flow_error_share)
         tries = tuple(dict.fromkeys((self.robust_deviations, 0.5 * self.robust_deviations, 0.0)))
-        for deviations in tries:
+        # Where nothing is found, half a pixel may decide: looked at more closely before anything is given up.
+        for deviations, closer in itertools.product(tries, (closest, 2 * closest)):
             terrain = _terrain(space, speed_um_s / px, deviations * deviation, idle_um_s)
             fine = terrain.finer(closer)
             times = time_field(fine, closer * target)
             path = None
-            if np.isfinite(times[::closer, ::closer].ravel()[start.node]):
+            known = bool(np.isfinite(times[::closer, ::closer].ravel()[start.node]))
+            if known:
                 path = descend(fine, times, closer * first, closer * target)
-            if path is None:
-                path = self._search(space, "astar_time", start.node, goal.node, speed_um_s / px)
-                if path is None or deviations > 0.0:
-                    continue
-            else:
+            if path is not None:
                 path = path / closer
+            elif deviations == 0.0 and closer > closest:
+                path = self._search(space, "astar_time", start.node, goal.node, speed_um_s / px)
+            if path is None:
+                continue
             route = self._refined(terrain, field, joined_ends(space, path, start, goal), speed_um_s, idle_um_s, closer)
             if not route.reachable:
                 continue
             if deviations < tries[0]:
-                spared = f"{deviations:g} of {tries[0]:g} deviations of the flow to spare" if deviations else "nothing"
-                route = replace(route, reason=f"the flow leaves no way with more to spare: planned with {spared}")
-            if self.cost == "energy":
+                spared = f"{deviations:g} of {tries[0]:g} deviations of the flow" if deviations else "nothing"
+                route = replace(route, reason=f"no way but against nearly all the robot has: {spared} to spare")
+            if self.cost == "energy" or not known:
                 return route
             if self.policy_share is not None:
                 speed = planning_speed_um_s(self.policy_share, robot) / px

@@ -1,4 +1,4 @@
-"""Local refinement of a path: smooth bumps along its normal, from wide to narrow, kept when they save time.
+"""Local refinement of a path: chords and smooth bumps along its normal, from wide to narrow, kept when they save time.
 
 A lattice path zigzags between a few directions; this takes it to within a fraction of a percent of the local optimum
 (notes/planning-control.md, section 1), and never nearer to a wall than it was or has to be.
@@ -17,6 +17,7 @@ from flowrec.planning.zermelo import bilinear, lowest_clearance, segment_cost
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
 SPACING_PX = 1.5  # of the points of a path
+_LONGEST_PX = 12.0  # chord
 _WIDEST_PX = 48.0  # half of the widest bump
 _SWEEPS = 12
 
@@ -38,21 +39,83 @@ def relax(
 
     Every part of it keeps the clearance `need` (px), or, where the given path did not, at least that of the given one.
     """
+    rasters = (clearance, need, vx, vy, weight, speed, idle)
+    for step in dict.fromkeys((max(spacing, SPACING_PX), spacing)):
+        points = _even_steps(_pulled(path, *rasters, _LONGEST_PX), step)
+        if len(points) < 2:
+            return points
+        widest = math.ceil(_WIDEST_PX / step)
+        widths = widest // 2 ** np.arange(widest.bit_length())
+        path = _bumps(points, *rasters, step, widths, _SWEEPS)
+    return path
+
+
+def _even_steps(path: Points, spacing: float) -> Points:
+    """The same path in steps of at most `spacing`: no vertex is left out, which would cut the corners of walls."""
     lengths = np.hypot(*np.diff(path, axis=0).T)
     path = path[np.concatenate([[True], lengths > 1e-9])]
     if len(path) < 2:
         return path
-    # No vertex is left out, which would cut the corners of walls.
     lengths = np.hypot(*np.diff(path, axis=0).T)
     counts = np.maximum(1, np.ceil(lengths / spacing - 1e-9)).astype(np.int64)
     if len(counts) == 1:
         counts = np.maximum(counts, 2)  # a single step has nothing to move
     leg = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(counts.sum()) - (np.cumsum(counts) - counts)[leg]) / counts[leg]
-    points = np.concatenate([path[leg] + share[:, None] * np.diff(path, axis=0)[leg], path[-1:]])
-    widest = math.ceil(_WIDEST_PX / spacing)
-    widths = widest // 2 ** np.arange(widest.bit_length())
-    return _bumps(points, clearance, need, vx, vy, weight, speed, idle, spacing, widths, _SWEEPS)
+    return np.concatenate([path[leg] + share[:, None] * np.diff(path, axis=0)[leg], path[-1:]])
+
+
+@compiled
+def _pulled(
+    path: Points,
+    clearance: Raster,
+    need: float,
+    vx: Raster,
+    vy: Raster,
+    weight: Raster,
+    speed: Raster,
+    idle: float,
+    longest: float,
+) -> Points:
+    """The path with chords wherever they cost no more and come no nearer to a wall than what they replace.
+
+    Walls of pixels are notched: a path that hugs them follows every notch, and bumps alone do not get it off.
+    """
+    n = len(path)
+    kept = np.empty((n, 2))
+    kept[0] = path[0]
+    count = 1
+    i = 0
+    while i < n - 1:
+        best = i + 1
+        lowest = need
+        spent = 0.0
+        for j in range(i + 1, n):
+            x0, y0, x1, y1 = path[j - 1, 0], path[j - 1, 1], path[j, 0], path[j, 1]
+            lowest = min(lowest, lowest_clearance(clearance, x0, y0, x1, y1))
+            spent += bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
+                vx, vy, speed, x0, y0, x1, y1, idle, 1.0
+            )
+            x0, y0 = path[i, 0], path[i, 1]
+            if math.hypot(x1 - x0, y1 - y0) > longest:
+                break
+            if j > best and lowest_clearance(clearance, x0, y0, x1, y1) >= lowest - 1e-9:
+                pieces = max(1, math.ceil(math.hypot(x1 - x0, y1 - y0)))
+                chord = 0.0
+                for k in range(pieces):
+                    a = x0 + (x1 - x0) * k / pieces
+                    b = y0 + (y1 - y0) * k / pieces
+                    c = x0 + (x1 - x0) * (k + 1) / pieces
+                    d = y0 + (y1 - y0) * (k + 1) / pieces
+                    chord += bilinear(weight, 0.5 * (a + c), 0.5 * (b + d)) * segment_cost(
+                        vx, vy, speed, a, b, c, d, idle, 1.0
+                    )
+                if chord <= spent:
+                    best = j
+        kept[count] = path[best]
+        count += 1
+        i = best
+    return kept[:count]
 
 
 @compiled

@@ -38,7 +38,7 @@ def test_the_least_time_on_a_finer_grid_is_what_a_finer_grid_still_finds():
     for world, trip in itertools.islice(drawn(), 2):
         ends = trip.ends("up")
         two, four = (best_time(world, world.field(0.9), *ends, SPEED_UM_S, finer)[0] for finer in (2, 4))
-        assert four == pytest.approx(two, rel=0.01)
+        assert four == pytest.approx(two, rel=0.02)
 
 
 def test_a_magnified_world_has_the_same_flow_and_the_same_times():

@@ -138,7 +138,8 @@ def test_ends_outside_in_walls_and_in_other_channels_are_told_apart():
 
 def test_a_robot_pushed_to_the_wall_is_led_away_from_it_with_a_remark():
     mask = channel()
-    route = Planner().plan(field_of(mask, 10.0), (300.0, 81.0), (900.0, 195.0), chip_of(mask), robot(radius_um=30.0))
+    plan = Planner(clearance_margin_um=15.0)
+    route = plan.plan(field_of(mask, 10.0), (300.0, 81.0), (900.0, 195.0), chip_of(mask), robot(radius_um=30.0))
     assert route.reachable and "start 300,81 um is only 6 um from a wall" in route.reason
     np.testing.assert_allclose(route.waypoints_um[0], [300.0, 81.0])
     beyond = route.waypoints_um[np.abs(route.waypoints_um[:, 0] - 300.0) > 60.0]
