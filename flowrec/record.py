@@ -28,6 +28,7 @@ from flowrec.status import StatusLine, say, table, warn
 from flowrec.store import SessionReader
 
 View = Literal["spawn", "serve", "rrd", "none"]
+from flowrec.units import seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +204,7 @@ def record(
             )
         facts = facts_of(chip, report, witness.true_field)
         facts["frames dropped"] = str(writer.dropped_frames)
-        if math.isfinite(witness.rms_um):
+        if math.isfinite(witness.rms_um) and config.control.method != "policy":  # which has no reference to be off
             facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
         outcome = {key.replace(" ", "_"): value for key, value in facts.items()}
         outcome |= {"outcome": report.outcome, "note": report.note}
@@ -225,6 +226,8 @@ def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dic
         facts["route"] = (
             f"{length_mm(last.route):.2f} mm, planned {last.route.arrival_s[-1]:.1f} s ({last.route.method})"
         )
+        if last.mission.outcome == "reached":
+            facts["navigation"] = f"{seconds(last.mission.since_ns - last.route.stamp_ns):.1f} s"
     if true_field is not None:
         facts["wall contacts"] = str(report.contacts)
         for name, field in (("assumed", last.assumed), ("refined", last.refined)):
