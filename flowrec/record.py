@@ -26,9 +26,9 @@ from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sin
 from flowrec.session import length_mm, session_writer
 from flowrec.status import StatusLine, say, table, warn
 from flowrec.store import SessionReader
+from flowrec.units import seconds
 
 View = Literal["spawn", "serve", "rrd", "none"]
-from flowrec.units import seconds
 
 
 @dataclass(frozen=True, slots=True)
