@@ -38,7 +38,7 @@ Cost = Literal["time", "energy"]
 Points = NDArray[np.float64]
 
 _LEAST_SHARE = 0.02
-_CLOSER = ((2500, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely
+_CLOSER = ((6000, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely
 
 
 @dataclass(frozen=True, slots=True)
