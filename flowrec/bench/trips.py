@@ -27,7 +27,7 @@ from flowrec.robot import Robot
 
 SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it
 UM_PER_PX = 20.0
-FINER = 8  # the reference's pixels per pixel side: four times as fine as what time_field looks at
+FINER = 8  # the reference's pixels per pixel side: time_field looks at four of them at most
 _EIGHT = np.ones((3, 3), np.int64)
 Points = NDArray[np.float64]
 

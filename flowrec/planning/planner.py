@@ -43,7 +43,7 @@ Points = NDArray[np.float64]
 # of the time, and kept no robot off a wall that a tenth, with the swift places left out, did not.
 USUAL_MARGIN_RADII = 0.1
 _LEAST_SHARE = 0.02
-_CLOSER = ((2500, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely,
+_CLOSER = ((6000, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely,
 _LARGEST_PX = 2_000_000  # as long as all of the chip has no more than these
 
 
