@@ -34,9 +34,6 @@ from flowrec.robot import Robot
 
 Method = Literal["time_field", "astar_time", "astar_paper", "astar_length"]
 Points = NDArray[np.float64]
-# In radii. Against the flow the fastest way is along the wall, so every micrometre costs: half a radius cost a tenth
-# of the time, and kept no robot off a wall that a tenth, with the swift places left out, did not.
-_USUAL_MARGIN = 0.1
 _POINTS_PER_RADIUS = 3.0
 _FINEST = 4
 
@@ -53,9 +50,12 @@ class Planner:
     """
 
     method: Method = "astar_time"
-    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: a tenth of it
+    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
     policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
+    # Of that margin in the time to go. Against the flow the fastest way is along the wall, and a policy, which no
+    # reference drags there, keeps off it by itself; a robot that tracks a route needs all of the margin.
+    policy_margin_share: float = 0.2
     swift: Swift = field(default_factory=Swift)  # more is kept where the flow is swift
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     paper_radius_px: float = 3.5  # neighbours of astar_paper
@@ -76,7 +76,7 @@ class Planner:
         """
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot, _USUAL_MARGIN)
+        margins = margins_um(self.clearance_margin_um, robot)
         drift = self.swift.drift(robot, robot.speed_limit_um_s)
         trouble = ""
         for margin_um in margins:
@@ -84,10 +84,11 @@ class Planner:
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
+                lean = margin_remark(margin_um, margins)
                 route = self._through(space, field, start, goal, speed_um_s)
                 if self.method == "time_field" and route.reachable:
-                    route = replace(route, time_to_go_s=self._time_to_go(space, goal, robot))
-                lean = margin_remark(margin_um, margins)
+                    near = open_space(chip, field, robot.radius, self.policy_margin_share * margin_um, drift)
+                    route = replace(route, time_to_go_s=self._time_to_go(near, attach_goal(near, goal_at), robot))
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
         swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift)
