@@ -26,7 +26,6 @@ from flowrec.chip import clearance_um
 from flowrec.errors import UsageError
 from flowrec.messages import FlowField, Route
 from flowrec.planning import Planner, travel_time
-from flowrec.planning.planner import USUAL_MARGIN_RADII
 from flowrec.planning.rrt import Rrt
 from flowrec.planning.space import Space, open_space
 from flowrec.planning.zermelo import bilinear
@@ -326,7 +325,7 @@ def _speed_on(world: World, trip: Trip, repeats: int = 7) -> dict[str, Any]:
     field = world.field(0.9)
     planner = Planner()
     start, goal = trip.ends("up")
-    space = open_space(world.chip, field, world.robot.radius, USUAL_MARGIN_RADII * world.robot.radius)
+    space = open_space(world.chip, field, world.robot.radius, 0.5 * world.robot.radius)
     speed = 0.85 * SPEED_UM_S / space.um_per_px
 
     def cpu(action: Callable[[], object]) -> float:

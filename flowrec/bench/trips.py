@@ -17,7 +17,6 @@ from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField
-from flowrec.planning.planner import USUAL_MARGIN_RADII
 from flowrec.planning.relax import SPACING_PX, relax
 from flowrec.planning.space import open_space
 from flowrec.planning.terrain import Terrain
@@ -112,7 +111,7 @@ def _world(chip: Chip, k: int) -> World | None:
 
 def draw_trip(world: World, rng: np.random.Generator, least_share: float = 0.4) -> Trip | None:
     """Two places with room for the robot, at least a share of the chip's size apart; None where none is found."""
-    space = open_space(world.chip, world.flow, world.robot.radius, USUAL_MARGIN_RADII * world.robot.radius)
+    space = open_space(world.chip, world.flow, world.robot.radius, 0.5 * world.robot.radius)
     parts = label(space.free, _EIGHT)[0]
     rows, columns = np.nonzero(space.free)
     for _ in range(400 if len(rows) else 0):
@@ -135,7 +134,7 @@ def best_time(
 
     Flow and clearance are the same bilinear ones, looked at more closely. inf where there is no way.
     """
-    space = open_space(world.chip, field, world.robot.radius, USUAL_MARGIN_RADII * world.robot.radius)
+    space = open_space(world.chip, field, world.robot.radius, 0.5 * world.robot.radius)
     px = space.um_per_px
     even = np.full_like(space.clearance, speed_um_s / px)
     terrain = Terrain(space.free, space.clearance, space.need, space.vx, space.vy, even).finer(finer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 from dataclasses import field as setting
 from typing import Literal
@@ -39,12 +40,12 @@ Method = Literal["time_field", "astar_time", "astar_paper", "astar_length", "rrt
 Cost = Literal["time", "energy"]
 Points = NDArray[np.float64]
 
-# Against the flow the fastest way is along the wall, so every micrometre costs: half a radius cost a tenth
-# of the time, and kept no robot off a wall that a tenth, with the swift places left out, did not.
-USUAL_MARGIN_RADII = 0.1
 _LEAST_SHARE = 0.02
 _CLOSER = ((6000, 4), (12000, 2))  # of fewer free pixels each is looked at so many times as closely,
 _LARGEST_PX = 2_000_000  # as long as all of the chip has no more than these
+# A policy needs points between the pixels where the robot is small: the way along the wall lies between them.
+_POINTS_PER_RADIUS = 3.0
+_FINEST = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,10 +67,13 @@ class Planner:
     method: Method = "time_field"
     cost: Cost = "time"
     idle_speed_um_s: float | None = None  # swimming at this speed takes as much power as being there; None: half of V
-    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: a tenth of it
+    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
     swift: Swift = setting(default_factory=Swift)  # more is kept where the flow is swift
     speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
-    policy_share: float | None = None  # the same for the time to go alone; None: as the path
+    policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
+    # Of that margin in the time to go. Against the flow the fastest way is along the wall, and a policy, which no
+    # reference drags there, keeps off it by itself; a robot that tracks a route needs all of the margin.
+    policy_margin_share: float = 0.2
     robust_deviations: float = 1.0  # of the flow, by which it may be worse than believed; fewer where no way is left
     flow_error_share: float = 0.05  # one deviation of a flow that does not know its own, as a share of its speed
     reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
@@ -93,7 +97,7 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         self._check()
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot, USUAL_MARGIN_RADII)
+        margins = margins_um(self.clearance_margin_um, robot)
         drift = self.swift.drift(robot, robot.speed_limit_um_s)
         trouble = ""
         for margin_um in margins:
@@ -102,7 +106,10 @@ class Planner:
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
                 if self.method == "time_field":
-                    route = self._by_time_field(space, field, start, goal, speed_um_s, robot)
+                    route, deviations = self._by_time_field(space, field, start, goal, speed_um_s)
+                    if route.reachable and self.cost == "time":
+                        near = open_space(chip, field, robot.radius, self.policy_margin_share * margin_um, drift)
+                        route = self._with_policy(route, near, field, goal_at, deviations, robot)
                 else:
                     route = self._by_nodes(space, field, start, goal, speed_um_s)
                 lean = margin_remark(margin_um, margins)
@@ -123,9 +130,9 @@ class Planner:
             raise UsageError("plan: robust_deviations and flow_error_share must not be negative")
 
     def _by_time_field(
-        self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float, robot: Robot
-    ) -> Route:
-        """The route between two ends that geometry connects, with as many deviations to spare as leave a way."""
+        self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float
+    ) -> tuple[Route, float]:
+        """The route between two ends that geometry connects, and the deviations of the flow that it has to spare."""
         px = space.um_per_px
         idle_um_s = None
         if self.cost == "energy":
@@ -144,8 +151,7 @@ class Planner:
             fine = terrain.finer(closer)
             times = time_field(fine, closer * target)
             path = None
-            known = bool(np.isfinite(times[::closer, ::closer].ravel()[start.node]))
-            if known:
+            if np.isfinite(times[::closer, ::closer].ravel()[start.node]):
                 path = descend(fine, times, closer * first, closer * target)
             if path is not None:
                 path = path / closer
@@ -159,15 +165,30 @@ class Planner:
             if deviations < tries[0]:
                 spared = f"{deviations:g} of {tries[0]:g} deviations of the flow" if deviations else "nothing"
                 route = replace(route, reason=f"no way but against nearly all the robot has: {spared} to spare")
-            if self.cost == "energy" or not known:
-                return route
-            if self.policy_share is not None:
-                speed = planning_speed_um_s(self.policy_share, robot) / px
-                fine = _terrain(space, speed, deviations * deviation, None).finer(closer)
-                times = time_field(fine, closer * target)
-            policy = _policy(space, fine, times, closer, speed_um_s / px)
-            return replace(route, time_to_go_s=policy, time_to_go_um_per_px=px / closer)
-        return self._too_fast(space, field, start, goal, speed_um_s)
+            return route, deviations
+        return self._too_fast(space, field, start, goal, speed_um_s), 0.0
+
+    def _with_policy(
+        self, route: Route, space: Space, field: FlowField, goal_um: Points, deviations: float, robot: Robot
+    ) -> Route:
+        """The route with the time to go to its goal, also from where the robot is nearer to the walls than it may be.
+
+        Where none is known from its start, the route is left as it is: better a path than no way.
+        """
+        px = space.um_per_px
+        finest = max(math.isqrt(_LARGEST_PX // space.free.size), 1)
+        closer = min(max(math.ceil(_POINTS_PER_RADIUS / space.radius), 1), _FINEST, finest)
+        goal = attach_goal(space, goal_um)
+        target = _place(space, goal.node) if goal.point is None else goal.point
+        speed = planning_speed_um_s(self.policy_share, robot) / px
+        fine = _terrain(space, speed, deviations * _deviation(space, field, self.flow_error_share), None).finer(closer)
+        times = time_field(fine, closer * target)
+        clearance = closer * interpolated(space.clearance, closer)
+        policy = with_band(times, fine.free, clearance, fine.need, closer * speed).astype(np.float32)
+        column, row = np.rint(closer * route.waypoints_um[0] / px).astype(int)
+        if not np.isfinite(policy[row, column]):
+            return route
+        return replace(route, time_to_go_s=policy, time_to_go_um_per_px=px / closer)
 
     def _refined(
         self,
@@ -251,15 +272,6 @@ def _terrain(space: Space, speed: float, deviation: NDArray[np.float64] | float,
     left = np.maximum(np.full_like(space.clearance, speed) - deviation, _LEAST_SHARE * speed)
     idle = -1.0 if idle_um_s is None else idle_um_s / space.um_per_px
     return Terrain(space.free, space.room, space.need, space.vx, space.vy, left, idle)
-
-
-def _policy(space: Space, fine: Terrain, times: NDArray[np.float64], closer: int, speed: float) -> NDArray[np.float32]:
-    """The time to go (s) also where the robot is nearer to the walls than the route, with `closer` points to a pixel.
-
-    In a channel of few pixels the way along the wall, which is the fastest against the flow, lies between them.
-    """
-    clearance = closer * interpolated(space.clearance, closer)
-    return with_band(times, fine.free, clearance, fine.need, closer * speed).astype(np.float32)
 
 
 def _deviation(space: Space, field: FlowField, flow_error_share: float) -> NDArray[np.float64]:

@@ -293,9 +293,9 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
     return column, row
 
 
-def margins_um(wanted_um: float | None, robot: Robot, usual_radii: float) -> tuple[float, ...]:
-    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: the usual), half of it, none."""
-    first = usual_radii * robot.radius if wanted_um is None else wanted_um
+def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
+    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: half the radius), half, none."""
+    first = 0.5 * robot.radius if wanted_um is None else wanted_um
     return tuple(dict.fromkeys((first, 0.5 * first, 0.0)))
 
 

@@ -17,7 +17,6 @@ from flowrec.planning.space import Space, Swift, attach_start, joined_ends, marg
 from flowrec.robot import Robot
 
 _METHOD = "survey"
-_USUAL_MARGIN = 0.5  # radii
 Raster = NDArray[np.float64]
 
 
@@ -54,7 +53,7 @@ class SurveyPlanner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         limit_um = distance_um if distance_um is not None else self.distance_um
         at = np.asarray(start_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot, _USUAL_MARGIN)
+        margins = margins_um(self.clearance_margin_um, robot)
         drift = self.swift.drift(robot, speed_um_s)
         route = no_route(_METHOD, "")
         for margin_um in margins:
