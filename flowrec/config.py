@@ -94,6 +94,7 @@ class Config:
 
 
 _ADAPTER = TypeAdapter(Config)
+_FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _hints = functools.cache(get_type_hints)
 
 
@@ -162,7 +163,7 @@ def resolve(config: Config, chip: Chip) -> Config:
         robot = replace(robot, max_speed_um_s=min(robot.max_speed_um_s, round(config.coils.fastest_um_s(robot), 1)))
     assert robot.max_speed_um_s is not None
     if camera.rate_hz is None:
-        rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), 100.0)
+        rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), _FASTEST_CAMERA_HZ)
         camera = replace(camera, rate_hz=round(rate, 1))
     assert camera.rate_hz is not None
     plan = replace(config.plan, swift=_timed(config.plan.swift, robot, camera.rate_hz))

@@ -28,6 +28,7 @@ from flowrec.planning.space import (
     joined_ends,
     margin_remark,
     margins_um,
+    narrowest,
     open_space,
     too_swift,
     why_apart,
@@ -85,7 +86,8 @@ class Planner:
         """Route from start to goal, both (2,) um; stamp and request are 0.
 
         A reachable route may carry a remark in `reason`. A start too near to a wall is joined to the nearest
-        place with room; where a channel leaves no room for the margin, half of it is kept, or none.
+        place with room; where a channel leaves no room for the usual margin, half of it is kept, or none. A margin
+        that was asked for is kept.
 
         Raises
         ------
@@ -115,6 +117,8 @@ class Planner:
                 lean = margin_remark(margin_um, margins)
                 remarks = [lean, start.remark, goal.remark, route.reason]
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
+        if self.clearance_margin_um is not None:
+            trouble = narrowest(space, start_at, goal_at) or trouble
         swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift)
         return no_route(self.method, swift or trouble)
 

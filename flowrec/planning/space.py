@@ -216,6 +216,20 @@ def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, r
     )
 
 
+def narrowest(space: Space, start_um: Points, goal_um: Points) -> str:
+    """What `why_apart` says of the pixels of two places, whether there is room at them or not; '' outside the fluid."""
+    h, w = space.free.shape
+    pixels = []
+    for place_um in (start_um, goal_um):
+        if not np.isfinite(place_um).all():
+            return ""
+        column, row = np.rint(place_um / space.um_per_px).astype(int)
+        if not (0 <= column < w and 0 <= row < h and space.fluid[row, column]):
+            return ""
+        pixels.append(int(row * w + column))
+    return why_apart(space, pixels[0], pixels[1])
+
+
 def _attach(space: Space, name: str, point_um: Points, within: float) -> End:
     point = point_um / space.um_per_px
     h, w = space.free.shape
@@ -294,9 +308,8 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
 
 
 def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
-    """Clearances beside the robot's radius to be tried in turn: the wanted one (None: half the radius), half, none."""
-    first = 0.5 * robot.radius if wanted_um is None else wanted_um
-    return tuple(dict.fromkeys((first, 0.5 * first, 0.0)))
+    """Clearances beside the robot's radius to be tried in turn: what was asked for, else half the radius, less, none."""
+    return (0.5 * robot.radius, 0.25 * robot.radius, 0.0) if wanted_um is None else (wanted_um,)
 
 
 def margin_remark(margin_um: float, tried_um: tuple[float, ...]) -> str:

@@ -114,7 +114,7 @@ def test_the_margin_is_given_up_where_there_is_no_room_for_it_and_the_narrowest_
     mask = channel(h=40, w=120, wall=8)
     mask[:16, 60:64] = mask[24:, 60:64] = False  # a gap of 8 px
     field, chip = field_of(mask, 10.0), chip_of(mask)
-    tight = Planner(clearance_margin_um=15.0).plan(field, (100.0, 195.0), (1100.0, 195.0), chip, robot(radius_um=30.0))
+    tight = Planner().plan(field, (100.0, 195.0), (1100.0, 195.0), chip, robot(radius_um=30.0))
     assert tight.reachable and "no room for the margin of 15 um" in tight.reason
     stuck = Planner().plan(field, (100.0, 195.0), (1100.0, 195.0), chip, robot(radius_um=50.0))
     assert not stuck.reachable and "too narrow at 6" in stuck.reason and "needs 50 um" in stuck.reason
