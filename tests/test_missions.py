@@ -13,6 +13,7 @@ from flowrec.config import load_config
 from flowrec.record import GOOD_ENDS, Recorded, record
 from flowrec.refly import refly
 from flowrec.store import SessionReader
+from flowrec.whatif import before_and_after
 from tests.conftest import SMALL
 
 SESSIONS = Path(__file__).parents[1] / "sessions"
@@ -63,6 +64,19 @@ def test_the_paper_planner_goes_upstream_the_same_way_but_slower(upstream: Recor
     ours_s, paper_s = (float(text.split()[0]) for text in flown["reflown: navigation"])
     assert paper_s > ours_s
     assert SessionReader(tmp_path / "flown.mcap").outcome["outcome"] == "reached"
+
+
+def test_what_time_field_would_have_gained_over_the_paper_planner_is_gained_when_it_is_flown(tmp_path: Path) -> None:
+    sets = [*SMALL, "plan.method=astar_paper"]
+    recorded = record(load_config(SESSIONS / "upstream.toml", sets), tmp_path / "paper.mcap")
+    assert recorded.report.outcome == "reached"
+    done = verb.replay(recorded.path, verb.Change(plan="time_field"))
+    rows = {row[0]: row[1:] for row in [*before_and_after(done), *refly(done, None)]}
+    was_s, now_s = (float(text.split()[0]) for text in rows["travel time on the assimilate map"])
+    assert now_s < 0.995 * was_s
+    flown_was_s, flown_now_s = (float(text.split()[0]) for text in rows["reflown: navigation"])
+    assert flown_now_s < flown_was_s
+    assert flown_now_s / flown_was_s == pytest.approx(now_s / was_s, rel=0.03)
 
 
 def test_a_robot_slower_than_the_flow_says_that_it_can_not_go_back(tmp_path: Path) -> None:

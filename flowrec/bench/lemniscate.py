@@ -65,10 +65,15 @@ class Flight:
 def lemniscate(turns: int = 2) -> Route:
     """The paper's reference, a turn in 40 s."""
     time = np.linspace(0.0, turns * PERIOD_S, turns * 4000 + 1)
-    theta = 2.0 * np.pi * time / PERIOD_S
+    return Route(0, 1, "lemniscate", True, "", place_um(time), time)
+
+
+def place_um(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 2) where the reference is at some times."""
+    theta = 2.0 * np.pi * time_s / PERIOD_S
     spread = (1.0 + np.sin(theta) ** 2)[:, None]
     points = np.stack([A_UM * np.cos(theta), B_UM * np.sin(theta) * np.cos(theta)], -1) / spread
-    return Route(0, 1, "lemniscate", True, "", points + CENTRE_UM, time)
+    return np.asarray(CENTRE_UM + points)
 
 
 def vortex_map(error: float) -> FlowField:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flowrec.bench.figure_flow import need_matplotlib
 from flowrec.bench.figure_observer import draw
+from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, RATE_HZ, SPIN_PER_S, place_um, vortex_map
 from flowrec.estimation import HealthMonitor, Kalman, Luenberger, Observer, smooth
 from flowrec.estimation.tuning import tune
 from flowrec.flow import sample
@@ -26,12 +27,8 @@ from flowrec.status import progress, say, table
 from flowrec.units import seconds
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
-RATE_HZ = 30.0
-LAP_S = 40.0
 LAPS = 2
 GAINS_PER_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
-MIDDLE_UM = np.array([2200.0, 1200.0])
-SPIN_PER_S = 0.2
 MAP_SHARE = 1.1  # the map is that much too strong
 
 Floats = NDArray[np.float64]
@@ -69,32 +66,18 @@ class Run:
     flow_um_s: Floats
 
 
-def lemniscate(time_s: Floats) -> Floats:
-    """(n, 2) um: a = 1.8 mm, b = 1.5 mm, once around in 40 s."""
-    sine, cosine = np.sin(2 * np.pi * time_s / LAP_S), np.cos(2 * np.pi * time_s / LAP_S)
-    return np.asarray(MIDDLE_UM + np.stack([1800.0 * cosine, 1500.0 * sine * cosine], -1) / (1.0 + sine**2)[:, None])
-
-
-def vortex_map(share: float, um_per_px: float = 20.0) -> FlowField:
-    """The flow share [-0.2 y, 0.2 x] about the middle of the lemniscate, as a map."""
-    y, x = np.mgrid[0:120, 0:220] * um_per_px
-    velocity = share * SPIN_PER_S * np.stack((-(y - MIDDLE_UM[1]), x - MIDDLE_UM[0]), -1)
-    nothing = np.zeros(velocity.shape[:2], np.float32)
-    return FlowField(0, 0, "map", um_per_px, velocity.astype(np.float32), nothing, None, np.zeros(0), 1.0, 1000.0, "")
-
-
 def drive(case: Case, seed: int = 0, laps: int = LAPS) -> Run:
     """The robot on its lemniscate: its own displacement is what the flow (Simpson's rule) leaves of the way."""
     rng = np.random.default_rng(seed)
-    count = round(laps * LAP_S * RATE_HZ)
+    count = round(laps * PERIOD_S * RATE_HZ)
     time = np.arange(count) / RATE_HZ
 
     def flow(at: Floats) -> Floats:
-        away = lemniscate(at) - MIDDLE_UM
+        away = place_um(at) - CENTRE_UM
         pulse = 1.0 + case.pulsation * np.sin(2 * np.pi * case.pulsation_hz * at)
         return np.asarray(SPIN_PER_S * pulse[:, None] * np.stack([-away[:, 1], away[:, 0]], -1))
 
-    place, true = lemniscate(time), flow(time)
+    place, true = place_um(time), flow(time)
     carried = (true[:-1] + 4.0 * flow(time[:-1] + 0.5 / RATE_HZ) + true[1:]) / (6.0 * RATE_HZ)
     moved = np.concatenate([np.zeros((1, 2)), np.diff(place, axis=0) - carried])
     measured = place + case.noise_um * rng.standard_normal(place.shape)
@@ -156,7 +139,7 @@ def measure(session: Path | None = None, figure: Path | None = None, seed: int =
     with progress("observing", len(CASES)) as done:
         for number, case in enumerate(CASES):
             run = drive(case, seed)
-            field = vortex_map(case.map_share)
+            field = vortex_map(case.map_share - 1.0)
             kalman = Kalman(position_noise_um=case.noise_um)
             tried = {
                 gain: _flows(observe(Observer("luenberger", luenberger=Luenberger(gain)), run)) for gain in GAINS_PER_S
@@ -172,7 +155,7 @@ def measure(session: Path | None = None, figure: Path | None = None, seed: int =
                 "luenberger, best gain": (tried[best], []),
                 "kalman": by(Observer(kalman=kalman)),
                 "kalman_map": by(Observer("kalman_map", kalman=kalman), field),
-                "map alone": (sample(field, lemniscate(run.time_s)), []),
+                "map alone": (sample(field, place_um(run.time_s)), []),
                 "smoother": (smooth(run.tracks, run.applied, kalman, ROBOT).flow_um_s, []),
             }
             if case.gain != 1.0:

@@ -32,6 +32,7 @@ from flowrec.planning.space import (
     open_space,
     too_swift,
     why_apart,
+    with_margin,
 )
 from flowrec.planning.terrain import Terrain, interpolated
 from flowrec.planning.time_field import descend, time_field, with_band
@@ -110,7 +111,7 @@ class Planner:
                 if self.method == "time_field":
                     route, deviations = self._by_time_field(space, field, start, goal, speed_um_s)
                     if route.reachable and self.cost == "time":
-                        near = open_space(chip, field, robot.radius, self.policy_margin_share * margin_um, drift)
+                        near = with_margin(space, self.policy_margin_share * margin_um)
                         route = self._with_policy(route, near, field, goal_at, deviations, robot)
                 else:
                     route = self._by_nodes(space, field, start, goal, speed_um_s)

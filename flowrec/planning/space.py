@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,8 @@ class Space:
     free: NDArray[np.bool_]  # (h, w) where the robot's centre may be: the nodes
     radius: float  # of the robot
     need: float  # clearance of nodes and of long edges
-    room: Raster  # (h, w) the clearance that counts: less by what the robot may drift beyond its margin
+    swept: Raster  # (h, w) px that the robot takes up with how far it may drift
+    room: Raster  # (h, w) the clearance that counts: less by what is swept beyond `need`
     vx: Raster  # (h, w)
     vy: Raster  # (h, w)
     um_per_px: float
@@ -133,11 +134,19 @@ def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float,
         free=chip.mask & (room >= need),
         radius=float(radius_um) / chip.um_per_px,
         need=need,
+        swept=swept,
         room=room,
         vx=np.ascontiguousarray(field.velocity_um_s[..., 0], np.float64) / chip.um_per_px,
         vy=np.ascontiguousarray(field.velocity_um_s[..., 1], np.float64) / chip.um_per_px,
         um_per_px=float(chip.um_per_px),
     )
+
+
+def with_margin(space: Space, margin_um: float) -> Space:
+    """The same space for a robot that keeps another margin from the walls."""
+    need = space.radius + margin_um / space.um_per_px
+    room = space.clearance - np.maximum(space.swept - need, 0.0)
+    return replace(space, need=need, room=room, free=space.fluid & (room >= need))
 
 
 def attach_start(space: Space, point_um: Points) -> End:
@@ -308,7 +317,7 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
 
 
 def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
-    """Clearances beside the robot's radius to be tried in turn: what was asked for, else half the radius, less, none."""
+    """Clearances beside the robot's radius, to be tried in turn: what was asked for, else half of it, less, none."""
     return (0.5 * robot.radius, 0.25 * robot.radius, 0.0) if wanted_um is None else (wanted_um,)
 
 

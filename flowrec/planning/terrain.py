@@ -40,13 +40,21 @@ class Terrain:
         return Terrain(free, clearance, self.need * k, vx, vy, speed, self.idle * k)
 
 
+@compiled
 def interpolated(raster: Raster, k: int) -> Raster:
     """A raster (h, w) with k - 1 points between any two, bilinear: ((h - 1) k + 1, (w - 1) k + 1)."""
-    for _ in range(2):
-        share = (np.arange(k) / k)[:, None]
-        between = (1.0 - share) * raster[:-1, None] + share * raster[1:, None]
-        raster = np.concatenate([between.reshape(-1, raster.shape[1]), raster[-1:]]).T
-    return np.ascontiguousarray(raster)
+    h, w = raster.shape
+    fine = np.empty(((h - 1) * k + 1, (w - 1) * k + 1))
+    for j in range(h):
+        for i in range(w - 1):
+            for m in range(k):
+                fine[j * k, i * k + m] = ((k - m) * raster[j, i] + m * raster[j, i + 1]) / k
+        fine[j * k, (w - 1) * k] = raster[j, w - 1]
+    for j in range(h - 1):
+        for n in range(1, k):
+            for i in range(fine.shape[1]):
+                fine[j * k + n, i] = ((k - n) * fine[j * k, i] + n * fine[j * k + k, i]) / k
+    return fine
 
 
 @compiled

@@ -12,10 +12,12 @@ from flowrec.view import palette
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Scene
 
-_EVERYTHING = frozenset({"assumed", "refined", "change", "uncertainty", "truth", "true robot", "timing", "time to go"})
+_EVERYTHING = frozenset(
+    {"assumed", "refined", "change", "uncertainty", "truth", "true robot", "timing", "time to go", "health", "voltages"}
+)
 _COIL_WINDOW_S = 2.0  # the currents turn several times a second; a whole session of them is a solid block
 
-_SEVERAL_LINES = frozenset({e.CURRENT, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
+_SEVERAL_LINES = frozenset({e.CURRENT, e.VOLTAGE, e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
 
 
 def blueprint(scene: Scene, has_replay: bool = False, present: AbstractSet[str] = _EVERYTHING) -> rrb.Blueprint:
@@ -62,13 +64,17 @@ def _single(scene: Scene, present: AbstractSet[str]) -> rrb.Container:
         _plots(
             _tabs(
                 _plot("Coil currents (A)", [e.CURRENT], window_s=_COIL_WINDOW_S),
+                _plot("Amplifier voltages (V)", [e.VOLTAGE], window_s=_COIL_WINDOW_S)
+                if "voltages" in present
+                else None,
                 _plot("Field frequency (Hz)", [e.FREQUENCY]),
                 _plot("Field heading (°)", [e.HEADING]),
             ),
             _tabs(
                 _plot("Tracking error (µm)", [e.TRACKING_ERROR]),
                 _plot("Estimate error (µm)", [e.ESTIMATE_ERROR]) if "true robot" in present else None,
-                _plot("Observer NIS", [e.NIS]),
+                _plot("Observer NIS", [e.NIS, e.NIS_MEAN] if "health" in present else [e.NIS]),
+                _plot("Pulsation (% of the flow)", [e.PULSATION]) if "health" in present else None,
             ),
             _tabs(
                 _plot("Flow at the robot: observer and map (µm/s)", [e.FLOW_SPEED]),

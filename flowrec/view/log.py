@@ -18,6 +18,7 @@ from flowrec.messages import (
     Event,
     FlowField,
     Frame,
+    Health,
     Mission,
     OperatorEvent,
     Route,
@@ -102,6 +103,8 @@ class TickLogger:
             self._log_demand(tick.demand, tick.estimate)
         if tick.currents is not None and tick.currents is not last.currents:
             self._log_currents(tick.currents)
+        if tick.health is not None and tick.health is not last.health:
+            self._log_health(tick.health)
         if tick.timing is not None and tick.timing is not last.timing:
             self._log_timing(tick.timing)
         if tick.event is not None and tick.event is not last.event:
@@ -235,7 +238,8 @@ class TickLogger:
     def _log_demand(self, demand: Demand, estimate: Estimate | None) -> None:
         # No data, not NaN, where there is no reference: the plot shows a gap either way, a statistic does not.
         if math.isfinite(demand.error_um):
-            self._pen.log(e.TRACKING_ERROR, rr.Scalars(demand.error_um))
+            if demand.error_um > 0.0:  # a policy has no reference to be off
+                self._pen.log(e.TRACKING_ERROR, rr.Scalars(demand.error_um))
             reference = self._scene.to_plane(demand.reference_um)
             self._pen.log(e.REFERENCE, rr.Points2D.from_fields(positions=[reference]))
         if estimate is not None:
@@ -249,8 +253,17 @@ class TickLogger:
 
     def _log_currents(self, currents: Currents) -> None:
         self._pen.log(e.CURRENT, rr.Scalars(currents.currents_a))
+        if len(currents.voltages_v):
+            self.present.add("voltages")
+            self._pen.log(e.VOLTAGE, rr.Scalars(currents.voltages_v))
         self._pen.log(e.FREQUENCY, rr.Scalars(currents.frequency_hz))
         self._pen.log(e.HEADING, rr.Scalars(math.degrees(currents.heading_rad)))
+
+    def _log_health(self, health: Health) -> None:
+        self.present.add("health")
+        if math.isfinite(health.nis):
+            self._pen.log(e.NIS_MEAN, rr.Scalars(health.nis))
+        self._pen.log(e.PULSATION, rr.Scalars(100.0 * health.pulsation_share))
 
     def _log_timing(self, timing: Timing) -> None:
         self.present.add("timing")

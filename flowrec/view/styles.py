@@ -52,6 +52,9 @@ def log_series(pen: Pen) -> None:
     lines(e.TRACKING_ERROR, ("tracking error (µm)", own))
     lines(e.ESTIMATE_ERROR, ("estimate error (µm)", own))
     lines(e.NIS, ("NIS", own))
+    lines(e.NIS_MEAN, ("mean NIS (2: all noise is stated right)", palette.WHITE))
+    lines(e.PULSATION, ("pulsation (% of the flow)", own))
+    lines(e.VOLTAGE, ("x (V)", palette.RED), ("y (V)", palette.GREEN), ("z (V)", palette.BLUE))
     truth = () if pen.prefix == "replayed" else (("truth", palette.GREEN),)  # the same in both
     lines(e.FLOW_SPEED, ("observer", pen.style.path), ("map", paler), *truth)
     lines(

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.bench.observer import ROBOT, Case, drive, observe, rmse, vortex_map
+from flowrec.bench.lemniscate import vortex_map
+from flowrec.bench.observer import ROBOT, Case, drive, observe, rmse
 from flowrec.errors import UsageError
 from flowrec.estimation import Kalman, Observer, smooth
 from flowrec.estimation.tuning import moving_noise, parked_noise, tune
@@ -45,7 +46,7 @@ def test_tuning_finds_the_noise_of_a_driven_robot_and_brings_the_nis_to_two() ->
 
 def test_the_gain_is_found_where_the_headings_vary() -> None:
     run = drive(Case("gain", 10.0, gain=1.1), laps=1)
-    field = vortex_map(1.0)
+    field = vortex_map(0.0)
     fixed = Kalman(position_noise_um=10.0)
     felt = replace(fixed, estimate_gain=True)
     blind = observe(Observer("kalman_map", kalman=fixed), run, field)
