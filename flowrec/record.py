@@ -20,7 +20,7 @@ from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import Demand, FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.planning.space import too_swift
+from flowrec.planning.space import no_room, too_swift
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
 from flowrec.session import length_mm, session_writer
@@ -108,10 +108,11 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
 
 
 def refuse_adrift(config: Config, chip: Chip) -> None:
-    """Raise UsageError where the flow would have its way with the robot before anything can be planned.
+    """Raise UsageError where the robot would be let in for nothing: by the assumed flow, before anything is driven.
 
     So it is where it can not be held at the start, or is out of an outlet before the coils are up: their field, and
-    with it the speed that they can drive, grows to all of it in the time of the ramp.
+    with it the speed that they can drive, grows to all of it in the time of the ramp. And so it is where no way to the
+    goal is wide enough, or all are too swift to be steered on.
     """
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
@@ -120,6 +121,11 @@ def refuse_adrift(config: Config, chip: Chip) -> None:
     reason = too_swift(chip, field, start, start, robot.radius, drift)
     if reason:
         raise UsageError(f"unreachable: the robot can not be held at the start: {reason}")
+    if {"plan", "navigate"} & set(config.mission.phases):
+        goal = np.asarray(config.mission.goal, np.float64)
+        reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius, drift)
+        if reason:
+            raise UsageError(f"unreachable: {reason}")
     flow_um_s = float(np.hypot(*sample(field, start)))
     swept_um = flow_um_s * (drift.blind_s + 0.5 * config.coils.ramp_s * min(flow_um_s / limit_um_s, 1.0))
     for opening in chip.openings:

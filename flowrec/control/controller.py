@@ -14,7 +14,7 @@ from flowrec.control.laws import ff_fb_law, ff_fb_literal_law, saturated, shorte
 from flowrec.control.policy import astray_um, downhill
 from flowrec.control.prediction import FlowBelief, blend, remembered, roll_forward
 from flowrec.control.reference import bearable_pace, governed_pace, nearest_on, place_on, velocity_on
-from flowrec.control.walls import guarded
+from flowrec.control.walls import guarded, least_room
 from flowrec.flow import sample
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
 from flowrec.robot import Robot
@@ -25,6 +25,7 @@ Method = Literal["vector", "policy", "ff_fb", "ff_fb_literal", "ff_fb_no_flow", 
 _FOLLOWING = ("survey", "navigate")
 _USUAL_RADII_PER_S = 12.0
 _LARGEST_SHARE = 0.3
+_NEAR_RADII = 4.0
 
 
 def _mapped_flow(field: FlowField | None, estimate: Estimate) -> Vector:
@@ -143,6 +144,11 @@ class Controller:
             demand, cut = self._law(aim, estimate, field, belief, point, robot, limit_um_s, dt_s)
             if clearance_um is not None and self.guard_radii > 0.0:
                 keep_um, per_s = self.guard_radii * robot.radius, _quicker(self.guard_per_s, robot, dt_s)
+                if route is not None:
+                    # Where the way leads through a gap with less room than that, the guard must not close it.
+                    near_um = route.waypoints_um[_apart(route.waypoints_um, point) < _NEAR_RADII * robot.radius]
+                    some_um = near_um[:: len(near_um) // 16 + 1]
+                    keep_um = min(keep_um, max(least_room(some_um, clearance_um, um_per_px), robot.radius))
                 demand = guarded(demand, belief.at(point), point, clearance_um, um_per_px, keep_um, per_s)
                 demand, cut_again = shortened(demand, limit_um_s)
                 cut = cut or cut_again
@@ -277,6 +283,10 @@ def _hurry(robot: Robot) -> float:
 def _quicker(per_s: float, robot: Robot, dt_s: float) -> float:
     """A rate for this robot; what is held for a whole frame must not undo more than a third of an error in one."""
     return max(per_s, min(per_s * _hurry(robot), _LARGEST_SHARE / dt_s)) if dt_s > 0.0 else per_s
+
+
+def _apart(points_um: NDArray[np.float64], point_um: Vector) -> NDArray[np.float64]:
+    return np.asarray(np.hypot(points_um[:, 0] - point_um[0], points_um[:, 1] - point_um[1]))
 
 
 def _length(vector: Vector) -> float:

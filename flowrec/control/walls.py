@@ -35,6 +35,11 @@ def guarded(
     return demand_um_s + max(missing, 0.0) * away
 
 
+def least_room(points_um: NDArray[np.float64], clearance_um: NDArray[np.float32], um_per_px: float) -> float:
+    """The smallest clearance (um) at some points (n, 2); inf of none."""
+    return min((_clearance_and_slope(clearance_um, point / um_per_px)[0] for point in points_um), default=math.inf)
+
+
 def _clearance_and_slope(raster: NDArray[np.float32], point: Vector) -> tuple[float, Vector]:
     """Bilinear value of a raster (h, w) and its gradient per pixel at a point (x, y) in pixels."""
     h, w = raster.shape

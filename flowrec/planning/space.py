@@ -225,6 +225,13 @@ def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, r
     )
 
 
+def no_room(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, robot: Robot) -> str:
+    """Why a robot does not fit through from start to goal (2,), however near to the walls; '' when it does."""
+    space = open_space(chip, field, robot.radius, 0.0)
+    start, goal = attach_start(space, start_um), attach_goal(space, goal_um)
+    return start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
+
+
 def narrowest(space: Space, start_um: Points, goal_um: Points) -> str:
     """What `why_apart` says of the pixels of two places, whether there is room at them or not; '' outside the fluid."""
     h, w = space.free.shape
