@@ -170,17 +170,7 @@ def record(
     config, chip, pipeline = prepare(config)
     path = out if out is not None else default_path(config)
     fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
-    rig = SimulatedRig(
-        chip,
-        config.robot,
-        pipeline.calibration,
-        config.camera,
-        config.simulated,
-        config.mission.start,
-        duration_s=config.duration_s,
-        realtime=realtime,
-        coils=config.coils,
-    )
+    rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
     worker: Worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
     if fields:
         worker = Preloaded(worker, fields)

@@ -13,7 +13,7 @@ from flowrec.pipeline import assemble
 from flowrec.replay import Replayed, planned_from
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, RunReport, Sink, run
-from flowrec.session import open_session, session_writer
+from flowrec.session import session_writer
 from flowrec.status import say
 from flowrec.units import seconds
 
@@ -28,10 +28,9 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
         raise UsageError(
             "--refly: the session has no map or no route to fly; replay it with --refine --plan astar_time"
         )
-    source_config = open_session(done.source)[1]
     start = tuple(float(value) for value in planned_from(done.recorded, done.replayed))
     flights = {
-        "recorded": (source_config, done.recorded, None),
+        "recorded": (done.recorded_config, done.recorded, None),
         "replayed": (done.config, done.replayed, out),
     }
     reports: dict[str, RunReport] = {}
@@ -40,16 +39,7 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
         mission = replace(config.mission, phases=("plan", "navigate"), start=start, replan_error_um=None)
         flown = replace(config, mission=mission)
         pipeline = assemble(flown, done.chip)
-        rig = SimulatedRig(
-            done.chip,
-            flown.robot,
-            pipeline.calibration,
-            flown.camera,
-            flown.simulated,
-            start,
-            true_field=flow,
-            coils=flown.coils,
-        )
+        rig = SimulatedRig.of(pipeline, flown, true_field=flow)
         known: Mapping[str, FlowField] = {
             key: value for key in ("assumed", "refined") if (value := getattr(tick, key)) is not None
         }

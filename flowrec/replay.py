@@ -113,6 +113,7 @@ class Replayed:
     """What a replay found."""
 
     source: Path
+    recorded_config: Config
     config: Config
     chip: Chip
     report: RunReport
@@ -204,6 +205,7 @@ def replay(
             writer.close({"outcome": "replayed", "note": f"replay of {path.name}", "ticks": str(report.ticks)})
     return Replayed(
         source=path,
+        recorded_config=recorded_config,
         config=config,
         chip=chip,
         report=report,

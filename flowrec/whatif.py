@@ -11,7 +11,7 @@ from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import FlowField, Observations, Route, Tick
 from flowrec.planning import travel_time
 from flowrec.replay import Replayed
-from flowrec.session import length_mm, open_session
+from flowrec.session import length_mm
 from flowrec.units import seconds
 from flowrec.work import no_observations
 
@@ -57,7 +57,7 @@ def before_and_after(done: Replayed) -> list[tuple[str, str, str]]:
                     _time_on(now.route, now.field, limit),
                 )
             )
-    was_control, now_control = open_session(done.source)[1].control.method, done.config.control.method
+    was_control, now_control = done.recorded_config.control.method, done.config.control.method
     if was_control != now_control:
         rows.append(("controller", was_control, now_control))
     commands = done.commands

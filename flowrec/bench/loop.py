@@ -74,16 +74,7 @@ class Keep:
 
 def prepare_inputs(config: Config, pipeline: Pipeline, ticks: int) -> list[Inputs]:
     """Fly a mission in the simulator and keep what its rig yielded, worker results included."""
-    rig = SimulatedRig(
-        pipeline.chip,
-        config.robot,
-        pipeline.calibration,
-        config.camera,
-        config.simulated,
-        config.mission.start,
-        duration_s=ticks / (config.camera.rate_hz or RATE_HZ),
-        coils=config.coils,
-    )
+    rig = SimulatedRig.of(pipeline, config, ticks / (config.camera.rate_hz or RATE_HZ))
     kept = Keep()
     with progress("preparing frames", ticks) as done:
         run(

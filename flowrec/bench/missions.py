@@ -245,15 +245,7 @@ def fly(
         nothing = (0, 0, None, None, None, None, None, 0, math.nan, math.nan, math.nan)
         return Row(seed, name, way, how, policy, "refused", str(error), *nothing)
     pipeline = assemble(config, chip)
-    rig = SimulatedRig(
-        chip,
-        config.robot,
-        pipeline.calibration,
-        config.camera,
-        config.simulated,
-        config.mission.start,
-        true_field=truth,
-    )
+    rig = SimulatedRig.of(pipeline, config, true_field=truth)
     log = Logbook()
     report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], on_tick=watch)
     mission = report.last.mission

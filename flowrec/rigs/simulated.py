@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import check_point, clearance_um
+from flowrec.config import Config
 from flowrec.control.coils import Coils
 from flowrec.control.rotation import Order, Rotation, course
 from flowrec.errors import RigError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
-from flowrec.pipeline import Inputs
+from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.debris import Debris
 from flowrec.rigs.microscope import Microscope
 from flowrec.rigs.swimmer import Swimmer
@@ -72,6 +73,29 @@ class SimulatedRig:
 
     Raises RigError or ChipError for settings that no world can be made of.
     """
+
+    @classmethod
+    def of(
+        cls,
+        pipeline: Pipeline,
+        config: Config,
+        duration_s: float | None = None,
+        realtime: bool = False,
+        true_field: FlowField | None = None,
+    ) -> SimulatedRig:
+        """The rig of a run: its resolved configuration's camera, world, robot, start and coils, on its chip."""
+        return cls(
+            pipeline.chip,
+            config.robot,
+            pipeline.calibration,
+            config.camera,
+            config.simulated,
+            config.mission.start,
+            duration_s=duration_s,
+            realtime=realtime,
+            true_field=true_field,
+            coils=config.coils,
+        )
 
     def __init__(
         self,
