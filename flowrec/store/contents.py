@@ -110,7 +110,7 @@ class Contents:
             return header_from(self._metadata(), attachments)
         except KeyError as error:
             raise self.source.damaged(0, f"the record {error} is missing") from error
-        except UnicodeDecodeError as error:
+        except ValueError as error:
             raise self.source.damaged(0, error) from error
 
     def _metadata(self) -> dict[str, dict[str, str]]:

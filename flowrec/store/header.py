@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from mcap.records import Attachment, Metadata
 
@@ -15,6 +16,7 @@ PROFILE = "flowrec"
 SESSION = "flowrec.session"
 PROVENANCE = "flowrec.provenance"
 PARENT = "flowrec.parent"
+PART = "flowrec.part"
 OUTCOME = "flowrec.outcome"
 VIEW = "flowrec.view"
 
@@ -22,6 +24,29 @@ CONFIG_FILE = "config.toml"
 CHIP_IMAGE_FILE = "chip.png"
 CHIP_FILE = "chip.toml"
 _WEIGHTS = "weights/"
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Which piece of a run a file is.
+
+    A piece that does not begin with the run begins with one tick more than it recorded: the last one before, with
+    everything known by then, at its own stamp. So it can be read alone, and readers of a whole run pass over it.
+
+    Attributes
+    ----------
+    run : the same random word in all pieces of a run.
+    number : from 1.
+    kind : "part" of a run that was split, or "snapshot", of which each is whole in itself.
+    carried_ns : stamp of the tick that is repeated at the beginning; None where the run itself begins.
+    why : what a snapshot was taken for.
+    """
+
+    run: str
+    number: int
+    kind: Literal["part", "snapshot"] = "part"
+    carried_ns: int | None = None
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +60,7 @@ class SessionHeader:
     provenance : version, commit, packages, host, seed, operator, ...: all text.
     parent : name and hash of the session that this one replays; empty for a live run.
     weights : network weights by file name.
+    part : which piece of a run this is; None where the run is in one file.
     """
 
     config_toml: str
@@ -43,6 +69,7 @@ class SessionHeader:
     provenance: Mapping[str, str]
     parent: Mapping[str, str] = field(default_factory=dict)
     weights: Mapping[str, bytes] = field(default_factory=dict)
+    part: Part | None = None
 
 
 def records_of(header: SessionHeader) -> Iterator[Metadata | Attachment]:
@@ -50,6 +77,8 @@ def records_of(header: SessionHeader) -> Iterator[Metadata | Attachment]:
     yield Metadata(SESSION, {"format_version": str(FORMAT_VERSION), "flowrec_version": flowrec.__version__})
     yield Metadata(PROVENANCE, dict(header.provenance))
     yield Metadata(PARENT, dict(header.parent))
+    if header.part is not None:
+        yield Metadata(PART, _said(header.part))
     yield _attachment(CONFIG_FILE, "application/toml", header.config_toml.encode())
     yield _attachment(CHIP_IMAGE_FILE, "image/png", header.chip_png)
     yield _attachment(CHIP_FILE, "application/toml", header.chip_toml.encode())
@@ -64,6 +93,7 @@ def header_from(metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[
     ------
     KeyError : a record is missing; its argument is the record's name.
     UnicodeDecodeError : text that is not UTF-8.
+    ValueError : a part that makes no sense.
     """
     return SessionHeader(
         config_toml=attachments[CONFIG_FILE].decode(),
@@ -72,12 +102,40 @@ def header_from(metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[
         provenance=dict(metadata[PROVENANCE]),
         parent=dict(metadata.get(PARENT, {})),
         weights={name.removeprefix(_WEIGHTS): data for name, data in attachments.items() if name.startswith(_WEIGHTS)},
+        part=part_from(metadata),
+    )
+
+
+def part_from(metadata: Mapping[str, Mapping[str, str]]) -> Part | None:
+    """Which piece of a run a file is, from its records by name.
+
+    Raises
+    ------
+    ValueError : it makes no sense.
+    """
+    said = metadata.get(PART)
+    if said is None:
+        return None
+    number, kind, carried = said.get("number", ""), said.get("kind", ""), said.get("carried_ns", "")
+    if kind not in ("part", "snapshot") or not number.isdecimal() or not (carried.isdecimal() or not carried):
+        raise ValueError(f"a piece of a run that is called {kind!r} {number!r}, carried from {carried!r}")
+    return Part(
+        said.get("run", ""),
+        int(number),
+        "part" if kind == "part" else "snapshot",
+        int(carried) if carried else None,
+        said.get("why", ""),
     )
 
 
 def belongs(name: str) -> bool:
     """Whether an attachment is part of a session's header."""
     return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith(_WEIGHTS)
+
+
+def _said(part: Part) -> dict[str, str]:
+    said = {"run": part.run, "number": str(part.number), "kind": part.kind, "why": part.why}
+    return said if part.carried_ns is None else said | {"carried_ns": str(part.carried_ns)}
 
 
 def _attachment(name: str, media_type: str, data: bytes) -> Attachment:

@@ -13,10 +13,11 @@ from flowrec.store.contents import Contents
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
 from flowrec.store.mcap_file import is_growing
+from flowrec.store.names import PARTIAL_SUFFIX, partial_path
 from flowrec.store.reader import SessionReader
 from flowrec.store.scan import Scan, scan
 from flowrec.store.source import DamageError, Source
-from flowrec.store.writer import PARTIAL_SUFFIX, SessionWriter, sync_directory
+from flowrec.store.writer import SessionWriter, sync_directory
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
@@ -120,7 +121,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         raise SessionError(f"{path}: is left as it was; {str(error).split('; ')[0]}") from error
     finally:
         reader.close()
-        for remains in (draft, draft.with_name(draft.name + PARTIAL_SUFFIX)):
+        for remains in (draft, partial_path(draft)):
             remains.unlink(missing_ok=True)
     if partial and target == final:
         path.unlink()

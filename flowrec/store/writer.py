@@ -20,12 +20,12 @@ from flowrec.store.backlog import Backlog, Entry, News
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
 from flowrec.store.layout import FRAME_PATH
+from flowrec.store.names import partial_path
 from flowrec.store.recorder import Recorder
 from flowrec.store.thinning import Thinning
 from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S
 
-PARTIAL_SUFFIX = ".partial"
 _NICE = 5  # where there are too few cores for all, the control loop goes first
 _TELL_DROPS_NS = NS_PER_S // 2
 _MESSAGE_BYTES = 500  # about what a message weighs besides its pixels
@@ -79,7 +79,7 @@ class SessionWriter:
         queue_limit_bytes: int = 256 << 20,
     ) -> None:
         self.path = Path(path)
-        self.partial_path = self.path.with_name(self.path.name + PARTIAL_SUFFIX)
+        self.partial_path = partial_path(self.path)
         self.ticks = 0  # written so far
         self.dropped_frames = 0  # for want of a faster disk
         self.missing_frames = 0  # live: those that the camera counted and never delivered

@@ -1,0 +1,60 @@
+"""How the files of a run are named.
+
+X.mcap                           a run in one file
+X.part001.mcap, X.part002.mcap   one that was split; all of them together are called X.mcap
+X.snap001.mcap                   one of its snapshots
+NAME.partial                     any of these while it is written, or what is left of it
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+SUFFIX = ".mcap"
+PARTIAL_SUFFIX = ".partial"
+_PIECE = re.compile(r"(?P<stem>.+)\.(?P<kind>part|snap)(?P<number>\d{3,6})")
+
+
+def part_path(path: Path, number: int) -> Path:
+    """The file of part `number` (from 1) of the run X.mcap."""
+    return _piece(path, "part", number)
+
+
+def snapshot_path(path: Path, number: int) -> Path:
+    """The file of snapshot `number` (from 1) of the run X.mcap."""
+    return _piece(path, "snap", number)
+
+
+def partial_path(path: Path) -> Path:
+    """What a file is called until it is whole."""
+    return path.with_name(path.name + PARTIAL_SUFFIX)
+
+
+def run_path(path: Path) -> Path:
+    """X.mcap for any of its pieces, finished or not."""
+    whole = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
+    match = _PIECE.fullmatch(whole.stem)
+    return whole if match is None else whole.with_name(match["stem"] + whole.suffix)
+
+
+def pieces(path: Path) -> list[Path]:
+    """Everything that is there of the run X.mcap in order of name, finished or not, itself included."""
+    if not path.parent.is_dir():
+        return []
+    return sorted(other for other in path.parent.iterdir() if other.is_file() and run_path(other) == path)
+
+
+def parts(path: Path) -> list[Path]:
+    """The finished parts of the run X.mcap, in order."""
+    found = [(match, other) for other in pieces(path) if (match := _PIECE.fullmatch(other.stem)) is not None]
+    numbered = [
+        (int(match["number"]), other)
+        for match, other in found
+        if match["kind"] == "part" and other.suffix == path.suffix
+    ]
+    return [other for _, other in sorted(numbered)]
+
+
+def _piece(path: Path, kind: str, number: int) -> Path:
+    return path.with_name(f"{path.stem}.{kind}{number:03d}{path.suffix}")
