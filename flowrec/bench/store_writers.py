@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,14 +81,14 @@ def _poses() -> list[Given]:
     """Estimates of 1 kB on the wire, by way of a covariance of ten states."""
     rng = np.random.default_rng(0)
     given = []
-    for here in np.cumsum(rng.normal(size=(4096, 2)), axis=0):
-        pose = Estimate(10**9, here, rng.normal(size=2), rng.normal(size=(10, 10)), 1.0, here, True)
+    for number, here in enumerate(np.cumsum(rng.normal(size=(4096, 2)), axis=0)):
+        pose = Estimate(10**9 + number * _STEP_NS, here, rng.normal(size=2), rng.normal(size=(10, 10)), 1.0, here, True)
         given.append(Given("estimate", pose, encode(pose)))
     return given
 
 
 def _frames(width: int, height: int) -> list[Given]:
-    frames = [Frame(10**9, number, image) for number, image in enumerate(pictures(width, height))]
+    frames = [Frame(10**9 + number * _STEP_NS, number, image) for number, image in enumerate(pictures(width, height))]
     return [Given("frame", frame, encode(frame)) for frame in frames]
 
 
@@ -98,9 +98,9 @@ def _session(encoding: str) -> Write:
     def write(path: Path, data: list[Given], count: int) -> None:
         with SessionWriter(path, made_up_header(), frames=encoding, block=True) as writer:
             for number in range(count):
-                now, given = 10**9 + number * _STEP_NS, data[number % len(data)]
-                fresh: dict[str, Any] = {given.field: replace(given.message, stamp_ns=now)}  # type: ignore[type-var]
-                writer.write(replace(Tick(now), **fresh))
+                given = data[number % len(data)]
+                fresh: dict[str, Any] = {given.field: given.message}
+                writer.write(Tick(10**9 + number * _STEP_NS, **fresh))
 
     return write
 

@@ -19,10 +19,10 @@ from flowrec.messages import Event, Frame, Message, OperatorEvent
 from flowrec.store import standard
 from flowrec.store.form import Codec, Payload
 from flowrec.store.frames import FRAME_CODECS, RAW_IMAGE
-from flowrec.store.schemas import FieldForm, array_schema, forms_of, schema_of
+from flowrec.store.schemas import FieldForm, forms_of, schema_of
+from flowrec.store.wire import encoder_of
 
 _M = TypeVar("_M", bound=Message)
-_PACKERS: dict[Any, Callable[[Any], Any]] = {int: operator.index, float: float, bool: bool, str: str}
 # Up to here a loop over the wire's values is quicker than numpy's general conversion.
 _SHORT_VECTOR = 64
 
@@ -41,7 +41,7 @@ def codec_of(message_type: type[Any], schema: str = "") -> Codec:
     codec = _codecs.get(message_type)
     if codec is None:
         derived = schema_of(message_type)
-        codec = Codec(derived, _encoder(message_type, derived.wire), _decoder(message_type, derived.wire))
+        codec = Codec(derived, encoder_of(message_type), _decoder(message_type, derived.wire))
         _codecs[message_type] = codec
     return codec
 
@@ -98,41 +98,6 @@ def _without_surrogates(message: _M) -> _M:
         value = getattr(message, form.name)
         changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
     return type(message)(**changes)
-
-
-def _encoder(message_type: type[Any], wire: Any) -> Callable[[Any], Payload]:
-    packers = [(form.name, _packer(form), form.optional) for form in forms_of(message_type)]
-
-    def encode(message: Any) -> Payload:
-        values = {}
-        for name, pack, optional in packers:
-            value = getattr(message, name)
-            if value is not None:
-                values[name] = pack(value)
-            elif not optional:
-                raise ValueError(f"{name} is missing")
-        return (wire(**values).SerializeToString(),)
-
-    return encode
-
-
-def _packer(form: FieldForm) -> Callable[[Any], Any]:
-    if form.kind == "vector":
-        return _packed_vector
-    if form.kind == "array":
-        return _packed_array
-    return _PACKERS[form.kind]
-
-
-def _packed_vector(value: NDArray[Any]) -> list[float]:
-    if value.ndim != 1:
-        raise ValueError(f"a vector of shape {value.shape}")
-    numbers: list[float] = value.tolist()
-    return numbers
-
-
-def _packed_array(value: NDArray[Any]) -> Any:
-    return array_schema().wire(shape=value.shape, dtype=value.dtype.str, data=value.tobytes())
 
 
 def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview, int], Any]:

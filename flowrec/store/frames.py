@@ -22,6 +22,7 @@ from flowrec.store.form import Codec, Payload
 from flowrec.store.pictures import jpeg, picture, png, row_differences
 from flowrec.store.schemas import Schema, foxglove_schema
 from flowrec.store.standard import stamp_of, timestamp
+from flowrec.store.wire import varint
 
 RAW_IMAGE, COMPRESSED_IMAGE = "foxglove.RawImage", "foxglove.CompressedImage"
 _SEQUENCE_LIMIT = 2**32  # MCAP keeps the sequence in 32 bit
@@ -65,7 +66,7 @@ def _raw_image() -> Codec:
         height, width = _shape(frame)
         head = wire(timestamp=timestamp(frame.stamp_ns), width=width, height=height, encoding="mono8", step=width)
         # The image goes to the compressor as it lies in memory: protobuf would copy it three times, holding the GIL.
-        prefix = head.SerializeToString() + _RAW_IMAGE_DATA + _varint(frame.image.nbytes)
+        prefix = head.SerializeToString() + _RAW_IMAGE_DATA + varint(frame.image.nbytes)
         return (prefix, frame.image.reshape(-1).data)
 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
@@ -87,7 +88,7 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
         _shape(frame)
         parts = file_of(frame.image)
         head = wire(timestamp=timestamp(frame.stamp_ns), format=file_format).SerializeToString()
-        return (head + _COMPRESSED_IMAGE_DATA + _varint(sum(map(len, parts))), *parts)
+        return (head + _COMPRESSED_IMAGE_DATA + varint(sum(map(len, parts))), *parts)
 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
         parsed = wire.FromString(payload)
@@ -107,16 +108,6 @@ def _sequence(frame: Frame) -> int:
     if not 0 <= frame.index < _SEQUENCE_LIMIT:
         raise ValueError(f"frame index {frame.index} is not in 32 bit")
     return frame.index
-
-
-def _varint(number: int) -> bytes:
-    """Protobuf's variable-length form of a size."""
-    out = bytearray()
-    while number > 0x7F:
-        out.append(number & 0x7F | 0x80)
-        number >>= 7
-    out.append(number)
-    return bytes(out)
 
 
 _RAW = _raw_image()

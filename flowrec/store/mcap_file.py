@@ -104,10 +104,10 @@ class McapFile:
             length, offsets = len(head) + len(chunk.data), {}
             at += length
             for index in chunk.indexes:
-                parts.append(_bytes_of(index))
-                offsets[index.channel_id] = at
+                parts.append(index.record())
+                offsets[index.channel] = at
                 at += len(parts[-1])
-                self._counts[index.channel_id] += len(index.records)
+                self._counts[index.channel] += len(index)
             place = ChunkIndex(
                 chunk_length=length,
                 chunk_start_offset=start,

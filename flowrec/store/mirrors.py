@@ -8,6 +8,7 @@ Both flow previews use one colour scale, viridis from 0 to the highest speed of 
 from __future__ import annotations
 
 import functools
+import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,14 +16,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowrec.messages import Estimate, FlowField, Message, Route, Track
+from flowrec.messages import Estimate, FlowField, Message, Route, Track, Vector
 from flowrec.store.schemas import foxglove_schema
 from flowrec.store.standard import timestamp
+from flowrec.units import NS_PER_S
 
 _UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
 # A ring about the robot: a single point of Rerun's default size drowns in the path.
 _MARK_POINTS, _MARK_UM = 24, 60.0
 _MARK_RGBA = (255, 64, 32, 255)
+# Field 3 of both, a Pose: its field 1 is a Vector3 with x and y, its field 2 a Quaternion with w alone.
+_POSE = struct.Struct("<BBBBBdBdBBBd")
+_POSE_HEAD, _POSE_TAIL = (0x1A, 31, 0x0A, 18), (0x12, 9, 0x21, 1.0)
+_ROBOT_EVERY_NS = NS_PER_S // 125  # more often nobody can see it move
 _COLOURS = ("red", "green", "blue", "alpha")
 
 
@@ -52,11 +58,13 @@ class Mirrors:
 
     def __init__(self) -> None:
         self.top_um_s: float | None = None  # speed at the bright end of the scale, set by the first field
+        self._robot_ns = -_ROBOT_EVERY_NS
 
     def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, bytes]]:
         """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
         robot = news.get("estimate") or news.get("track")
-        if isinstance(robot, (Estimate, Track)):
+        if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
+            self._robot_ns = robot.stamp_ns
             yield ROBOT_POSE, robot.stamp_ns, _pose_in_frame(robot)
             yield ROBOT_POINT, robot.stamp_ns, _mark(robot)
         route = news.get("route")
@@ -100,14 +108,22 @@ def _pose(x_um: float, y_um: float) -> dict[str, dict[str, float]]:
 
 
 def _pose_in_frame(robot: Estimate | Track) -> bytes:
-    pose = _pose(float(robot.position_um[0]), float(robot.position_um[1]))
-    return _serialized(_wire("PoseInFrame")(timestamp=timestamp(robot.stamp_ns), pose=pose))
+    return _timestamp(robot.stamp_ns) + _placed(robot.position_um)
 
 
 def _mark(robot: Estimate | Track) -> bytes:
-    x_um, y_um = robot.position_um.tolist()
-    news = _wire("PointCloud")(timestamp=timestamp(robot.stamp_ns), pose=_pose(x_um, y_um))
-    return _serialized(news) + _mark_points()
+    return _timestamp(robot.stamp_ns) + _placed(robot.position_um) + _mark_points()
+
+
+@functools.lru_cache(maxsize=4)  # both views of the robot are of the same moment
+def _timestamp(stamp_ns: int) -> bytes:
+    """The field `timestamp`, which has the same number in PoseInFrame and PointCloud."""
+    return _serialized(_wire("PoseInFrame")(timestamp=timestamp(stamp_ns)))
+
+
+def _placed(position_um: Vector) -> bytes:
+    """The field `pose`, likewise; by hand, for it is made in every tick."""
+    return _POSE.pack(*_POSE_HEAD, 9, position_um[0], 17, position_um[1], *_POSE_TAIL)
 
 
 @functools.cache

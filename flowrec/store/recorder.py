@@ -139,18 +139,20 @@ class Recorder:
         self._file.close()
 
     def _append(self, path: str, log_ns: int, publish_ns: int, payload: Payload, sequence: int | None) -> None:
+        slot = SLOTS[path]
         if sequence is None:
             sequence = self._sequences[path]
             self._sequences[path] = (sequence + 1) % 2**32
-        slot = SLOTS[path]
-        size = sum(map(len, payload))
-        if size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
-            raise SessionError(f"a message of {path} has {size} bytes, more than a chunk may hold; use a smaller chip")
         builder = self._builders[slot.group]
-        if builder.size and builder.size + size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
+        size = sum(map(len, payload))
+        if builder.size + size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
+            if size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
+                raise SessionError(
+                    f"a message of {path} has {size} bytes, more than a chunk may hold; use a smaller chip"
+                )
             self._file.add_chunks([builder.seal()])
         # The stamp itself travels in the payload; MCAP knows no time before zero.
-        self._builders[slot.group].add(slot.channel, sequence, log_ns, max(0, publish_ns), payload)
+        builder.add(slot.channel, sequence, log_ns, max(0, publish_ns), payload)
 
     def _sync(self) -> None:
         self._synced_size = self._file.size

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import operator
 import os
 import threading
@@ -201,12 +202,12 @@ class SessionWriter:
         messages = _messages_of(tick)
         last, self._last = self._last, messages
         news: News = {}
-        for name, message, before in zip(_FIELDS, messages, last, strict=True):
+        # Most messages are the objects of the tick before; those are passed over without a step of the interpreter.
+        changed = map(operator.is_not, messages, last)
+        for name, message, before in itertools.compress(zip(_FIELDS, messages, last, strict=True), changed):
             # A stage that says the same thing again in a new object has said nothing new.
-            if (
-                message is not None
-                and message is not before
-                and (before is None or message.stamp_ns != before.stamp_ns or not message.same_as(before))
+            if message is not None and (
+                before is None or message.stamp_ns != before.stamp_ns or not message.same_as(before)
             ):
                 news[name] = message
         return news

@@ -80,6 +80,20 @@ def test_every_message_comes_back_bit_for_bit(kind):
     round_trip()
 
 
+@pytest.mark.parametrize(
+    "kind", [Maybe, *(kind for kind in TYPES if kind is not Frame)], ids=lambda kind: kind.__name__
+)
+def test_bytes_are_those_that_protobuf_itself_would_write(kind):
+    @settings(max_examples=40, deadline=None)
+    @given(messages(kind))
+    def same(message):
+        payload = codec.encode(message)
+        parsed = codec.codec_of(kind).schema.wire.FromString(payload)
+        assert parsed.SerializeToString(deterministic=True) == payload
+
+    same()
+
+
 @pytest.mark.parametrize("level", ["info", "warning", "error", "debug", "fatal", "", "odd: level", "flowrec."])
 def test_event_levels_come_back_whatever_they_are(level):
     event = Event(5, level, "x")
