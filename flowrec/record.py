@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +21,7 @@ from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import Demand, FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.space import no_room, too_swift
+from flowrec.priority import first_of_all
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
 from flowrec.session import length_mm, session_writer
@@ -188,7 +189,9 @@ def record(
             say(live.message)
             sinks.append(live)
         status = stack.enter_context(StatusLine(path.resolve().parent, lambda: writer.bytes_written).shown())
-        with stop.armed():
+        # A run that does not keep real time never waits: it would keep a core for itself.
+        priority = first_of_all() if realtime else nullcontext(enter_result=False)
+        with stop.armed(), priority as first:
             report = run(
                 pipeline,
                 rig,
@@ -204,6 +207,8 @@ def record(
             facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
         outcome = {key.replace(" ", "_"): value for key, value in facts.items()}
         outcome |= {"outcome": report.outcome, "note": report.note}
+        if realtime:
+            outcome["loop_priority"] = "real time" if first else "ordinary"
         writer.close(outcome)
     facts["file"] = f"{path} ({path.stat().st_size / 1e6:.1f} MB)"
     if view == "rrd":

@@ -19,7 +19,7 @@ from flowrec.pipeline import Inputs, Pipeline, step
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
 
-_SWITCH_S = 1e-4
+_SWITCH_S = 2e-5
 
 
 class Rig(Protocol):
