@@ -165,8 +165,10 @@ def show(figures: dict[str, Any]) -> None:
             ],
         )
     loop = figures["stall"]
+    priority = "real-time" if loop["loop_in_real_time"] else "ordinary"
     table(
-        f"Control step, 2448x2048 at 60 Hz, {loop['ticks']} steps each, in real time: {'yes' if loop['loop_in_real_time'] else 'no'}; disk {figures['disk_mb_s']:.0f} MB/s",
+        f"Control step, 2448x2048 at 60 Hz, {loop['ticks']} steps each, {priority} priority; "
+        f"disk {figures['disk_mb_s']:.0f} MB/s",
         ("recording", "p50 ms", "p99 ms", "max ms", "p99 of off", "dropped", "queue MB", "CPU ms per frame"),
         [
             (
