@@ -14,10 +14,11 @@ from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
 from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import PARTIAL_SUFFIX, partial_path
+from flowrec.store.piece import sync_directory
 from flowrec.store.reader import SessionReader
 from flowrec.store.scan import Scan, scan
 from flowrec.store.source import DamageError, Source
-from flowrec.store.writer import SessionWriter, sync_directory
+from flowrec.store.writer import SessionWriter
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
