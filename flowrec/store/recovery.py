@@ -202,6 +202,9 @@ def _losses(reader: SessionReader, found: Scan, images_missing: int, images_ahea
         nbytes, first = sum(lost.nbytes for lost in found.lost), found.lost[0].offset
         yield f"{nbytes} damaged or cut-off bytes, the first at {first}"
     gaps = found.gaps.get(_channel(found, "/coils/applied"), [])
+    part = reader.header.part
+    if part is not None and part.kind == "snapshot":  # which begins on the way
+        gaps = [gap for gap in gaps if gap.before_ns > reader.first_ns]
     if gaps:
         from_s = seconds(gaps[0].before_ns - reader.first_ns)
         yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"

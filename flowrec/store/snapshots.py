@@ -86,20 +86,27 @@ class _Segment:
         self.nbytes = 0
         self.packer = packer
         self.taken: _Taken | None = None
-        self.last = False  # of that snapshot, which ends ...
+        self.forgotten = False  # too old before all of its images had come
+        self.first = self.last = False  # of that snapshot, which ends ...
         self.outcome: dict[str, str] = {}  # ... like this
         self._snapshots = snapshots
         packer.take = self._keep
 
+    @property
+    def is_held(self) -> bool:
+        """In memory, and needed."""
+        return self.taken is None and not self.forgotten
+
     def add(self, entry: Entry) -> None:
         if self.begin_ns is None:
             self.begin_ns = entry.stamp_ns
-        self.packer.add(entry)
+        if not self.forgotten:
+            self.packer.add(entry)
 
     def carry_image(self, stamp_ns: int, image: Frame) -> None:
-        if self.taken is not None:
+        if self.taken is not None and not self.first:
             return  # the one before is in the same file
-        take, self.packer.take = self.packer.take, self._keep_image
+        take, self.packer.take = self.packer.take, self._keep_image if self.taken is None else self.taken.file.put
         self.packer.add(Entry(stamp_ns, {"frame": image}, 0))
         self.packer.seal((FRAMES,))
         self.packer.take = take
@@ -231,7 +238,9 @@ class Snapshots:
     def completed(self, segment: _Segment, tally: Tally) -> None:
         """All images of a segment have come."""
         taken = segment.taken
-        if taken is None:
+        if segment.forgotten:
+            pass
+        elif taken is None:
             self._ring.append((segment, tally))
             self._trim()
         else:
@@ -261,15 +270,20 @@ class Snapshots:
 
     def _segments(self) -> list[_Segment]:
         """Those in memory, from the oldest on."""
-        return [segment for segment, _ in self._ring] + [place.stretch for place in self._stretches.open]
+        waiting = [place.stretch for place in self._stretches.open if place.stretch.is_held]
+        return [segment for segment, _ in self._ring] + waiting
+
+    def _is_old(self, segment: _Segment) -> bool:
+        """Whether it reaches far enough into the past, without those before it."""
+        last_ns = self._stretches.last_ns
+        return last_ns is not None and segment.begin_ns is not None and last_ns - segment.begin_ns >= self._before_ns
 
     def _trim(self) -> None:
         """Forget what is older than asked for, or does not fit."""
         now_ns = self._stretches.last_ns or 0
         while self._ring:
             segments = self._segments()
-            begin_ns = segments[1].begin_ns
-            old = begin_ns is not None and now_ns - begin_ns >= self._before_ns
+            begin_ns, old = segments[1].begin_ns, self._is_old(segments[1])
             large = sum(segment.nbytes for segment in segments) > self._limit_bytes
             if not old and not large:
                 return
@@ -289,6 +303,8 @@ class Snapshots:
             return
         self._trim()
         segments, making = self._segments(), self._making
+        while len(segments) > 1 and self._is_old(segments[1]):  # still without some of its images, and not needed
+            segments.pop(0).forgotten = True
         first = segments[0]
         held_s = seconds(stamp_ns - (stamp_ns if first.begin_ns is None else first.begin_ns))
         self._number += 1
@@ -308,6 +324,7 @@ class Snapshots:
             packer.add(carried(first.carried_ns, first.known))
             packer.seal()
             file.put(first.image)
+        first.first = True
         for _, tally in self._ring:
             taken.tally.include(tally)
         for segment in segments:
