@@ -17,7 +17,7 @@ from flowrec.store.names import snapshot_path
 from flowrec.units import NS_PER_S
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 from tests.store.test_disk import slow_disk
-from tests.store.test_parts import messages_in, same
+from tests.store.test_splitting import messages_in, same
 from tests.store.test_trouble import names_in
 
 QUIET = [replace(tick, operator=None) for tick in ticks_of(600)]  # 10 s
