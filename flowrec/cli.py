@@ -460,6 +460,9 @@ def bench_store(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
     minutes: Annotated[float, typer.Option(min=0.0, help="Only watch memory while recording for so long.")] = 0.0,
     kills: Annotated[int, typer.Option(min=0, help="Only kill so many recordings and recover them.")] = 0,
+    split: Annotated[
+        float, typer.Option(min=0.0, metavar="S", help="Only split runs after so long: what it does to the loop.")
+    ] = 0.0,
     folder: Annotated[
         Path | None, typer.Option("--at", metavar="DIR", help="On which disk; by default that of temporary files.")
     ] = None,
@@ -467,7 +470,7 @@ def bench_store(
     """Recording beside a bare mcap and a bare foxglove-sdk writer: speed, stall of the control loop, reading."""
     from flowrec.bench.store import measure, show
 
-    figures = measure(folder, quick, minutes, kills)
+    figures = measure(folder, quick, minutes, kills, split)
     show(figures)
     _keep(figures, json_file)
 

@@ -159,6 +159,7 @@ class Parts:
 
     def end(self, part: _Part, tally: Tally) -> None:
         """Give a part that is not the last its end, in a thread of its own."""
+        part.recorder.flush()
         outcome = {**self._continued(part), **self._making.said(tally)}
         self._ending.append((part.recorder, self._beside.submit(part.recorder.finish, outcome)))
 
@@ -189,9 +190,10 @@ class Parts:
         return False
 
     def _go_on(self) -> None:
-        last_ns = self._stretches.last_ns
+        last, last_ns = self._stretches.current.stretch, self._stretches.last_ns
         assert last_ns is not None
-        part = self._next(self._stretches.current.stretch.number + 1, last_ns)
+        last.recorder.flush()  # before anything of the next part: a kill must not leave a hole between them
+        part = self._next(last.number + 1, last_ns)
         part.recorder.add(carried(last_ns, self._stretches.known))
         part.first_bytes = part.size
         self._stretches.cut(part)

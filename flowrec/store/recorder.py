@@ -124,6 +124,11 @@ class Recorder:
         if now >= self._synced_s + self._sync_every_s and self._synced_size < self._piece.size:
             self._sync_beside(now)
 
+    def flush(self) -> None:
+        """Write what waits."""
+        self._flush()
+        self._flushed_s, self._flushed_ns = time.monotonic(), self._last_ns
+
     def finish(self, outcome: Mapping[str, str]) -> None:
         """The rest of the messages, the outcome and the summary, down to the disk; then the file has its name."""
         self._flush()
