@@ -1,6 +1,9 @@
 """A run in several files: nothing is lost between them, each can be read alone, and nothing stale stays behind."""
 
+import contextlib
 import errno
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,14 +20,18 @@ from mcap.reader import make_reader
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
 from flowrec.store import SessionReader, SessionWriter, Split, recover
+from flowrec.store.layout import SLOTS
 from flowrec.store.mcap_file import McapFile
 from flowrec.store.names import part_path, pieces
+from flowrec.store.scan import scan
+from flowrec.store.source import Source
 from flowrec.units import seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 from tests.store.test_disk import slow_disk
 from tests.store.test_trouble import names_in
 
 TICKS = list(ticks_of(120, shape=(96, 96)))
+APPLIED = SLOTS["/coils/applied"].channel
 SPAN_S = seconds(TICKS[-1].stamp_ns - TICKS[0].stamp_ns)
 
 
@@ -228,3 +235,24 @@ def test_a_kill_at_or_about_a_split_leaves_whole_parts_and_a_last_one_to_be_save
     stamps = sorted({log for _, log, _, _ in news_of(saved)})
     assert stamps == [tick.stamp_ns for tick in ticks_of(len(stamps), shape=(8, 8))]
     assert len(stamps) > moment - 0.05 / 0.003 - 10
+
+
+def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.15))
+    path, moments = tmp_path / "x.mcap", []
+    with SessionWriter(path, HEADER, pieces=Split(seconds=0.3), flush_s=0.1) as writer:
+        for number, tick in enumerate(TICKS):
+            writer.write(tick)
+            time.sleep(0.004)
+            if number % 20 == 19:  # as a kill would find it
+                moments.append(tmp_path / f"{number}")
+                shutil.copytree(tmp_path, moments[-1], ignore=shutil.ignore_patterns("[0-9]*"))
+    for moment in moments:
+        left = pieces(moment / "x.mcap")
+        stamps = set()
+        for piece in left:
+            with contextlib.closing(Source(piece)) as source:
+                found = scan(source)
+                for chunk in found.summary.chunks:
+                    stamps |= {record.log_ns for record in source.messages(chunk) if record.channel == APPLIED}
+        assert stamps == {tick.stamp_ns for tick in TICKS[: len(stamps)]} and len(left) > 1
