@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import zstandard
@@ -24,7 +25,7 @@ _LARGE_BYTES = 1 << 16  # from here on numpy copies, which leaves the interprete
 class Sealed:
     """What goes into one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
 
-    `data` may lie in the builder's memory: it is to be written before the builder is used again.
+    `data` may lie in the builder's memory: it is to be written, or `kept`, before the builder is used again.
     """
 
     compression: str
@@ -34,6 +35,11 @@ class Sealed:
     uncompressed_crc: int
     uncompressed_size: int
     indexes: list[MessageIndex]
+
+
+def kept(sealed: Iterable[Sealed]) -> list[Sealed]:
+    """Chunks whose bytes are their own."""
+    return [replace(chunk, data=bytes(chunk.data)) for chunk in sealed]
 
 
 class ChunkBuilder:

@@ -21,7 +21,7 @@ from flowrec.store.mirrors import Mirrors
 from flowrec.store.names import part_path
 from flowrec.store.piece import Making
 from flowrec.store.recorder import Recorder
-from flowrec.store.stretches import Stretches, Tally, carried
+from flowrec.store.stretches import Open, Stretches, Tally, carried
 from flowrec.units import nanoseconds
 
 
@@ -49,7 +49,7 @@ class _Part:
         self.number = number
         self.recorder = recorder
         self.raw_bytes = 1  # of what went in
-        self.first_bytes = recorder.size  # of the head, and of what is told once more
+        self.image_bytes = 0  # of the one that is told once more
         self._parts = parts
 
     def add(self, entry: Entry) -> None:
@@ -59,7 +59,7 @@ class _Part:
     def carry_image(self, stamp_ns: int, image: Frame) -> None:
         before = self.size
         self.recorder.add(Entry(stamp_ns, {"frame": image}, 0))
-        self.first_bytes += self.size - before
+        self.image_bytes += self.size - before
 
     def complete(self, tally: Tally) -> None:
         self._parts.end(self, tally)
@@ -67,6 +67,11 @@ class _Part:
     @property
     def size(self) -> int:
         return self.recorder.size + self.recorder.waiting_bytes
+
+    @property
+    def first_bytes(self) -> int:
+        """What does not count as its own."""
+        return self.recorder.first_bytes + self.image_bytes
 
     def news_bytes(self, awaited_bytes: int) -> float:
         """What is in it besides, with the images that are still to come, if they pack as the ones before."""
@@ -183,19 +188,23 @@ class Parts:
                 # The parts of an hour begin on the hour, whatever was lost in between.
                 self._until_ns += ((stamp_ns - self._until_ns) // every_ns + 1) * every_ns
                 return True
-        if self._split.megabytes:
-            first_bytes = place.stretch.first_bytes
-            enough = max(1e6 * self._split.megabytes - first_bytes, first_bytes)
-            return place.stretch.news_bytes(place.awaited_bytes) >= enough
+        if self._split.megabytes and self._is_large(place):
+            # It has to be known what a part begins with before it can be said how much of it is its own.
+            place.stretch.recorder.wait_for_beginning()
+            return self._is_large(place)
         return False
+
+    def _is_large(self, place: Open[_Part]) -> bool:
+        part = place.stretch
+        enough = max(1e6 * (self._split.megabytes or 0.0) - part.first_bytes, part.first_bytes)
+        return part.news_bytes(place.awaited_bytes) >= enough
 
     def _go_on(self) -> None:
         last, last_ns = self._stretches.current.stretch, self._stretches.last_ns
         assert last_ns is not None
         last.recorder.flush()  # before anything of the next part: a kill must not leave a hole between them
         part = self._next(last.number + 1, last_ns)
-        part.recorder.add(carried(last_ns, self._stretches.known))
-        part.first_bytes = part.size
+        part.recorder.begin_with(carried(last_ns, self._stretches.known))
         self._stretches.cut(part)
 
     def _next(self, number: int, carried_ns: int | None) -> _Part:

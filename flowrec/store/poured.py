@@ -7,17 +7,13 @@ import time
 from collections.abc import Mapping
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
-from flowrec.store.chunk import Sealed
+from flowrec.store.backlog import Entry
+from flowrec.store.chunk import Sealed, kept
 from flowrec.store.header import SessionHeader
+from flowrec.store.packer import Packer
 from flowrec.store.piece import Making, Piece
-
-
-def kept(sealed: list[Sealed]) -> list[Sealed]:
-    """Chunks that may be kept: their bytes are theirs."""
-    return [replace(chunk, data=bytes(chunk.data)) for chunk in sealed]
 
 
 class Poured:
@@ -52,6 +48,11 @@ class Poured:
         """Bytes handed to the operating system."""
         return self._piece.size
 
+    def begin_with(self, packer: Packer, entry: Entry) -> None:
+        """A tick that comes first; it is packed in the thread, too, for that may take as long as writing it."""
+        packer.take = self._piece.add_chunks
+        self._last = self._thread.submit(self._begin, packer, entry)
+
     def put(self, sealed: list[Sealed]) -> None:
         """Chunks, the next ones in the file."""
         chunks = kept(sealed)
@@ -83,12 +84,19 @@ class Poured:
         self._thread.shutdown()
         self._piece.close()
 
+    def _begin(self, packer: Packer, entry: Entry) -> None:
+        try:
+            packer.add(entry)
+            packer.seal()
+        except BaseException as error:  # noqa: BLE001  whatever it is, the writer has to hear of it
+            self._failure = error
+
     def _write(self, chunk: Sealed, nbytes: int) -> None:
         try:
             if self._failure is None:
                 self._piece.add_chunks([chunk])
                 self._sync_if_due()
-        except BaseException as error:  # noqa: BLE001  whatever it is, the writer has to hear of it
+        except BaseException as error:  # noqa: BLE001  as above
             self._failure = error
         finally:
             with self._written:

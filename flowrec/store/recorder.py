@@ -9,14 +9,16 @@ from pathlib import Path
 
 from flowrec.errors import SessionError
 from flowrec.store.backlog import Entry
+from flowrec.store.chunk import Sealed, kept
 from flowrec.store.frames import FrameEncoding
 from flowrec.store.header import SessionHeader
 from flowrec.store.mirrors import Mirrors
 from flowrec.store.packer import Packer
 from flowrec.store.piece import Piece, PieceError
+from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
-_SYNC_POLL_S = 0.05
+_POLL_S = 0.05
 
 
 class Recorder:
@@ -29,6 +31,10 @@ class Recorder:
     Parameters
     ----------
     wait : until the disk keeps the head; else it does so with what comes next.
+
+    Attributes
+    ----------
+    first_bytes : what the file begins with, its head and the tick that it was told to begin with.
 
     Raises
     ------
@@ -53,7 +59,11 @@ class Recorder:
         self._flush_s = 0.8 * min(flush_s, self._sync_every_s)
         self._mirrors = mirrors
         self._piece = Piece(path, header, frames, overwrite=overwrite)
+        self._frames = frames
         self._packer = Packer(frames, mirrors, self._piece.add_chunks)
+        self.first_bytes = self._piece.size
+        self._beginning: Future[None] | None = None
+        self._held: list[Sealed] = []
         self._flushed_s = self._synced_s = time.monotonic()
         self._synced_size = 0
         self._flushed_ns: int | None = None
@@ -84,8 +94,8 @@ class Recorder:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes that were not, before they are compressed."""
-        return self._packer.size
+        """Bytes that were not, mostly before they are compressed."""
+        return self._packer.size + sum(len(chunk.data) for chunk in self._held)
 
     @property
     def broken(self) -> bool:
@@ -95,16 +105,30 @@ class Recorder:
     @property
     def patience_s(self) -> float | None:
         """For how long one may wait for the next entry before `flush_if_due` has something to do; None: for ever."""
+        if self._beginning is not None:
+            return _POLL_S
         if self._packer.size:
             return max(0.0, self._flushed_s + self._flush_s - time.monotonic())
         if self._synced_size < self._piece.size:
             # While the last fsync is still running there is nothing to do about the next one.
-            shortest = _SYNC_POLL_S if self._sync_running else 0.0
+            shortest = _POLL_S if self._sync_running else 0.0
             return max(shortest, self._synced_s + self._sync_every_s - time.monotonic())
         return None
 
+    def begin_with(self, entry: Entry) -> None:
+        """Let one tick come first. Large flow fields take a while, in which chunks of what follows are held back."""
+        self._packer.take = self._hold
+        self._packer.sequences.update(BY_FIELD[field].path for field in entry.news)
+        packer = Packer(self._frames, self._mirrors, self._piece.add_chunks)
+        self._beginning = self._beside.submit(_begin, packer, entry)
+
+    def wait_for_beginning(self) -> None:
+        """Until that tick is in the file."""
+        self._hear_of_beginning(wait=True)
+
     def add(self, entry: Entry) -> None:
         """Encode the messages of one tick; write the chunks that are full."""
+        self._hear_of_beginning(wait=False)
         if self._flushed_ns is None:
             self._flushed_ns = entry.stamp_ns
         self._last_ns = max(self._last_ns, entry.stamp_ns)
@@ -117,6 +141,7 @@ class Recorder:
 
     def flush_if_due(self) -> None:
         """Write what has waited for long enough, and have the disk keep it."""
+        self._hear_of_beginning(wait=False)
         now, stamps_s = time.monotonic(), seconds(self._last_ns - (self._flushed_ns or 0))
         if now >= self._flushed_s + self._flush_s or stamps_s >= self._flush_s:
             self._flush()
@@ -126,11 +151,13 @@ class Recorder:
 
     def flush(self) -> None:
         """Write what waits."""
+        self._hear_of_beginning(wait=True)
         self._flush()
         self._flushed_s, self._flushed_ns = time.monotonic(), self._last_ns
 
     def finish(self, outcome: Mapping[str, str]) -> None:
         """The rest of the messages, the outcome and the summary, down to the disk; then the file has its name."""
+        self._hear_of_beginning(wait=True)
         self._flush()
         self._join_sync()
         self._piece.finish(outcome, self._mirrors.top_um_s)
@@ -142,6 +169,20 @@ class Recorder:
 
     def _flush(self) -> None:
         self._packer.seal()
+
+    def _hold(self, sealed: list[Sealed]) -> None:
+        self._held += kept(sealed)
+
+    def _hear_of_beginning(self, *, wait: bool) -> None:
+        if self._beginning is None or not (wait or self._beginning.done()):
+            return
+        self._beginning.result()
+        self._beginning = None
+        self.first_bytes = self._piece.size
+        self._packer.take = self._piece.add_chunks
+        if self._held:
+            held, self._held = self._held, []
+            self._piece.add_chunks(held)
 
     def _sync(self) -> None:
         self._synced_size = self._piece.size
@@ -165,3 +206,8 @@ class Recorder:
         if self._syncing is not None:
             self._syncing.result()
             self._syncing = None
+
+
+def _begin(packer: Packer, entry: Entry) -> None:
+    packer.add(entry)
+    packer.seal()

@@ -15,14 +15,14 @@ from pathlib import Path
 
 from flowrec.messages import Drops, Event, Frame, OperatorEvent
 from flowrec.store.backlog import Entry, News
-from flowrec.store.chunk import Sealed
+from flowrec.store.chunk import Sealed, kept
 from flowrec.store.header import Part
 from flowrec.store.layout import FRAMES
 from flowrec.store.mirrors import Mirrors
 from flowrec.store.names import partial_path, snapshot_path
 from flowrec.store.packer import Packer
 from flowrec.store.piece import Making, Piece
-from flowrec.store.poured import Poured, kept
+from flowrec.store.poured import Poured
 from flowrec.store.stretches import Stretches, Tally, carried
 from flowrec.units import nanoseconds, seconds
 
@@ -319,10 +319,9 @@ class Snapshots:
         self._taken = taken = _Taken(file, stamp_ns + self._after_ns, [why], short if self._short else {})
         if first.carried_ns is not None:
             # Numbered as if they had been written just before what follows.
-            packer = Packer(making.frames, self._mirrors, file.put)
+            packer = Packer(making.frames, self._mirrors, _nowhere)
             packer.sequences = Counter({path: (number - 1) % 2**32 for path, number in first.sequences.items()})
-            packer.add(carried(first.carried_ns, first.known))
-            packer.seal()
+            file.begin_with(packer, carried(first.carried_ns, first.known))
             file.put(first.image)
         first.first = True
         for _, tally in self._ring:
