@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -18,9 +19,10 @@ from flowrec.store import SessionWriter, Snapshot, Split
 
 _RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 1224, 1024  # what two cores that do other things as well keep up with
-_FIELD = (1024, 1280)  # rows and columns of a flow field: 16 MB with its pressure, to be told anew in every part
+_FIELD = (512, 640)  # rows and columns of a flow field: 4 MB with its pressure, to be told anew in every part
 _RING = 64
 _WARM = 30  # ticks until queue and memory have their size
+_SWITCH_S = 1e-4  # as the loop has it (run.py)
 _NEAR = 20  # ticks from a split on
 
 
@@ -57,6 +59,8 @@ def _fly(
     write_ms: list[float] = []
     queue_mb = 0.0
     cpu_s = time.process_time()
+    before_s = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
     with SessionWriter(path, made_up_header(), frames="zstd", pieces=pieces, overwrite=True) as writer:
         began = time.perf_counter()
         for number, tick in enumerate(_ticks(images, round(duration_s * _RATE_HZ))):
@@ -71,6 +75,7 @@ def _fly(
             writer.write(given)
             write_ms.append(1e3 * (time.perf_counter() - before))
             queue_mb = max(queue_mb, writer.queue_bytes / 1e6)
+    sys.setswitchinterval(before_s)
     cpu_s = time.process_time() - cpu_s
     files = writer.files
     size = sum(file.stat().st_size for file in files)
