@@ -65,6 +65,13 @@ def record(
     realtime: Annotated[bool, typer.Option("--realtime", help="Keep the simulated rig to the wall clock.")] = False,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and print the resolved configuration.")] = False,
+    split: Annotated[
+        str | None, typer.Option(metavar="SIZE|TIME", help="Go on in another file after as much: 2GB, 10min, or both.")
+    ] = None,
+    snapshot: Annotated[
+        str | None,
+        typer.Option(metavar="TIME[,TIME]", help="Only keep the time before and after marks and alarms: 30s,10s."),
+    ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -82,13 +89,15 @@ def record(
         settings.append(f"simulated.seed={seed}")
     if duration is not None:
         settings.append(f"duration_s={duration}")
+    settings += _pieces(split, snapshot)
     chosen = load_config(config, settings)
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return
     recorded = run_record(chosen, out, view, realtime, overwrite)
     if as_json:
-        typer.echo(json.dumps({"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}))
+        found: dict[str, Any] = {"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}
+        typer.echo(json.dumps(found | {"files": [str(file) for file in recorded.files]}))
     else:
         print_summary(recorded)
     raise typer.Exit(recorded.exit_status)
@@ -451,6 +460,9 @@ def bench_store(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
     minutes: Annotated[float, typer.Option(min=0.0, help="Only watch memory while recording for so long.")] = 0.0,
     kills: Annotated[int, typer.Option(min=0, help="Only kill so many recordings and recover them.")] = 0,
+    split: Annotated[
+        float, typer.Option(min=0.0, metavar="S", help="Only split runs after so long: what it does to the loop.")
+    ] = 0.0,
     folder: Annotated[
         Path | None, typer.Option("--at", metavar="DIR", help="On which disk; by default that of temporary files.")
     ] = None,
@@ -458,7 +470,7 @@ def bench_store(
     """Recording beside a bare mcap and a bare foxglove-sdk writer: speed, stall of the control loop, reading."""
     from flowrec.bench.store import measure, show
 
-    figures = measure(folder, quick, minutes, kills)
+    figures = measure(folder, quick, minutes, kills, split)
     show(figures)
     _keep(figures, json_file)
 
@@ -558,6 +570,31 @@ def _keep(figures: dict[str, Any], json_file: Path | None) -> None:
     """Write the figures of a bench where they are wanted."""
     if json_file is not None:
         json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+def _pieces(split: str | None, snapshot: str | None) -> list[str]:
+    """`--split` and `--snapshot` as settings."""
+    from flowrec.units import amounts
+
+    settings: list[str] = []
+    try:
+        if split is not None:
+            asked = amounts(split)
+            if len(asked["s"]) > 1 or len(asked["mb"]) > 1:
+                raise ValueError("one size, one time, or both")
+            settings += [f"recording.split_{unit}={value}" for unit, values in asked.items() for value in values]
+    except ValueError as error:
+        raise typer.BadParameter(f"{error}; as in --split 2GB,10min", param_hint="--split") from error
+    try:
+        if snapshot is not None:
+            asked = amounts(snapshot)
+            if asked["mb"] or not 1 <= len(asked["s"]) <= 2:
+                raise ValueError("the time before and, if 10 s is not it, the time after")
+            keys = ("recording.snapshot_before_s", "recording.snapshot_after_s")
+            settings += [f"{key}={value}" for key, value in zip(keys, asked["s"], strict=False)]
+    except ValueError as error:
+        raise typer.BadParameter(f"{error}; as in --snapshot 30s,10s", param_hint="--snapshot") from error
+    return settings
 
 
 def _point(text: str) -> str:

@@ -54,6 +54,13 @@ class Recording:
     flush_s: float = 0.5  # at most this much of the end is lost when the process is killed, in wall or session time
     sync_s: float = 1.0  # the same when the power fails
     queue_mb: float = 256.0  # waiting for the disk; a live run thins out its frames from the half of it on
+    # A run in several files: each of about so many MB, or of so many seconds, or both; else it is in one.
+    split_mb: float | None = None
+    split_s: float | None = None
+    # Nothing is written but what is around events: so many seconds before and after. None: everything is.
+    snapshot_before_s: float | None = None
+    snapshot_after_s: float = 10.0
+    snapshot_mb: float = 1000.0  # in memory; where it is too little, fewer seconds before the event are kept
     operator: str = ""
     notes: str = ""
     sample: str = ""
@@ -290,11 +297,27 @@ def _refuse_nonsense(config: Config, where: str) -> None:
         "camera.height_px": config.camera.height_px,
         "chip.um_per_px": config.chip.um_per_px,
         "duration_s": config.duration_s,
+        "recording.snapshot_mb": config.recording.snapshot_mb,
     }
     for key, value in positive.items():
         if value is not None and not value > 0:
             raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
     config.coils.check(where)
+    recording = config.recording
+    not_negative = {
+        "recording.split_mb": recording.split_mb,
+        "recording.split_s": recording.split_s,
+        "recording.snapshot_before_s": recording.snapshot_before_s,
+        "recording.snapshot_after_s": recording.snapshot_after_s,
+    }
+    for key, value in not_negative.items():
+        if value is not None and not value >= 0:
+            raise UsageError(f"{where}: {key} = {value:g}: must not be negative; 0 switches it off")
+    if recording.snapshot_before_s and (recording.split_mb or recording.split_s):
+        raise UsageError(
+            f"{where}: recording.snapshot_before_s keeps single moments and recording.split_* all of a run; set one of "
+            "them to 0"
+        )
     if config.control.method == "policy" and config.plan.method != "time_field":
         raise UsageError(
             f"{where}: control.method = 'policy' goes down the time to go, which plan.method = {config.plan.method!r} "

@@ -26,7 +26,7 @@ from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
 from flowrec.session import length_mm, session_writer
 from flowrec.status import StatusLine, say, table, warn
-from flowrec.store import SessionReader
+from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
 from flowrec.units import seconds
 
 View = Literal["spawn", "serve", "rrd", "none"]
@@ -36,9 +36,15 @@ View = Literal["spawn", "serve", "rrd", "none"]
 class Recorded:
     """What a finished recording is known by."""
 
-    path: Path
+    path: Path  # of the run, also where it is in several files
     report: RunReport
     facts: dict[str, str]
+    files: tuple[Path, ...] = ()  # in order; none where a run was to be kept around events, and none came
+
+    @property
+    def sessions(self) -> tuple[Path, ...]:
+        """What can be given to other verbs: the run, or each of its snapshots."""
+        return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
 
     @property
     def exit_status(self) -> int:
@@ -144,9 +150,10 @@ def default_path(config: Config, folder: Path | None = None) -> Path:
     words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
     stem = "_".join(word.replace(" ", "-") for word in words if word)
     folder = folder or Path()
+    names = taken(folder)
     for number in range(1, 10_000):
         path = folder / f"{stem}_{number:03d}.mcap"
-        if not path.exists() and not path.with_name(path.name + ".partial").exists():
+        if path not in names:
             return path
     raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
 
@@ -178,7 +185,9 @@ def record(
     stop = StopSwitch()
     witness = Witness()
     with ExitStack() as stack:
-        writer = stack.enter_context(session_writer(path, config, chip, live=realtime, overwrite=overwrite))
+        writer = stack.enter_context(
+            session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True)
+        )
         sinks: list[Sink] = [writer, witness]
         if view in ("spawn", "serve"):
             # Late: importing Rerun takes a second, and most runs do without.
@@ -189,6 +198,11 @@ def record(
             say(live.message)
             sinks.append(live)
         status = stack.enter_context(StatusLine(path.resolve().parent, lambda: writer.bytes_written).shown())
+
+        def on_tick(tick: Tick) -> None:
+            status(tick)
+            _say_remarks(writer)
+
         # A run that does not keep real time never waits: it would keep a core for itself.
         priority = first_of_all() if realtime else nullcontext(enter_result=False)
         with stop.armed(), priority as first:
@@ -198,7 +212,7 @@ def record(
                 worker,
                 sinks,
                 stop=stop,
-                on_tick=status,
+                on_tick=on_tick,
                 queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
             )
         facts = facts_of(chip, report, witness.true_field)
@@ -209,13 +223,36 @@ def record(
         outcome |= {"outcome": report.outcome, "note": report.note}
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
-        writer.close(outcome)
-    facts["file"] = f"{path} ({path.stat().st_size / 1e6:.1f} MB)"
+        bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
+        writer.close(outcome, why=bad)
+        _say_remarks(writer)
+    files = tuple(writer.files)
+    facts["file"] = files_told(path, files)
+    recorded = Recorded(path, report, facts, files)
     if view == "rrd":
         from flowrec.export import write_rrd_of
 
-        facts["recording for Rerun"] = str(write_rrd_of(path))
-    return Recorded(path, report, facts)
+        for name in recorded.sessions:
+            facts["recording for Rerun"] = str(write_rrd_of(name))
+    return recorded
+
+
+def _say_remarks(writer: SessionWriter) -> None:
+    while writer.remarks:
+        say(writer.remarks.popleft())
+
+
+def files_told(path: Path, files: tuple[Path, ...]) -> str:
+    """Which files a run is in, and how large they are."""
+    if not files:
+        return "none: no mark, note, warning or loss of images, and a good end"
+    size = f"{sum(file.stat().st_size for file in files) / 1e6:.1f} MB"
+    if files == (path,):
+        return f"{path} ({size})"
+    kind = "snapshots" if is_snapshot(files[0]) else "parts"
+    if len(files) == 1:
+        return f"{files[0]} ({size})"
+    return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
 
 
 def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dict[str, str]:
@@ -243,9 +280,11 @@ def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dic
 def print_summary(recorded: Recorded) -> None:
     """The table at the end of a run and what to do next."""
     table("Session", ("", "value"), list(recorded.facts.items()))
-    if recorded.exit_status:
+    sessions = recorded.sessions
+    if recorded.exit_status and sessions:
         say(
             f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; "
-            f"see flowrec view {recorded.path}"
+            f"see flowrec view {sessions[-1]}"
         )
-    say(f"next: flowrec replay {recorded.path} --refine    flowrec view {recorded.path}")
+    if sessions:
+        say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")

@@ -13,7 +13,7 @@ from flowrec.chip.chip import Chip
 from flowrec.config import Config, config_from_toml, to_toml
 from flowrec.messages import Route
 from flowrec.provenance import provenance
-from flowrec.store import SessionHeader, SessionReader, SessionWriter, encoding_for
+from flowrec.store import SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for
 
 
 def session_writer(
@@ -24,10 +24,11 @@ def session_writer(
     parent: Path | None = None,
     live: bool = False,
     overwrite: bool = False,
+    in_pieces: bool = False,
 ) -> SessionWriter:
     """A new session file with its head written. `parent` is the session that it replays, named by content.
 
-    A `live` run drops images rather than wait for the disk.
+    A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
     """
     named = {"file": parent.name, "sha256": file_sha256(parent)} if parent is not None else None
     return SessionWriter(
@@ -39,7 +40,15 @@ def session_writer(
         queue_limit_bytes=int(config.recording.queue_mb * 1e6),
         block=not live,
         overwrite=overwrite,
+        pieces=_pieces_of(config) if in_pieces else None,
     )
+
+
+def _pieces_of(config: Config) -> Split | Snapshot:
+    recording = config.recording
+    if recording.snapshot_before_s:
+        return Snapshot(recording.snapshot_before_s, recording.snapshot_after_s, recording.snapshot_mb)
+    return Split(recording.split_mb, recording.split_s)
 
 
 def frames_of(config: Config) -> str:

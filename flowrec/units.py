@@ -4,11 +4,16 @@ The flow solver alone works in SI; everything else in um, um/s, s, rad, Hz, mT, 
 """
 
 import math
+import re
 
 NS_PER_S = 1_000_000_000
 M_PER_UM = 1e-6
 UM_PER_M = 1e6
 PA_S_PER_MPA_S = 1e-3
+# What people type on a command line.
+_S_PER = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+_MB_PER = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6}
+_AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
 
 
 def seconds(stamp_ns: int) -> float:
@@ -24,3 +29,23 @@ def nanoseconds(time_s: float) -> int:
 def wrap_rad(angle_rad: float) -> float:
     """The same angle within (-pi, pi]."""
     return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)
+
+
+def amounts(text: str) -> dict[str, list[float]]:
+    """What is asked for with `10min`, `2GB`, `30s,10s`: times under `s`, in s, and sizes under `mb`, in MB.
+
+    Raises
+    ------
+    ValueError : a part of it that is neither.
+    """
+    found: dict[str, list[float]] = {"s": [], "mb": []}
+    for part in text.split(","):
+        match = _AMOUNT.fullmatch(part)
+        unit = match[2].lower() if match is not None else ""
+        if match is not None and unit in _S_PER:
+            found["s"].append(float(match[1]) * _S_PER[unit])
+        elif match is not None and unit in _MB_PER:
+            found["mb"].append(float(match[1]) * _MB_PER[unit])
+        else:
+            raise ValueError(f"{part.strip()!r} is neither a time (ms, s, min, h) nor a size (kB, MB, GB, TB)")
+    return found

@@ -19,6 +19,7 @@ import numpy as np
 
 from flowrec.bench.store_kills import kills
 from flowrec.bench.store_loop import soak, stall
+from flowrec.bench.store_splits import show_splits, splits
 from flowrec.bench.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
 from flowrec.status import progress, table
 from flowrec.store import SessionReader, SessionWriter, recover
@@ -27,16 +28,21 @@ _MEMORY = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is mad
 _AIM = {"p99_ratio": 1.2, "disk_mb_s": 350.0, "throughput": 0.9}
 
 
-def measure(folder: Path | None = None, quick: bool = False, minutes: float = 0.0, killed: int = 0) -> dict[str, Any]:
+def measure(
+    folder: Path | None = None, quick: bool = False, minutes: float = 0.0, killed: int = 0, split_s: float = 0.0
+) -> dict[str, Any]:
     """Throughput of each writer, stall of the control step, read, seek and recovery times.
 
     `folder` is where the disk is measured and the stall is; by default that for temporary files. With `minutes`
-    nothing but memory is measured, for so long; with `killed` nothing but what so many kills cost.
+    nothing but memory is measured, for so long; with `killed` nothing but what so many kills cost. With `split_s` the
+    killed runs go on in another file after so many seconds; alone, what that does to the control loop is measured.
     """
     if minutes:
-        return {"soak": soak(minutes, folder)}
+        return {"soak": soak(minutes, folder, keeping=False), "soak_ring": soak(minutes, folder, keeping=True)}
     if killed:
-        return {"kills": kills(killed, folder)}
+        return {"kills": kills(killed, folder, split_s)}
+    if split_s:
+        return {"splits": splits(folder, split_s, 3.0 if quick else 12.0, 1 if quick else 3)}
     share = 0.1 if quick else 1.0
     seconds = 2.0 if quick else 10.0
     with tempfile.TemporaryDirectory(dir=folder) as disk_name:
@@ -137,13 +143,20 @@ def _reading(folder: Path, count: int) -> dict[str, float]:
 def show(figures: dict[str, Any]) -> None:
     """Print the figures as tables."""
     if "soak" in figures:
-        found = figures["soak"]
+        both = (figures["soak"], figures["soak_ring"])
         names = ("minutes", "file_mb", "dropped", "lowest_mb", "highest_mb", "growth_mb_per_minute")
-        table("Soak, 640x512 at 100 Hz", ("", ""), [(name.replace("_", " "), f"{found[name]:.1f}") for name in names])
+        rows = [(name.replace("_", " "), *(f"{found[name]:.1f}" for found in both)) for name in names]
+        table("Soak, 640x512 at 100 Hz", ("", "all of it", "a ring of 30 s"), rows)
+        return
+    if "splits" in figures:
+        show_splits(figures["splits"])
         return
     if "kills" in figures:
         found = figures["kills"]
-        rows = [(name.replace("_", " "), str(found[name])) for name in ("kills", "before_the_first_flush", "broken")]
+        rows = [
+            (name.replace("_", " "), str(found[name]))
+            for name in ("kills", "files", "before_the_first_flush", "broken")
+        ]
         rows += [(f"lost, {name}, s", f"{value:.3f}") for name, value in found["lost_s"].items()]
         table("kill -9 of a recording, 640x512 at 100 Hz", ("", ""), rows)
         return

@@ -16,17 +16,18 @@ from flowrec.bench.loop import PacedRig, TimingsOnly, prepare_inputs
 from flowrec.bench.store_rivals import BareProcess, BareThread
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.config import load_config
-from flowrec.messages import Frame, Image, Tick
+from flowrec.messages import Frame, Image, OperatorEvent, Tick
 from flowrec.priority import first_of_all
 from flowrec.record import prepare
 from flowrec.run import LockstepWorker, Sink, run
 from flowrec.status import progress
-from flowrec.store import SessionWriter
+from flowrec.store import SessionWriter, Snapshot
 
 RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 2448, 2048
 _RING = 64
 _SOAK_RATE_HZ = 100.0
+_RING_S = 30.0
 _WARM_S = 5.0  # until the queue, the pools and the caches have their size
 
 
@@ -124,27 +125,38 @@ def _row(runs: list[Any], ticks: int) -> dict[str, float]:
     }
 
 
-def soak(minutes: float, folder: Path | None = None) -> dict[str, Any]:
-    """Memory of this process while 640x512 images are recorded at 100 Hz, once a second."""
+def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -> dict[str, Any]:
+    """Memory of this process while 640x512 images are recorded at 100 Hz, once a second.
+
+    `keeping`: in a ring of 30 s, with a mark every minute.
+    """
     images = pictures(640, 512)
     mb: list[float] = []
     count = round(minutes * 60 * _SOAK_RATE_HZ)
     with tempfile.TemporaryDirectory(dir=folder) as name:
         path = Path(name) / "soak.mcap"
-        with SessionWriter(path, made_up_header(), frames="delta") as writer, progress("soaking", count) as done:
+        pieces = Snapshot(_RING_S) if keeping else None
+        with (
+            SessionWriter(path, made_up_header(), frames="delta", pieces=pieces) as writer,
+            progress("soaking", count) as done,
+        ):
             began = time.perf_counter()
+            mark: OperatorEvent | None = None
             for number, tick in enumerate(ticks_of(images, count, _SOAK_RATE_HZ)):
                 wait_s = began + number / _SOAK_RATE_HZ - time.perf_counter()
                 if wait_s > 0:
                     time.sleep(wait_s)
                 assert tick.frame is not None
-                writer.write(replace(tick, frame=replace(tick.frame, image=tick.frame.image.copy())))
+                if number % (60 * _SOAK_RATE_HZ) == 59 * _SOAK_RATE_HZ:
+                    mark = OperatorEvent(tick.stamp_ns, "mark", "")
+                writer.write(replace(tick, frame=replace(tick.frame, image=tick.frame.image.copy()), operator=mark))
                 if number % _SOAK_RATE_HZ == 0:
                     mb.append(memory_mb())
                     done(number)
             dropped = writer.dropped_frames
-        size = path.stat().st_size
-    settled = np.array(mb[int(_WARM_S) :]) if len(mb) > 2 * _WARM_S else np.array(mb)
+        size = sum(file.stat().st_size for file in writer.files)
+    warm = int(_WARM_S + _RING_S if keeping else _WARM_S)
+    settled = np.array(mb[warm:]) if len(mb) > 2 * warm else np.array(mb)
     growth = np.polyfit(np.arange(len(settled)), settled, 1)[0] * 60.0 if len(settled) > 1 else 0.0
     return {
         "minutes": minutes,

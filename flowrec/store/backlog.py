@@ -15,11 +15,26 @@ News = dict[str, Message]  # the new messages of one tick by field of Tick, in t
 
 
 class Entry(NamedTuple):
-    """The new messages of one tick and about what they weigh in memory."""
+    """The new messages of one tick and about what they weigh in memory.
+
+    Attributes
+    ----------
+    stamp_ns, news, nbytes : its stamp, its messages, their weight.
+    ticks : 1 for a tick itself, 0 for its image and for what is added to it.
+    image_bytes : weight of its image, which follows in the other lane; 0 where none does.
+    late : it is that image.
+    dropped, missing : images that the writer left out, and that the camera has not delivered, up to here from the
+        entry before.
+    """
 
     stamp_ns: int
     news: News
     nbytes: int
+    ticks: int = 0
+    image_bytes: int = 0
+    late: bool = False
+    dropped: int = 0
+    missing: int = 0
 
 
 class Backlog:
@@ -48,10 +63,10 @@ class Backlog:
             self._changed.wait_for(lambda: self._abandoned or self.has_room(nbytes))
 
     def put(self, entry: Entry, image: Entry | None = None) -> None:
-        """Append what is not empty, `image` to the lane that waits; never blocks."""
+        """Append an entry, `image` to the lane that waits; never blocks."""
         with self._changed:
             for news, lane in ((entry, self._state), (image, self._images)):
-                if news is not None and news.news:
+                if news is not None:
                     lane.append(news)
                     self.nbytes += news.nbytes
             self._changed.notify_all()
@@ -67,6 +82,19 @@ class Backlog:
     def images_wait(self) -> bool:
         """Whether the next entry may be the image of a tick that was taken before."""
         return bool(self._images)
+
+    def drop_images(self) -> int:
+        """Take the images out of what waits; how many there were."""
+        with self._changed:
+            dropped = len(self._images)
+            for place, image in enumerate(self._images):
+                self._images[place] = image._replace(news={}, dropped=1)
+            for place, entry in enumerate(self._state):  # where nobody minds to wait, images travel with the rest
+                if "frame" in entry.news:
+                    others = {name: message for name, message in entry.news.items() if name != "frame"}
+                    self._state[place] = entry._replace(news=others, dropped=entry.dropped + 1)
+                    dropped += 1
+        return dropped
 
     def done(self, entry: Entry) -> None:
         """The entry has been dealt with: its bytes are free again."""

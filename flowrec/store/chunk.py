@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 import zlib
 from array import array
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import zstandard
@@ -42,7 +43,7 @@ class ChannelIndex:
 class Sealed:
     """What goes into one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
 
-    `data` may lie in the builder's memory: it is to be written before the builder is used again.
+    `data` may lie in the builder's memory: it is to be written, or `kept`, before the builder is used again.
     """
 
     compression: str
@@ -52,6 +53,11 @@ class Sealed:
     uncompressed_crc: int
     uncompressed_size: int
     indexes: list[ChannelIndex]
+
+
+def kept(sealed: Iterable[Sealed]) -> list[Sealed]:
+    """Chunks whose bytes are their own."""
+    return [replace(chunk, data=bytes(chunk.data)) for chunk in sealed]
 
 
 class ChunkBuilder:

@@ -45,6 +45,17 @@ def pieces(path: Path) -> list[Path]:
     return sorted(other for other in path.parent.iterdir() if other.is_file() and run_path(other) == path)
 
 
+def taken(folder: Path) -> set[Path]:
+    """Every X.mcap in a folder of which any piece is there."""
+    return {run_path(path) for path in folder.iterdir()} if folder.is_dir() else set()
+
+
+def is_snapshot(path: Path) -> bool:
+    """Whether a file is a snapshot by its name."""
+    match = _PIECE.fullmatch(path.stem)
+    return match is not None and match["kind"] == "snap"
+
+
 def parts(path: Path) -> list[Path]:
     """The finished parts of the run X.mcap, in order."""
     found = [(match, other) for other in pieces(path) if (match := _PIECE.fullmatch(other.stem)) is not None]

@@ -1,37 +1,24 @@
-"""Entries of the backlog -> chunks of the file. Runs in the writer's thread and knows nothing of it."""
+"""Entries of the backlog -> one file, as durable as was promised. Runs in the writer's thread."""
 
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from mcap.records import Metadata
-
-import flowrec
 from flowrec.errors import SessionError
-from flowrec.messages import Frame
 from flowrec.store.backlog import Entry
-from flowrec.store.chunk import ChunkBuilder
-from flowrec.store.codec import encode_record, message_stamp
-from flowrec.store.form import Payload
+from flowrec.store.chunk import Sealed, kept
 from flowrec.store.frames import FrameEncoding
-from flowrec.store.header import OUTCOME, PROFILE, VIEW, SessionHeader, records_of
-from flowrec.store.layout import FRAMES, GROUPS, SLOTS, STATE, declarations
-from flowrec.store.layout import VIEW as VIEW_GROUP
-from flowrec.store.mcap_file import McapFile
+from flowrec.store.header import SessionHeader
 from flowrec.store.mirrors import Mirrors
-from flowrec.store.source import CHUNK_LIMIT_BYTES
+from flowrec.store.packer import Packer
+from flowrec.store.piece import Piece, PieceError
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
-# A chunk is what one needs to read for one message, and what a compressor sees at once.
-_CHUNK_BYTES = {FRAMES: 1 << 20, STATE: 1 << 18, VIEW_GROUP: 1 << 18}
-# Left in the largest chunk that is read for what surrounds a message.
-_CHUNK_ROOM_BYTES = 1 << 20
-_SYNC_POLL_S = 0.05
+_POLL_S = 0.05
 
 
 class Recorder:
@@ -41,122 +28,165 @@ class Recorder:
     `sync_s` is kept by the disk, as long as one fsync takes less than half of that. It is done in a thread of its
     own: on a busy disk it may take a second, in which a camera fills the queue.
 
+    Parameters
+    ----------
+    wait : until the disk keeps the head; else it does so with what comes next.
+
+    Attributes
+    ----------
+    first_bytes : what the file begins with, its head and the tick that it was told to begin with.
+
     Raises
     ------
-    OSError : from any method, when the disk refuses.
-    SessionError : a message that can not be encoded.
+    PieceError : from any method, when the disk refuses, or a message can not be encoded.
     """
 
     def __init__(
-        self, path: Path, header: SessionHeader, *, frames: FrameEncoding, flush_s: float, sync_s: float, truncate: bool
+        self,
+        path: Path,
+        header: SessionHeader,
+        *,
+        frames: FrameEncoding,
+        mirrors: Mirrors,
+        flush_s: float,
+        sync_s: float,
+        overwrite: bool,
+        wait: bool = True,
     ) -> None:
         # A message waits up to half of the time for the next fsync to begin, and the other half until it is done.
         self._sync_every_s = sync_s / 2
         # Begun a fifth early, a flush is over in time also on a busy machine.
         self._flush_s = 0.8 * min(flush_s, self._sync_every_s)
+        self._mirrors = mirrors
+        self._piece = Piece(path, header, frames, overwrite=overwrite)
         self._frames = frames
-        self._builders = {group: ChunkBuilder(compressed=frames.packed or group != FRAMES) for group in GROUPS}
-        self._sequences: Counter[str] = Counter()
-        self._mirrors = Mirrors()
-        self._file = McapFile(path, truncate=truncate)
+        self._packer = Packer(frames, mirrors, self._piece.add_chunks)
+        self.first_bytes = self._piece.size
+        self._beginning: Future[None] | None = None
+        self._held: list[Sealed] = []
         self._flushed_s = self._synced_s = time.monotonic()
+        self._synced_size = 0
         self._flushed_ns: int | None = None
         self._last_ns = 0
         self._syncing: Future[None] | None = None
         self._beside = ThreadPoolExecutor(1, "session-sync")
-        try:
-            self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
-            for record in (*records_of(header), *declarations(frames)):
-                self._file.add(record)
-            self._sync()
-        except BaseException:
-            self.close()
-            raise
+        if wait:
+            try:
+                self._sync()
+            except BaseException:
+                self.close()
+                raise
+
+    @property
+    def path(self) -> Path:
+        """What the file will be called."""
+        return self._piece.path
+
+    @property
+    def partial_path(self) -> Path:
+        """What it is called until then."""
+        return self._piece.partial_path
 
     @property
     def size(self) -> int:
         """Bytes handed to the operating system."""
-        return self._file.size
+        return self._piece.size
 
     @property
-    def encoding(self) -> str:
-        """How images travel."""
-        return self._frames.name
+    def waiting_bytes(self) -> int:
+        """Bytes that were not, mostly before they are compressed."""
+        return self._packer.size + sum(len(chunk.data) for chunk in self._held)
 
     @property
-    def lossless(self) -> bool:
-        """Whether they come back as they were."""
-        return self._frames.lossless
+    def broken(self) -> bool:
+        """Whether something has failed."""
+        return self._piece.broken
 
     @property
     def patience_s(self) -> float | None:
         """For how long one may wait for the next entry before `flush_if_due` has something to do; None: for ever."""
-        if any(builder.size for builder in self._builders.values()):
+        if self._beginning is not None:
+            return _POLL_S
+        if self._packer.size:
             return max(0.0, self._flushed_s + self._flush_s - time.monotonic())
-        if self._synced_size < self._file.size:
+        if self._synced_size < self._piece.size:
             # While the last fsync is still running there is nothing to do about the next one.
-            shortest = _SYNC_POLL_S if self._sync_running else 0.0
+            shortest = _POLL_S if self._sync_running else 0.0
             return max(shortest, self._synced_s + self._sync_every_s - time.monotonic())
         return None
 
+    def begin_with(self, entry: Entry) -> None:
+        """Let one tick come first. Large flow fields take a while, in which chunks of what follows are held back."""
+        self._packer.take = self._hold
+        self._packer.sequences.update(BY_FIELD[field].path for field in entry.news)
+        packer = Packer(self._frames, self._mirrors, self._piece.add_chunks)
+        self._beginning = self._beside.submit(_begin, packer, entry)
+
+    def wait_for_beginning(self) -> None:
+        """Until that tick is in the file."""
+        self._hear_of_beginning(wait=True)
+
     def add(self, entry: Entry) -> None:
         """Encode the messages of one tick; write the chunks that are full."""
+        self._hear_of_beginning(wait=False)
         if self._flushed_ns is None:
             self._flushed_ns = entry.stamp_ns
         self._last_ns = max(self._last_ns, entry.stamp_ns)
-        for field, message in entry.news.items():
-            codec = self._frames.codec if isinstance(message, Frame) else None
-            sequence, payload = encode_record(message, codec)
-            self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
-        for mirror, stamp_ns, view in self._mirrors.of(entry.news):
-            self._append(mirror.path, entry.stamp_ns, stamp_ns, (view,), None)
-        full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]
-        if full:
-            self._file.add_chunks([builder.seal() for builder in full])
+        try:
+            self._packer.add(entry)
+        except PieceError:
+            raise
+        except SessionError as error:
+            raise self._piece.spoiled(error) from error
 
     def flush_if_due(self) -> None:
         """Write what has waited for long enough, and have the disk keep it."""
+        self._hear_of_beginning(wait=False)
         now, stamps_s = time.monotonic(), seconds(self._last_ns - (self._flushed_ns or 0))
         if now >= self._flushed_s + self._flush_s or stamps_s >= self._flush_s:
             self._flush()
             self._flushed_s, self._flushed_ns = now, self._last_ns
-        if now >= self._synced_s + self._sync_every_s and self._synced_size < self._file.size:
+        if now >= self._synced_s + self._sync_every_s and self._synced_size < self._piece.size:
             self._sync_beside(now)
 
+    def flush(self) -> None:
+        """Write what waits."""
+        self._hear_of_beginning(wait=True)
+        self._flush()
+        self._flushed_s, self._flushed_ns = time.monotonic(), self._last_ns
+
     def finish(self, outcome: Mapping[str, str]) -> None:
-        """The rest of the messages, the outcome and the summary, down to the disk."""
+        """The rest of the messages, the outcome and the summary, down to the disk; then the file has its name."""
+        self._hear_of_beginning(wait=True)
         self._flush()
         self._join_sync()
-        if self._mirrors.top_um_s is not None:
-            self._file.add(Metadata(VIEW, {"speed_scale_um_s": repr(self._mirrors.top_um_s)}))
-        self._file.add(Metadata(OUTCOME, dict(outcome)))
-        self._file.finish()
-        self._sync()
+        self._piece.finish(outcome, self._mirrors.top_um_s)
 
     def close(self) -> None:
         """Close the file as it is."""
         self._beside.shutdown()
-        self._file.close()
+        self._piece.close()
 
-    def _append(self, path: str, log_ns: int, publish_ns: int, payload: Payload, sequence: int | None) -> None:
-        slot = SLOTS[path]
-        if sequence is None:
-            sequence = self._sequences[path]
-            self._sequences[path] = (sequence + 1) % 2**32
-        builder = self._builders[slot.group]
-        size = sum(map(len, payload))
-        if builder.size + size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
-            if size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
-                raise SessionError(
-                    f"a message of {path} has {size} bytes, more than a chunk may hold; use a smaller chip"
-                )
-            self._file.add_chunks([builder.seal()])
-        # The stamp itself travels in the payload; MCAP knows no time before zero.
-        builder.add(slot.channel, sequence, log_ns, max(0, publish_ns), payload)
+    def _flush(self) -> None:
+        self._packer.seal()
+
+    def _hold(self, sealed: list[Sealed]) -> None:
+        self._held += kept(sealed)
+
+    def _hear_of_beginning(self, *, wait: bool) -> None:
+        if self._beginning is None or not (wait or self._beginning.done()):
+            return
+        self._beginning.result()
+        self._beginning = None
+        self.first_bytes = self._piece.size
+        self._packer.take = self._piece.add_chunks
+        if self._held:
+            held, self._held = self._held, []
+            self._piece.add_chunks(held)
 
     def _sync(self) -> None:
-        self._synced_size = self._file.size
-        self._file.sync()
+        self._synced_size = self._piece.size
+        self._piece.sync()
         self._synced_s = time.monotonic()
 
     def _sync_beside(self, now_s: float) -> None:
@@ -164,8 +194,8 @@ class Recorder:
             return
         self._join_sync()
         self._flush()
-        self._synced_s, self._synced_size = now_s, self._file.size
-        self._syncing = self._beside.submit(self._file.sync)
+        self._synced_s, self._synced_size = now_s, self._piece.size
+        self._syncing = self._beside.submit(self._piece.sync)
 
     @property
     def _sync_running(self) -> bool:
@@ -177,7 +207,7 @@ class Recorder:
             self._syncing.result()
             self._syncing = None
 
-    def _flush(self) -> None:
-        waiting = [builder for builder in self._builders.values() if builder.size]
-        if waiting:
-            self._file.add_chunks([builder.seal() for builder in waiting])
+
+def _begin(packer: Packer, entry: Entry) -> None:
+    packer.add(entry)
+    packer.seal()

@@ -14,10 +14,11 @@ from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
 from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import PARTIAL_SUFFIX, partial_path
+from flowrec.store.piece import sync_directory
 from flowrec.store.reader import SessionReader
 from flowrec.store.scan import Scan, scan
 from flowrec.store.source import DamageError, Source
-from flowrec.store.writer import SessionWriter, sync_directory
+from flowrec.store.writer import SessionWriter
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
@@ -201,6 +202,9 @@ def _losses(reader: SessionReader, found: Scan, images_missing: int, images_ahea
         nbytes, first = sum(lost.nbytes for lost in found.lost), found.lost[0].offset
         yield f"{nbytes} damaged or cut-off bytes, the first at {first}"
     gaps = found.gaps.get(_channel(found, "/coils/applied"), [])
+    part = reader.header.part
+    if part is not None and part.kind == "snapshot":  # which begins on the way
+        gaps = [gap for gap in gaps if gap.before_ns > reader.first_ns]
     if gaps:
         from_s = seconds(gaps[0].before_ns - reader.first_ns)
         yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import itertools
 import operator
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -21,8 +21,11 @@ from flowrec.store.backlog import Backlog, Entry, News
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
 from flowrec.store.layout import FRAME_PATH
-from flowrec.store.names import partial_path
-from flowrec.store.recorder import Recorder
+from flowrec.store.mcap_file import is_growing
+from flowrec.store.names import pieces as pieces_of
+from flowrec.store.parts import Parts, Split
+from flowrec.store.piece import Making, refuse_if_taken
+from flowrec.store.snapshots import Snapshot, Snapshots
 from flowrec.store.thinning import Thinning
 from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S
@@ -42,6 +45,29 @@ def _pixels(message_type: Any) -> tuple[str, ...]:
 _PIXELS = {topic.type: _pixels(topic.type) for topic in TOPICS}
 
 
+class _Output(Protocol):
+    """Where entries go; all in the writer's thread but for `size`, and `finish` and `close` after its end."""
+
+    files: list[Path]
+
+    @property
+    def partial_path(self) -> Path: ...
+
+    @property
+    def size(self) -> int: ...
+
+    @property
+    def patience_s(self) -> float | None: ...
+
+    def add(self, entry: Entry) -> None: ...
+
+    def flush_if_due(self) -> None: ...
+
+    def finish(self, outcome: Mapping[str, str], why: str = "") -> None: ...
+
+    def close(self, reason: str = "") -> None: ...
+
+
 class SessionWriter:
     """Records ticks in a new session file; `write` returns at once, a thread encodes, compresses and writes.
 
@@ -57,10 +83,16 @@ class SessionWriter:
     flush_s : at most this much of a run is lost when the process is killed, in s, of wall time and of stamps;
         besides, of its images and where `block` is set, what `queue_bytes` says is waiting.
     sync_s : the same when the power fails, as long as an fsync takes less than half of it.
-    overwrite : replace an existing file, and the remains of an unfinished one.
+    overwrite : replace whatever there is of the run, once the new one is whole.
     block : what to do when the disk is slower than the run. True: `write` waits (simulation).
         False: images are thinned out (thinning.py) and counted, nothing else ever is dropped (live run).
     queue_limit_bytes : how much may wait for the disk.
+    pieces : a Split, after which the run X.mcap is in the files X.part001.mcap, X.part002.mcap, ..., each of which can
+        be read alone; or a Snapshot: nothing is written but X.snap001.mcap, ... around events.
+
+    Attributes
+    ----------
+    remarks : on snapshots, for a person, as they are taken.
 
     Raises
     ------
@@ -78,9 +110,9 @@ class SessionWriter:
         overwrite: bool = False,
         block: bool = False,
         queue_limit_bytes: int = 256 << 20,
+        pieces: Split | Snapshot | None = None,
     ) -> None:
         self.path = Path(path)
-        self.partial_path = partial_path(self.path)
         self.ticks = 0  # written so far
         self.dropped_frames = 0  # for want of a faster disk
         self.missing_frames = 0  # live: those that the camera counted and never delivered
@@ -93,18 +125,17 @@ class SessionWriter:
         self._last_ns = -1
         self._failure: BaseException | None = None
         self._closed = False
-        self._refuse_if_taken()
-        try:
-            self._recorder = Recorder(
-                self.partial_path,
-                header,
-                frames=ENCODINGS[frames],
-                flush_s=flush_s,
-                sync_s=sync_s,
-                truncate=overwrite,
-            )
-        except OSError as error:
-            raise _not_writable(self.partial_path, error) from error
+        part = header.part
+        self._carried_ns = part.carried_ns if part is not None else None
+        refuse_if_taken(self.path, overwrite=overwrite)
+        making = Making(self.path, header, ENCODINGS[frames], flush_s, sync_s, overwrite)
+        run = os.urandom(8).hex()  # the same in all pieces, and in no other run
+        self.remarks: deque[str] = deque()
+        self._output: _Output
+        if isinstance(pieces, Snapshot):
+            self._output = Snapshots(making, pieces, run, self.remarks)
+        else:
+            self._output = Parts(making, pieces or Split(), run)
         self._backlog = Backlog(queue_limit_bytes)
         self._thread = threading.Thread(target=self._work, name="session-writer", daemon=True)
         self._thread.start()
@@ -116,8 +147,18 @@ class SessionWriter:
 
     @property
     def bytes_written(self) -> int:
-        """Size of the file so far."""
-        return self._recorder.size
+        """Size of the files so far."""
+        return self._output.size
+
+    @property
+    def files(self) -> list[Path]:
+        """Those that are whole, in order."""
+        return list(self._output.files)
+
+    @property
+    def partial_path(self) -> Path:
+        """What is written just now."""
+        return self._output.partial_path
 
     def write(self, tick: Tick) -> None:
         """Record what is new in this tick.
@@ -136,28 +177,44 @@ class SessionWriter:
                 " stamps of a session must grow, check the clock of the rig"
             )
         self._last_ns = tick.stamp_ns
-        self.ticks += 1
+        counted = int(tick.stamp_ns != self._carried_ns)  # one that another part has recorded counts there
+        self.ticks += counted
         news = self._news_of(tick)
         if self._block:
-            entry = _entry(tick.stamp_ns, news)
+            entry = Entry(tick.stamp_ns, news, _weight(news), counted)
             if not self._backlog.has_room(entry.nbytes):
                 self._backlog.wait_for_room(entry.nbytes)
                 self._raise_failure()
             self._backlog.put(entry)
             return
         frame = news.pop("frame", None)
-        if isinstance(frame, Frame) and not self._takes(frame):
-            frame = None
+        dropped, missing = self.dropped_frames, self.missing_frames
+        image: Entry | None = None
+        if isinstance(frame, Frame) and self._takes(frame):
+            image = Entry(tick.stamp_ns, {"frame": frame}, _nbytes(frame), late=True)
         self._tell_drops(news, tick.stamp_ns)
-        image: News = {"frame": frame} if frame is not None else {}
-        self._backlog.put(_entry(tick.stamp_ns, news), _entry(tick.stamp_ns, image))
+        entry = Entry(
+            tick.stamp_ns,
+            news,
+            _weight(news),
+            counted,
+            image_bytes=image.nbytes if image is not None else 0,
+            dropped=self.dropped_frames - dropped,
+            missing=self.missing_frames - missing,
+        )
+        self._backlog.put(entry, image)
 
-    def close(self, outcome: Mapping[str, str] | None = None) -> None:
+    def close(
+        self, outcome: Mapping[str, str] | None = None, patience_s: float | None = None, *, why: str = ""
+    ) -> None:
         """Finish the file and give it its name; a second call does nothing.
 
         Parameters
         ----------
         outcome : how the run ended, as text; numbers of ticks and of dropped frames are added.
+        patience_s : for how long images that wait may still be written, in s; what is left of them then is dropped
+            and counted. Everything else is always written. None: as long as it takes.
+        why : the end is worth a snapshot, for this.
 
         Raises
         ------
@@ -167,17 +224,16 @@ class SessionWriter:
             return
         self._closed = True
         self._backlog.close()
+        self._thread.join(patience_s)
+        waiting = self._backlog.drop_images() if self._thread.is_alive() else 0
         self._thread.join()
-        counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
-        if self.missing_frames:
-            counts["frames_missing_from_camera"] = str(self.missing_frames)
-        if not self._recorder.lossless:
-            counts["frames_encoding"] = f"{self._recorder.encoding}, not lossless: a replay sees other pixels"
         try:
             if self._failure is None:
-                self._finish({**(outcome or {"outcome": "ended"}), **counts})
+                self._finish(outcome or {"outcome": "ended"}, waiting, why)
+        except Exception as error:  # noqa: BLE001  told below, as those of the thread
+            self._failure = error
         finally:
-            self._recorder.close()
+            self._output.close(f"{self._failure}" if self._failure is not None else "")
         self._raise_failure()
 
     def __enter__(self) -> Self:
@@ -192,7 +248,7 @@ class SessionWriter:
         stopped = isinstance(error, KeyboardInterrupt)
         reason = f"{type(error).__name__}: {error}".rstrip(": ")
         try:
-            self.close({"outcome": "stopped" if stopped else "failed", "reason": reason})
+            self.close({"outcome": "stopped" if stopped else "failed", "reason": reason}, why=reason)
         except SessionError as second:
             if str(second) != str(error):  # the first one matters more
                 error.add_note(str(second))
@@ -240,53 +296,39 @@ class SessionWriter:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
             while not self._backlog.drained:
-                entry = self._backlog.take(self._recorder.patience_s)
+                entry = self._backlog.take(self._output.patience_s)
                 if entry is not None:
-                    self._recorder.add(entry)
+                    self._output.add(entry)
                 # The image of a tick comes after its other messages: where it can be, what is flushed are whole ticks.
                 if entry is None or "frame" in entry.news or not self._backlog.images_wait:
-                    self._recorder.flush_if_due()
+                    self._output.flush_if_due()
                 if entry is not None:
                     self._backlog.done(entry)
         except Exception as error:  # noqa: BLE001  whatever it is, the control loop has to hear of it
             self._failure = error
             self._backlog.abandon()
 
-    def _finish(self, outcome: Mapping[str, str]) -> None:
-        try:
-            self._recorder.finish(outcome)
-            self._refuse_if_taken(finished=True)
-            self.partial_path.replace(self.path)
-            sync_directory(self.path.parent)
-        except OSError as error:
-            self._failure = error
+    def _finish(self, outcome: Mapping[str, str], dropped: int, why: str) -> None:
+        """What the thread leaves to be done; `dropped` images found no time."""
+        if dropped:
+            self.dropped_frames += dropped
+            drops = Drops(self._last_ns, FRAME_PATH, self.dropped_frames, self.missing_frames, self._thinning.every)
+            self._output.add(Entry(self._last_ns, {"drops": drops}, 0))  # at the last tick, for no other comes
+        self._output.finish(outcome, why)
+        if self._overwrite and self.files:  # else nothing has come of the run, and what was there may stay
+            for stale in set(pieces_of(self.path)) - set(self.files):
+                if not is_growing(stale):
+                    stale.unlink(missing_ok=True)
 
     def _raise_failure(self) -> None:
-        if self._failure is None:
-            return
-        if isinstance(self._failure, OSError):
-            raise _disk_failed(self.partial_path, self._failure) from self._failure
         if isinstance(self._failure, SessionError):
-            raise SessionError(
-                f"{self.path}: {self._failure}; `flowrec recover {self.partial_path}` keeps what came before"
-            ) from self._failure
-        raise self._failure
-
-    def _refuse_if_taken(self, *, finished: bool = False) -> None:
-        if self._overwrite and not self.path.is_dir():
-            return
-        if self.path.exists():
-            kept = f" (the finished session stays in {self.partial_path})" if finished else ""
-            raise SessionError(f"{self.path}: exists already{kept}; choose another name with --out, or --overwrite it")
-        if not finished and self.partial_path.exists():
-            raise SessionError(
-                f"{self.partial_path}: is left from a run that did not finish; `flowrec recover {self.partial_path}`"
-                " saves it, another --out or --overwrite goes on without it"
-            )
+            raise SessionError(str(self._failure)) from self._failure
+        if self._failure is not None:
+            raise self._failure
 
 
-def _entry(stamp_ns: int, news: News) -> Entry:
-    return Entry(stamp_ns, news, sum(map(_nbytes, news.values())))
+def _weight(news: News) -> int:
+    return sum(map(_nbytes, news.values()))
 
 
 def _nbytes(message: Message) -> int:
@@ -296,25 +338,3 @@ def _nbytes(message: Message) -> int:
         if pixels is not None:
             nbytes += pixels.nbytes
     return nbytes
-
-
-def sync_directory(directory: Path) -> None:
-    """Have the disk keep the new name as well."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _not_writable(path: Path, error: OSError) -> SessionError:
-    if isinstance(error, FileNotFoundError):
-        return SessionError(f"{path.parent}: no such directory; make it, or choose another place with --out")
-    return SessionError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
-
-
-def _disk_failed(path: Path, error: OSError) -> SessionError:
-    if error.errno == errno.ENOENT:
-        return SessionError(f"{path}: is gone, it or its directory was removed or renamed; look for it there")
-    what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
-    return SessionError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")
