@@ -171,6 +171,7 @@ def view(
     ] = None,
     time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session and open it in Rerun."""
     from flowrec.export import write_rrd_of
@@ -178,9 +179,11 @@ def view(
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
-    if not session.exists():
-        raise FlowrecError(f"{session}: no such file; flowrec record makes one")
+    if session.suffix == ".rrd" and not session.exists():
+        raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out)
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size}))
     if screenshot is not None:
         for problem in take(rrd, screenshot, time_s=time):
             say(problem)
@@ -195,11 +198,14 @@ def view(
 def export(
     session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
     out: Annotated[Path | None, typer.Option(help="Where to write the .rrd; beside the session by default.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session without opening it."""
     from flowrec.export import write_rrd_of
 
-    write_rrd_of(session, out)
+    rrd = write_rrd_of(session, out)
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size}))
 
 
 @app.command()
@@ -283,21 +289,28 @@ def check(
 
 @app.command()
 def recover(
-    session: Annotated[Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file.")],
+    session: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file, or a run in parts.")
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Session file to make; X.mcap or X_recovered.mcap by default.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
-    from flowrec.status import say
-    from flowrec.store import recover as save
+    from dataclasses import asdict
 
-    done = save(session, out)
-    if not done.changed:
-        say(f"{session}: is whole; nothing to do")
-    else:
-        say(f"{done.path}: {done.ticks} ticks, {done.duration_s:.1f} s" + (f"; lost: {done.lost}" if done.lost else ""))
-    raise typer.Exit(0 if done.complete else 3)
+    from flowrec.status import say
+    from flowrec.store import recover_run
+
+    saved = recover_run(session, out)
+    if as_json:
+        typer.echo(json.dumps([asdict(done) | {"path": str(done.path)} for done in saved]))
+    for done in saved:
+        lost = f"; lost: {done.lost}" if done.lost else ""
+        said = f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}" if done.changed else "is whole; nothing to do"
+        say(f"{done.path}: {said}")
+    raise typer.Exit(0 if all(done.complete for done in saved) else 3)
 
 
 @app.command()

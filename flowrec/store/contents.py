@@ -15,7 +15,7 @@ import flowrec
 from flowrec.errors import SessionError
 from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
-from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, belongs, header_from
+from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, belongs, header_from, part_from
 from flowrec.store.index import Summary
 from flowrec.store.source import ForeignError, Source
 from flowrec.topics import BY_FIELD, BY_PATH
@@ -40,6 +40,7 @@ class Contents:
     chunks : where the messages are.
     statistics : how many there are.
     outcome : how the run ended.
+    part : which piece of a run the file is; None where the run is in one file.
     flowrec_version : of the program that wrote it.
     channels, attachments, metadata : what else is listed.
 
@@ -73,6 +74,8 @@ class Contents:
         self.flowrec_version = metadata[SESSION].get("flowrec_version", "?")
         self._check_version(metadata[SESSION].get("format_version", ""))
         self.outcome = metadata.get(OUTCOME, {})
+        with self.source.parsing(0):
+            self.part = part_from(metadata)
         self.chunks: list[ChunkIndex] = self._summary.chunks
         self.channels, self.attachments = self._summary.channels, self._summary.attachments
         self.metadata = self._summary.metadata

@@ -86,6 +86,7 @@ class SessionWriter:
         self._thinning = Thinning()
         self._next_index: int | None = None
         self._said: Drops | None = None
+        self._carried_ns = header.part.carried_ns if header.part is not None else None
         self._block = block
         self._overwrite = overwrite
         self._last: tuple[Any, ...] = (None,) * len(_FIELDS)
@@ -135,7 +136,7 @@ class SessionWriter:
                 " stamps of a session must grow, check the clock of the rig"
             )
         self._last_ns = tick.stamp_ns
-        self.ticks += 1
+        self.ticks += tick.stamp_ns != self._carried_ns
         news = self._news_of(tick)
         if self._block:
             entry = _entry(tick.stamp_ns, news)

@@ -1,0 +1,219 @@
+"""One session file -> what is new in each of its ticks; reader.py makes ticks of it."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from mcap.records import ChunkIndex
+
+from flowrec.errors import SessionError
+from flowrec.messages import Message
+from flowrec.store.codec import decode
+from flowrec.store.contents import Contents
+from flowrec.store.header import SessionHeader
+from flowrec.store.lane import by_time, lane, threads
+from flowrec.store.shapes import misfit
+from flowrec.store.source import DamageError, Record
+from flowrec.topics import BY_FIELD
+
+Kept = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
+News = dict[str, Any]  # messages by field of Tick
+_KEPT_MESSAGES = 64  # of restored states
+
+
+class FileReader:
+    """A finished file, open for reading; several iterations may run at a time.
+
+    Parameters
+    ----------
+    path : the file.
+    contents : its index, where the file has none or a wrong one (recovery.py).
+    pass_over : told what is wrong with a message that makes no sense, which is then left out; without it that is
+        an error.
+    kept : restored messages, shared by the files of a run.
+
+    Attributes
+    ----------
+    path : the file.
+    part : which piece of a run it is; None where the run is in one file.
+    outcome : how the run ended: `outcome`, `reason`, `ticks`, `dropped_frames`, ...; all text, may be empty.
+    counts : number of messages by field of Tick, for the topics that have any.
+    first_ns, last_ns : stamps of the first and the last tick; both 0 in an empty session.
+    flowrec_version : of the program that wrote it.
+
+    Raises
+    ------
+    SessionError : there is no such file, or it is no session that this flowrec can read; on reading, damage.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        contents: Contents | None = None,
+        pass_over: Callable[[str], None] | None = None,
+        kept: Kept | None = None,
+    ) -> None:
+        self.path = path
+        self._pass_over = pass_over
+        self._contents = contents if contents is not None else Contents(path)
+        self._source = self._contents.source
+        self._fields = self._contents.fields
+        self.part = self._contents.part
+        self.outcome = self._contents.outcome
+        self.flowrec_version = self._contents.flowrec_version
+        statistics = self._contents.statistics
+        self.first_ns: int = statistics.message_start_time
+        self.last_ns: int = statistics.message_end_time
+        counts: Counter[str] = Counter()
+        for channel, count in statistics.channel_message_counts.items():
+            if channel in self._fields and count:
+                counts[self._fields[channel]] += count
+        self.counts: dict[str, int] = dict(counts)
+        self._kept: Kept = kept if kept is not None else {}
+        self._frame_channels = self._channels_of({"frame"})
+
+    @property
+    def header(self) -> SessionHeader:
+        """Configuration, chip, provenance and weights, as they were written first into the file."""
+        return self._contents.header
+
+    def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, News]]:
+        """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
+        for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=by_time):
+            news: News = {}
+            for record in records:
+                message = self._message(record)
+                if message is not None:
+                    news[self._fields[record.channel]] = message
+            if news:
+                yield stamp_ns, news
+
+    def messages(self, field: str) -> Iterator[tuple[int, Any]]:
+        """All messages of one topic, each with the stamp of its tick."""
+        channels = self._channels_of({field})
+        with threads() as executor:
+            for record in lane(self._source, self._chunks_with(channels), executor):
+                if record.channel in channels:
+                    message = self._message(record)
+                    if message is not None:
+                        yield record.log_ns, message
+
+    def state_at(self, stamp_ns: int, fields: Collection[str]) -> tuple[int, News]:
+        """The latest message of each of these topics at or before a stamp, from as few chunks as possible.
+
+        With the stamp of the tick that held the latest of them, -1 without any. The same message is the same object,
+        however often it is asked for.
+        """
+        latest = self._latest(stamp_ns, self._channels_of(fields))
+        news = {field: message for field, record in latest.items() if (message := self._restored(record)) is not None}
+        return max((record.log_ns for record in latest.values()), default=-1), news
+
+    def counts_until(self, stamp_ns: int) -> Counter[str]:
+        """Number of messages by field of Tick at or before a stamp."""
+        counts: Counter[str] = Counter()
+        for chunk in self._chunks_with(set(self._fields)):
+            if chunk.message_start_time <= stamp_ns:
+                for record in self._source.messages(chunk):
+                    if record.channel in self._fields and record.log_ns <= stamp_ns:
+                        counts[self._fields[record.channel]] += 1
+        return counts
+
+    def close(self) -> None:
+        """Close the file; forgotten readers close it when they are collected."""
+        self._source.close()
+
+    def _message(self, record: Record) -> Message | None:
+        field = self._fields[record.channel]
+        try:
+            schema = self._contents.schemas[record.channel]
+            message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema)
+            wrong = misfit(message)
+        except SessionError as error:
+            wrong = str(error)
+        if not wrong:
+            return message
+        wrong = f"{BY_FIELD[field].path} at {record.log_ns} ns: {wrong}"
+        if self._pass_over is None:
+            raise DamageError(self.path, wrong)
+        self._pass_over(wrong)
+        return None
+
+    def _restored(self, record: Record) -> Message | None:
+        # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
+        key = (self.path, record.channel, record.log_ns)
+        message = self._kept.pop(key, None) or self._message(record)
+        if message is None:
+            return None
+        self._kept[key] = message
+        if len(self._kept) > _KEPT_MESSAGES:
+            del self._kept[next(iter(self._kept))]
+        return message
+
+    def _records(self, start_ns: int | None, with_frames: bool) -> Iterator[Record]:
+        """The messages of known topics from a time on, state and frames merged."""
+        start = 0 if start_ns is None else start_ns
+        state, frames = self._lanes(start)
+        wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
+        read = dict.fromkeys(wanted, 0)
+        with threads() as executor:
+            lanes = [lane(self._source, state, executor)]
+            if with_frames:
+                lanes.append(lane(self._source, frames, executor))
+            for record in heapq.merge(*lanes, key=by_time):
+                if record.log_ns >= start and record.channel in wanted:
+                    read[record.channel] += 1
+                    yield record
+        if start_ns is None:
+            self._compare(read)
+
+    def _compare(self, read: Mapping[int, int]) -> None:
+        """A file that has less in it than it says must not pass for a whole one."""
+        for channel, count in read.items():
+            announced = self._contents.statistics.channel_message_counts.get(channel, 0)
+            if count != announced:
+                path = BY_FIELD[self._fields[channel]].path
+                raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
+
+    def _lanes(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
+        """Chunks that reach beyond a time: those with anything but frames, and those with frames only."""
+        state: list[ChunkIndex] = []
+        frames: list[ChunkIndex] = []
+        for chunk in self._chunks_with(set(self._fields)):
+            if chunk.message_end_time >= start_ns:
+                only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
+                (frames if only_frames else state).append(chunk)
+        return state, frames
+
+    def _chunks_with(self, channels: set[int]) -> list[ChunkIndex]:
+        # A chunk without an index may hold anything.
+        return [
+            chunk
+            for chunk in self._contents.chunks
+            if not chunk.message_index_offsets or not channels.isdisjoint(chunk.message_index_offsets)
+        ]
+
+    def _channels_of(self, fields: Collection[str]) -> set[int]:
+        return {channel for channel, field in self._fields.items() if field in fields}
+
+    def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
+        latest: dict[str, Record] = {}
+        for chunk in sorted(self._chunks_with(channels), key=lambda chunk: chunk.message_end_time, reverse=True):
+            if chunk.message_start_time > stamp_ns:
+                continue
+            reach_ns = min(chunk.message_end_time, stamp_ns)
+            held = channels & set(chunk.message_index_offsets) if chunk.message_index_offsets else channels
+            fields = {self._fields[channel] for channel in held}
+            if all(field in latest and latest[field].log_ns >= reach_ns for field in fields):
+                continue
+            for record in self._source.messages(chunk):
+                field_name = self._fields.get(record.channel)
+                if field_name not in fields or field_name is None or record.log_ns > stamp_ns:
+                    continue
+                if field_name not in latest or latest[field_name].log_ns <= record.log_ns:
+                    latest[field_name] = record
+        return latest
