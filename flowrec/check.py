@@ -15,7 +15,8 @@ from flowrec.chip import chip_from_files
 from flowrec.config import Config, config_from_toml
 from flowrec.errors import FlowrecError, printable
 from flowrec.messages import Frame, Message, Timing
-from flowrec.store import Audit, audit, is_growing, not_finite
+from flowrec.store import is_growing, not_finite
+from flowrec.store.audit import Audit, audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import NS_PER_S, seconds
 

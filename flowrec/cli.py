@@ -246,7 +246,7 @@ def list_directory(
         columns,
         [
             (
-                row.name,
+                row.name + (f" ({row.parts} parts)" if row.parts else ""),
                 row.outcome,
                 "" if row.duration_s is None else f"{row.duration_s:.1f} s",
                 f"{row.size_bytes / 1e6:.1f} MB",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from flowrec.errors import SessionError
 from flowrec.messages import Message
 from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
-from flowrec.store.header import SessionHeader
 from flowrec.store.lane import by_time, lane, threads
 from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record
@@ -40,11 +38,7 @@ class FileReader:
     Attributes
     ----------
     path : the file.
-    part : which piece of a run it is; None where the run is in one file.
-    outcome : how the run ended: `outcome`, `reason`, `ticks`, `dropped_frames`, ...; all text, may be empty.
-    counts : number of messages by field of Tick, for the topics that have any.
-    first_ns, last_ns : stamps of the first and the last tick; both 0 in an empty session.
-    flowrec_version : of the program that wrote it.
+    contents : its index.
 
     Raises
     ------
@@ -60,27 +54,11 @@ class FileReader:
     ) -> None:
         self.path = path
         self._pass_over = pass_over
-        self._contents = contents if contents is not None else Contents(path)
-        self._source = self._contents.source
-        self._fields = self._contents.fields
-        self.part = self._contents.part
-        self.outcome = self._contents.outcome
-        self.flowrec_version = self._contents.flowrec_version
-        statistics = self._contents.statistics
-        self.first_ns: int = statistics.message_start_time
-        self.last_ns: int = statistics.message_end_time
-        counts: Counter[str] = Counter()
-        for channel, count in statistics.channel_message_counts.items():
-            if channel in self._fields and count:
-                counts[self._fields[channel]] += count
-        self.counts: dict[str, int] = dict(counts)
+        self.contents = contents if contents is not None else Contents(path)
+        self._source = self.contents.source
+        self._fields = self.contents.fields
         self._kept: Kept = kept if kept is not None else {}
         self._frame_channels = self._channels_of({"frame"})
-
-    @property
-    def header(self) -> SessionHeader:
-        """Configuration, chip, provenance and weights, as they were written first into the file."""
-        return self._contents.header
 
     def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, News]]:
         """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
@@ -113,16 +91,6 @@ class FileReader:
         news = {field: message for field, record in latest.items() if (message := self._restored(record)) is not None}
         return max((record.log_ns for record in latest.values()), default=-1), news
 
-    def counts_until(self, stamp_ns: int) -> Counter[str]:
-        """Number of messages by field of Tick at or before a stamp."""
-        counts: Counter[str] = Counter()
-        for chunk in self._chunks_with(set(self._fields)):
-            if chunk.message_start_time <= stamp_ns:
-                for record in self._source.messages(chunk):
-                    if record.channel in self._fields and record.log_ns <= stamp_ns:
-                        counts[self._fields[record.channel]] += 1
-        return counts
-
     def close(self) -> None:
         """Close the file; forgotten readers close it when they are collected."""
         self._source.close()
@@ -130,7 +98,7 @@ class FileReader:
     def _message(self, record: Record) -> Message | None:
         field = self._fields[record.channel]
         try:
-            schema = self._contents.schemas[record.channel]
+            schema = self.contents.schemas[record.channel]
             message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema)
             wrong = misfit(message)
         except SessionError as error:
@@ -174,7 +142,7 @@ class FileReader:
     def _compare(self, read: Mapping[int, int]) -> None:
         """A file that has less in it than it says must not pass for a whole one."""
         for channel, count in read.items():
-            announced = self._contents.statistics.channel_message_counts.get(channel, 0)
+            announced = self.contents.statistics.channel_message_counts.get(channel, 0)
             if count != announced:
                 path = BY_FIELD[self._fields[channel]].path
                 raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
@@ -193,7 +161,7 @@ class FileReader:
         # A chunk without an index may hold anything.
         return [
             chunk
-            for chunk in self._contents.chunks
+            for chunk in self.contents.chunks
             if not chunk.message_index_offsets or not channels.isdisjoint(chunk.message_index_offsets)
         ]
 

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
 from flowrec.errors import SessionError
-from flowrec.store.file_reader import FileReader
+from flowrec.store.head import Head
 from flowrec.store.header import Part, SessionHeader
 from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import part_number, part_path, partial_path, parts, pieces
 from flowrec.store.source import UnfinishedError
 
 
+_COUNTS = ("ticks", "dropped_frames", "frames_missing_from_camera")  # of an outcome: each part tells its own
+
+
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """What must be known of a file to read it with others; attributes as in FileReader."""
+    """What must be known of a file to read it with others."""
 
     path: Path
     part: Part | None
@@ -25,16 +29,74 @@ class Piece:
     last_ns: int
     counts: Mapping[str, int]
     outcome: Mapping[str, str]
+    flowrec_version: str
 
     @classmethod
-    def of(cls, file: FileReader) -> Self:
+    def of(cls, head: Head) -> Self:
         """Of an open file."""
-        return cls(file.path, file.part, file.first_ns, file.last_ns, file.counts, file.outcome)
+        statistics = head.statistics
+        first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
+        return cls(head.source.path, head.part, first_ns, last_ns, head.counts, head.outcome, head.flowrec_version)
 
-    def said(self, key: str) -> int:
-        """A number of the outcome, 0 where there is none."""
-        text = self.outcome.get(key, "")
-        return int(text) if text.isdecimal() and len(text) < 20 else 0
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A session as its files tell of it, one or the parts of a run in order."""
+
+    path: Path
+    pieces: Sequence[Piece]
+
+    @classmethod
+    def at(cls, path: Path) -> Self:
+        """What `path` names; SessionError as `files_of` and `check_joints`."""
+        found = []
+        for file in files_of(path):
+            with Head(file) as head:
+                found.append(Piece.of(head))
+        run = cls(path, found)
+        if run.in_parts:
+            check_joints(path, found)
+        return run
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether it is a run of parts, rather than the file that was named."""
+        return self.pieces[0].path != self.path
+
+    @property
+    def part(self) -> Part | None:
+        """Which piece of a run it is; None for a whole run."""
+        return None if self.in_parts else self.pieces[0].part
+
+    @property
+    def first_ns(self) -> int:
+        """Stamp of the first tick, 0 where there is none."""
+        return self.pieces[0].first_ns
+
+    @property
+    def last_ns(self) -> int:
+        """Stamp of the last tick, 0 where there is none."""
+        return self.pieces[-1].last_ns
+
+    @property
+    def outcome(self) -> dict[str, str]:
+        """How it ended, and the sums of what each part counts."""
+        outcome = dict(self.pieces[-1].outcome)
+        if self.in_parts:
+            for key in _COUNTS:
+                said = [piece.outcome[key] for piece in self.pieces if key in piece.outcome]
+                if said and all(text.isdecimal() and len(text) < 20 for text in said):
+                    outcome[key] = str(sum(map(int, said)))
+        return outcome
+
+    def counts(self) -> dict[str, int]:
+        """Number of messages by topic; what parts repeat is counted once, for which their first chunks are read."""
+        total = Counter(self.pieces[0].counts)
+        for piece in self.pieces[1:]:
+            total.update(piece.counts)
+            with Head(piece.path) as head:
+                total.subtract(head.counts_until(piece.first_ns))
+        return {topic: count for topic, count in total.items() if count > 0}
 
 
 def files_of(path: Path) -> list[Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +13,12 @@ from flowrec.errors import SessionError
 from flowrec.messages import Tick
 from flowrec.store.contents import Contents
 from flowrec.store.file_reader import FileReader, Kept
-from flowrec.store.header import Part, SessionHeader
-from flowrec.store.joints import Piece, check_joints, files_of, without_part
-from flowrec.topics import BY_FIELD
+from flowrec.store.header import SessionHeader
+from flowrec.store.joints import Piece, Run, without_part
+from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
 from flowrec.units import seconds
 
 _OPEN_FILES = 4
-_COUNTS = ("ticks", "dropped_frames", "frames_missing_from_camera")  # of an outcome: each part tells its own
 
 
 class SessionReader:
@@ -55,41 +53,31 @@ class SessionReader:
         self, path: Path | str, contents: Contents | None = None, pass_over: Callable[[str], None] | None = None
     ) -> None:
         self.path = Path(path)
-        self.files = files_of(self.path) if contents is None else [self.path]
         self._kept: Kept = {}
         self._closed = False
-        first = FileReader(self.files[0], contents, pass_over, self._kept)
-        self._open = {0: first}  # the one that was used longest ago first
-        self._pieces = [Piece.of(first), *(Piece.of(FileReader(file)) for file in self.files[1:])]
-        in_parts = self.files != [self.path]
-        if in_parts:
-            check_joints(self.path, self._pieces)
-        self.part: Part | None = None if in_parts else first.part
+        self._open: dict[int, FileReader] = {}  # the one that was used longest ago first
+        if contents is not None or self.path.exists():
+            self._open[0] = first = FileReader(self.path, contents, pass_over, self._kept)
+            self._run = Run(self.path, [Piece.of(first.contents)])
+        else:
+            self._run = Run.at(self.path)
+        self.files = [piece.path for piece in self._run.pieces]
+        self.part = self._run.part
         self.carried_ns = self.part.carried_ns if self.part is not None else None
-        self.first_ns, self.last_ns = self._pieces[0].first_ns, self._pieces[-1].last_ns
-        self.flowrec_version = first.flowrec_version
-        self.outcome = dict(self._pieces[-1].outcome)
-        if in_parts:
-            self.outcome |= {
-                key: str(sum(piece.said(key) for piece in self._pieces))
-                for key in _COUNTS
-                if any(key in piece.outcome for piece in self._pieces)
-            }
+        self.first_ns, self.last_ns = self._run.first_ns, self._run.last_ns
+        self.outcome = self._run.outcome
+        self.flowrec_version = self._run.pieces[0].flowrec_version
+        self._fields = [{topic.field for topic in TOPICS if topic.path in piece.counts} for piece in self._run.pieces]
 
     @functools.cached_property
     def header(self) -> SessionHeader:
         """Configuration, chip, provenance and weights, as they were written first into the file."""
-        return self._file(0).header
+        return self._file(0).contents.header
 
     @functools.cached_property
     def counts(self) -> dict[str, int]:
         """Number of messages by field of Tick, for the topics that have any."""
-        counts: Counter[str] = Counter()
-        for number, piece in enumerate(self._pieces):
-            counts.update(piece.counts)
-            if number:
-                counts.subtract(self._file(number).counts_until(piece.first_ns))
-        return {field: count for field, count in counts.items() if count > 0}
+        return {BY_PATH[path].field: count for path, count in self._run.counts().items() if path in BY_PATH}
 
     @property
     def duration_s(self) -> float:
@@ -110,7 +98,7 @@ class SessionReader:
             was new are left out.
         """
         tick = Tick() if start_ns is None else self.tick_before(start_ns - 1, with_frames=with_frames)
-        for number, piece in enumerate(self._pieces):
+        for number, piece in enumerate(self._run.pieces):
             if start_ns is not None and piece.last_ns < start_ns:
                 continue
             # What is read whole is compared with what it says of itself.
@@ -126,12 +114,12 @@ class SessionReader:
         `tick_before(start_ns - 1)` holds the same objects as what `ticks(start_ns)` goes on from, so that a
         message of its first tick is new if and only if it is another object.
         """
-        begun = [number for number, piece in enumerate(self._pieces) if piece.first_ns <= stamp_ns]
+        begun = [number for number, piece in enumerate(self._run.pieces) if piece.first_ns <= stamp_ns]
         wanted = {field for field in BY_FIELD if with_frames or field != "frame"}
         found_ns, known = -1, dict[str, Any]()
         # A part says at its beginning what is known; what it should not have said is looked for before it.
         for number in reversed(begun):
-            missing = (wanted - known.keys()) & self._pieces[number].counts.keys()
+            missing = (wanted - known.keys()) & self._fields[number]
             if missing:
                 latest_ns, state = self._file(number).state_at(stamp_ns, missing)
                 found_ns, known = max(found_ns, latest_ns), known | state
@@ -146,8 +134,8 @@ class SessionReader:
         """
         if field not in BY_FIELD:
             raise SessionError(f"{self.path}: there is no topic {field!r}; the topics are {', '.join(BY_FIELD)}")
-        for number, piece in enumerate(self._pieces):
-            if field in piece.counts:
+        for number, piece in enumerate(self._run.pieces):
+            if field in self._fields[number]:
                 for stamp_ns, message in self._file(number).messages(field):
                     if not number or stamp_ns > piece.first_ns:
                         yield message
@@ -172,7 +160,7 @@ class SessionReader:
             if self._closed:
                 raise SessionError(f"{self.path}: has been closed; open the session again")
             file = FileReader(self.files[number], kept=self._kept)
-            if without_part(file.header) != without_part(self.header):
+            if number and without_part(file.contents.header) != without_part(self.header):
                 raise SessionError(
                     f"{file.path}: has another head than {self.files[0].name}, so it is not of the same run;"
                     " move it away, or name it alone"
