@@ -268,10 +268,12 @@ def check(
 ) -> None:
     """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
     from flowrec.check import check as judge
+    from flowrec.check import files_to_check
     from flowrec.status import progress
 
+    nbytes = sum(file.stat().st_size for file in files_to_check(session) if file.is_file())
     try:
-        with progress(f"reading {session.name}", max(session.stat().st_size if session.is_file() else 1, 1)) as done:
+        with progress(f"reading {session.name}", max(nbytes, 1)) as done:
             verdict = judge(session, done)
     except FlowrecError as error:
         if not as_json:

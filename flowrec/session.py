@@ -72,7 +72,7 @@ def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:
 
 
 def session_sha256(files: Sequence[Path]) -> str:
-    """Hash of a session's content, by which a replay names its parent: of its file, or of its parts one after another."""
+    """Hash of a session's content, by which a replay names its parent: of its file, or of its parts in order."""
     digest = hashlib.sha256()
     for path in files:
         with path.open("rb") as file:

@@ -15,7 +15,6 @@ from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import part_number, part_path, partial_path, parts, pieces
 from flowrec.store.source import UnfinishedError
 
-
 _COUNTS = ("ticks", "dropped_frames", "frames_missing_from_camera")  # of an outcome: each part tells its own
 
 
@@ -148,7 +147,9 @@ def check_joints(path: Path, run: Sequence[Piece]) -> None:
     """
     for number, piece in enumerate(run, 1):
         if (fault := fault_of(piece, number, run[number - 2] if number > 1 else None)) is not None:
-            raise SessionError(f"{piece.path}: {fault}; `flowrec check {path}` says more, a part that is named is read alone")
+            raise SessionError(
+                f"{piece.path}: {fault}; `flowrec check {path}` says more, a part that is named is read alone"
+            )
     last = run[-1]
     if goes_on(last.outcome):
         following = part_path(path, len(run) + 1)
@@ -167,8 +168,7 @@ def fault_of(piece: Piece, number: int, before: Piece | None) -> str | None:
         return f"is part {part.number} of a run by what it says, and {number} by its name"
     if before is None:
         return "is called the first part and goes on from another" if part.carried_ns is not None else None
-    assert before.part is not None
-    if part.run != before.part.run:
+    if before.part is not None and part.run != before.part.run:
         return f"is of another run than {before.path.name}"
     if part.carried_ns is None:
         return f"does not say where {before.path.name} ended"

@@ -47,8 +47,9 @@ def pieces(path: Path) -> list[Path]:
 
 def parts(path: Path) -> list[Path]:
     """The finished parts of the run X.mcap, in order."""
-    found = [(number, other) for other in pieces(path) if (number := part_number(other)) and other.suffix == path.suffix]
-    return [other for _, other in sorted(found)]
+    return sorted(
+        (other for other in pieces(path) if part_number(other) and other.suffix == path.suffix), key=part_number
+    )
 
 
 def part_number(path: Path) -> int:

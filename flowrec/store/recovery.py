@@ -21,14 +21,12 @@ from flowrec.store.writer import SessionWriter, sync_directory
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
+_QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
+_HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
 
 
 class NothingSavedError(SessionError):
-    """There is no message in the remains of a run."""
-
-
-_QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
-_HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
+    """There is no whole tick in the remains of a run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +167,7 @@ def _last_whole_ns(path: Path, reader: SessionReader, found: Scan) -> int:
     """Stamp of the last tick with inputs and outputs; those of one tick are always in the same chunk."""
     ends = [found.last_ns.get(_channel(found, topic)) for topic in ("/coils/applied", "/robot/track")]
     if any(end is None for end in ends):
-        raise SessionError(
+        raise NothingSavedError(
             f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; remove the file"
         )
     return min(end for end in ends if end is not None)

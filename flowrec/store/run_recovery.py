@@ -8,17 +8,19 @@ from pathlib import Path
 from flowrec.errors import SessionError
 from flowrec.store.header import Part
 from flowrec.store.joints import goes_on, unfinished_of
-from flowrec.store.names import part_number, part_path, parts
+from flowrec.store.names import PARTIAL_SUFFIX, part_number, part_path, parts
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import NothingSavedError, Recovered, recover
 from flowrec.store.writer import SessionWriter
+
+_REMAINS_SUFFIX = ".remains"
 
 
 def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
     """Recover a file as `recover` does or, where X.mcap is no file, whatever is unfinished of that run.
 
-    A part that has nothing in it yet becomes one that holds nothing but the end of the part before, so that the run
-    has an end.
+    Where there is no whole tick in the last part, one is made that holds nothing but the end of the part before, so
+    that the run has an end; the remains are put aside as NAME.remains.
 
     Raises
     ------
@@ -37,7 +39,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
             number = part_number(file)
             if number < 2 or number <= len(parts(path)):
                 raise
-            file.unlink()
+            file.rename(file.with_name(file.name.removesuffix(PARTIAL_SUFFIX) + _REMAINS_SUFFIX))
     finished = parts(path)
     if finished:
         with SessionReader(finished[-1]) as last:
@@ -56,5 +58,5 @@ def _end_of_run(path: Path, last: SessionReader, part: Part) -> Recovered:
     lost = f"everything after {last.path.name}"
     with SessionWriter(target, header, block=True) as writer:
         writer.write(replace(last.tick_before(last.last_ns), stamp_ns=last.last_ns))
-        writer.close({"outcome": "cut", "note": f"lost: {lost}"})
+        writer.close({"outcome": "cut", "note": f"lost: {lost}", "recovered_from": last.path.name})
     return Recovered(target, 0, 0.0, lost=lost)
