@@ -154,6 +154,7 @@ class _Reading:
             found.backwards[name] += record.log_ns < self._last_ns.get(name, record.log_ns)
             self._last_ns[name] = record.log_ns
             try:
+                assert isinstance(record.payload, memoryview)
                 message = decode(BY_FIELD[name].type, record.payload, record.sequence, self._schemas[record.channel])
                 wrong = misfit(message)
             except SessionError as error:

@@ -11,9 +11,10 @@ from typing import Any
 from mcap.records import ChunkIndex
 
 from flowrec.errors import SessionError
-from flowrec.messages import Message
+from flowrec.messages import Frame, Message
 from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
+from flowrec.store.frames import ENCODINGS
 from flowrec.store.lane import by_time, lane, threads
 from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record
@@ -22,6 +23,7 @@ from flowrec.topics import BY_FIELD
 Kept = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 News = dict[str, Any]  # messages by field of Tick
 _KEPT_MESSAGES = 64  # of restored states
+_GROWTH = 2  # of an image that is decoded ahead; JPEG packs more and is decoded when its turn comes
 
 
 class FileReader:
@@ -59,6 +61,8 @@ class FileReader:
         self._fields = self.contents.fields
         self._kept: Kept = kept if kept is not None else {}
         self._frame_channels = self._channels_of({"frame"})
+        encoding = ENCODINGS.get(self.contents.frame_encoding)
+        self._lossless = encoding is None or encoding.lossless
 
     def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, News]]:
         """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
@@ -75,7 +79,7 @@ class FileReader:
         """All messages of one topic, each with the stamp of its tick."""
         channels = self._channels_of({field})
         with threads() as executor:
-            for record in lane(self._source, self._chunks_with(channels), executor):
+            for record in lane(self._source, self._chunks_with(channels), executor, self._ready):
                 if record.channel in channels:
                     message = self._message(record)
                     if message is not None:
@@ -96,6 +100,8 @@ class FileReader:
         self._source.close()
 
     def _message(self, record: Record) -> Message | None:
+        if isinstance(record.payload, Message):
+            return record.payload
         field = self._fields[record.channel]
         try:
             schema = self.contents.schemas[record.channel]
@@ -110,6 +116,17 @@ class FileReader:
             raise DamageError(self.path, wrong)
         self._pass_over(wrong)
         return None
+
+    def _ready(self, record: Record) -> Record:
+        """An image decoded, in a thread; where that fails, what is wrong is told when its turn comes."""
+        if record.channel not in self._frame_channels or isinstance(record.payload, Message) or not self._lossless:
+            return record
+        try:
+            frame = decode(Frame, record.payload, record.sequence, self.contents.schemas[record.channel])
+        except SessionError:
+            return record
+        sound = not misfit(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
+        return record._replace(payload=frame) if sound else record
 
     def _restored(self, record: Record) -> Message | None:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
@@ -131,7 +148,7 @@ class FileReader:
         with threads() as executor:
             lanes = [lane(self._source, state, executor)]
             if with_frames:
-                lanes.append(lane(self._source, frames, executor))
+                lanes.append(lane(self._source, frames, executor, self._ready))
             for record in heapq.merge(*lanes, key=by_time):
                 if record.log_ns >= start and record.channel in wanted:
                     read[record.channel] += 1

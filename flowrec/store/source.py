@@ -13,7 +13,7 @@ import weakref
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import zstandard
 from google.protobuf.message import DecodeError
@@ -24,6 +24,9 @@ from mcap.records import AttachmentIndex, ChunkIndex, Footer, Header, Metadata, 
 from flowrec.errors import SessionError
 from flowrec.store.index import Summary, records_of, stream_of, summary_from
 from flowrec.store.mcap_file import MAGIC
+
+if TYPE_CHECKING:
+    from flowrec.messages import Message
 
 # Of one chunk before compression: a flow field on 1900 x 1900 pixels, or one image of 8500 x 8500. Two of them and two
 # copies on the way to a message are what reading needs at most, which leaves it within 512 MB with the program itself.
@@ -78,7 +81,7 @@ class Record(NamedTuple):
     log_ns: int
     channel: int
     sequence: int
-    payload: memoryview
+    payload: memoryview | Message  # a message where it has been decoded already
 
 
 class AttachmentBody(NamedTuple):
