@@ -215,12 +215,13 @@ def info(
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
     from flowrec.listing import describe
-    from flowrec.status import table
 
     facts, topics = describe(session)
     if as_json:
         typer.echo(json.dumps({"session": str(session), "facts": facts, "topics": topics}))
         return
+    from flowrec.status import table
+
     table(session.name, ("", "value"), list(facts.items()))
     table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
 
@@ -234,12 +235,13 @@ def list_directory(
     from dataclasses import asdict
 
     from flowrec.listing import list_sessions
-    from flowrec.status import say, table
 
     rows = list_sessions(directory)
     if as_json:
         typer.echo(json.dumps([asdict(row) for row in rows]))
         return
+    from flowrec.status import say, table
+
     columns = ("name", "outcome", "duration", "size", "chip", "recorded")
     table(
         str(directory),

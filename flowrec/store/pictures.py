@@ -24,7 +24,7 @@ _UP = 2  # PNG's filter that stores each row as its difference from the one abov
 _JPEG_QUALITY = 90
 # Deflate packs no more than 1032 into one byte, baseline JPEG fewer pixels: more are a bomb.
 _PIXELS_PER_BYTE = 1100
-_PIXELS_LIMIT = 72 << 20  # what a chunk may hold
+_PIXELS_LIMIT = 32 << 20  # before it is packed: it is there twice while it is unpacked
 # Filter and strategy by which cv2's PNG is three times quicker than by default and smaller, on camera noise.
 _PNG_OPTIONS = (
     cv2.IMWRITE_PNG_FILTER,
@@ -63,13 +63,14 @@ def row_differences(image: Image) -> Payload:
     )
 
 
-def picture(data: bytes) -> Image:
+def picture(data: bytes | memoryview) -> Image:
     """The pixels of a PNG or JPEG file, (h, w) grey levels.
 
     Raises
     ------
     ValueError : it is none, it is coloured, or it claims more pixels than its bytes can hold or anybody needs.
     """
+    data = memoryview(data)
     height, width = _shape_of(data)
     if not 0 < height * width <= min(_PIXELS_PER_BYTE * len(data), _PIXELS_LIMIT):
         raise ValueError(f"an image of {width} x {height} in {len(data)} bytes")
@@ -86,22 +87,21 @@ def picture(data: bytes) -> Image:
     return pixels
 
 
-def _stored_differences(data: bytes, height: int, width: int) -> NDArray[np.uint8] | None:
+def _stored_differences(data: memoryview, height: int, width: int) -> NDArray[np.uint8] | None:
     """The row differences of a PNG like those of `row_differences`, (h, w), checksums verified; None for any other."""
     head = _PNG_MAGIC + b"".join(_png_part(b"IHDR", _PNG_HEADER.pack(width, height, 8, 0, 0, 0, 0)))
     tail = b"".join(_png_part(b"IEND", b""))
     start, end = len(head) + 8, len(data) - len(tail) - 4
-    if end <= start or not data.startswith(head) or not data.endswith(tail):
+    if end <= start or data[: len(head)] != head or data[len(data) - len(tail) :] != tail:
         return None
-    view = memoryview(data)
-    if view[len(head) : start] != _SIZE.pack(end - start) + b"IDAT":
+    if data[len(head) : start] != _SIZE.pack(end - start) + b"IDAT":
         return None
-    if zlib.crc32(view[start - 4 : end]) != _SIZE.unpack_from(data, end)[0]:
+    if zlib.crc32(data[start - 4 : end]) != _SIZE.unpack_from(data, end)[0]:
         return None
     # Past zlib's head and without its own checksum: the one above was over both.
     unpacker, nbytes = zlib.decompressobj(-zlib.MAX_WBITS), height * (width + 1)
     try:
-        unpacked = unpacker.decompress(view[start + 2 : end - 4], nbytes + 1)
+        unpacked = unpacker.decompress(data[start + 2 : end - 4], nbytes + 1)
     except zlib.error:
         return None
     if len(unpacked) != nbytes or not unpacker.eof or unpacker.unused_data:
@@ -145,9 +145,9 @@ def _png_part(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes]:
     return _SIZE.pack(len(data)) + kind, data, _SIZE.pack(zlib.crc32(data, zlib.crc32(kind)))
 
 
-def _shape_of(data: bytes) -> tuple[int, int]:
+def _shape_of(data: memoryview) -> tuple[int, int]:
     """Height and width as the file's own head says."""
-    if data.startswith(_PNG_MAGIC):
+    if data[: len(_PNG_MAGIC)] == _PNG_MAGIC:
         if len(data) < 33:
             raise ValueError("a PNG without a head")
         width, height, bits, colours = _PNG_HEADER.unpack_from(data, 16)[:4]
@@ -163,9 +163,9 @@ def _shape_of(data: bytes) -> tuple[int, int]:
     raise ValueError("neither PNG nor JPEG")
 
 
-def _jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+def _jpeg_segments(data: memoryview) -> Iterator[tuple[int, int]]:
     """Marker and start of the body of each segment before the pixels."""
     at = 2
-    while data[:2] == b"\xff\xd8" and at + 9 <= len(data) and data[at] == 0xFF:
+    while bytes(data[:2]) == b"\xff\xd8" and at + 9 <= len(data) and data[at] == 0xFF:
         yield data[at + 1], at + 4
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
