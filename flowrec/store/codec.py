@@ -20,7 +20,7 @@ from flowrec.store import standard
 from flowrec.store.form import Codec, Payload
 from flowrec.store.frames import FRAME_CODECS, RAW_IMAGE
 from flowrec.store.schemas import FieldForm, array_schema, forms_of, schema_of
-from flowrec.store.wire import LARGE_BYTES, cut_out, head_of
+from flowrec.store.wire import LARGE_BYTES, cut_out, head_of, own
 
 _M = TypeVar("_M", bound=Message)
 _PACKERS: dict[Any, Callable[[Any], Any]] = {int: operator.index, float: float, bool: bool, str: str}
@@ -161,7 +161,7 @@ def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview
             parsed = parse(payload)
             return message_type(*[unpack(parsed) for unpack in unpackers])
         rest, found = cut_out(memoryview(payload), arrays)
-        parsed = parse(rest)
+        parsed, found = parse(rest), own(memoryview(payload), found)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)

@@ -16,6 +16,7 @@ from flowrec.store.codec import decode
 from flowrec.store.contents import Contents
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.lane import by_time, lane, threads
+from flowrec.store.pictures import PIXELS_LIMIT
 from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record
 from flowrec.topics import BY_FIELD
@@ -23,7 +24,34 @@ from flowrec.topics import BY_FIELD
 Kept = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 News = dict[str, Any]  # messages by field of Tick
 _KEPT_MESSAGES = 64  # of restored states
+_KNOWN_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
+_LARGE_CHUNK_BYTES = 1 << 22
 _GROWTH = 2  # of an image that is decoded ahead; JPEG packs more and is decoded when its turn comes
+
+
+class _Known:
+    """How much all that is known in a tick takes: bounded, whatever a file says."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._nbytes: dict[str, int] = {}
+        self._total = 0
+
+    def add(self, field: str, record: Record) -> None:
+        """Take note of the latest message of a topic."""
+        payload = record.payload
+        nbytes = payload.image.nbytes if isinstance(payload, Frame) else len(payload)  # type: ignore[arg-type]
+        self._total += nbytes - self._nbytes.get(field, 0)
+        self._nbytes[field] = nbytes
+        if self._total > _KNOWN_LIMIT_BYTES:
+            what = f"all that is known at {record.log_ns} ns takes {self._total} bytes, more than {_KNOWN_LIMIT_BYTES}"
+            raise DamageError(self._path, what)
+
+
+def _detached(record: Record) -> Record:
+    """The record without the chunk that it lies in."""
+    payload = record.payload
+    return record._replace(payload=memoryview(bytes(payload))) if isinstance(payload, memoryview) else record
 
 
 class FileReader:
@@ -66,12 +94,15 @@ class FileReader:
 
     def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, News]]:
         """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
+        known = _Known(self.path)
         for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=by_time):
             news: News = {}
             for record in records:
+                field = self._fields[record.channel]
+                known.add(field, record)
                 message = self._message(record)
                 if message is not None:
-                    news[self._fields[record.channel]] = message
+                    news[field] = message
             if news:
                 yield stamp_ns, news
 
@@ -171,6 +202,8 @@ class FileReader:
         for chunk in self._chunks_with(set(self._fields)):
             if chunk.message_end_time >= start_ns:
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
+                if only_frames and chunk.uncompressed_size > PIXELS_LIMIT + _LARGE_CHUNK_BYTES:
+                    raise self._source.damaged(chunk.chunk_start_offset, "images of more pixels than flowrec reads")
                 (frames if only_frames else state).append(chunk)
         return state, frames
 
@@ -187,6 +220,7 @@ class FileReader:
 
     def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
         latest: dict[str, Record] = {}
+        known = _Known(self.path)
         for chunk in sorted(self._chunks_with(channels), key=lambda chunk: chunk.message_end_time, reverse=True):
             if chunk.message_start_time > stamp_ns:
                 continue
@@ -200,5 +234,8 @@ class FileReader:
                 if field_name not in fields or field_name is None or record.log_ns > stamp_ns:
                     continue
                 if field_name not in latest or latest[field_name].log_ns <= record.log_ns:
+                    known.add(field_name, record)
                     latest[field_name] = record
+            if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # which is not kept for the sake of a few messages in it
+                latest = {field: _detached(record) for field, record in latest.items()}
         return latest

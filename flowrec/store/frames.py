@@ -19,10 +19,10 @@ import numpy as np
 
 from flowrec.messages import Frame, Image
 from flowrec.store.form import Codec, Payload
-from flowrec.store.pictures import jpeg, picture, png, row_differences
+from flowrec.store.pictures import PIXELS_LIMIT, jpeg, picture, png, row_differences
 from flowrec.store.schemas import Schema, foxglove_schema
 from flowrec.store.standard import stamp_of, timestamp
-from flowrec.store.wire import cut_out, head_of
+from flowrec.store.wire import cut_out, head_of, own
 
 RAW_IMAGE, COMPRESSED_IMAGE = "foxglove.RawImage", "foxglove.CompressedImage"
 _SEQUENCE_LIMIT = 2**32  # MCAP keeps the sequence in 32 bit
@@ -71,6 +71,7 @@ def _raw_image() -> Codec:
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
         rest, found = cut_out(memoryview(payload), (_RAW_IMAGE_DATA,))
         parsed = wire.FromString(rest)
+        found = own(memoryview(payload), found)
         shape, data = (parsed.height, parsed.width), found.get(_RAW_IMAGE_DATA, parsed.data)
         if parsed.encoding != "mono8" or parsed.step != shape[1] or len(data) != shape[0] * shape[1]:
             raise ValueError(f"an image of {shape[1]} x {shape[0]} {parsed.encoding!r} in {len(data)} bytes")
@@ -101,6 +102,8 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
 def _shape(frame: Frame) -> tuple[int, int]:
     if frame.image.ndim != 2:
         raise ValueError(f"an image of shape {frame.image.shape}")
+    if frame.image.size > PIXELS_LIMIT:
+        raise ValueError(f"an image of {frame.image.size} pixels, more than {PIXELS_LIMIT}, which the reader takes")
     height, width = frame.image.shape
     return height, width
 

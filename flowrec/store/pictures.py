@@ -24,7 +24,7 @@ _UP = 2  # PNG's filter that stores each row as its difference from the one abov
 _JPEG_QUALITY = 90
 # Deflate packs no more than 1032 into one byte, baseline JPEG fewer pixels: more are a bomb.
 _PIXELS_PER_BYTE = 1100
-_PIXELS_LIMIT = 32 << 20  # before it is packed: it is there twice while it is unpacked
+PIXELS_LIMIT = 32 << 20  # before it is packed: it is there twice while it is unpacked
 # Filter and strategy by which cv2's PNG is three times quicker than by default and smaller, on camera noise.
 _PNG_OPTIONS = (
     cv2.IMWRITE_PNG_FILTER,
@@ -72,7 +72,7 @@ def picture(data: bytes | memoryview) -> Image:
     """
     data = memoryview(data)
     height, width = _shape_of(data)
-    if not 0 < height * width <= min(_PIXELS_PER_BYTE * len(data), _PIXELS_LIMIT):
+    if not 0 < height * width <= min(_PIXELS_PER_BYTE * len(data), PIXELS_LIMIT):
         raise ValueError(f"an image of {width} x {height} in {len(data)} bytes")
     rows = _stored_differences(data, height, width)
     if rows is not None:

@@ -5,7 +5,7 @@ https://protobuf.dev/programming-guides/encoding
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Mapping
 
 LARGE_BYTES = 1 << 16  # from here on it pays
 _FIELDS_LIMIT = 64  # of a message that is looked at here; one with more is left to protobuf
@@ -27,10 +27,17 @@ def cut_out(payload: memoryview, numbers: Container[int]) -> tuple[bytes | memor
         if kind == _BYTES and number in numbers:
             if number in found:
                 raise ValueError(f"field {number} is in it twice")
-            found[number] = _own(payload, value, end)
+            found[number] = payload[value:end]
         else:
             rest.append(payload[begin:end])
     return b"".join(rest), found
+
+
+def own(payload: memoryview, found: Mapping[int, memoryview]) -> dict[int, memoryview]:
+    """The fields as they are or, where they would keep much more in memory than themselves, copied."""
+    whole = payload.obj
+    much = not isinstance(whole, bytes | bytearray) or len(whole) > 2 * sum(map(len, found.values()))
+    return {number: memoryview(bytes(view)) if much else view for number, view in found.items()}
 
 
 def head_of(number: int, nbytes: int) -> bytes:
@@ -46,13 +53,6 @@ def varint(number: int) -> bytes:
         number >>= 7
     out.append(number)
     return bytes(out)
-
-
-def _own(payload: memoryview, value: int, end: int) -> memoryview:
-    """A view, unless it would keep much more in memory than itself."""
-    whole = payload.obj
-    view = payload[value:end]
-    return view if isinstance(whole, bytes | bytearray) and len(whole) < 2 * len(view) else memoryview(bytes(view))
 
 
 def _fields(payload: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
