@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from flowrec.store.writer import SessionWriter, sync_directory
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
+_POLL_S = 1e-3
 _QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
 _HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
 
@@ -200,6 +202,8 @@ def _rewrite(
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
             before = tick
+            while writer.queue_bytes > _QUEUE_BYTES:  # a large one is not to wait while the next is read
+                time.sleep(_POLL_S)
         lost = "; ".join([*_losses(reader, found, images_missing - dropped, images_ahead), *nonsense.told()])
         writer.close(_outcome(reader, lost, before.stamp_ns, dropped))
     return whole, lost
