@@ -5,8 +5,8 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,8 +15,11 @@ from flowrec.chip import chip_from_files
 from flowrec.config import Config, config_from_toml
 from flowrec.errors import FlowrecError, printable
 from flowrec.messages import Frame, Message, Timing
-from flowrec.store import Audit, audit, is_growing, not_finite
-from flowrec.topics import BY_FIELD
+from flowrec.store import is_growing, not_finite
+from flowrec.store.audit import Audit, audit
+from flowrec.store.joints import fault_of, goes_on, without_part
+from flowrec.store.names import part_number, part_path, pieces
+from flowrec.topics import BY_FIELD, TOPICS, Role
 from flowrec.units import NS_PER_S, seconds
 
 GAP_PERIODS = 1.5
@@ -61,6 +64,7 @@ class Verdict:
     facts : what was looked at, for people, by name.
     topics : messages read, by topic.
     gaps : the longest times without a frame, in order of time; `gap_count` has all of them.
+    parts : the verdicts on its parts, where it is a run in parts.
     """
 
     path: Path
@@ -69,6 +73,7 @@ class Verdict:
     topics: dict[str, int] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
     gap_count: int = 0
+    parts: list[Verdict] = field(default_factory=list)
 
     @property
     def word(self) -> Literal["good", "usable", "bad"]:
@@ -117,22 +122,44 @@ class Verdict:
             "topics": self.topics,
             "gap_count": self.gap_count,
             "gaps": [{"at_s": gap.at_s, "length_s": gap.length_s} for gap in self.gaps],
+            "parts": [part.as_json() for part in self.parts],
         }
+
+
+def files_to_check(path: Path) -> list[Path]:
+    """What `path` names: a file or, where there is none, what is there of the parts of that run, finished or not."""
+    if path.exists():
+        return [path]
+    return sorted(filter(part_number, pieces(path)), key=part_number) or [path]
 
 
 def check(path: Path, progress: Callable[[int], None] | None = None) -> Verdict:
     """Read a whole session, finished or not, and judge it. Memory does not grow with the file.
 
+    Of a run in parts each is judged, and whether they fit together.
+
     Parameters
     ----------
-    progress : told up to which byte the file has been read.
+    progress : told how many bytes have been read.
 
     Raises
     ------
     SessionError : it is no session that this flowrec can read; its text says what it is.
     """
+    files = files_to_check(path)
+    if files == [path]:
+        return _check_file(path, progress)[0]
+    judged, before = [], 0
+    for file in files:
+        done = (lambda at, before=before: progress(before + at)) if progress is not None else None
+        judged.append(_check_file(file, done))
+        before += file.stat().st_size
+    return _check_run(path, judged)
+
+
+def _check_file(path: Path, progress: Callable[[int], None] | None) -> tuple[Verdict, Audit, _Reading]:
     reading = _Reading()
-    found = audit(path, reading.see, progress)
+    found = audit(path, reading.see, progress, reading.begin)
     reading.close()
     verdict = Verdict(path)
     verdict.topics = {BY_FIELD[name].path: count for name, count in found.counts.items()}
@@ -144,7 +171,80 @@ def check(path: Path, progress: Callable[[int], None] | None = None) -> Verdict:
     _judge_numbers(verdict, reading)
     _judge_clocks(verdict, found)
     _judge_replay(verdict, found, reading)
-    return verdict
+    return verdict, found, reading
+
+
+def _check_run(path: Path, judged: Sequence[tuple[Verdict, Audit, _Reading]]) -> Verdict:
+    """The verdict on all parts together."""
+    run = Verdict(path)
+    run.parts = [verdict for verdict, _, _ in judged]
+    said: dict[Finding, list[int]] = {}
+    for (verdict, found, _), number in zip(judged, map(part_number, (v.path for v in run.parts)), strict=True):
+        for finding in verdict.findings:
+            said.setdefault(finding, []).append(number)
+        run.gap_count += verdict.gap_count
+        later_s = seconds(found.first_ns - judged[0][1].first_ns)
+        run.gaps += [Gap(gap.at_s + later_s, gap.length_s) for gap in verdict.gaps]
+    for finding, numbers in said.items():
+        which = f"part {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} of {len(judged)} parts"
+        run.findings.append(replace(finding, text=f"{which}: {finding.text}"))
+    _judge_joints(run, judged)
+    last = judged[-1][1]
+    if last.finished and goes_on(last.outcome):
+        following = part_path(path, part_number(last.path) + 1).name
+        run.bad(
+            "end", f"the run goes on in {following}, which is not here; `flowrec recover {path}` ends it before that"
+        )
+    counts = Counter[str]()
+    for _, found, reading in judged:
+        counts.update(found.counts)
+        counts.subtract(reading.repeated)
+    run.topics = {BY_FIELD[name].path: count for name, count in counts.items() if count}
+    ticks, size_mb = sum(reading.ticks for _, _, reading in judged), sum(a.size_bytes for _, a, _ in judged) / 1e6
+    run.fact("outcome", run.parts[-1].facts["outcome"])
+    run.fact("content", f"{counts.total()} messages on {len(run.topics)} topics in {size_mb:.1f} MB")
+    run.fact("length", f"{seconds(last.last_ns - judged[0][1].first_ns):.2f} s, {ticks} ticks")
+    run.fact("images", f"{counts['frame']} for {ticks} ticks")
+    exact = all(verdict.facts.get("replay", "").startswith("yes:") for verdict in run.parts)
+    replay = "no" if run.word == "bad" else "yes" if exact else "yes, but not exact after what is missing"
+    run.fact("replay", f"{replay}; each part alone, too" if replay == "yes" else replay)
+    return run
+
+
+def _judge_joints(run: Verdict, judged: Sequence[tuple[Verdict, Audit, _Reading]]) -> None:
+    before: tuple[Audit, _Reading] | None = None
+    number = 0
+    for _, found, reading in judged:
+        number += 1
+        while number < part_number(found.path):
+            run.bad("parts", f"part {number} is missing; the others can be read one by one")
+            number, before = number + 1, None
+        name = f"part {number}"
+        if found.header is None:  # which has been told
+            before = None
+            continue
+        fault = fault_of(found.piece, number, before[0].piece if before is not None else None)
+        if fault is not None and (before is not None or number == 1):
+            run.bad("parts", f"{name} {fault}")
+        elif before is not None:
+            _judge_joint(run, name, before, (found, reading))
+        before = found, reading
+    if not any(finding.about == "parts" for finding in run.findings):
+        run.fact("parts", f"{len(judged)}, each begins where the one before ends")
+
+
+def _judge_joint(run: Verdict, name: str, before: tuple[Audit, _Reading], after: tuple[Audit, _Reading]) -> None:
+    (found, reading), (following, repeats) = before, after
+    assert following.header is not None
+    if found.header is not None and without_part(found.header) != without_part(following.header):
+        run.bad("parts", f"{name} has another head (configuration, chip or origin) than the part before")
+    if found.finished and not goes_on(found.outcome) and found.outcome.get("outcome") != "cut":
+        run.odd("parts", f"{name} goes on although the part before says that the run ended with it")
+    # An image that the disk had no time for may be in one of them only; no stage sees truths and timings.
+    seen = {topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {"frame"}
+    apart = [BY_FIELD[key].path for key in seen if reading.latest_ns.get(key) != repeats.repeated_ns.get(key)]
+    if apart:
+        run.odd("parts", f"{name} repeats something else than the part before ended with: {', '.join(sorted(apart))}")
 
 
 class _Reading:
@@ -165,13 +265,28 @@ class _Reading:
         self._last_ns: int | None = None
         self._last_index: int | None = None
         self._pending: dict[int, int] = {}
+        self._carried_ns: int | None = None
+        self.repeated: Counter[str] = Counter()  # messages of the tick that a part repeats, by field
+        self.repeated_ns: dict[str, int] = {}  # their own stamps
+        self.latest_ns: dict[str, int] = {}  # stamps of the last messages
+
+    def begin(self, found: Audit) -> None:
+        """Take note of the head."""
+        part = found.header.part if found.header is not None else None
+        self._carried_ns = part.carried_ns if part is not None else None
 
     def see(self, name: str, log_ns: int, message: Message) -> None:
         """Take note of one message."""
         for wrong in not_finite(message):
             self.not_finite[f"{BY_FIELD[name].path} {wrong}"] += 1
+        stamp_ns: int = message.stamp_ns  # type: ignore[attr-defined]
+        self.latest_ns[name] = stamp_ns
+        repeated = log_ns == self._carried_ns
+        if repeated:
+            self.repeated[name] += 1
+            self.repeated_ns[name] = stamp_ns
         bit = _BITS.get(name)
-        if bit is not None:
+        if bit is not None and not repeated:
             bits = self._pending.pop(log_ns, 0) | bit
             if bits == _FRAME | _APPLIED | _TRACK:
                 self._count(bits)
@@ -333,7 +448,7 @@ def _judge_times(verdict: Verdict, found: Audit, reading: _Reading, config: Conf
 
 
 def _judge_images(verdict: Verdict, found: Audit, reading: _Reading) -> None:
-    images = found.counts["frame"]
+    images = found.counts["frame"] - reading.repeated["frame"]
     elsewhere = not images and found.header is not None and bool(found.header.parent)
     if elsewhere:
         verdict.fact("images", "none: a replay, the recorded tracks stand in")
@@ -379,7 +494,9 @@ def _judge_clocks(verdict: Verdict, found: Audit) -> None:
 
 
 def _judge_replay(verdict: Verdict, found: Audit, reading: _Reading) -> None:
-    if not reading.ticks:
+    if not reading.ticks and reading.repeated:
+        verdict.odd("replay", "there is nothing in it but the tick that it repeats")
+    elif not reading.ticks:
         verdict.bad("replay", "there is no tick in it, so nothing to replay")
     if reading.inputs_missing:
         verdict.odd(

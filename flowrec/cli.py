@@ -180,6 +180,7 @@ def view(
     ] = None,
     time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session and open it in Rerun."""
     from flowrec.export import write_rrd_of
@@ -187,9 +188,11 @@ def view(
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
-    if not session.exists():
-        raise FlowrecError(f"{session}: no such file; flowrec record makes one")
+    if session.suffix == ".rrd" and not session.exists():
+        raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out)
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size}))
     if screenshot is not None:
         for problem in take(rrd, screenshot, time_s=time):
             say(problem)
@@ -204,11 +207,14 @@ def view(
 def export(
     session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
     out: Annotated[Path | None, typer.Option(help="Where to write the .rrd; beside the session by default.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session without opening it."""
     from flowrec.export import write_rrd_of
 
-    write_rrd_of(session, out)
+    rrd = write_rrd_of(session, out)
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size}))
 
 
 @app.command()
@@ -218,12 +224,13 @@ def info(
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
     from flowrec.listing import describe
-    from flowrec.status import table
 
     facts, topics = describe(session)
     if as_json:
         typer.echo(json.dumps({"session": str(session), "facts": facts, "topics": topics}))
         return
+    from flowrec.status import table
+
     table(session.name, ("", "value"), list(facts.items()))
     table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
 
@@ -237,19 +244,20 @@ def list_directory(
     from dataclasses import asdict
 
     from flowrec.listing import list_sessions
-    from flowrec.status import say, table
 
     rows = list_sessions(directory)
     if as_json:
         typer.echo(json.dumps([asdict(row) for row in rows]))
         return
+    from flowrec.status import say, table
+
     columns = ("name", "outcome", "duration", "size", "chip", "recorded")
     table(
         str(directory),
         columns,
         [
             (
-                row.name,
+                row.name + (f" ({row.parts} parts)" if row.parts else ""),
                 row.outcome,
                 "" if row.duration_s is None else f"{row.duration_s:.1f} s",
                 f"{row.size_bytes / 1e6:.1f} MB",
@@ -271,10 +279,12 @@ def check(
 ) -> None:
     """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
     from flowrec.check import check as judge
+    from flowrec.check import files_to_check
     from flowrec.status import progress
 
+    nbytes = sum(file.stat().st_size for file in files_to_check(session) if file.is_file())
     try:
-        with progress(f"reading {session.name}", max(session.stat().st_size if session.is_file() else 1, 1)) as done:
+        with progress(f"reading {session.name}", max(nbytes, 1)) as done:
             verdict = judge(session, done)
     except FlowrecError as error:
         if not as_json:
@@ -292,21 +302,28 @@ def check(
 
 @app.command()
 def recover(
-    session: Annotated[Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file.")],
+    session: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file, or a run in parts.")
+    ],
     out: Annotated[
         Path | None, typer.Option(help="Session file to make; X.mcap or X_recovered.mcap by default.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
-    from flowrec.status import say
-    from flowrec.store import recover as save
+    from dataclasses import asdict
 
-    done = save(session, out)
-    if not done.changed:
-        say(f"{session}: is whole; nothing to do")
-    else:
-        say(f"{done.path}: {done.ticks} ticks, {done.duration_s:.1f} s" + (f"; lost: {done.lost}" if done.lost else ""))
-    raise typer.Exit(0 if done.complete else 3)
+    from flowrec.status import say
+    from flowrec.store import recover_run
+
+    saved = recover_run(session, out)
+    if as_json:
+        typer.echo(json.dumps([asdict(done) | {"path": str(done.path)} for done in saved]))
+    for done in saved:
+        lost = f"; lost: {done.lost}" if done.lost else ""
+        said = f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}" if done.changed else "is whole; nothing to do"
+        say(f"{done.path}: {said}")
+    raise typer.Exit(0 if all(done.complete for done in saved) else 3)
 
 
 @app.command()

@@ -10,7 +10,7 @@ from flowrec.config import Config
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.session import open_session
 from flowrec.status import progress, say
-from flowrec.store import SessionReader
+from flowrec.store import SessionReader, files_of
 from flowrec.view import Scene, write_rrd
 
 
@@ -37,7 +37,7 @@ def write_rrd_of(path: Path, out: Path | None = None) -> Path:
     parent = path.parent / name if name else None
     began = time.perf_counter()
     with progress(f"writing {target.name}", max(reader.duration_s, 1e-3)) as done:
-        if parent is not None and parent.is_file():
+        if parent is not None and any(file.is_file() for file in files_of(parent)):
             write_rrd(target, scene, SessionReader(parent).ticks(), reader.ticks(with_frames=False), progress=done)
         else:
             write_rrd(target, scene, reader.ticks(), progress=done)

@@ -1,6 +1,7 @@
 """What `flowrec info` and `flowrec ls` tell of sessions: from heads and indexes only, at once however large they are.
 
-The configuration is read as the text that it is: the stages behind it take seconds to import.
+The configuration is read as the text that it is, and topics by what the file calls them: the stages and the messages
+behind them take long to import.
 """
 
 from __future__ import annotations
@@ -13,47 +14,55 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import SessionError
-from flowrec.store import SessionReader, is_growing
-from flowrec.topics import BY_FIELD
+from flowrec.store.head import Head
+from flowrec.store.header import Part, SessionHeader
+from flowrec.store.joints import Run
+from flowrec.store.mcap_file import is_growing
+from flowrec.store.names import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
+from flowrec.units import seconds
 
-SESSION_NAMES = (".mcap", ".mcap.partial")
+_NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16
 
 
 def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
-    """Facts about a session for people, and its message counts by topic. Reads no message."""
-    with SessionReader(path) as reader:
-        header = reader.header
-        config = _table(header.config_toml, f"{path}: config.toml inside")
-        said = header.provenance
-        facts = {
-            "outcome": reader.outcome.get("outcome", "unknown") + _bracketed(_why(reader.outcome)),
-            "duration": f"{reader.duration_s:.1f} s",
-            "size": f"{path.stat().st_size / 1e6:.1f} MB",
-            "chip": _chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
-            "rig": _at(config, "rig"),
-            "phases": " -> ".join(map(str, _listed_at(config, "mission", "phases"))) or "?",
-            "stages": ", ".join(_at(config, stage, "method") for stage in ("observer", "refine", "plan", "control")),
-            "recorded": said.get("wall_time", "unknown"),
-            "by": f"flowrec {said.get('flowrec', '?')}" + _bracketed(said.get("git_commit", "")[:10]),
-        }
-        for key, code in said.items():
-            if key.startswith("weights."):
-                facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
-        if header.parent:
-            facts["replay of"] = header.parent.get("file", "?")
-        facts |= {
-            key.replace("_", " "): value
-            for key, value in reader.outcome.items()
-            if key not in ("outcome", "note", "duration")
-        }
-        return facts, {BY_FIELD[name].path: count for name, count in reader.counts.items()}
+    """Facts about a session for people, and its message counts by topic.
+
+    Reads no message, but for those that the parts of a run repeat.
+    """
+    run = Run.at(path)
+    header = _header(run)
+    outcome = run.outcome
+    config = _table(header.config_toml, f"{path}: config.toml inside")
+    said = header.provenance
+    facts = {
+        "outcome": outcome.get("outcome", "unknown") + _bracketed(_why(outcome)),
+        "duration": f"{_duration_s(run):.1f} s",
+        "size": f"{_size(run) / 1e6:.1f} MB" + (f" in {len(run.pieces)} parts" if run.in_parts else ""),
+        "chip": _chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
+        "rig": _at(config, "rig"),
+        "phases": " -> ".join(map(str, _listed_at(config, "mission", "phases"))) or "?",
+        "stages": ", ".join(_at(config, stage, "method") for stage in ("observer", "refine", "plan", "control")),
+        "recorded": said.get("wall_time", "unknown"),
+        "by": f"flowrec {said.get('flowrec', '?')}" + _bracketed(said.get("git_commit", "")[:10]),
+    }
+    if run.part is not None:
+        facts["piece"] = _piece(run.part, path)
+    for key, code in said.items():
+        if key.startswith("weights."):
+            facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
+    if header.parent:
+        facts["replay of"] = header.parent.get("file", "?")
+    facts |= {
+        key.replace("_", " "): value for key, value in outcome.items() if key not in ("outcome", "note", "duration")
+    }
+    return facts, run.counts()
 
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """One session file of a directory; what is not known of it is None or empty."""
+    """One session of a directory, the parts of a run together; what is not known of it is None or empty."""
 
     name: str
     outcome: str  # or: recording, unfinished, unreadable
@@ -62,6 +71,7 @@ class Listed:
     duration_s: float | None = None
     chip: str = ""
     recorded: str = ""
+    parts: int = 0  # of a run that was split; finished or not
 
 
 def list_sessions(directory: Path) -> list[Listed]:
@@ -72,23 +82,49 @@ def list_sessions(directory: Path) -> list[Listed]:
     if not directory.is_dir():
         raise SessionError(f"{directory}: no such directory; flowrec ls lists the sessions in one")
     try:
-        paths = [path for path in directory.iterdir() if path.is_file() and path.name.endswith(SESSION_NAMES)]
+        paths = [path for path in directory.iterdir() if path.is_file() and path.name.endswith(_NAMES)]
     except OSError as error:
         raise SessionError(f"{directory}: can not be listed ({error.strerror}); check its permissions") from error
-    return [_listed(path) for path in sorted(paths)]
+    rows: dict[Path, list[Path]] = {}
+    for path in sorted(paths):
+        run = run_path(path)
+        # Beside a file of that name the parts are not what opens under it: each is a session of its own.
+        rows.setdefault(run if part_number(path) and run not in paths else path, []).append(path)
+    return [_listed(path, files) for path, files in sorted(rows.items())]
 
 
-def _listed(path: Path) -> Listed:
-    size = path.stat().st_size
+def _listed(path: Path, files: list[Path]) -> Listed:
+    size = sum(file.stat().st_size for file in files)
+    parts = len(files) if files != [path] else 0
     try:
-        with SessionReader(path) as reader:
-            head = reader.header
-            outcome = reader.outcome.get("outcome", "unknown"), _why(reader.outcome)
-            chip = str(_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
-            return Listed(path.name, *outcome, size, reader.duration_s, chip, head.provenance.get("wall_time", ""))
+        run = Run.at(path)
+        head = _header(run)
+        outcome = run.outcome.get("outcome", "unknown"), _why(run.outcome)
+        chip = str(_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
+        recorded = head.provenance.get("wall_time", "")
+        return Listed(path.name, *outcome, size, _duration_s(run), chip, recorded, parts)
     except SessionError as error:
-        what = "recording" if is_growing(path) else "unfinished" if path.suffix == ".partial" else "unreadable"
-        return Listed(path.name, what, str(error).removeprefix(f"{path}: "), size)
+        unfinished = any(file.name.endswith(PARTIAL_SUFFIX) for file in files)
+        what = "recording" if any(map(is_growing, files)) else "unfinished" if unfinished else "unreadable"
+        return Listed(path.name, what, str(error).removeprefix(f"{path}: "), size, parts=parts)
+
+
+def _header(run: Run) -> SessionHeader:
+    with Head(run.pieces[0].path) as head:
+        return head.header
+
+
+def _duration_s(run: Run) -> float:
+    return seconds(run.last_ns - run.first_ns)
+
+
+def _size(run: Run) -> int:
+    return sum(piece.path.stat().st_size for piece in run.pieces)
+
+
+def _piece(part: Part, path: Path) -> str:
+    said = f"{part.kind} {part.number} of the run {run_path(path).stem}" + _bracketed(part.why)
+    return said if part.carried_ns is None else f"{said}, goes on from {seconds(part.carried_ns):.2f} s"
 
 
 def _table(text: str, where: str) -> dict[str, Any]:

@@ -166,11 +166,16 @@ def replay(
         raise UsageError(
             f"--from {from_s:g}: {path} runs from {seconds(reader.first_ns):g} s to {seconds(reader.last_ns):g} s"
         )
+    if reader.carried_ns is not None:
+        # A piece of a run begins with what was known, not with a frame to work on.
+        start_ns = max(start_ns or 0, reader.carried_ns + 1)
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
     worker = LockstepWorker(pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale)
-    _resubmit(reader, start, worker)
-    checker = WorkerCheck(pipeline) if verify else None
+    order = _order_under_way(reader, start)
+    if order is not None:
+        worker.submit(order)
+    checker = WorkerCheck(pipeline, start, order) if verify else None
     comparison, commands = Comparison(), CommandDifference()
     truth: list[FlowField] = [] if start.true_field is None else [start.true_field]
 
@@ -268,13 +273,21 @@ class WithoutFrames:
 class WorkerCheck:
     """Does each recorded work order again and compares the adopted result with its topic's tolerance."""
 
-    def __init__(self, pipeline: Pipeline) -> None:
+    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None) -> None:
         self._pipeline = pipeline
         self._made: dict[int, FlowField | Route] = {}
-        self._asked = 0
-        self._last = Tick()
+        self._asked = start.mission.request if start.mission is not None else 0
+        self._last = start
         self.comparison = Comparison()
         self.results: list[str] = []
+        if order is None or order.mission is None:
+            return
+        wanted, seen = order.mission.wanted, order.observations
+        if wanted == "refine" and seen is not None and seen.stamp_ns > order.mission.requested_ns:
+            # Ordered before this piece of a run begins, from fewer observations than are repeated in it.
+            self.results.append(f"{BY_FIELD[FILLS[wanted]].path}: ordered in the part before, taken as recorded")
+        else:
+            self._made[order.mission.request] = work(pipeline, order)
 
     def see(self, tick: Tick) -> None:
         """Take note of one tick: new orders are worked on, adopted results compared."""
@@ -302,14 +315,18 @@ class WorkerCheck:
         return self.comparison.same
 
 
-def _resubmit(reader: SessionReader, start: Tick, worker: LockstepWorker) -> None:
-    """An order that was on its way at the starting tick is given again, with what was known when it was given."""
+def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
+    """The tick of an order that was on its way at the starting tick, with what was known when it was given.
+
+    Where a piece of a run begins after that, with what it repeats: the same but for observations made meanwhile.
+    """
     mission = start.mission
     if mission is None or not mission.wanted:
-        return
+        return None
     answer = getattr(start, FILLS[mission.wanted])
-    if answer is None or answer.request != mission.request:
-        worker.submit(reader.tick_before(mission.requested_ns))
+    if answer is not None and answer.request == mission.request:
+        return None
+    return reader.tick_before(max(mission.requested_ns, reader.first_ns))
 
 
 def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick, stale: frozenset[str]) -> Tick:

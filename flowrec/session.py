@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from flowrec.chip.chip import Chip
 from flowrec.config import Config, config_from_toml, to_toml
 from flowrec.messages import Route
 from flowrec.provenance import provenance
-from flowrec.store import SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for
+from flowrec.store import SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
 
 
 def session_writer(
@@ -30,7 +30,7 @@ def session_writer(
 
     A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
     """
-    named = {"file": parent.name, "sha256": file_sha256(parent)} if parent is not None else None
+    named = {"file": parent.name, "sha256": session_sha256(files_of(parent))} if parent is not None else None
     return SessionWriter(
         path,
         session_header(config, chip, named),
@@ -80,10 +80,13 @@ def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:
     return reader, config, chip_from_files(reader.header.chip_png, reader.header.chip_toml)
 
 
-def file_sha256(path: Path) -> str:
-    """Hash of a file's content, by which a replay names its parent."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def session_sha256(files: Sequence[Path]) -> str:
+    """Hash of a session's content, by which a replay names its parent: of its file, or of its parts in order."""
+    digest = hashlib.sha256()
+    for path in files:
+        with path.open("rb") as file:
+            hashlib.file_digest(file, lambda: digest)
+    return digest.hexdigest()
 
 
 def length_mm(route: Route) -> float:

@@ -10,18 +10,20 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 from rich.console import Console
-from rich.live import Live
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from flowrec.errors import printable
-from flowrec.messages import Tick
 from flowrec.units import seconds
+
+if TYPE_CHECKING:  # what only a running session needs is imported then: a table is to be there at once
+    from rich.live import Live
+
+    from flowrec.messages import Tick
 
 _PATIENCE_S = 2.0  # without a tick, then a person wants to know why
 
@@ -51,7 +53,7 @@ class StatusLine:
         self._latency_ms: deque[float] = deque(maxlen=240)
         self._shown = 0.0
         self._live: Live | None = None
-        self._last = Tick()
+        self._last: Tick | None = None
 
     @contextmanager
     def shown(self) -> Iterator[StatusLine]:
@@ -62,6 +64,8 @@ class StatusLine:
             if not console.is_terminal:
                 yield self
                 return
+            from rich.live import Live
+
             with Live(Text("starting"), console=console, refresh_per_second=8, transient=True) as live:
                 self._live = live
                 yield self
@@ -83,7 +87,7 @@ class StatusLine:
         self._arrivals.append(now)
         if tick.timing is not None:
             self._latency_ms.append(tick.timing.total_ms)
-        if tick.event is not None and tick.event is not self._last.event:
+        if tick.event is not None and (self._last is None or tick.event is not self._last.event):
             colour = {"warning": "yellow", "error": "red"}.get(tick.event.level, "cyan")
             text = escape(printable(tick.event.text))
             console.print(f"[dim]{seconds(tick.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
@@ -94,6 +98,8 @@ class StatusLine:
 
     def text(self, tick: Tick) -> Text:
         """The line itself."""
+        import numpy as np
+
         mission, timing = tick.mission, tick.timing
         phase = mission.phase if mission is not None else "start"
         wait = f" ({mission.wanted.replace('_', ' ')} ...)" if mission is not None and mission.wanted else ""
@@ -123,6 +129,8 @@ def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
     if not console.is_terminal:
         yield lambda _done: None
         return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
     bar = Progress(
         TextColumn(what), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True
     )

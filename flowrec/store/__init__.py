@@ -1,28 +1,61 @@
-from flowrec.store.audit import Audit, audit
-from flowrec.store.frames import encoding_for
-from flowrec.store.header import SessionHeader
-from flowrec.store.mcap_file import is_growing
-from flowrec.store.names import is_snapshot, taken
-from flowrec.store.parts import Split
-from flowrec.store.reader import SessionReader
-from flowrec.store.recovery import Recovered, recover
-from flowrec.store.shapes import not_finite
-from flowrec.store.snapshots import Snapshot
-from flowrec.store.writer import SessionWriter
+"""Ticks to MCAP and back. What is asked for is imported then: `flowrec ls` needs no schema, codec or array."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flowrec.store.frames import encoding_for
+    from flowrec.store.header import SessionHeader
+    from flowrec.store.joints import files_of
+    from flowrec.store.mcap_file import is_growing
+    from flowrec.store.names import is_snapshot, taken
+    from flowrec.store.parts import Split
+    from flowrec.store.reader import SessionReader
+    from flowrec.store.recovery import Recovered, recover
+    from flowrec.store.run_recovery import recover_run
+    from flowrec.store.shapes import not_finite
+    from flowrec.store.snapshots import Snapshot
+    from flowrec.store.writer import SessionWriter
+
+_HOME = {
+    "Recovered": "recovery",
+    "SessionHeader": "header",
+    "SessionReader": "reader",
+    "SessionWriter": "writer",
+    "Snapshot": "snapshots",
+    "Split": "parts",
+    "encoding_for": "frames",
+    "files_of": "joints",
+    "is_growing": "mcap_file",
+    "is_snapshot": "names",
+    "not_finite": "shapes",
+    "recover": "recovery",
+    "recover_run": "run_recovery",
+    "taken": "names",
+}
 
 __all__ = [
-    "Audit",
     "Recovered",
     "SessionHeader",
     "SessionReader",
     "SessionWriter",
     "Snapshot",
     "Split",
-    "audit",
     "encoding_for",
+    "files_of",
     "is_growing",
     "is_snapshot",
     "not_finite",
     "recover",
+    "recover_run",
     "taken",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    return found

@@ -14,6 +14,7 @@ from flowrec.messages import Message
 from flowrec.store.codec import decode, message_stamp
 from flowrec.store.contents import Contents
 from flowrec.store.header import SessionHeader
+from flowrec.store.joints import Piece
 from flowrec.store.scan import Scan, scan
 from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record, Source, UnfinishedError
@@ -73,14 +74,27 @@ class Audit:
         """From the first message to the last, in s."""
         return seconds(self.last_ns - self.first_ns)
 
+    @property
+    def piece(self) -> Piece:
+        """The file as joints.py looks at it."""
+        part = self.header.part if self.header is not None else None
+        counts = {BY_FIELD[name].path: count for name, count in self.counts.items()}
+        return Piece(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.flowrec_version)
 
-def audit(path: Path, see: See, progress: Callable[[int], None] | None = None) -> Audit:
+
+def audit(
+    path: Path,
+    see: See,
+    progress: Callable[[int], None] | None = None,
+    begin: Callable[[Audit], None] | None = None,
+) -> Audit:
     """Read everything that can be read, in file order; one chunk is in memory at a time.
 
     Parameters
     ----------
     see : told every message that can be decoded; those of one tick need not follow each other.
     progress : told up to which byte the file has been read.
+    begin : told what the head says, before the first message.
 
     Raises
     ------
@@ -99,6 +113,8 @@ def audit(path: Path, see: See, progress: Callable[[int], None] | None = None) -
             found.header = contents.header
         except SessionError as error:
             found.header_fault = error.what if isinstance(error, DamageError) else _first_part(error, path)
+        if begin is not None:
+            begin(found)
         reading = _Reading(found, contents, see)
         scanned = scan(contents.source, reading.take, progress)
         found.lost = sum(lost.nbytes for lost in scanned.lost)
@@ -138,6 +154,7 @@ class _Reading:
             found.backwards[name] += record.log_ns < self._last_ns.get(name, record.log_ns)
             self._last_ns[name] = record.log_ns
             try:
+                assert isinstance(record.payload, memoryview)
                 message = decode(BY_FIELD[name].type, record.payload, record.sequence, self._schemas[record.channel])
                 wrong = misfit(message)
             except SessionError as error:

@@ -19,6 +19,7 @@ _FIXED_PART = 22  # bytes of a message record besides its payload
 # Noise does not compress: level 1 gets the same 1.2 to 1.6 of a camera image as higher ones, five times quicker.
 _ZSTD_LEVEL = 1
 _INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries
+_KEPT_BYTES = 32 << 20  # of memory from chunk to chunk
 _LARGE_BYTES = 1 << 16  # from here on numpy copies, which leaves the interpreter free meanwhile
 
 
@@ -90,7 +91,7 @@ class ChunkBuilder:
         end = self.size + 9 + length
         if end > len(self._memory):
             # A new one, with the old content: the growth of a bytearray would refuse while somebody looks at it.
-            grown = bytearray(end + end // 4)
+            grown = bytearray(end + min(end, _KEPT_BYTES) // 4)
             grown[: self.size] = memoryview(self._memory)[: self.size]
             self._memory = grown
         _MESSAGE_HEAD.pack_into(self._memory, self.size, Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns)
@@ -116,4 +117,6 @@ class ChunkBuilder:
             indexes=[ChannelIndex(channel, entries) for channel, entries in self._index.items()],
         )
         self.size, self._index = 0, {}
+        if len(self._memory) > _KEPT_BYTES and self._compressor:
+            self._memory = bytearray(1 << 18)  # a flow field comes once a minute
         return sealed

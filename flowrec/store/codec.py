@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, Message, OperatorEvent
 from flowrec.store import standard
+from flowrec.store.encoder import encoder_of
 from flowrec.store.form import Codec, Payload
 from flowrec.store.frames import FRAME_CODECS, RAW_IMAGE
-from flowrec.store.schemas import FieldForm, forms_of, schema_of
-from flowrec.store.wire import encoder_of
+from flowrec.store.schemas import FieldForm, array_schema, forms_of, schema_of
+from flowrec.store.wire import LARGE_BYTES, cut_out, own
 
 _M = TypeVar("_M", bound=Message)
 # Up to here a loop over the wire's values is quicker than numpy's general conversion.
 _SHORT_VECTOR = 64
+_LONG_VECTOR = 1 << 16
+_ARRAY_DATA = 3  # number of the field of flowrec.Array that holds the bytes
 
 
 _codecs: dict[type[Any], Codec] = {
@@ -103,10 +106,20 @@ def _without_surrogates(message: _M) -> _M:
 def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview, int], Any]:
     parse = wire.FromString
     unpackers = [_unpacker(form) for form in forms_of(message_type)]
+    arrays = {number: form for number, form in enumerate(forms_of(message_type), 1) if form.kind == "array"}
 
     def decode(payload: bytes | memoryview, sequence: int) -> Any:
-        parsed = parse(payload)
-        return message_type(*[unpack(parsed) for unpack in unpackers])
+        if len(payload) < LARGE_BYTES or not arrays:
+            parsed = parse(payload)
+            return message_type(*[unpack(parsed) for unpack in unpackers])
+        rest, found = cut_out(memoryview(payload), arrays)
+        parsed, found = parse(rest), own(memoryview(payload), found)
+        return message_type(
+            *[
+                _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)
+                for number, unpack in enumerate(unpackers, 1)
+            ]
+        )
 
     return decode
 
@@ -119,7 +132,9 @@ def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
         def present(parsed: Any) -> Any:
             values = getattr(parsed, name)
             count = len(values)
-            return np.fromiter(values, np.float64, count) if count < _SHORT_VECTOR else np.array(values, np.float64)
+            # numpy's general conversion makes a list first, which is not to be a large one.
+            short_or_huge = count < _SHORT_VECTOR or count > _LONG_VECTOR
+            return np.fromiter(values, np.float64, count) if short_or_huge else np.array(values, np.float64)
 
     elif form.kind == "array":
         assert dtype is not None
@@ -134,10 +149,17 @@ def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
     return lambda parsed: present(parsed) if parsed.HasField(name) else None
 
 
-def _unpacked_array(parsed: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
+    assert dtype is not None
+    rest, found = cut_out(field, (_ARRAY_DATA,))
+    parsed = array_schema().wire.FromString(rest)
+    return _unpacked_array(parsed, dtype, found.get(_ARRAY_DATA))
+
+
+def _unpacked_array(parsed: Any, dtype: np.dtype[Any], cut: memoryview | None = None) -> NDArray[Any]:
     if parsed.dtype != dtype.str:
         raise ValueError(f"an array of {parsed.dtype!r} where {dtype.str!r} belongs")
-    shape, data = tuple(parsed.shape), parsed.data
+    shape, data = tuple(parsed.shape), cut if cut is not None else parsed.data
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"an array of shape {shape} in {len(data)} bytes")
     return np.frombuffer(data, dtype).reshape(shape)

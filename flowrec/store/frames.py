@@ -19,15 +19,14 @@ import numpy as np
 
 from flowrec.messages import Frame, Image
 from flowrec.store.form import Codec, Payload
-from flowrec.store.pictures import jpeg, picture, png, row_differences
+from flowrec.store.pictures import PIXELS_LIMIT, jpeg, picture, png, row_differences
 from flowrec.store.schemas import Schema, foxglove_schema
 from flowrec.store.standard import stamp_of, timestamp
-from flowrec.store.wire import varint
+from flowrec.store.wire import cut_out, head_of, own
 
 RAW_IMAGE, COMPRESSED_IMAGE = "foxglove.RawImage", "foxglove.CompressedImage"
 _SEQUENCE_LIMIT = 2**32  # MCAP keeps the sequence in 32 bit
-_RAW_IMAGE_DATA = b"\x32"  # tag of RawImage.data: field 6, length-delimited
-_COMPRESSED_IMAGE_DATA = b"\x12"  # tag of CompressedImage.data: field 2
+_RAW_IMAGE_DATA, _COMPRESSED_IMAGE_DATA = 6, 2  # numbers of the fields that hold the bytes
 # Up to here packing takes at most about a quarter and three quarters of a core, the checksums included.
 _DELTA_PX_S = 80e6
 _ZSTD_PX_S = 400e6
@@ -66,12 +65,14 @@ def _raw_image() -> Codec:
         height, width = _shape(frame)
         head = wire(timestamp=timestamp(frame.stamp_ns), width=width, height=height, encoding="mono8", step=width)
         # The image goes to the compressor as it lies in memory: protobuf would copy it three times, holding the GIL.
-        prefix = head.SerializeToString() + _RAW_IMAGE_DATA + varint(frame.image.nbytes)
+        prefix = head.SerializeToString() + head_of(_RAW_IMAGE_DATA, frame.image.nbytes)
         return (prefix, frame.image.reshape(-1).data)
 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
-        parsed = wire.FromString(payload)
-        shape, data = (parsed.height, parsed.width), parsed.data
+        rest, found = cut_out(memoryview(payload), (_RAW_IMAGE_DATA,))
+        parsed = wire.FromString(rest)
+        found = own(memoryview(payload), found)
+        shape, data = (parsed.height, parsed.width), found.get(_RAW_IMAGE_DATA, parsed.data)
         if parsed.encoding != "mono8" or parsed.step != shape[1] or len(data) != shape[0] * shape[1]:
             raise ValueError(f"an image of {shape[1]} x {shape[0]} {parsed.encoding!r} in {len(data)} bytes")
         return Frame(stamp_of(parsed), sequence, np.frombuffer(data, np.uint8).reshape(shape))
@@ -88,11 +89,12 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
         _shape(frame)
         parts = file_of(frame.image)
         head = wire(timestamp=timestamp(frame.stamp_ns), format=file_format).SerializeToString()
-        return (head + _COMPRESSED_IMAGE_DATA + varint(sum(map(len, parts))), *parts)
+        return (head + head_of(_COMPRESSED_IMAGE_DATA, sum(map(len, parts))), *parts)
 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
-        parsed = wire.FromString(payload)
-        return Frame(stamp_of(parsed), sequence, picture(parsed.data))
+        rest, found = cut_out(memoryview(payload), (_COMPRESSED_IMAGE_DATA,))
+        parsed = wire.FromString(rest)
+        return Frame(stamp_of(parsed), sequence, picture(found.get(_COMPRESSED_IMAGE_DATA, parsed.data)))
 
     return Codec(schema, encode, decode, _sequence)
 
@@ -100,6 +102,8 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
 def _shape(frame: Frame) -> tuple[int, int]:
     if frame.image.ndim != 2:
         raise ValueError(f"an image of shape {frame.image.shape}")
+    if frame.image.size > PIXELS_LIMIT:
+        raise ValueError(f"an image of {frame.image.size} pixels, more than {PIXELS_LIMIT}, which the reader takes")
     height, width = frame.image.shape
     return height, width
 

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from operator import attrgetter
 
 from mcap.records import ChunkIndex
 
+from flowrec.store.index import records_of
 from flowrec.store.source import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, Source
 
 _AHEAD_BYTES = 32 << 20  # decompressed before they are asked for
 _AHEAD_CHUNKS = 16
 _THREADS = 2
+_FEW = 64  # messages of a chunk that may wait as objects
+
+Ready = Callable[[Record], Record]
+_Bundle = list[bytes | memoryview | list[Record]]  # of each chunk its content, or its messages
 
 by_time = attrgetter("log_ns")
 
@@ -29,11 +35,18 @@ def threads() -> Iterator[Executor]:
         executor.shutdown(cancel_futures=True)
 
 
-def lane(source: Source, chunks: Iterable[ChunkIndex], executor: Executor) -> Iterator[Record]:
+def lane(
+    source: Source, chunks: Iterable[ChunkIndex], executor: Executor, ready: Ready | None = None
+) -> Iterator[Record]:
     """Merge chunks into one stream of messages; those of equal time stay in file order.
 
     flowrec's own chunks of a group follow each other in time. Where other programs have rewritten a file,
     chunks that overlap are read together and sorted.
+
+    Parameters
+    ----------
+    ready : what can be done with each record in the threads, where a chunk holds few and large ones: images. It
+        gives the record back with a message of at most twice its size as payload, or as it was.
 
     Raises
     ------
@@ -42,7 +55,7 @@ def lane(source: Source, chunks: Iterable[ChunkIndex], executor: Executor) -> It
     waiting = deque(
         _bundles(source, sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)))
     )
-    running: deque[tuple[list[ChunkIndex], Future[list[bytes | memoryview]]]] = deque()
+    running: deque[tuple[list[ChunkIndex], Future[_Bundle]]] = deque()
     ahead_bytes = 0
     while waiting or running:
         while waiting and len(running) < _AHEAD_CHUNKS:
@@ -50,12 +63,14 @@ def lane(source: Source, chunks: Iterable[ChunkIndex], executor: Executor) -> It
             if ahead_bytes and ahead_bytes + weight > _AHEAD_BYTES:
                 break  # one that is larger than all that may be ahead comes alone
             bundle = waiting.popleft()
-            running.append((bundle, executor.submit(_contents, source, bundle)))
+            running.append((bundle, executor.submit(_contents, source, bundle, ready)))
             ahead_bytes += weight
         bundle, future = running.popleft()
-        # A message as an object takes more memory than as bytes: they are made for one bundle at a time.
-        yield from _sorted_messages(source, bundle, future.result())
+        # A small message as an object takes more memory than as bytes: they are made for one bundle at a time.
+        records = _sorted_messages(source, bundle, future.result())
         del future
+        yield from records
+        del records
         ahead_bytes -= _weight(bundle)
 
 
@@ -79,15 +94,25 @@ def _weight(bundle: list[ChunkIndex]) -> int:
     return sum(chunk.uncompressed_size for chunk in bundle)
 
 
-def _contents(source: Source, bundle: list[ChunkIndex]) -> list[bytes | memoryview]:
-    return [source.chunk(chunk) for chunk in bundle]
+def _contents(source: Source, bundle: list[ChunkIndex], ready: Ready | None) -> _Bundle:
+    return [_content(source, chunk, ready) for chunk in bundle]
 
 
-def _sorted_messages(source: Source, bundle: list[ChunkIndex], contents: list[bytes | memoryview]) -> Iterator[Record]:
+def _content(source: Source, chunk: ChunkIndex, ready: Ready | None) -> bytes | memoryview | list[Record]:
+    content = source.chunk(chunk)
+    if ready is None:
+        return content
+    with source.parsing(chunk.chunk_start_offset):
+        if len(list(itertools.islice(records_of(content), _FEW))) == _FEW:
+            return content
+    return [ready(record) for record in source.messages_in(content, chunk.chunk_start_offset)]
+
+
+def _sorted_messages(source: Source, bundle: list[ChunkIndex], contents: _Bundle) -> Iterator[Record]:
     places = [chunk.chunk_start_offset for chunk in bundle]
     records: list[Record] = []
     for place, content in sorted(zip(places, contents, strict=True), key=lambda pair: pair[0]):
-        records += source.messages_in(content, place)
+        records += content if isinstance(content, list) else source.messages_in(content, place)
         if len(records) > MESSAGES_LIMIT:
             raise source.damaged(place, "too many messages claim the same time")
     records.sort(key=by_time)

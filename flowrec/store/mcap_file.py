@@ -14,6 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -33,7 +34,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from flowrec.store.chunk import Sealed
+if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
+    from flowrec.store.chunk import Sealed
 
 MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_HEAD = struct.Struct("<BQQQQII")  # opcode, length, first and last time, size, checksum, length of the name

@@ -58,13 +58,15 @@ def is_snapshot(path: Path) -> bool:
 
 def parts(path: Path) -> list[Path]:
     """The finished parts of the run X.mcap, in order."""
-    found = [(match, other) for other in pieces(path) if (match := _PIECE.fullmatch(other.stem)) is not None]
-    numbered = [
-        (int(match["number"]), other)
-        for match, other in found
-        if match["kind"] == "part" and other.suffix == path.suffix
-    ]
-    return [other for _, other in sorted(numbered)]
+    return sorted(
+        (other for other in pieces(path) if part_number(other) and other.suffix == path.suffix), key=part_number
+    )
+
+
+def part_number(path: Path) -> int:
+    """The number of a part of a run, finished or not, as its name tells; 0 for any other file."""
+    match = _PIECE.fullmatch(path.with_name(path.name.removesuffix(PARTIAL_SUFFIX)).stem)
+    return int(match["number"]) if match is not None and match["kind"] == "part" else 0
 
 
 def _piece(path: Path, kind: str, number: int) -> Path:

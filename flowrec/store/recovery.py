@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +23,13 @@ from flowrec.store.writer import SessionWriter
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
+_POLL_S = 1e-3
 _QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
 _HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
+
+
+class NothingSavedError(SessionError):
+    """There is no whole tick in the remains of a run."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +39,7 @@ class Recovered:
     Attributes
     ----------
     path : the whole session.
-    ticks, duration_s : what is in it.
+    ticks, duration_s : what is in it, without what a part repeats of the one before.
     lost_bytes : of the old file, not to be used.
     lost : what was lost, for people; empty when nothing was.
     changed : False where the file was whole already.
@@ -90,6 +96,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
     if is_growing(path):
         raise SessionError(f"{path}: is being recorded just now; stop that run with Ctrl-C, and its file is whole")
+    if partial and path.is_file() and not path.stat().st_size:
+        raise NothingSavedError(f"{path}: is empty; nothing was recorded into it; remove the file")
     with _without_circular_advice(path):
         whole = _checked(path)
         if whole is not None:
@@ -100,6 +108,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             return Recovered(target, whole.ticks, whole.duration_s)
         with contextlib.closing(Source(path)) as source:
             found = scan(source)
+        if partial and not found.summary.chunks:
+            raise NothingSavedError(f"{path}: nothing can be saved: no message was on the disk; remove the file")
         nonsense = _Nonsense()
         contents = Contents(path, found.summary)
         reader = SessionReader(path, contents, nonsense.add)
@@ -139,7 +149,8 @@ def _checked(path: Path) -> Recovered | None:
             for chunk in contents.chunks:  # the rest: views for other programs
                 if contents.fields.keys().isdisjoint(chunk.message_index_offsets):
                     contents.source.messages(chunk)
-            return Recovered(path, reader.counts.get("track", 0), reader.duration_s, changed=False)
+            repeated = reader.carried_ns is not None
+            return Recovered(path, reader.counts.get("track", 0) - repeated, reader.duration_s, changed=False)
     except SessionError:
         return None
 
@@ -159,7 +170,7 @@ def _last_whole_ns(path: Path, reader: SessionReader, found: Scan) -> int:
     """Stamp of the last tick with inputs and outputs; those of one tick are always in the same chunk."""
     ends = [found.last_ns.get(_channel(found, topic)) for topic in ("/coils/applied", "/robot/track")]
     if any(end is None for end in ends):
-        raise SessionError(
+        raise NothingSavedError(
             f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; remove the file"
         )
     return min(end for end in ends if end is not None)
@@ -184,12 +195,16 @@ def _rewrite(
             if tick.stamp_ns > end_ns:
                 images_ahead += 1
                 continue
-            if tick.applied is not before.applied and tick.track is not before.track:
+            if tick.stamp_ns == reader.carried_ns:
+                pass  # counted where it was recorded
+            elif tick.applied is not before.applied and tick.track is not before.track:
                 whole += 1
                 images_missing += has_images and tick.frame is before.frame
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
             before = tick
+            while writer.queue_bytes > _QUEUE_BYTES:  # a large one is not to wait while the next is read
+                time.sleep(_POLL_S)
         lost = "; ".join([*_losses(reader, found, images_missing - dropped, images_ahead), *nonsense.told()])
         writer.close(_outcome(reader, lost, before.stamp_ns, dropped))
     return whole, lost
@@ -201,10 +216,9 @@ def _losses(reader: SessionReader, found: Scan, images_missing: int, images_ahea
     if found.lost:
         nbytes, first = sum(lost.nbytes for lost in found.lost), found.lost[0].offset
         yield f"{nbytes} damaged or cut-off bytes, the first at {first}"
-    gaps = found.gaps.get(_channel(found, "/coils/applied"), [])
-    part = reader.header.part
-    if part is not None and part.kind == "snapshot":  # which begins on the way
-        gaps = [gap for gap in gaps if gap.before_ns > reader.first_ns]
+    # The numbers of a part may go on from those of the part before.
+    begin_ns = -1 if reader.carried_ns is None else reader.carried_ns
+    gaps = [gap for gap in found.gaps.get(_channel(found, "/coils/applied"), []) if gap.before_ns > begin_ns]
     if gaps:
         from_s = seconds(gaps[0].before_ns - reader.first_ns)
         yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"

@@ -13,7 +13,7 @@ import weakref
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
 
 import zstandard
 from google.protobuf.message import DecodeError
@@ -25,11 +25,16 @@ from flowrec.errors import SessionError
 from flowrec.store.index import Summary, records_of, stream_of, summary_from
 from flowrec.store.mcap_file import MAGIC
 
-# Of one chunk before compression: a flow field on 1900 x 1900 pixels, or one image of 8500 x 8500. Two of them and two
-# copies on the way to a message are what reading needs at most, which leaves it within 512 MB with the program itself.
+if TYPE_CHECKING:
+    from flowrec.messages import Message
+
+# Of one chunk before compression: a flow field on 1900 x 1900 pixels. What a tick knows, such a chunk on its way into
+# the next tick, and an image on its way are what reading needs at most: with the program itself less than 512 MB.
 CHUNK_LIMIT_BYTES = 72 << 20
 # Above so many bytes a chunk must have taken at least a thousandth of them: noise, flow and text never pack better.
 _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
+# What is read of a compressed chunk at a time, and how far back zstd may look; ours look back half a megabyte.
+_AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
 MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
@@ -78,7 +83,7 @@ class Record(NamedTuple):
     log_ns: int
     channel: int
     sequence: int
-    payload: memoryview
+    payload: memoryview | Message  # a message where it has been decoded already
 
 
 class AttachmentBody(NamedTuple):
@@ -200,16 +205,39 @@ class Source:
 
     def content(self, offset: int, length: int) -> bytes | memoryview:
         """What is in a chunk: decompressed within our limits, whatever it announces; checksum verified."""
-        body = self.body(offset, length, Opcode.CHUNK)
+        self._check_size(offset, length, Opcode.CHUNK)
+        whole = length <= _AT_ONCE_BYTES
+        body = self.body(offset, length, Opcode.CHUNK) if whole else memoryview(self.read(offset, _AT_ONCE_BYTES))[9:]
         with self.parsing(offset):
             _, _, size, crc, name_bytes = _CHUNK_HEAD.unpack_from(body)
             compression, at = _text(body, _CHUNK_HEAD.size, name_bytes)
-            if _LONG.unpack_from(body, at)[0] != len(body) - at - _LONG.size:
+            begin = at + _LONG.size
+            if _LONG.unpack_from(body, at)[0] != length - RECORD_HEAD.size - begin:
                 raise ValueError("the chunk is not as long as announced")
-            content = _decompressed(body[at + _LONG.size :], compression, size)
+            if not whole and _can_be_streamed(body[begin:], compression):
+                content: bytes | memoryview = self._streamed(
+                    offset + RECORD_HEAD.size + begin, offset + length, body[begin:], size
+                )
+            else:
+                body = body if whole else self.body(offset, length, Opcode.CHUNK)
+                content = _decompressed(body[begin:], compression, size)
             if crc and zlib.crc32(content) != crc:
                 raise ValueError("the checksum of the chunk is wrong")
         return content
+
+    def _streamed(self, start: int, end: int, begin: memoryview, size: int) -> memoryview:
+        """What zstd has packed into the bytes from `start` to `end`, of which `begin` are the first: piece by piece."""
+        _refuse_bomb(size, end - start)
+        _refuse_other_size(begin, size)
+        content = memoryview(bytearray(size))
+        unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_LIMIT_BYTES)
+        at = 0
+        with unpacker.stream_reader(cast(IO[bytes], _Pieces(self, start, end))) as stream:
+            while at < size and (count := stream.readinto(content[at:])):
+                at += count
+            if at < size or stream.read(1):
+                raise ValueError(f"{at} bytes or more where {size} are announced")
+        return content.toreadonly()
 
     def chunk(self, index: ChunkIndex) -> bytes | memoryview:
         """`content` of a chunk of the index, of the size that the index tells."""
@@ -253,9 +281,7 @@ class Source:
 
     def body(self, offset: int, length: int, opcode: Opcode) -> memoryview:
         """What follows the head of a record of that kind and whole length."""
-        limit = _LIMIT_BYTES.get(opcode, _SMALL_LIMIT_BYTES)
-        if length > limit:
-            raise self.damaged(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
+        self._check_size(offset, length, opcode)
         data = self.read(offset, length)
         with self.parsing(offset):
             found, size = RECORD_HEAD.unpack_from(data)
@@ -263,11 +289,29 @@ class Source:
                 raise ValueError(f"no {opcode.name.lower()} of {length} bytes here")
         return memoryview(data)[RECORD_HEAD.size :]
 
+    def _check_size(self, offset: int, length: int, opcode: Opcode) -> None:
+        limit = _LIMIT_BYTES.get(opcode, _SMALL_LIMIT_BYTES)
+        if length > limit:
+            raise self.damaged(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
+
     def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> Any:
         """One small record of that kind and whole length, parsed."""
         body = self.body(offset, length, opcode)
         with self.parsing(offset):
             return parse(stream_of(body))
+
+
+class _Pieces:
+    """Bytes of a file, read when they are asked for."""
+
+    def __init__(self, source: Source, start: int, end: int) -> None:
+        self._source, self._at, self._end = source, start, end
+
+    def read(self, count: int) -> bytes:
+        """The next bytes, at most so many."""
+        data = self._source.read(self._at, min(count, self._end - self._at))
+        self._at += len(data)
+        return data
 
 
 _LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: _ATTACHMENT_LIMIT_BYTES}
@@ -280,17 +324,30 @@ def _text(body: memoryview, at: int, nbytes: int) -> tuple[str, int]:
     return str(body[at : at + nbytes], "utf-8"), at + nbytes
 
 
-def _decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
+def _refuse_bomb(size: int, nbytes: int) -> None:
     if size > CHUNK_LIMIT_BYTES:
         raise ValueError(f"a chunk of {size} bytes, more than {CHUNK_LIMIT_BYTES}")
-    if size > _FREE_BYTES and size > _RATIO_LIMIT * len(data):
-        raise ValueError(f"a chunk that unpacks {len(data)} bytes to {size}")
+    if size > _FREE_BYTES and size > _RATIO_LIMIT * nbytes:
+        raise ValueError(f"a chunk that unpacks {nbytes} bytes to {size}")
+
+
+def _refuse_other_size(data: memoryview, size: int) -> None:
+    # The size in zstd's own header is what the library allocates, whatever limit it is given.
+    if zstandard.frame_content_size(data) not in (-1, size):
+        raise ValueError("zstd announces another size than the chunk")
+
+
+def _can_be_streamed(begin: memoryview, compression: str) -> bool:
+    """Whether unpacking piece by piece needs little memory besides what comes out."""
+    return compression == "zstd" and zstandard.get_frame_parameters(begin).window_size <= _WINDOW_LIMIT_BYTES
+
+
+def _decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
+    _refuse_bomb(size, len(data))
     if compression == "":
         content: bytes | memoryview = data
     elif compression == "zstd":
-        # The size in zstd's own header is what the library allocates, whatever limit it is given.
-        if zstandard.frame_content_size(data) not in (-1, size):
-            raise ValueError("zstd announces another size than the chunk")
+        _refuse_other_size(data, size)
         # A new one each time: they are cheap, and may not be shared between threads.
         content = zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
     else:

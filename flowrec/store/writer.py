@@ -119,6 +119,7 @@ class SessionWriter:
         self._thinning = Thinning()
         self._next_index: int | None = None
         self._said: Drops | None = None
+        self._carried_ns = header.part.carried_ns if header.part is not None else None
         self._block = block
         self._overwrite = overwrite
         self._last: tuple[Any, ...] = (None,) * len(_FIELDS)

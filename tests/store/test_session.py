@@ -92,9 +92,10 @@ def test_the_state_between_two_ticks_is_that_of_the_earlier_one(path):
 
 def test_poses_are_read_without_touching_a_frame(path, monkeypatch):
     reader = SessionReader(path)
-    frames = {chunk.chunk_start_offset for chunk in reader._contents.chunks if 1 in chunk.message_index_offsets}
-    read, pread = [], reader._source.read
-    monkeypatch.setattr(type(reader._source), "read", lambda _, at, length: (read.append(at), pread(at, length))[1])
+    source = reader._file(0)._source
+    frames = {c.chunk_start_offset for c in reader._file(0).contents.chunks if 1 in c.message_index_offsets}
+    read, pread = [], source.read
+    monkeypatch.setattr(type(source), "read", lambda _, at, length: (read.append(at), pread(at, length))[1])
     ticks = list(reader.ticks(with_frames=False))
     assert all(same(a, b, but=("frame",)) and b.frame is None for a, b in zip(TICKS, ticks, strict=True))
     assert read and frames and frames.isdisjoint(read)

@@ -191,7 +191,7 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
     plain = McapFile.add_chunks
 
     def refuse(self, sealed):
-        if "part002" in str(self._file.name) and self.size > 30_000:
+        if "part002" in str(self._file.name) and self.size > 80_000:
             raise OSError(errno.ENOSPC, "No space left on device")
         plain(self, sealed)
 

@@ -1,0 +1,291 @@
+"""A run in parts is read as if it had never been split; each part is a session of its own."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from flowrec import replay as verb
+from flowrec.check import check
+from flowrec.chip import load_chip
+from flowrec.cli import app
+from flowrec.compare import compare_sessions
+from flowrec.config import load_config, resolve
+from flowrec.errors import SessionError
+from flowrec.listing import describe, list_sessions
+from flowrec.messages import Tick
+from flowrec.replay import Change
+from flowrec.session import session_header, session_sha256
+from flowrec.store import SessionReader, SessionWriter, recover_run
+from flowrec.store.header import Part
+from flowrec.store.names import part_path, partial_path
+from flowrec.topics import BY_FIELD
+from tests.store.made_up import ticks_of
+
+CONFIG = load_config(None, ["camera.rate_hz=60"])
+CHIP = load_chip(CONFIG.chip)
+HEADER = session_header(resolve(CONFIG, CHIP), CHIP)
+TICKS = list(ticks_of(60, shape=(8, 8)))
+# What a simulator knows is in a tick only when it is new: the part after repeats less than was ever known.
+SPARSE = [
+    replace(now, true_field=None) if now.true_field is before.true_field else now
+    for before, now in zip([Tick(), *TICKS], TICKS, strict=False)
+]
+
+
+def in_parts(path, cuts, ticks=SPARSE, header=HEADER, outcome=None):
+    """Write ticks as the parts of a run that are cut before these; their files."""
+    bounds = [0, *sorted(cuts), len(ticks)]
+    files = []
+    for number, (begin, end) in enumerate(pairwise(bounds), 1):
+        carried = ticks[begin - 1] if begin else None
+        part = Part("one run", number, carried_ns=None if carried is None else carried.stamp_ns)
+        following = part_path(path, number + 1).name
+        last = number == len(bounds) - 1
+        with SessionWriter(part_path(path, number), replace(header, part=part), block=True) as writer:
+            for tick in [*([carried] if carried is not None else []), *ticks[begin:end]]:
+                writer.write(tick)
+            writer.close(outcome or {"outcome": "reached"} if last else {"outcome": "continued", "next": following})
+        files.append(part_path(path, number))
+    return files
+
+
+def same(one, other):
+    return one.stamp_ns == other.stamp_ns and all(
+        mine is theirs or (mine is not None and mine.same_as(theirs))
+        for mine, theirs in ((getattr(one, field), getattr(other, field)) for field in BY_FIELD)
+    )
+
+
+def news(ticks, before):
+    for tick in ticks:
+        yield [field for field in BY_FIELD if getattr(tick, field) is not getattr(before, field)]
+        before = tick
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "x.mcap"
+    with SessionWriter(path, HEADER, block=True) as writer:
+        for tick in SPARSE:
+            writer.write(tick)
+        writer.close({"outcome": "reached"})
+    return SessionReader(path)
+
+
+@pytest.fixture
+def run(tmp_path):
+    in_parts(tmp_path / "x.mcap", [11, 12, 40])
+    return tmp_path / "x.mcap"
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cuts=st.sets(st.integers(1, len(TICKS) - 1), max_size=6), late=st.integers(-1, len(TICKS)), data=st.data())
+def test_however_a_session_is_cut_its_ticks_are_the_same_from_any_time(whole, tmp_path_factory, cuts, late, data):
+    path = tmp_path_factory.mktemp("cut") / "x.mcap"
+    files = in_parts(path, cuts)
+    start_ns = None if late < 0 else TICKS[min(late, len(TICKS) - 1)].stamp_ns + (late == len(TICKS))
+    with_frames = data.draw(st.booleans())
+    with SessionReader(path) as reader:
+        before, expected = Tick(), Tick()
+        if start_ns is not None:
+            before = reader.tick_before(start_ns - 1, with_frames=with_frames)
+            expected = whole.tick_before(start_ns - 1, with_frames=with_frames)
+            assert same(before, expected)
+        mine = list(reader.ticks(start_ns, with_frames=with_frames))
+        theirs = list(whole.ticks(start_ns, with_frames=with_frames))
+        assert len(mine) == len(theirs) and all(map(same, mine, theirs))
+        assert list(news(mine, before)) == list(news(theirs, expected))
+        assert (reader.first_ns, reader.last_ns, reader.counts) == (whole.first_ns, whole.last_ns, whole.counts)
+        assert reader.outcome == whole.outcome and reader.header == replace(
+            HEADER, part=Part("one run", 1, carried_ns=None)
+        )
+        for field in ("frame", "true_field", "route"):
+            messages = list(reader.messages(field))
+            assert [message.stamp_ns for message in messages] == [m.stamp_ns for m in whole.messages(field)]
+        assert reader.files == files
+    number = data.draw(st.integers(1, len(files)))
+    with SessionReader(files[number - 1]) as part:
+        ticks = list(part.ticks())
+        assert (ticks[0].stamp_ns == part.carried_ns) == (number > 1)
+        assert all(same(tick, replace(whole.tick_before(tick.stamp_ns), true_field=tick.true_field)) for tick in ticks)
+
+
+def test_a_run_of_very_many_parts_needs_few_open_files(tmp_path):
+    import resource
+
+    in_parts(tmp_path / "x.mcap", range(1, 60))
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    reader = SessionReader(tmp_path / "x.mcap")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(list((tmp_path / "/proc/self/fd").iterdir())) + 12, limits[1]))
+    try:
+        together = [reader.ticks(tick.stamp_ns) for tick in TICKS[::20]]  # several iterations at a time
+        firsts = [next(ticks) for ticks in together]
+        assert [tick.stamp_ns for tick in firsts] == [tick.stamp_ns for tick in TICKS[::20]]
+        assert [sum(1 for _ in ticks) for ticks in together] == [59, 39, 19]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def damage(run, what):
+    first, second, third, last = (part_path(run, number) for number in (1, 2, 3, 4))
+    other = run.with_name("y.mcap")
+    if what == "no first":
+        first.unlink()
+    elif what == "gap":
+        third.unlink()
+    elif what == "no end":
+        last.unlink()
+    elif what == "exchanged":
+        second.rename(run.with_name("z")), third.rename(second), run.with_name("z").rename(third)
+    elif what == "another run":
+        in_parts(other, [11, 12, 40])
+        _rewritten(part_path(other, 2), second, lambda part: replace(part, run="another"))
+    elif what == "other cuts":
+        in_parts(other, [11, 30, 40])
+        part_path(other, 3).replace(third)
+    elif what == "another head":
+        in_parts(other, [11, 12, 40], header=replace(HEADER, config_toml=HEADER.config_toml + "\n"))
+        part_path(other, 2).replace(second)
+    elif what == "no part":
+        with SessionWriter(second, HEADER, overwrite=True) as writer:
+            writer.write(TICKS[11])
+    elif what == "carries too early":
+        in_parts(other, [10, 11, 12, 40])
+        _rewritten(part_path(other, 2), first, lambda part: replace(part, number=1))
+
+
+def _rewritten(source, target, change):
+    with SessionReader(source) as reader:
+        header = replace(reader.header, part=change(reader.header.part))
+        with SessionWriter(target, header, block=True, overwrite=True) as writer:
+            for tick in reader.ticks():
+                writer.write(tick)
+            writer.close({"outcome": "continued"})
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("no first", r"x.part001.mcap: is missing"),
+        ("gap", r"x.part003.mcap: is missing"),
+        ("no end", r"x.part004.mcap: is missing, though x.part003.mcap says .*recover .*x.mcap"),
+        ("exchanged", r"x.part002.mcap: is part 3 of a run by what it says, and 2 by its name"),
+        ("another run", r"x.part002.mcap: is of another run than x.part001.mcap"),
+        ("other cuts", r"x.part003.mcap: goes on 0.300 s after the end of x.part002.mcap"),
+        ("another head", r"x.part002.mcap: has another head than x.part001.mcap"),
+        ("no part", r"x.part002.mcap: is no part of a run"),
+        ("carries too early", r"x.part001.mcap: is called the first part and goes on from another"),
+    ],
+)
+def test_parts_that_make_no_run_are_refused_in_one_line_and_judged(run, what, said):
+    damage(run, what)
+    with pytest.raises(SessionError, match=said) as error:
+        list(SessionReader(run).ticks())
+    assert len(str(error.value).splitlines()) == 1
+    verdict = check(run)
+    assert verdict.exit_status == 1 and any(finding.about in ("parts", "end") for finding in verdict.findings)
+    left = [path for path in run.parent.glob("x.part*.mcap") if what != "no part"]
+    assert all(list(SessionReader(path).ticks()) for path in left)
+
+
+def test_a_run_that_goes_on_or_was_killed_is_refused_as_such(run):
+    last = part_path(run, 4)
+    last.rename(partial_path(last))
+    with pytest.raises(SessionError, match=r"was not finished .*x\.part004\.mcap\.partial.*recover .*x\.mcap`"):
+        SessionReader(run)
+    assert [(row.name, row.outcome, row.parts) for row in list_sessions(run.parent)] == [("x.mcap", "unfinished", 4)]
+    partial_path(last).unlink()
+    with SessionWriter(last, HEADER):
+        with pytest.raises(SessionError, match="is being recorded just now"):
+            SessionReader(run)
+        assert [row.outcome for row in list_sessions(run.parent)] == ["recording"]
+
+
+@pytest.mark.parametrize("left", ["all but the index", "half", "no message", "nothing", "no file"])
+def test_recover_makes_a_run_whole_whatever_is_left_of_its_last_part(run, whole, left):
+    last = part_path(run, 4)
+    content = last.read_bytes()
+    last.unlink()
+    keep = {
+        "all but the index": -100,
+        "half": len(content) // 2,
+        "no message": content.index(b"zstd") - 60,
+        "nothing": 0,
+    }
+    if left != "no file":
+        partial_path(last).write_bytes(content[: keep[left]])
+    (done,) = recover_run(run)
+    assert done.path == last and not partial_path(last).exists()
+    reader = SessionReader(run)
+    ticks = list(reader.ticks())
+    assert all(map(same, ticks, whole.ticks()))
+    assert SessionReader(last).part == Part("one run", 4, carried_ns=TICKS[39].stamp_ns)
+    assert len(ticks) == 40 + done.ticks == int(reader.outcome["ticks"]) and done.complete == (len(ticks) == 60)
+    assert reader.outcome["outcome"] == ("reached" if done.complete else "cut")
+    assert check(run).word == ("good" if done.complete else "usable")
+    assert [again.changed for again in recover_run(run)] == [False]
+
+
+def test_the_verbs_take_the_run(run, whole, tmp_path, monkeypatch):
+    monkeypatch.setattr("flowrec.export.write_rrd", lambda target, *_, **__: target.touch())
+    verdict = check(run)
+    assert (verdict.word, verdict.exit_status, len(verdict.parts)) == ("good", 0, 4), verdict.lines()
+    assert verdict.facts["parts"] == "4, each begins where the one before ends"
+    assert verdict.topics == {BY_FIELD[field].path: count for field, count in whole.counts.items()} == describe(run)[1]
+    assert "in 4 parts" in describe(run)[0]["size"]
+    assert "part 2 of the run x, goes on from 1.17 s" in describe(part_path(run, 2))[0]["piece"]
+    (row,) = list_sessions(run.parent)
+    assert (row.name, row.outcome, row.parts) == ("x.mcap", "reached", 4)
+    assert compare_sessions(SessionReader(run), whole).identical
+    files = SessionReader(run).files
+    joined = tmp_path / "joined"
+    joined.write_bytes(b"".join(file.read_bytes() for file in files))
+    assert session_sha256(files) == session_sha256([joined])
+
+
+def test_a_part_that_repeats_something_else_is_odd(run):
+    second = part_path(run, 3)
+    with SessionReader(second) as reader:
+        ticks = list(reader.ticks())
+        ticks[0] = replace(ticks[0], estimate=replace(ticks[0].estimate, stamp_ns=5))
+        with SessionWriter(second, reader.header, block=True, overwrite=True) as writer:
+            for tick in ticks:
+                writer.write(tick)
+            writer.close(reader.outcome)
+    verdict = check(run)
+    assert verdict.exit_status == 3
+    assert [f.text for f in verdict.findings] == [
+        "part 3 repeats something else than the part before ended with: /robot/estimate"
+    ]
+
+
+def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut(session, tmp_path):
+    with SessionReader(session) as reader:
+        ticks, header = list(reader.ticks()), reader.header
+    path = tmp_path / "x.mcap"
+    waits = [i for i, tick in enumerate(ticks) if tick.mission is not None and tick.mission.wanted]
+    orders = [i for i in waits if ticks[i - 1].mission is None or ticks[i].mission is not ticks[i - 1].mission]
+    files = in_parts(path, {order + 2 for order in orders}, ticks, header)  # in the middle of each order
+    for file in (path, *files):
+        done = verb.replay(file, Change(), verify=True)
+        same_again, lines = verb.verdict(done)
+        assert same_again and done.comparison.identical, lines
+        assert (done.worker_check is not None and done.worker_check.results) or file == files[0]
+    # What is planned or refined anew from a part alone goes out from what the part knows.
+    done = verb.replay(files[-1], Change(refine="assimilate"), out=tmp_path / "again.mcap")
+    assert done.replayed.refined is not None
+    assert SessionReader(tmp_path / "again.mcap").header.parent["sha256"] == session_sha256([files[-1]])
+
+
+def test_recover_and_export_answer_in_json(run, monkeypatch):
+    monkeypatch.setattr("flowrec.export.write_rrd", lambda target, *_, **__: target.touch())
+    partial = partial_path(part_path(run, 4))
+    part_path(run, 4).rename(partial)
+    done = CliRunner().invoke(app, ["recover", str(run), "--json"], catch_exceptions=False)
+    (told,) = json.loads(done.stdout)
+    assert told["path"].endswith("x.part004.mcap") and told["ticks"] == 20 and done.exit_code == 0
