@@ -46,7 +46,7 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
         facts |= {
             key.replace("_", " "): value
             for key, value in reader.outcome.items()
-            if key not in ("outcome", "note", "duration")
+            if key not in ("outcome", "note", "duration", "wall_ns", "monotonic_ns")
         }
         return facts, {BY_FIELD[name].path: count for name, count in reader.counts.items()}
 

@@ -13,6 +13,7 @@ What is handed out follows the envelope at a limited rate, so that a better fit 
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -194,7 +195,8 @@ class DeviceClock:
         half = len(fit.early) // 2
         # Over half a second each, and the median of them: neither a stall nor frames that come in pairs mislead it.
         rates = sorted(
-            (b[1] - a[1]) / (b[0] - a[0]) for a, b in zip(fit.early[: len(fit.early) - half], fit.early[half:], strict=True)
+            (b[1] - a[1]) / (b[0] - a[0])
+            for a, b in zip(fit.early[: len(fit.early) - half], fit.early[half:], strict=True)
         )
         rate = rates[len(rates) // 2]
         judged = replace(fit, sure=True, early=())
@@ -227,7 +229,7 @@ def envelope(points: tuple[Point, ...]) -> tuple[Point, float]:
             hull.pop()
         hull.append((x, y))
     total = sum(x for x, _ in points)
-    for a, b in zip(hull, hull[1:], strict=False):
+    for a, b in itertools.pairwise(hull):
         if b[0] * len(points) >= total:
             return a, (b[1] - a[1]) / (b[0] - a[0])
     raise ValueError("an envelope of less than two points")

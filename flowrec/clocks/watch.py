@@ -127,7 +127,9 @@ def camera_told(last: Clocks, late_s: float, latest_s: float) -> str:
         skew = "was not measured, the run was too short"
     else:
         skew = f"{skew_ppm(last):+.1f} ppm"
-    return f"camera's clock {skew}; frames arrived {1e3 * late_s:.2f} ms late on average, {1e3 * latest_s:.1f} ms at most"
+    return (
+        f"camera's clock {skew}; frames arrived {1e3 * late_s:.2f} ms late on average, {1e3 * latest_s:.1f} ms at most"
+    )
 
 
 def skew_ppm(clocks: Clocks) -> float:
@@ -153,5 +155,3 @@ def _counts(fit: Fit | None) -> tuple[float, ...]:
 
 def _told(said: Clocks) -> tuple[float, ...]:
     return (said.duplicates, said.disordered, said.resets, said.jumps, said.unit)
-
-
