@@ -364,6 +364,11 @@ def _judge_images(verdict: Verdict, found: Audit, reading: _Reading) -> None:
         return
     dropped = max(reading.dropped, _whole(found.outcome, "dropped_frames"), _whole(found.outcome, "frames_dropped"))
     verdict.fact("images", f"{images} for {reading.ticks} ticks; {dropped} dropped by the writer")
+    if found.frame_region:
+        windows = found.outcome.get(
+            "frames_windows", "most of them hold what the tracker read, and are black elsewhere"
+        )
+        verdict.fact("windows", f"{windows}; exact for the recorded tracker and robot only")
     if dropped:
         verdict.odd("drops", f"{dropped} images were dropped because the disk was too slow (counted by the writer)")
     if reading.images_missing > dropped:

@@ -10,10 +10,10 @@ import numpy as np
 
 from flowrec.chip import chip_files, chip_from_files
 from flowrec.chip.chip import Chip
-from flowrec.config import Config, config_from_toml, to_toml
+from flowrec.config import Config, calibration_of, config_from_toml, to_toml
 from flowrec.messages import Route
 from flowrec.provenance import provenance
-from flowrec.store import SessionHeader, SessionReader, SessionWriter, encoding_for
+from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, encoding_for
 
 
 def session_writer(
@@ -39,7 +39,21 @@ def session_writer(
         queue_limit_bytes=int(config.recording.queue_mb * 1e6),
         block=not live,
         overwrite=overwrite,
+        region=region_of(config, chip, again=parent is not None),
     )
+
+
+def region_of(config: Config, chip: Chip, again: bool = False) -> Region | None:
+    """Which part of most images is kept, as settings and tracker will have it; None: all.
+
+    `again`: the images were cut when they were recorded, and are kept as they are.
+    """
+    recording, camera = config.recording, config.camera
+    if recording.region == "whole":
+        return None
+    shape = (camera.height_px, camera.width_px)
+    sight = config.tracker.sight(chip, calibration_of(config, chip), config.robot, shape)
+    return Region(sight.pad_px + recording.region_pad_px, sight.everywhere_px, recording.full_every_s, cut=not again)
 
 
 def frames_of(config: Config) -> str:

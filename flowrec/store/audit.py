@@ -44,6 +44,7 @@ class Audit:
     backwards : by field, how often the time of a tick was before that of the message before.
     stamps_backwards : the same of the stamps that the source itself gave.
     undecodable : by field, messages that make no sense; `first_undecodable` says why.
+    frame_region : `robot` where images are black but for a window around it (region.py).
     missing : by field, messages that should be between others, told by their numbers; not of images.
     """
 
@@ -67,6 +68,7 @@ class Audit:
     undecodable: Counter[str] = field(default_factory=Counter)
     first_undecodable: str = ""
     missing: Counter[str] = field(default_factory=Counter)
+    frame_region: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -95,6 +97,7 @@ def audit(path: Path, see: See, progress: Callable[[int], None] | None = None) -
         found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
     with contents:
         found.flowrec_version, found.outcome = contents.flowrec_version, contents.outcome
+        found.frame_region = contents.frame_region
         try:
             found.header = contents.header
         except SessionError as error:

@@ -10,6 +10,7 @@ from collections import deque
 from typing import NamedTuple
 
 from flowrec.messages import Message
+from flowrec.store.region import Window
 
 News = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
 
@@ -20,6 +21,7 @@ class Entry(NamedTuple):
     stamp_ns: int
     news: News
     nbytes: int
+    window: Window | None = None  # of the image, where not all of it is to be kept
 
 
 class Backlog:

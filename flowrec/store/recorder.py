@@ -23,6 +23,7 @@ from flowrec.store.layout import FRAMES, GROUPS, SLOTS, STATE, declarations
 from flowrec.store.layout import VIEW as VIEW_GROUP
 from flowrec.store.mcap_file import McapFile
 from flowrec.store.mirrors import Mirrors
+from flowrec.store.region import Blank, Region
 from flowrec.store.source import CHUNK_LIMIT_BYTES
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -48,7 +49,15 @@ class Recorder:
     """
 
     def __init__(
-        self, path: Path, header: SessionHeader, *, frames: FrameEncoding, flush_s: float, sync_s: float, truncate: bool
+        self,
+        path: Path,
+        header: SessionHeader,
+        *,
+        frames: FrameEncoding,
+        flush_s: float,
+        sync_s: float,
+        truncate: bool,
+        region: Region | None = None,
     ) -> None:
         # A message waits up to half of the time for the next fsync to begin, and the other half until it is done.
         self._sync_every_s = sync_s / 2
@@ -58,6 +67,7 @@ class Recorder:
         self._builders = {group: ChunkBuilder(compressed=frames.packed or group != FRAMES) for group in GROUPS}
         self._sequences: Counter[str] = Counter()
         self._mirrors = Mirrors()
+        self._blank = Blank()
         self._file = McapFile(path, truncate=truncate)
         self._flushed_s = self._synced_s = time.monotonic()
         self._flushed_ns: int | None = None
@@ -66,7 +76,7 @@ class Recorder:
         self._beside = ThreadPoolExecutor(1, "session-sync")
         try:
             self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
-            for record in (*records_of(header), *declarations(frames)):
+            for record in (*records_of(header), *declarations(frames, region)):
                 self._file.add(record)
             self._sync()
         except BaseException:
@@ -106,6 +116,8 @@ class Recorder:
         self._last_ns = max(self._last_ns, entry.stamp_ns)
         for field, message in entry.news.items():
             codec = self._frames.codec if isinstance(message, Frame) else None
+            if isinstance(message, Frame) and entry.window is not None:
+                message = self._blank.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
             sequence, payload = encode_record(message, codec)
             self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
         for mirror, stamp_ns, view in self._mirrors.of(entry.news):

@@ -15,13 +15,14 @@ from typing import Any, Self
 import numpy as np
 
 from flowrec.errors import SessionError
-from flowrec.messages import Drops, Frame, Message, Tick, array_fields
+from flowrec.messages import Drops, Frame, Message, Tick, Track, array_fields
 from flowrec.store.backlog import Backlog, Entry, News
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
 from flowrec.store.layout import FRAME_PATH
 from flowrec.store.names import partial_path
 from flowrec.store.recorder import Recorder
+from flowrec.store.region import Region, Window, Windows
 from flowrec.store.thinning import Thinning
 from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S
@@ -60,6 +61,7 @@ class SessionWriter:
     block : what to do when the disk is slower than the run. True: `write` waits (simulation).
         False: images are thinned out (thinning.py) and counted, nothing else ever is dropped (live run).
     queue_limit_bytes : how much may wait for the disk.
+    region : keep of most images only the window around the robot (region.py); None: all of all images.
 
     Raises
     ------
@@ -77,6 +79,7 @@ class SessionWriter:
         overwrite: bool = False,
         block: bool = False,
         queue_limit_bytes: int = 256 << 20,
+        region: Region | None = None,
     ) -> None:
         self.path = Path(path)
         self.partial_path = partial_path(self.path)
@@ -84,6 +87,7 @@ class SessionWriter:
         self.dropped_frames = 0  # for want of a faster disk
         self.missing_frames = 0  # live: those that the camera counted and never delivered
         self._thinning = Thinning()
+        self._windows = Windows(region) if region is not None else None
         self._next_index: int | None = None
         self._said: Drops | None = None
         self._block = block
@@ -101,6 +105,7 @@ class SessionWriter:
                 flush_s=flush_s,
                 sync_s=sync_s,
                 truncate=overwrite,
+                region=region,
             )
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
@@ -138,7 +143,7 @@ class SessionWriter:
         self.ticks += 1
         news = self._news_of(tick)
         if self._block:
-            entry = _entry(tick.stamp_ns, news)
+            entry = _entry(tick.stamp_ns, news, self._window_of(news.get("frame"), tick.track))
             if not self._backlog.has_room(entry.nbytes):
                 self._backlog.wait_for_room(entry.nbytes)
                 self._raise_failure()
@@ -149,7 +154,8 @@ class SessionWriter:
             frame = None
         self._tell_drops(news, tick.stamp_ns)
         image: News = {"frame": frame} if frame is not None else {}
-        self._backlog.put(_entry(tick.stamp_ns, news), _entry(tick.stamp_ns, image))
+        window = self._window_of(frame, tick.track)
+        self._backlog.put(_entry(tick.stamp_ns, news), _entry(tick.stamp_ns, image, window))
 
     def close(self, outcome: Mapping[str, str] | None = None) -> None:
         """Finish the file and give it its name; a second call does nothing.
@@ -172,6 +178,11 @@ class SessionWriter:
             counts["frames_missing_from_camera"] = str(self.missing_frames)
         if not self._recorder.lossless:
             counts["frames_encoding"] = f"{self._recorder.encoding}, not lossless: a replay sees other pixels"
+        if self._windows is not None and self._windows.windows:
+            counts["frames_windows"] = (
+                f"{self._windows.windows} of {self._windows.images} images hold what the tracker read, and are black "
+                "elsewhere"
+            )
         try:
             if self._failure is None:
                 self._finish({**(outcome or {"outcome": "ended"}), **counts})
@@ -210,6 +221,10 @@ class SessionWriter:
             ):
                 news[name] = message
         return news
+
+    def _window_of(self, frame: Message | None, track: Track | None) -> Window | None:
+        """What is kept of an image that is kept; None: all of it."""
+        return self._windows.of(frame, track) if self._windows is not None and isinstance(frame, Frame) else None
 
     def _takes(self, frame: Frame) -> bool:
         """Whether there is room for an image of a live run; counts those that are missing."""
@@ -284,8 +299,8 @@ class SessionWriter:
             )
 
 
-def _entry(stamp_ns: int, news: News) -> Entry:
-    return Entry(stamp_ns, news, sum(map(_nbytes, news.values())))
+def _entry(stamp_ns: int, news: News, window: Window | None = None) -> Entry:
+    return Entry(stamp_ns, news, sum(map(_nbytes, news.values())), window)
 
 
 def _nbytes(message: Message) -> int:
