@@ -364,7 +364,7 @@ def _judge_images(verdict: Verdict, found: Audit, reading: _Reading) -> None:
         return
     dropped = max(reading.dropped, _whole(found.outcome, "dropped_frames"), _whole(found.outcome, "frames_dropped"))
     verdict.fact("images", f"{images} for {reading.ticks} ticks; {dropped} dropped by the writer")
-    if found.frame_region:
+    if found.region is not None:
         windows = found.outcome.get(
             "frames_windows", "most of them hold what the tracker read, and are black elsewhere"
         )

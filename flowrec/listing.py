@@ -41,7 +41,7 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
         for key, code in said.items():
             if key.startswith("weights."):
                 facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
-        if reader.frame_region and "frames_windows" not in reader.outcome:
+        if reader.region is not None and "frames_windows" not in reader.outcome:
             facts["frames windows"] = "most images hold what the tracker read, and are black elsewhere"
         if header.parent:
             facts["replay of"] = header.parent.get("file", "?")

@@ -170,8 +170,8 @@ def replay(
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
     worker = LockstepWorker(pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale)
-    _resubmit(reader, start, worker)
     checker = WorkerCheck(pipeline) if verify else None
+    _resubmit(reader, start, worker, checker)
     comparison, commands = Comparison(), CommandDifference()
     truth: list[FlowField] = [] if start.true_field is None else [start.true_field]
 
@@ -222,7 +222,7 @@ def replay(
 
 def _warned_of_windows(reader: SessionReader, recorded: Config, config: Config) -> Config:
     """Where images are windows another tracker may look outside of them, and what is written are windows again."""
-    if not reader.frame_region:
+    if reader.region is None:
         return config
     if (config.tracker, config.robot) != (recorded.tracker, recorded.robot):
         warn(
@@ -315,14 +315,17 @@ class WorkerCheck:
         return self.comparison.same
 
 
-def _resubmit(reader: SessionReader, start: Tick, worker: LockstepWorker) -> None:
+def _resubmit(reader: SessionReader, start: Tick, worker: LockstepWorker, checker: WorkerCheck | None) -> None:
     """An order that was on its way at the starting tick is given again, with what was known when it was given."""
     mission = start.mission
     if mission is None or not mission.wanted:
         return
     answer = getattr(start, FILLS[mission.wanted])
     if answer is None or answer.request != mission.request:
-        worker.submit(reader.tick_before(mission.requested_ns))
+        order = reader.tick_before(mission.requested_ns)
+        worker.submit(order)
+        if checker is not None:  # which would else take the first tick that it sees for the order
+            checker.see(order)
 
 
 def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick, stale: frozenset[str]) -> Tick:

@@ -17,7 +17,7 @@ from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
 from flowrec.store.header import FORMAT_VERSION, OUTCOME, PROFILE, SESSION, SessionHeader, belongs, header_from
 from flowrec.store.index import Summary
-from flowrec.store.region import REGION_NOTE
+from flowrec.store.region import Region, region_from
 from flowrec.store.source import ForeignError, Source
 from flowrec.topics import BY_FIELD, BY_PATH
 
@@ -95,10 +95,10 @@ class Contents:
         return next((c.metadata.get("encoding", "") for c in channels if c.topic == BY_FIELD["frame"].path), "")
 
     @property
-    def frame_region(self) -> str:
-        """`robot` where images hold a window around it and little else (region.py); empty: they are whole."""
+    def region(self) -> Region | None:
+        """Which part of most images was kept (region.py); None: they are whole."""
         channels = self._summary.channels.values()
-        return next((c.metadata.get(REGION_NOTE, "") for c in channels if c.topic == BY_FIELD["frame"].path), "")
+        return next((region_from(c.metadata) for c in channels if c.topic == BY_FIELD["frame"].path), None)
 
     def __enter__(self) -> Self:
         return self

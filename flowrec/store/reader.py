@@ -44,7 +44,7 @@ class SessionReader:
     counts : number of messages by field of Tick, for the topics that have any.
     first_ns, last_ns : stamps of the first and the last tick; both 0 in an empty session.
     flowrec_version : of the program that wrote it.
-    frame_region : `robot` where images are black but for a window around it (region.py); empty where they are whole.
+    region : which part of most images was kept, the rest being black (region.py); None: they are whole.
 
     Raises
     ------
@@ -61,7 +61,7 @@ class SessionReader:
         self._fields = self._contents.fields
         self.outcome = self._contents.outcome
         self.flowrec_version = self._contents.flowrec_version
-        self.frame_region = self._contents.frame_region
+        self.region = self._contents.region
         statistics = self._contents.statistics
         self.first_ns: int = statistics.message_start_time
         self.last_ns: int = statistics.message_end_time

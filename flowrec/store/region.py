@@ -6,6 +6,8 @@ image keeps its size and its schema: every viewer reads it, and compression make
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +17,9 @@ from flowrec.units import nanoseconds
 
 Window = tuple[int, int, int, int]  # x0, y0, x1, y1 in camera px, the latter two exclusive
 
-REGION_NOTE = "region"  # in the metadata of the channel
-ROBOT = "robot"
+# In the metadata of the channel.
+_NOTE, _PAD, _EVERY = "region", "pad_px", "full_every_s"
+_ROBOT = "robot"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,11 +43,21 @@ class Region:
     def notes(self) -> dict[str, str]:
         """For the metadata of the channel: what a reader must know."""
         return {
-            REGION_NOTE: ROBOT,
-            "pad_px": str(self.pad_px),
-            "full_every_s": f"{self.full_every_s:g}",
+            _NOTE: _ROBOT,
+            _PAD: str(self.pad_px),
+            _EVERY: f"{self.full_every_s:.6g}",
             "outside": "0 where the tracker did not look, but for the images that are whole",
         }
+
+
+def region_from(notes: Mapping[str, str]) -> Region | None:
+    """What the metadata of a channel says; None: its images are whole. They have been cut, and are not to be again."""
+    if notes.get(_NOTE) != _ROBOT:
+        return None
+    pad, every = notes.get(_PAD, ""), notes.get(_EVERY, "")
+    pad_px = int(pad) if pad.isdecimal() and len(pad) < 9 else 0
+    every_s = float(every) if re.fullmatch(r"\d{1,9}(\.\d{1,9})?", every) else 0.0
+    return Region(pad_px, (0, 0, 0, 0), every_s, cut=False)
 
 
 class Windows:
