@@ -61,6 +61,8 @@ def frames_of(config: Config) -> str:
     camera, chosen = config.camera, config.recording.frames
     if chosen != "auto":
         return chosen
+    if config.recording.region == "robot":
+        return "zstd"  # makes less of the black than delta in a fifth of its time (flowrec bench store)
     return encoding_for(camera.width_px, camera.height_px, camera.rate_hz or 0.0)
 
 
