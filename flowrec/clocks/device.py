@@ -59,7 +59,8 @@ class Fit:
     turned: int = 0  # counts lost to wrap-arounds
     support: Point = (0, 0)  # a point of the envelope
     began: Point = (0, 0)  # first frame of this fit
-    early: tuple[Point, ...] = ()  # of the first second, until the unit is sure
+    early: tuple[Point, ...] = ()  # of a second, until the unit is sure ...
+    doubt: float = 0.0  # ... and what it was in the second before, where that was not what it should be
     sure: bool = False
     earliest: Point = (0, 0)  # of the half second that is going on ...
     since: int = 0  # ... which began at this device time
@@ -77,7 +78,7 @@ class Fit:
 class DeviceClock:
     """How to fit. `take` is called with every frame that arrives; its memory is the previous Fit.
 
-    A camera whose unit is not known is best looked at for a second before a run begins: until then the unit is what
+    A camera whose unit is not known is best looked at for some seconds before a run begins: until then the unit is what
     it is said to be, and where it turns out to be another, a step is flagged.
     """
 
@@ -144,8 +145,11 @@ class DeviceClock:
         if not fit.sure:
             early = (*fit.early, point) if _apart(fit, x, fit.early[-1][0], self.sure_s / 64.0) else fit.early
             fit = replace(fit, early=early, device=device, arrival_ns=arrival_ns)
-            if len(early) > 7 and arrival_ns - fit.began[1] >= nanoseconds(self.sure_s):
-                return self._judged(fit, point)
+            if len(early) > 7 and arrival_ns - early[0][1] >= nanoseconds(self.sure_s):
+                judged = self._judged(fit, point)
+                if judged is not None:
+                    return judged
+                fit = replace(fit, early=(point,), doubt=(early[-1][1] - early[0][1]) / (early[-1][0] - early[0][0]))
             if early_ns > nanoseconds(self.early_s):
                 # It seems to count faster than said; wait until that is sure.
                 return replace(fit, last=point, stamp_ns=max(fit.stamp_ns + 1, arrival_ns))
@@ -182,7 +186,8 @@ class DeviceClock:
         oldest = point[0] - self.window_s * NS_PER_S / fit.rate
         kept = tuple(one for one in (*fit.kept, fit.earliest) if one[0] >= oldest)
         rate, support, known = fit.rate, fit.support, fit.known
-        if kept and _apart(fit, kept[-1][0], kept[0][0], self.least_span_s):
+        least_s = min(self.least_span_s, 2.0 * self.piece_s) if fit.unit else self.least_span_s
+        if kept and _apart(fit, kept[-1][0], kept[0][0], least_s):
             support, rate = envelope(kept)
             known = True
         elif kept:
@@ -190,19 +195,24 @@ class DeviceClock:
         return replace(fit, rate=rate, support=support, known=known, kept=kept, earliest=point, since=point[0],
                        stood=stood)  # fmt: skip
 
-    def _judged(self, fit: Fit, point: Point) -> Fit:
-        """After the first second: is a count what it is said to be?"""
+    def _judged(self, fit: Fit, point: Point) -> Fit | None:
+        """After a second: is a count what it is said to be? None: not sure yet.
+
+        That it is not has to be seen in two seconds running: a host that is busy at first and then catches up sees
+        frames at any rate.
+        """
         half = len(fit.early) // 2
         # Over half a second each, and the median of them: neither a stall nor frames that come in pairs mislead it.
-        rates = sorted(
-            (b[1] - a[1]) / (b[0] - a[0])
-            for a, b in zip(fit.early[: len(fit.early) - half], fit.early[half:], strict=True)
-        )
-        rate = rates[len(rates) // 2]
+        late, soon = fit.early[half:], fit.early[: len(fit.early) - half]
+        rates = sorted((b[1] - a[1]) / (b[0] - a[0]) for a, b in zip(soon, late, strict=True))
+        rate = max(rates[len(rates) // 2], 1e-12)
         judged = replace(fit, sure=True, early=())
-        if abs(math.log(max(rate, 1e-12) / fit.rate)) < math.log(1.0 + self.unit_tolerance):
-            return self._on(judged, judged.device, point)
-        return self._begun(replace(judged, rate=rate, unit=rate), *point, "unit")
+        if abs(math.log(rate / fit.rate)) < math.log(1.0 + self.unit_tolerance):
+            support = min((fit.support, *fit.early), key=lambda one: _late(fit.rate, fit.began, one))
+            return self._on(replace(judged, support=support), judged.device, point)
+        if fit.doubt and abs(math.log(rate / fit.doubt)) < math.log(1.1):
+            return self._begun(replace(judged, rate=rate, unit=rate), *point, "unit")
+        return None
 
     def _unwrapped(self, fit: Fit, device: int, arrival_ns: int) -> tuple[int, int]:
         """Device time with what wrap-arounds took added, and how much that is."""

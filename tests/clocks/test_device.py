@@ -50,6 +50,20 @@ def test_skew_unit_and_every_fault_are_told():
     assert all(b.stamp_ns == a.stamp_ns for a, b in itertools.pairwise(disorder) if not b.good)
 
 
+@pytest.mark.parametrize(("unit", "tells"), [(1.0, 0.0), (10.0, 0.1)])
+def test_a_host_that_is_busy_at_first_and_catches_up_does_not_mistake_the_unit(unit, tells):
+    one = series("plain", 30.0)
+    device = [round(unit * at) for at in one.true_ns.tolist()]
+    # The first frame is on time, then nothing for 0.9 s, then three frames for every one.
+    arrival = [max(at, min(900_000_000 + n * 3_333_333, 10**18)) if n else at for n, at in enumerate(one.arrival_ns)]
+    clock, fit, stamps = DeviceClock(), None, []
+    for count, at in zip(device, arrival, strict=True):
+        fit = clock.take(fit, count, at)
+        stamps.append(fit.stamp_ns)
+    assert fit.unit == pytest.approx(tells, rel=0.05) and fit.jumps == fit.resets == 0
+    assert max(abs(np.array(stamps) - one.true_ns)[1500:]) < 2_000_000
+
+
 def test_a_clock_that_stood_still_is_caught_up_with():
     one = series("plain", 40.0)
     arrival = [at + 3_000_000_000 * (n >= 2000) for n, at in enumerate(one.arrival_ns)]
