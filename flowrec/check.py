@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 import flowrec
 from flowrec.chip import chip_from_files
+from flowrec.clocks.watch import CRYSTAL_PPM, camera_told, faults_of, skew_ppm
 from flowrec.config import Config, config_from_toml
 from flowrec.errors import FlowrecError, printable
-from flowrec.messages import Frame, Message, Timing
+from flowrec.messages import Clocks, Frame, Message, Timing
 from flowrec.store import is_growing, not_finite
 from flowrec.store.audit import Audit, audit
 from flowrec.store.joints import fault_of, goes_on, without_part
@@ -169,7 +170,7 @@ def _check_file(path: Path, progress: Callable[[int], None] | None) -> tuple[Ver
     _judge_times(verdict, found, reading, config)
     _judge_images(verdict, found, reading)
     _judge_numbers(verdict, reading)
-    _judge_clocks(verdict, found)
+    _judge_clocks(verdict, found, reading.clocks)
     _judge_replay(verdict, found, reading)
     return verdict, found, reading
 
@@ -260,6 +261,7 @@ class _Reading:
         self.inputs_missing = 0  # ticks that can not be replayed: no report of the coils, or neither image nor track
         self.images_alone = 0
         self.unfinished_ticks = 0  # inputs that no stage has answered
+        self.clocks = _Clocks()
         self._intervals: Counter[int] = Counter()
         self._longest: list[tuple[int, int]] = []  # a heap of length and beginning
         self._last_ns: int | None = None
@@ -303,6 +305,8 @@ class _Reading:
             self._last_index = message.index
         elif isinstance(message, Timing):
             self.dropped = max(self.dropped, message.dropped_frames)
+        elif isinstance(message, Clocks):
+            self.clocks.see(message)
 
     def close(self) -> None:
         """Count what has not become complete."""
@@ -348,6 +352,26 @@ class _Reading:
         self.unfinished_ticks += bits == _FRAME | _APPLIED
         self.images_missing += bits == _APPLIED | _TRACK
         self.inputs_missing += not bits & _APPLIED or bits == _APPLIED
+
+
+class _Clocks:
+    """The tally of what was said of clocks during the run."""
+
+    def __init__(self) -> None:
+        self.last: Clocks | None = None
+        self.wall_set: list[tuple[int, float]] = []  # stamp, and by how many s
+        self.late_s = self.latest_s = 0.0
+        self._seconds = 0
+
+    def see(self, message: Clocks) -> None:
+        """Take note of one message."""
+        before, self.last = self.last, message
+        set_s = message.wall_set_s - (before.wall_set_s if before is not None else 0.0)
+        if message.wall_jumps > (before.wall_jumps if before is not None else 0) and len(self.wall_set) < _GAPS_KEPT:
+            self.wall_set.append((message.stamp_ns, set_s))
+        self._seconds += 1
+        self.late_s += (message.late_s - self.late_s) / self._seconds
+        self.latest_s = max(self.latest_s, message.latest_s)
 
 
 def _judge_head(verdict: Verdict, found: Audit) -> Config | None:
@@ -455,6 +479,11 @@ def _judge_images(verdict: Verdict, found: Audit, reading: _Reading) -> None:
         return
     dropped = max(reading.dropped, _whole(found.outcome, "dropped_frames"), _whole(found.outcome, "frames_dropped"))
     verdict.fact("images", f"{images} for {reading.ticks} ticks; {dropped} dropped by the writer")
+    if found.region is not None:
+        windows = found.outcome.get(
+            "frames_windows", "most of them hold what the tracker read, and are black elsewhere"
+        )
+        verdict.fact("windows", f"{windows}; exact for the recorded tracker and robot only")
     if dropped:
         verdict.odd("drops", f"{dropped} images were dropped because the disk was too slow (counted by the writer)")
     if reading.images_missing > dropped:
@@ -476,8 +505,27 @@ def _judge_numbers(verdict: Verdict, reading: _Reading) -> None:
         verdict.fact("numbers", "finite wherever they must be")
 
 
-def _judge_clocks(verdict: Verdict, found: Audit) -> None:
-    """Stamps are of one monotonic clock; the wall clock is noted beside it, and may jump."""
+def _judge_clocks(verdict: Verdict, found: Audit, clocks: _Clocks) -> None:
+    """Stamps are of one monotonic clock; those of the wall and of the camera are noted beside it, and may do as they
+    like.
+    """
+    if clocks.last is not None and clocks.last.rate:
+        verdict.fact("camera", camera_told(clocks.last, clocks.late_s, clocks.latest_s))
+        skew = skew_ppm(clocks.last)
+        if clocks.last.unit or (clocks.last.known and abs(skew) > CRYSTAL_PPM):
+            verdict.odd(
+                "clocks",
+                f"a count of the camera's clock is {clocks.last.rate:.6g} ns, which no crystal is off by; stamps are"
+                " mended by the fit",
+            )
+    if clocks.last is not None:
+        for what, count in faults_of(clocks.last):
+            verdict.odd("clocks", f"{count} frames {what}")
+    for stamp_ns, set_s in clocks.wall_set[:_GAPS_TOLD]:
+        at_s = seconds(stamp_ns - found.first_ns)
+        verdict.odd("clocks", f"the wall clock was set by {set_s:+.3f} s at {at_s:.2f} s; stamps are not affected")
+    if len(clocks.wall_set) > _GAPS_TOLD:
+        verdict.odd("clocks", f"and {len(clocks.wall_set) - _GAPS_TOLD} times more")
     said = dict(found.header.provenance) if found.header is not None else {}
     began = {name: _whole(said, name) for name in ("wall_ns", "monotonic_ns")}
     ended = {name: _whole(found.outcome, name) for name in ("wall_ns", "monotonic_ns")}
@@ -489,7 +537,7 @@ def _judge_clocks(verdict: Verdict, found: Audit) -> None:
     if all(ended.values()):
         jump_s = seconds((ended["wall_ns"] - began["wall_ns"]) - (ended["monotonic_ns"] - began["monotonic_ns"]))
         verdict.facts["clocks"] += f" and at the end, {1e3 * jump_s:+.0f} ms apart by then"
-        if abs(jump_s) > _CLOCK_JUMP_S:
+        if abs(jump_s) > _CLOCK_JUMP_S and not clocks.wall_set:
             verdict.odd("clocks", f"the wall clock was set by {jump_s:+.1f} s during the run; stamps are not affected")
 
 

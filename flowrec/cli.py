@@ -492,6 +492,20 @@ def bench_store(
     _keep(figures, json_file)
 
 
+@bench.command("clocks")
+def bench_clocks(
+    seconds: Annotated[float, typer.Option(min=60.0, help="Length of each series.")] = 300.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of delays.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,
+) -> None:
+    """A camera's clock fitted to the host's in five ways: errors of the dates, whatever goes wrong."""
+    from flowrec.bench.clocks import measure, show
+
+    figures = measure(seconds, seed)
+    show(figures)
+    _keep(figures, json_file)
+
+
 @bench.command("solver")
 def bench_solver(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")] = None,

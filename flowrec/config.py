@@ -53,6 +53,10 @@ class Recording:
     frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"  # auto: what the camera's rate allows
     flush_s: float = 0.5  # at most this much of the end is lost when the process is killed, in wall or session time
     sync_s: float = 1.0  # the same when the power fails
+    # robot: of most images only what the tracker read, the rest black; replays with the same tracker stay exact
+    region: Literal["whole", "robot"] = "whole"
+    full_every_s: float = 10.0  # so often an image is whole even so, and whenever the robot was not in sight
+    region_pad_px: int = 16  # kept around what the tracker read
     queue_mb: float = 256.0  # waiting for the disk; a live run thins out its frames from the half of it on
     # A run in several files: each of about so many MB, or of so many seconds, or both; else it is in one.
     split_mb: float | None = None
@@ -302,6 +306,10 @@ def _refuse_nonsense(config: Config, where: str) -> None:
     for key, value in positive.items():
         if value is not None and not value > 0:
             raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
+    for key in ("full_every_s", "region_pad_px"):
+        value = getattr(config.recording, key)
+        if not value >= 0:
+            raise UsageError(f"{where}: recording.{key} = {value:g}: can not be less than zero")
     config.coils.check(where)
     recording = config.recording
     not_negative = {

@@ -24,7 +24,8 @@ def scene_of(config: Config, chip: Chip, pipeline: Pipeline, path: Path) -> Scen
         "planner": config.plan.method,
         "controller": config.control.method,
     }
-    return Scene(chip, pipeline.calibration, pipeline.robot, path.stem, properties)
+    windows = config.recording.region != "whole"
+    return Scene(chip, pipeline.calibration, pipeline.robot, path.stem, properties, windows=windows)
 
 
 def write_rrd_of(path: Path, out: Path | None = None) -> Path:

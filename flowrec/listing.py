@@ -52,11 +52,12 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
     for key, code in said.items():
         if key.startswith("weights."):
             facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
+    if _at(config, "recording", "region") == "robot" and "frames_windows" not in outcome:
+        facts["frames windows"] = "most images hold what the tracker read, and are black elsewhere"
     if header.parent:
         facts["replay of"] = header.parent.get("file", "?")
-    facts |= {
-        key.replace("_", " "): value for key, value in outcome.items() if key not in ("outcome", "note", "duration")
-    }
+    hidden = ("outcome", "note", "duration", "wall_ns", "monotonic_ns")
+    facts |= {key.replace("_", " "): value for key, value in outcome.items() if key not in hidden}
     return facts, run.counts()
 
 

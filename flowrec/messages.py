@@ -288,6 +288,31 @@ class Drops(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Clocks(Message):
+    """The clocks beside the session's, about once a second and whenever one is set or goes wrong. Diagnostic."""
+
+    stamp_ns: int
+    monotonic_ns: int  # of the host, read together with ...
+    wall_ns: int  # ... the time of day, since 1970, UTC
+    wall_set_s: float  # by how much the time of day was set since the run began, in all
+    wall_jumps: int  # how often
+    passed_over: int  # frames left out because their stamp did not grow
+    device: int  # counts of the camera's clock at its latest frame, as they came
+    arrival_ns: int  # of that frame on the session clock
+    fitted_ns: int  # when, by the fit, it would have arrived at the earliest
+    rate: float  # ns of the session clock to one count, so the fit is fitted_ns + rate (counts - device); 0: no clock
+    known: bool  # whether the rate has been measured by now
+    late_s: float  # arrival - fit since the message before: the mean ...
+    latest_s: float  # ... and the largest
+    duplicates: int  # so far: the same frame again
+    disordered: int  # ... one from before the latest
+    wraps: int  # ... the counter began again
+    resets: int  # ... the camera's clock went back, a new fit was begun
+    jumps: int  # ... it went forwards or stood still, likewise
+    unit: float  # ns that a count seems to be where it is not what it was said to be; else 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth(Message):
     """What only a simulated rig can know. Recorded for judging; no stage ever sees it."""
 
@@ -321,6 +346,7 @@ class Tick:
     drops: Drops | None = None
     truth: Truth | None = None
     true_field: FlowField | None = None
+    clocks: Clocks | None = None
 
     @property
     def field(self) -> FlowField | None:

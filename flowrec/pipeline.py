@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flowrec.chip import clearance_um
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.clocks import Fit
 from flowrec.config import Config, calibration_of
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import Commander
@@ -42,6 +43,7 @@ class Inputs:
     # For the record only: handed past the pipeline to the sinks, no stage sees them.
     truth: Truth | None = None
     true_field: FlowField | None = None
+    clock: Fit | None = None  # of the camera's clock, by which the stamp was made or is judged
 
 
 @dataclass(frozen=True, slots=True, eq=False)

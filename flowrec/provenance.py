@@ -8,12 +8,12 @@ from __future__ import annotations
 import getpass
 import platform
 import subprocess
-import time
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import flowrec
+from flowrec.clocks import read_clocks
 
 PACKAGES = (
     "numpy",
@@ -37,10 +37,11 @@ def provenance(anonymous: bool = False) -> dict[str, str]:
     facts = {"flowrec": flowrec.__version__, "python": platform.python_version()}
     if not anonymous:
         facts |= {"platform": platform.platform(), "host": platform.node(), "user": _user()}
+    monotonic_ns, wall_ns = read_clocks()
     facts |= {
         "wall_time": datetime.now(UTC).isoformat(),
-        "wall_ns": str(time.time_ns()),
-        "monotonic_ns": str(time.monotonic_ns()),
+        "wall_ns": str(wall_ns),
+        "monotonic_ns": str(monotonic_ns),
     }
     for package in PACKAGES:
         try:

@@ -14,6 +14,7 @@ import numpy as np
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.chip.places import distance_um
+from flowrec.clocks import ClockWatch
 from flowrec.config import Config, resolve
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
@@ -184,6 +185,7 @@ def record(
         worker = Preloaded(worker, fields)
     stop = StopSwitch()
     witness = Witness()
+    clocks = ClockWatch()
     with ExitStack() as stack:
         writer = stack.enter_context(
             session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True)
@@ -214,13 +216,14 @@ def record(
                 stop=stop,
                 on_tick=on_tick,
                 queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
+                clocks=clocks,
             )
         facts = facts_of(chip, report, witness.true_field)
         facts["frames dropped"] = str(writer.dropped_frames)
         if math.isfinite(witness.rms_um) and config.control.method != "policy":  # which has no reference to be off
             facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
         outcome = {key.replace(" ", "_"): value for key, value in facts.items()}
-        outcome |= {"outcome": report.outcome, "note": report.note}
+        outcome |= {"outcome": report.outcome, "note": report.note} | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")

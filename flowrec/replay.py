@@ -21,7 +21,7 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, StopSwitch, run
 from flowrec.session import open_session, session_writer
-from flowrec.status import progress
+from flowrec.status import progress, warn
 from flowrec.store import SessionReader, SessionWriter
 from flowrec.topics import BY_FIELD
 from flowrec.units import nanoseconds, seconds
@@ -158,6 +158,7 @@ def replay(
         stale |= STALE["refine"]
     if verify and (stale or config != recorded_config):
         raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
+    config = _warned_of_windows(reader, recorded_config, config)
     pipeline = assemble(config, chip)
     if config.sampler.method == "smoothed":
         pipeline = replace(pipeline, hindsight=hindsight(reader, pipeline))
@@ -222,6 +223,18 @@ def replay(
         commands=commands,
         worker_check=checker,
     )
+
+
+def _warned_of_windows(reader: SessionReader, recorded: Config, config: Config) -> Config:
+    """Where images are windows another tracker may look outside of them, and what is written are windows again."""
+    if reader.region is None:
+        return config
+    if (config.tracker, config.robot) != (recorded.tracker, recorded.robot):
+        warn(
+            f"{reader.path.name}: most images are black but for what the recorded tracker read; with another tracker or"
+            " robot the replay is not what it would be on whole images"
+        )
+    return replace(config, recording=replace(config.recording, region="robot"))
 
 
 def hindsight(reader: SessionReader, pipeline: Pipeline) -> Callable[[int], Observations]:

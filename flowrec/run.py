@@ -14,12 +14,15 @@ from types import FrameType
 from typing import Any, Protocol
 
 from flowrec import work as working
+from flowrec.clocks import ClockWatch
+from flowrec.errors import RigError
 from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
 
 _SWITCH_S = 2e-5
+_PASSED_OVER = 50  # frames in a row, then the robot is out of control
 
 
 class Rig(Protocol):
@@ -190,6 +193,7 @@ class RunReport:
     duration_s: float = 0.0
     wall_s: float = 0.0
     contacts: int = 0
+    passed_over: int = 0  # frames whose stamp did not grow
     last: Tick = field(default_factory=Tick)
 
 
@@ -203,11 +207,13 @@ def run(
     on_tick: Callable[[Tick], None] | None = None,
     queue_state: Callable[[], tuple[float, int]] = lambda: (0.0, 0),
     end_when_finished: bool = True,
+    clocks: ClockWatch | None = None,
 ) -> RunReport:
     """Run until the rig ends, the mission is finished and the coils are at zero, or somebody stops it.
 
     `start` is the tick to resume from; `queue_state` tells MB waiting for the disk and frames dropped.
-    A stage that fails leaves its inputs, and only those, as the last tick in the sinks.
+    A stage that fails leaves its inputs, and only those, as the last tick in the sinks. A frame whose stamp does not
+    grow enters no stage and is counted; `clocks` has it told, with what else clocks do, in the record.
     """
     report = RunReport()
     tick = start if start is not None else Tick()
@@ -231,7 +237,7 @@ def run(
         sys.setswitchinterval(_SWITCH_S)
         stack.callback(worker.close)
         stack.enter_context(rig)
-        for arrived in rig.inputs():
+        for arrived in _growing(rig.inputs(), tick.stamp_ns, report, clocks):
             begin = mark = clock()
             due: dict[str, Any] = dict(worker.due(arrived.stamp_ns))
             inputs = replace(arrived, **due)
@@ -263,6 +269,8 @@ def run(
                 dropped_frames=dropped,
             )
             recorded = replace(tick, timing=timing, truth=inputs.truth, true_field=inputs.true_field)
+            if clocks is not None:
+                recorded = replace(recorded, clocks=clocks.see(tick.stamp_ns, inputs.clock))
             _write(sinks, recorded)
             lap("sinks")
             sinks_ms = laps["sinks"]
@@ -284,6 +292,32 @@ def run(
 def _write(sinks: Sequence[Sink], tick: Tick) -> None:
     for sink in sinks:
         sink.write(tick)
+
+
+def _growing(inputs: Iterator[Inputs], after_ns: int, report: RunReport, clocks: ClockWatch | None) -> Iterator[Inputs]:
+    """Inputs whose stamps grow. How far the field has turned since the frame before is not lost with one passed over.
+
+    Raises
+    ------
+    RigError : nothing else comes, so nobody steers any more.
+    """
+    lost: list[Inputs] = []
+    for arrived in inputs:
+        if arrived.stamp_ns > after_ns:
+            turns = sum((one.applied.turns for one in lost), arrived.applied.turns)
+            yield replace(arrived, applied=replace(arrived.applied, turns=turns)) if lost else arrived
+            after_ns = arrived.stamp_ns
+            lost.clear()
+            continue
+        lost.append(arrived)
+        report.passed_over += 1
+        if clocks is not None:
+            clocks.pass_over()
+        if len(lost) == _PASSED_OVER:
+            raise RigError(
+                f"the rig's frames have gone back in time by {seconds(after_ns - arrived.stamp_ns):.3f} s, {len(lost)}"
+                " in a row; see to the camera's clock, then record again"
+            )
 
 
 def _only_inputs(last: Tick, inputs: Inputs) -> Tick:

@@ -40,3 +40,5 @@ class Simulated:
     pulsation_share: float = 0.0  # the true flow is the steady one times 1 + this sin(2 pi pulsation_hz t)
     pulsation_hz: float = 1.0
     k: int = 1  # cells of the true flow per pixel side
+    clock_skew_ppm: float | None = None  # by which the camera's clock runs fast; None: drawn, up to 50 either way
+    arrival_jitter_s: float = 3e-4  # by which frames reach the host late, on average

@@ -50,6 +50,7 @@ TOPICS: tuple[Topic, ...] = (
     Topic("drops", "/run/drops", m.Drops, Role.DIAGNOSTIC),
     Topic("truth", "/truth/robot", m.Truth, Role.TRUTH),
     Topic("true_field", "/truth/flow", m.FlowField, Role.TRUTH),
+    Topic("clocks", "/run/clocks", m.Clocks, Role.DIAGNOSTIC),
 )
 
 BY_FIELD = {topic.field: topic for topic in TOPICS}

@@ -159,6 +159,12 @@ def small_draft() -> Draft:
     return Draft(head, pieces, ((METADATA, outcome),))
 
 
+# Numbers that do mean something: `flowrec check` looks at them.
+_UNTROUBLED = {"rate": 1.0, "unit": 0.0} | dict.fromkeys(
+    ("dropped_frames", "wall_jumps", "passed_over", "duplicates", "disordered", "resets", "jumps"), 0
+)
+
+
 def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Generator) -> Message:
     """A message of some type with shapes that fit and numbers that mean nothing."""
     lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4}
@@ -171,8 +177,7 @@ def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Gene
             values[name] = (100.0 * rng.random(shape)).astype(arrays[name])
         else:
             values[name] = {int: number, float: 1.5, float | None: None, bool: True, str: "words"}[hint]
-    if "dropped_frames" in values:
-        values["dropped_frames"] = 0
+    values |= {name: value for name, value in _UNTROUBLED.items() if name in values}
     return kind(**{**values, "stamp_ns": stamp_ns})
 
 

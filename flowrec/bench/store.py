@@ -19,6 +19,7 @@ import numpy as np
 
 from flowrec.bench.store_kills import kills
 from flowrec.bench.store_loop import soak, stall
+from flowrec.bench.store_region import regions
 from flowrec.bench.store_splits import show_splits, splits
 from flowrec.bench.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
 from flowrec.status import progress, table
@@ -51,6 +52,7 @@ def measure(
             fast = Path(fast_name)
             throughput = [_one_load(load, fast, share, 1 if quick else 3) for load in LOADS]
             reading = _reading(fast, 300 if quick else 3000)
+            windows = regions(fast, 1.0 if quick else 10.0)
         return {
             "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
             "storage": {"throughput": str(fast.parent), "stall": str(disk.parent)},
@@ -58,6 +60,7 @@ def measure(
             "throughput": throughput,
             "stall": stall(disk, seconds, 1 if quick else 3),
             "reading": reading,
+            "regions": windows,
             "aims": _AIM,
         }
 
@@ -205,5 +208,13 @@ def show(figures: dict[str, Any]) -> None:
             (name.removesuffix("_s").replace("_", " "), f"{1e3 * read[name]:.1f}")
             for name in read
             if name.endswith("_s")
+        ],
+    )
+    table(
+        "Whole images and windows around the robot, one image whole every 10 s",
+        ("camera", "encoding", "region", "MB per minute", "cores"),
+        [
+            (row["camera"], row["encoding"], row["region"], f"{row['mb_per_minute']:.0f}", f"{row['cores']:.2f}")
+            for row in figures["regions"]
         ],
     )

@@ -1,7 +1,8 @@
 """The simulated rig: a microscope, coils and a robot in a flow that is not quite the assumed one.
 
 It knows what no stage may know, and says it only in `truth` and `true_field`. Everything is drawn from the seed and
-from what is applied: same seed, same commands, same bytes, however long the loop takes.
+from what is applied: same seed, same commands, same bytes, however long the loop takes. In real time stamps are made
+as for a real camera, from its own clock and from when its frames arrive.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import check_point, clearance_um
+from flowrec.clocks import DeviceClock
 from flowrec.config import Config
 from flowrec.control.coils import Coils
 from flowrec.control.rotation import Order, Rotation, course
@@ -24,6 +26,7 @@ from flowrec.errors import RigError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
 from flowrec.pipeline import Inputs, Pipeline
+from flowrec.rigs.camera_clock import CameraClock
 from flowrec.rigs.debris import Debris
 from flowrec.rigs.microscope import Microscope
 from flowrec.rigs.swimmer import Swimmer
@@ -67,7 +70,8 @@ class SimulatedRig:
     robot : resolved (no None); its delay is from `apply` to motion
     start_um : (2,) where the robot's centre is on the first frame
     duration_s : None goes on for ever
-    realtime : pace the frames to the wall clock; none is skipped, a late one is just late
+    realtime : pace the frames to the host's clock and stamp them by the camera's, fitted to it; none is skipped, a late
+        one is just late
     true_field : a flow to use instead of solving for one, for tests and for known flows
     coils : how strong the field is beside the full one, and the currents it takes; None: always full, as commanded
 
@@ -162,7 +166,8 @@ class SimulatedRig:
         for n in range(moving.stop, len(debris.points_um)):
             microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))
         debris.drift(0.0)  # compiles, so that the second frame is not late
-        began = math.inf
+        camera_clock, host_clock, fit = CameraClock(self._simulated), DeviceClock(), None
+        began_ns: int | None = None
         index = 0
         while index < self._frames:
             stamp = round(index * NS_PER_S / self._rate_hz)
@@ -180,17 +185,22 @@ class SimulatedRig:
                 debris.radii_um[moving],
                 debris.darkness[moving],
             )
+            arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
             if self._realtime:
                 # An image is there when its exposure is over. The first one, with all that it takes, sets the clock.
-                began = min(began, time.monotonic())
-                ready = began + seconds(stamp) + 0.5 * self._camera.exposure_s
-                time.sleep(max(0.0, ready - time.monotonic()))
+                over_ns = nanoseconds(0.5 * self._camera.exposure_s)
+                began_ns = time.monotonic_ns() - over_ns if began_ns is None else began_ns
+                time.sleep(max(0.0, seconds(began_ns + arrival_ns + over_ns - time.monotonic_ns())))
+                arrival_ns = time.monotonic_ns() - began_ns - over_ns
+            fit = host_clock.take(fit, camera_clock.device(stamp), arrival_ns)
+            stamped = fit.stamp_ns if self._realtime else stamp
             yield Inputs(
-                stamp_ns=stamp,
-                frame=Frame(stamp, index, image),
-                applied=self._applied(stamp, turns),
-                truth=Truth(stamp, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
+                stamp_ns=stamped,
+                frame=Frame(stamped, index, image),
+                applied=self._applied(stamped, turns),
+                truth=Truth(stamped, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
                 true_field=field if index == 0 else None,
+                clock=fit,
             )
             index += 1
 
@@ -276,6 +286,7 @@ def _refuse_nonsense(camera: CameraSettings, simulated: Simulated) -> None:
         "simulated.seed": simulated.seed,
         "simulated.delay_s": simulated.delay_s or 0.0,
         "simulated.pulsation_hz": simulated.pulsation_hz,
+        "simulated.arrival_jitter_s": simulated.arrival_jitter_s,
     }
     for name, value in at_least_zero.items():
         if not (math.isfinite(value) and value >= 0):

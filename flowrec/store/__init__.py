@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from flowrec.store.parts import Split
     from flowrec.store.reader import SessionReader
     from flowrec.store.recovery import Recovered, recover
+    from flowrec.store.region import Region, lit
     from flowrec.store.run_recovery import recover_run
     from flowrec.store.shapes import not_finite
     from flowrec.store.snapshots import Snapshot
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "Recovered": "recovery",
+    "Region": "region",
     "SessionHeader": "header",
     "SessionReader": "reader",
     "SessionWriter": "writer",
@@ -30,6 +32,7 @@ _HOME = {
     "files_of": "joints",
     "is_growing": "mcap_file",
     "is_snapshot": "names",
+    "lit": "region",
     "not_finite": "shapes",
     "recover": "recovery",
     "recover_run": "run_recovery",
@@ -38,6 +41,7 @@ _HOME = {
 
 __all__ = [
     "Recovered",
+    "Region",
     "SessionHeader",
     "SessionReader",
     "SessionWriter",
@@ -47,6 +51,7 @@ __all__ = [
     "files_of",
     "is_growing",
     "is_snapshot",
+    "lit",
     "not_finite",
     "recover",
     "recover_run",

@@ -15,6 +15,7 @@ from flowrec.store.codec import decode, message_stamp
 from flowrec.store.contents import Contents
 from flowrec.store.header import SessionHeader
 from flowrec.store.joints import Piece
+from flowrec.store.region import Region
 from flowrec.store.scan import Scan, scan
 from flowrec.store.shapes import misfit
 from flowrec.store.source import DamageError, Record, Source, UnfinishedError
@@ -45,6 +46,7 @@ class Audit:
     backwards : by field, how often the time of a tick was before that of the message before.
     stamps_backwards : the same of the stamps that the source itself gave.
     undecodable : by field, messages that make no sense; `first_undecodable` says why.
+    region : which part of most images was kept (region.py); None: they are whole.
     missing : by field, messages that should be between others, told by their numbers; not of images.
     """
 
@@ -68,6 +70,7 @@ class Audit:
     undecodable: Counter[str] = field(default_factory=Counter)
     first_undecodable: str = ""
     missing: Counter[str] = field(default_factory=Counter)
+    region: Region | None = None
 
     @property
     def duration_s(self) -> float:
@@ -109,6 +112,7 @@ def audit(
         found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
     with contents:
         found.flowrec_version, found.outcome = contents.flowrec_version, contents.outcome
+        found.region = contents.region
         try:
             found.header = contents.header
         except SessionError as error:

@@ -10,6 +10,7 @@ from collections import deque
 from typing import NamedTuple
 
 from flowrec.messages import Message
+from flowrec.store.region import Window
 
 News = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
 
@@ -35,6 +36,7 @@ class Entry(NamedTuple):
     late: bool = False
     dropped: int = 0
     missing: int = 0
+    window: Window | None = None  # of the image, where not all of it is to be kept
 
 
 class Backlog:

@@ -12,6 +12,7 @@ from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
 from flowrec.store.head import Head
 from flowrec.store.index import Summary
+from flowrec.store.region import Region, region_from
 from flowrec.topics import BY_FIELD, BY_PATH
 
 
@@ -38,6 +39,12 @@ class Contents(Head):
         """Name of the way in which frames travel (frames.py); empty in files that do not say."""
         channels = self._summary.channels.values()
         return next((c.metadata.get("encoding", "") for c in channels if c.topic == BY_FIELD["frame"].path), "")
+
+    @property
+    def region(self) -> Region | None:
+        """Which part of most images was kept (region.py); None: they are whole."""
+        channels = self._summary.channels.values()
+        return next((region_from(c.metadata) for c in channels if c.topic == BY_FIELD["frame"].path), None)
 
     def _check_schema(self, channel_number: int) -> None:
         channel = self._summary.channels[channel_number]

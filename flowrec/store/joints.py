@@ -82,6 +82,7 @@ class Run:
         """How it ended, and the sums of what each part counts."""
         outcome = dict(self.pieces[-1].outcome)
         if self.in_parts:
+            outcome.pop("frames_windows", None)  # of the last part alone
             for key in _COUNTS:
                 said = [piece.outcome[key] for piece in self.pieces if key in piece.outcome]
                 if said and all(text.isdecimal() and len(text) < 20 for text in said):

@@ -15,6 +15,7 @@ from mcap.records import Schema as SchemaRecord
 from flowrec.store.codec import codec_of
 from flowrec.store.frames import FrameEncoding
 from flowrec.store.mirrors import MIRRORS
+from flowrec.store.region import Region
 from flowrec.store.schemas import Schema, foxglove_schema
 from flowrec.topics import BY_FIELD, TOPICS
 
@@ -50,13 +51,14 @@ SLOTS: dict[str, Slot] = dict(_slots())
 FRAME_PATH = BY_FIELD["frame"].path
 
 
-def declarations(frames: FrameEncoding) -> Iterator[SchemaRecord | Channel]:
+def declarations(frames: FrameEncoding, region: Region | None = None) -> Iterator[SchemaRecord | Channel]:
     """Every schema, each before the first channel that uses it, and every channel."""
     schemas: dict[str, int] = {}
     for path, usual in SLOTS.items():
         slot = usual
         if path == FRAME_PATH:
             notes = {"encoding": frames.name, "lossless": "yes" if frames.lossless else "no"}
+            notes |= region.notes if region is not None else {}
             slot = replace(usual, schema=frames.codec.schema, notes=usual.notes | notes)
         name = slot.schema.name
         if name not in schemas:

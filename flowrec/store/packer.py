@@ -15,6 +15,7 @@ from flowrec.store.frames import FrameEncoding
 from flowrec.store.layout import FRAMES, GROUPS, SLOTS, STATE
 from flowrec.store.layout import VIEW as VIEW_GROUP
 from flowrec.store.mirrors import Mirrors
+from flowrec.store.region import Blank
 from flowrec.store.source import CHUNK_LIMIT_BYTES
 from flowrec.topics import BY_FIELD
 
@@ -46,6 +47,7 @@ class Packer:
         self.sequences: Counter[str] = Counter()
         self._frames = frames
         self._mirrors = mirrors
+        self._blank = Blank()
         self._builders = {group: ChunkBuilder(compressed=frames.packed or group != FRAMES) for group in GROUPS}
 
     @property
@@ -62,6 +64,8 @@ class Packer:
         """
         for field, message in entry.news.items():
             codec = self._frames.codec if isinstance(message, Frame) else None
+            if isinstance(message, Frame) and entry.window is not None:
+                message = self._blank.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
             sequence, payload = encode_record(message, codec)
             self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
         for mirror, stamp_ns, view in self._mirrors.of(entry.news):

@@ -221,6 +221,7 @@ class Parts:
             flush_s=making.flush_s,
             sync_s=making.sync_s,
             overwrite=making.overwrite,
+            region=making.region,
             wait=carried_ns is None,
         )
         return _Part(self, number, recorder)

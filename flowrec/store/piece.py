@@ -19,6 +19,7 @@ from flowrec.store.header import OUTCOME, PROFILE, VIEW, SessionHeader, records_
 from flowrec.store.layout import declarations
 from flowrec.store.mcap_file import McapFile
 from flowrec.store.names import PARTIAL_SUFFIX, partial_path, pieces
+from flowrec.store.region import Region
 from flowrec.store.stretches import Tally
 
 
@@ -36,6 +37,7 @@ class Making:
     frames : how images travel.
     flush_s, sync_s : how old at most what is not with the operating system, and not kept by the disk, may become.
     overwrite : replace what is there.
+    region : which part of most images is kept (region.py); None: all.
     """
 
     path: Path
@@ -44,6 +46,7 @@ class Making:
     flush_s: float
     sync_s: float
     overwrite: bool
+    region: Region | None = None
 
     def said(self, tally: Tally) -> dict[str, str]:
         """What is added to every outcome."""
@@ -63,6 +66,7 @@ class Piece:
     header : goes first into it.
     frames : how images travel.
     overwrite : replace what is there.
+    region : which part of most images is kept; None: all.
 
     Attributes
     ----------
@@ -73,7 +77,15 @@ class Piece:
     PieceError : from any method, when the disk refuses.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, frames: FrameEncoding, *, overwrite: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: SessionHeader,
+        frames: FrameEncoding,
+        *,
+        overwrite: bool,
+        region: Region | None = None,
+    ) -> None:
         self.path = path
         self.partial_path = partial_path(path)
         self.broken = False
@@ -84,7 +96,7 @@ class Piece:
             raise _not_writable(self.partial_path, error) from error
         try:
             self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
-            for record in (*records_of(header), *declarations(frames)):
+            for record in (*records_of(header), *declarations(frames, region)):
                 self._file.add(record)
         except OSError as error:
             self._file.close()

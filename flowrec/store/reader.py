@@ -15,6 +15,7 @@ from flowrec.store.contents import Contents
 from flowrec.store.file_reader import FileReader, Kept
 from flowrec.store.header import SessionHeader
 from flowrec.store.joints import Piece, Run, without_part
+from flowrec.store.region import Region
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
 from flowrec.units import seconds
 
@@ -73,6 +74,11 @@ class SessionReader:
     def header(self) -> SessionHeader:
         """Configuration, chip, provenance and weights, as they were written first into the file."""
         return self._file(0).contents.header
+
+    @functools.cached_property
+    def region(self) -> Region | None:
+        """Which part of most images was kept, the rest being black (region.py); None: they are whole."""
+        return self._file(0).contents.region
 
     @functools.cached_property
     def counts(self) -> dict[str, int]:

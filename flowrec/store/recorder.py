@@ -15,6 +15,7 @@ from flowrec.store.header import SessionHeader
 from flowrec.store.mirrors import Mirrors
 from flowrec.store.packer import Packer
 from flowrec.store.piece import Piece, PieceError
+from flowrec.store.region import Region
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
@@ -52,13 +53,14 @@ class Recorder:
         sync_s: float,
         overwrite: bool,
         wait: bool = True,
+        region: Region | None = None,
     ) -> None:
         # A message waits up to half of the time for the next fsync to begin, and the other half until it is done.
         self._sync_every_s = sync_s / 2
         # Begun a fifth early, a flush is over in time also on a busy machine.
         self._flush_s = 0.8 * min(flush_s, self._sync_every_s)
         self._mirrors = mirrors
-        self._piece = Piece(path, header, frames, overwrite=overwrite)
+        self._piece = Piece(path, header, frames, overwrite=overwrite, region=region)
         self._frames = frames
         self._packer = Packer(frames, mirrors, self._piece.add_chunks)
         self.first_bytes = self._piece.size

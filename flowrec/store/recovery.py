@@ -189,7 +189,13 @@ def _rewrite(
     # Only replays are written without images.
     has_images = "frame" in reader.counts or not reader.header.parent
     with SessionWriter(
-        draft, reader.header, frames=frames, overwrite=True, block=True, queue_limit_bytes=_QUEUE_BYTES
+        draft,
+        reader.header,
+        frames=frames,
+        overwrite=True,
+        block=True,
+        queue_limit_bytes=_QUEUE_BYTES,
+        region=reader.region,
     ) as writer:
         for tick in reader.ticks():
             if tick.stamp_ns > end_ns:

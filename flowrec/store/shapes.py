@@ -44,6 +44,7 @@ _SHAPES: Mapping[type[Message], Mapping[str, Shape]] = {
     m.Event: {},
     m.Timing: {},
     m.Drops: {},
+    m.Clocks: {},
     m.Truth: {"position_um": (2,), "flow_um_s": (2,)},
 }
 # Where a value that is not finite says something: no measurement, no reference, no way, wall beyond sight.

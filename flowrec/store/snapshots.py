@@ -373,7 +373,7 @@ class Snapshots:
         """Whether a file can be made here; better now than at the event."""
         making = self._making
         path = snapshot_path(making.path, 1)
-        piece = Piece(path, making.header, making.frames, overwrite=making.overwrite)
+        piece = Piece(path, making.header, making.frames, overwrite=making.overwrite, region=making.region)
         piece.close()
         piece.partial_path.unlink(missing_ok=True)
 

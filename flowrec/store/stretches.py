@@ -22,23 +22,35 @@ class Tally:
     ticks: int = 0
     dropped_frames: int = 0
     missing_frames: int = 0
+    images: int = 0
+    windows: int = 0  # images of which only a part was kept
 
     def add(self, entry: Entry) -> None:
         """Count one entry."""
         self.ticks += entry.ticks
         self.dropped_frames += entry.dropped
         self.missing_frames += entry.missing
+        self.images += "frame" in entry.news
+        self.windows += entry.window is not None
 
     def include(self, other: Tally) -> None:
         """Add what was counted elsewhere."""
         self.ticks += other.ticks
         self.dropped_frames += other.dropped_frames
         self.missing_frames += other.missing_frames
+        self.images += other.images
+        self.windows += other.windows
 
     def told(self) -> dict[str, str]:
         """As an outcome says it."""
         counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
-        return counts | {"frames_missing_from_camera": str(self.missing_frames)} if self.missing_frames else counts
+        if self.missing_frames:
+            counts["frames_missing_from_camera"] = str(self.missing_frames)
+        if self.windows:
+            counts["frames_windows"] = (
+                f"{self.windows} of {self.images} images hold what the tracker read, and are black elsewhere"
+            )
+        return counts
 
 
 class Stretch(Protocol):

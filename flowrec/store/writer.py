@@ -16,7 +16,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from flowrec.errors import SessionError
-from flowrec.messages import Drops, Frame, Message, Tick, array_fields
+from flowrec.messages import Drops, Frame, Message, Tick, Track, array_fields
 from flowrec.store.backlog import Backlog, Entry, News
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
@@ -25,6 +25,7 @@ from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import pieces as pieces_of
 from flowrec.store.parts import Parts, Split
 from flowrec.store.piece import Making, refuse_if_taken
+from flowrec.store.region import Region, Window, Windows
 from flowrec.store.snapshots import Snapshot, Snapshots
 from flowrec.store.thinning import Thinning
 from flowrec.topics import TOPICS
@@ -89,6 +90,7 @@ class SessionWriter:
     queue_limit_bytes : how much may wait for the disk.
     pieces : a Split, after which the run X.mcap is in the files X.part001.mcap, X.part002.mcap, ..., each of which can
         be read alone; or a Snapshot: nothing is written but X.snap001.mcap, ... around events.
+    region : keep of most images only the window around the robot (region.py); None: all of all images.
 
     Attributes
     ----------
@@ -111,12 +113,14 @@ class SessionWriter:
         block: bool = False,
         queue_limit_bytes: int = 256 << 20,
         pieces: Split | Snapshot | None = None,
+        region: Region | None = None,
     ) -> None:
         self.path = Path(path)
         self.ticks = 0  # written so far
         self.dropped_frames = 0  # for want of a faster disk
         self.missing_frames = 0  # live: those that the camera counted and never delivered
         self._thinning = Thinning()
+        self._windows = Windows(region) if region is not None else None
         self._next_index: int | None = None
         self._said: Drops | None = None
         self._carried_ns = header.part.carried_ns if header.part is not None else None
@@ -129,7 +133,7 @@ class SessionWriter:
         part = header.part
         self._carried_ns = part.carried_ns if part is not None else None
         refuse_if_taken(self.path, overwrite=overwrite)
-        making = Making(self.path, header, ENCODINGS[frames], flush_s, sync_s, overwrite)
+        making = Making(self.path, header, ENCODINGS[frames], flush_s, sync_s, overwrite, region)
         run = os.urandom(8).hex()  # the same in all pieces, and in no other run
         self.remarks: deque[str] = deque()
         self._output: _Output
@@ -182,7 +186,8 @@ class SessionWriter:
         self.ticks += counted
         news = self._news_of(tick)
         if self._block:
-            entry = Entry(tick.stamp_ns, news, _weight(news), counted)
+            window = self._window_of(news.get("frame"), tick.track)
+            entry = Entry(tick.stamp_ns, news, _weight(news), counted, window=window)
             if not self._backlog.has_room(entry.nbytes):
                 self._backlog.wait_for_room(entry.nbytes)
                 self._raise_failure()
@@ -192,7 +197,8 @@ class SessionWriter:
         dropped, missing = self.dropped_frames, self.missing_frames
         image: Entry | None = None
         if isinstance(frame, Frame) and self._takes(frame):
-            image = Entry(tick.stamp_ns, {"frame": frame}, _nbytes(frame), late=True)
+            window = self._window_of(frame, tick.track)
+            image = Entry(tick.stamp_ns, {"frame": frame}, _nbytes(frame), late=True, window=window)
         self._tell_drops(news, tick.stamp_ns)
         entry = Entry(
             tick.stamp_ns,
@@ -268,6 +274,10 @@ class SessionWriter:
             ):
                 news[name] = message
         return news
+
+    def _window_of(self, frame: Message | None, track: Track | None) -> Window | None:
+        """What is kept of an image that is kept; None: all of it."""
+        return self._windows.of(frame, track) if self._windows is not None and isinstance(frame, Frame) else None
 
     def _takes(self, frame: Frame) -> bool:
         """Whether there is room for an image of a live run; counts those that are missing."""

@@ -19,6 +19,7 @@ from flowrec.messages import (
     FlowField,
     Frame,
     Health,
+    Image,
     Mission,
     OperatorEvent,
     Route,
@@ -27,6 +28,7 @@ from flowrec.messages import (
     Track,
     Truth,
 )
+from flowrec.store import lit
 from flowrec.units import NS_PER_S
 from flowrec.view import entities as e
 from flowrec.view import maps, palette
@@ -36,6 +38,7 @@ from flowrec.view.scene import Scene
 from flowrec.view.styles import log_series, log_styles
 
 _JPEG_QUALITY = 85
+_DIMMED = 0.6  # what is not of now, beside a window that is
 _TRAIL_S = 4.0
 _TRAIL_STEP_PX = 1.0  # likewise
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command, in an image of 640 pixels
@@ -70,6 +73,8 @@ class TickLogger:
         self._scene = scene
         self._pen = Pen(stream, prefix)
         self._images = images
+        self._whole: Image | None = None  # the last one, and the same dimmed
+        self._around: Image | None = None
         self.image_step = 1
         self._placed_step = 0
         self._flow = FlowLogger(self._pen, scene, maps.SpeedScale() if speeds is None else speeds, self.present)
@@ -147,9 +152,24 @@ class TickLogger:
         if self._placed_step != self.image_step:
             self._placed_step = self.image_step
             self._pen.log(e.IMAGE, maps.placed(self._scene.preview_placement(self.image_step)), static=True)
-        done, jpeg = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        image = self._completed(frame.image) if self._scene.windows else frame.image
+        done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         assert done
         self._pen.log(e.IMAGE, rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg", draw_order=-20.0))
+
+    def _completed(self, image: Image) -> Image:
+        """A window in the last whole image, dimmed, which says where it is and that the rest is not of now."""
+        x0, y0, x1, y1 = lit(image)
+        if (x0, y0) == (0, 0) and (y1, x1) == image.shape:
+            self._whole, self._around = image, None
+            return image
+        if self._whole is None or self._whole.shape != image.shape:
+            return image
+        if self._around is None:
+            self._around = (_DIMMED * self._whole).astype(np.uint8)
+        completed = self._around.copy()
+        completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
+        return completed
 
     def _log_route(self, route: Route) -> None:
         self.present.add("route")

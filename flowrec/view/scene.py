@@ -36,6 +36,7 @@ class Scene:
     title: str
     properties: dict[str, str] = field(default_factory=dict)
     image_px: tuple[int, int] | None = None  # width and height of the camera's image; None: as the chip
+    windows: bool = False  # whether most images are black but for a window around the robot
 
     def to_plane(self, points_um: ArrayLike) -> NDArray[np.float64]:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""

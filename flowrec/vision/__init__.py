@@ -1,5 +1,5 @@
 """Frame to Track."""
 
-from flowrec.vision.tracker import Tracker
+from flowrec.vision.tracker import Sight, Tracker
 
-__all__ = ["Tracker"]
+__all__ = ["Sight", "Tracker"]

@@ -42,7 +42,7 @@ def fit_disc(
     Pixels nearer to a wall than the margin do not count. Returns x, y, the radius, the darkness in grey levels, and
     the likeness sqrt(1 - residual / variation about the background), 0 to 1; 0 when there is too little to fit.
     """
-    reach = 1.25 * radius_px + 3.5 * edge_px
+    reach = disc_reach(radius_px, edge_px)
     across, down, grey = _samples(image, distance_px, margin_px, x, y, reach, step)
     trial = _start(across, down, grey, radius_px, edge_px)
     if trial[_DARKNESS] <= 0.0 or len(grey) < 2 * _PARAMETERS:
@@ -84,6 +84,12 @@ def fit_disc(
             best[:] = trial
             break
     return best[_X] + x, best[_Y] + y, best[_RADIUS], best[_DARKNESS], likeness
+
+
+@njit(cache=True)
+def disc_reach(radius_px: float, edge_px: float) -> float:
+    """How far from where a disc is looked for pixels take part in the fit."""
+    return 1.25 * radius_px + 3.5 * edge_px
 
 
 @njit(cache=True)

@@ -19,7 +19,7 @@ from flowrec.messages import Frame, Image, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 from flowrec.vision.appearance import edge_px, template
-from flowrec.vision.disc import fit_disc
+from flowrec.vision.disc import disc_reach, fit_disc
 from flowrec.vision.likeness import likeness
 from flowrec.vision.walls import Box, Walls, walls_in_view
 
@@ -28,6 +28,7 @@ _FINE_RADIUS_PX = 6.0  # and measured at about this one, or as they are when sma
 _LEAST_MATCH = 0.35  # correlation below which a place is not measured
 _SIZE_PX = 0.5  # blur hides so much of the radius of any disc
 _SURE = 0.92  # a score that needs no comparison
+_SMALLEST, _LARGEST = 0.75, 1.35  # radius that is expected, as a share of the robot's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +55,14 @@ class _Search:
     margin_px: float
     least_score: float
     least_likeness: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Which pixels a tracker reads: those of Track.roi_px and no farther than `pad_px` around it."""
+
+    pad_px: int
+    everywhere_px: Box  # roi_px of a search in the whole channel
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +107,21 @@ class Tracker:
             position_um=calibration.to_um((found.x, found.y)),
             score=found.score,
             lost_frames=0,
-            radius_px=min(max(radius_px, 0.75 * search.nominal_px), 1.35 * search.nominal_px),
+            radius_px=min(max(radius_px, _SMALLEST * search.nominal_px), _LARGEST * search.nominal_px),
             roi_px=roi,
         )
+
+    def sight(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Sight:
+        """How far around the searched region pixels of an image of `shape` have a say, whatever is in them."""
+        nominal = robot.radius / calibration.um_per_px
+        coarse = _coarse_step(nominal)
+        # Squares of the shrunk image that a template on the outermost square of the region covers; the last of them
+        # may reach out of the region by all but a pixel.
+        seen = coarse * (len(template(nominal, coarse)) // 2 + 1) - 1
+        # A disc is fitted about the middle of a square, to squares that begin on whole pixels.
+        largest = _LARGEST * nominal
+        fitted = 0.5 * (coarse - 1) + disc_reach(largest, edge_px(largest)) + 1.0
+        return Sight(max(seen, math.ceil(fitted)), walls_in_view(chip, calibration, shape).box)
 
     def _plan(
         self, previous: Track | None, frame: Frame, walls: Walls, calibration: Calibration, robot: Robot
@@ -131,7 +152,7 @@ class Tracker:
         if x1 <= x0 or y1 <= y0:
             return None
         nominal = search.nominal_px
-        step = max(1, int(nominal / _COARSE_RADIUS_PX))
+        step = _coarse_step(nominal)
         match = likeness(
             image, walls.distance_px, search.box, step, search.margin_px, 0.7 * nominal, template(nominal, step)
         )
@@ -166,7 +187,7 @@ class Tracker:
     def _measure(self, image: Image, walls: Walls, x: float, y: float, search: _Search) -> _Disc | None:
         """Fit a disc near a candidate; None when there is none of the robot's kind."""
         expected = search.expected_px
-        step = max(1, int(search.nominal_px / _FINE_RADIUS_PX))
+        step = _fine_step(search.nominal_px)
         fx, fy, radius_px, darkness, alike = fit_disc(
             image, walls.distance_px, search.margin_px, x, y, expected, edge_px(expected), step
         )
@@ -178,3 +199,11 @@ class Tracker:
             return None
         size = math.log(radius_px / expected) / math.hypot(self.size_tolerance, _SIZE_PX / expected)
         return _Disc(fx, fy, radius_px, darkness, alike, alike * math.exp(-0.5 * size * size))
+
+
+def _coarse_step(nominal_px: float) -> int:
+    return max(1, int(nominal_px / _COARSE_RADIUS_PX))
+
+
+def _fine_step(nominal_px: float) -> int:
+    return max(1, int(nominal_px / _FINE_RADIUS_PX))

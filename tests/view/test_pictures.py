@@ -171,3 +171,16 @@ def test_a_robot_that_is_not_seen_is_grey_and_says_so(scene: Scene, ticks: list[
 
 def test_the_stand_in_has_the_methods_of_a_real_stream() -> None:
     assert all(hasattr(rr.RecordingStream, name) for name in ("set_time", "disable_timeline", "log"))
+
+
+def test_a_window_is_shown_in_the_last_whole_image_dimmed(scene: Scene) -> None:
+    logger = TickLogger(Record(), replace(scene, windows=True))  # type: ignore[arg-type]
+    whole = np.full((40, 60), 200, np.uint8)
+    window = np.zeros_like(whole)
+    window[10:20, 30:45] = 90
+    assert np.array_equal(logger._completed(window), window)  # nothing is known of the rest
+    assert np.array_equal(logger._completed(whole), whole)
+    shown = logger._completed(window)
+    assert np.all(shown[10:20, 30:45] == 90)
+    shown[10:20, 30:45] = 120
+    assert np.all(shown == 120)

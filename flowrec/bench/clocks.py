@@ -1,0 +1,224 @@
+"""`flowrec bench clocks`: how well a camera's frames are dated from its own clock, by five ways to fit it.
+
+Made-up series, whose truth is known: a camera at 100 Hz for some minutes, its clock 50 ppm fast, frames that arrive
+late by a fifth of a millisecond and more, and one thing after the other that goes wrong.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.clocks import DeviceClock, Fit
+from flowrec.clocks.device import envelope
+from flowrec.status import table
+from flowrec.units import NS_PER_S
+
+_RATE_HZ = 100.0
+_SKEW = 50e-6
+_LEAST_S, _JITTER_S = 200e-6, 300e-6  # of the way to the host: at the least, and the mean of what comes on top
+_WINDOW, _EVERY = 6000, 50  # frames that the others look back on, and after how many they fit anew
+_SETTLED_S = 15.0  # from then on a series is judged, and from so long after something went wrong
+_EPOCH = 1_234_567_890_123
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Frames as they arrive.
+
+    Attributes
+    ----------
+    true_ns : (n,) when each was taken and could have been here at the earliest, ns on the host's clock.
+    device : counts of the camera's clock, n of them.
+    arrival_ns : n, in the order of arrival.
+    events_s : when something went wrong that a new fit has to be begun for.
+    """
+
+    name: str
+    true_ns: NDArray[np.int64]
+    device: list[int]
+    arrival_ns: list[int]
+    events_s: tuple[float, ...] = ()
+
+
+def series(name: str, seconds: float = 300.0, seed: int = 0) -> Series:
+    """One of `CASES`."""
+    rng = np.random.default_rng([seed, 31])
+    count = int(seconds * _RATE_HZ)
+    taken = np.arange(count) / _RATE_HZ  # s
+    delay = rng.exponential(_JITTER_S, count)
+    if name in ("stalls", "all at once"):
+        for at in rng.uniform(0.0, seconds, max(1, round(seconds / 5.0))):
+            delay += np.where((taken >= at) & (taken < at + 0.1), at + 0.1 - taken, 0.0)  # nothing gets through
+    if name == "busy host":  # most frames wait for a turn of some ms
+        delay += rng.gamma(2.0, 2e-3, count)
+    ran = taken * (1.0 + _SKEW)
+    if name in ("drift", "all at once"):  # warms up by 20 ppm with a time of two minutes
+        ran = ran + 20e-6 * (taken - 120.0 * (1.0 - np.exp(-taken / 120.0)))
+    events: tuple[float, ...] = ()
+    device = np.rint(ran * NS_PER_S).astype(np.int64) + _EPOCH
+    half = seconds / 2.0
+    if name == "unit x10":
+        device = np.rint(ran * 10.0 * NS_PER_S).astype(np.int64)
+    elif name == "unit x0.694":
+        device = np.rint(ran * 0.694 * NS_PER_S).astype(np.int64)
+    elif name == "reset":
+        device, events = device - np.where(taken >= half, device[taken >= half][0] - 1000, 0), (half,)
+    elif name == "set forwards":
+        device, events = device + np.where(taken >= half, 3600 * NS_PER_S, 0), (half,)
+    elif name == "32 bit":
+        device = device % (1 << 32)
+    true_ns = np.rint((taken + _LEAST_S) * NS_PER_S).astype(np.int64)
+    arrival_ns = np.maximum.accumulate(true_ns + np.rint(delay * NS_PER_S).astype(np.int64))  # none overtakes another
+    order = np.arange(count)
+    if name == "out of order":
+        for at in range(150, count - 1, 150):
+            order[at : at + 2] = order[at : at + 2][::-1]
+            arrival_ns[at : at + 2] = arrival_ns[at + 1] + np.array([0, 50_000])
+        for at in range(100, count - 1, 150):
+            order[at + 1] = order[at]  # and some twice
+    return Series(name, true_ns[order], device[order].tolist(), arrival_ns.tolist(), events)
+
+
+CASES = (
+    "plain", "stalls", "busy host", "drift", "all at once", "unit x10", "unit x0.694", "32 bit", "reset",
+    "set forwards", "out of order",
+)  # fmt: skip
+
+
+def measure(
+    seconds: float = 300.0, seed: int = 0, cases: Sequence[str] = CASES, methods: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """Errors of the dates by case and method, s."""
+    rows = []
+    for case in cases:
+        one = series(case, seconds, seed)
+        for method in METHODS if methods is None else methods:
+            dated = METHODS[method]
+            began = time.process_time()
+            stamps, said = dated(one)
+            cost_us = 1e6 * (time.process_time() - began) / len(one.device)
+            rows.append({"case": case, "method": method, "us_per_frame": cost_us, **_judged(one, stamps), "said": said})
+    return {"rate_hz": _RATE_HZ, "seconds": seconds, "skew_ppm": 1e6 * _SKEW, "rows": rows}
+
+
+def _judged(one: Series, stamps: NDArray[np.float64]) -> dict[str, float]:
+    """Of the frames that got a date, once the fit had time to settle; the largest step is of all of them."""
+    good = np.isfinite(stamps)
+    off_s = (stamps[good] - one.true_ns[good]) / NS_PER_S
+    at_s = one.true_ns[good] / NS_PER_S
+    settled = at_s > _SETTLED_S
+    for event_s in one.events_s:
+        settled &= (at_s < event_s) | (at_s > event_s + _SETTLED_S)
+    judged = off_s[settled] if settled.any() else np.array([np.nan])
+    return {
+        "mean_s": float(judged.mean()),
+        "rms_s": float(np.sqrt((judged**2).mean())),
+        "p99_s": float(np.percentile(abs(judged), 99)),
+        "max_s": float(abs(judged).max()),
+        "step_s": float(abs(np.diff(off_s)[settled[1:]]).max(initial=0.0)),
+        "backwards": int((np.diff(stamps[good]) <= 0).sum()),
+    }
+
+
+def _arrival(one: Series) -> tuple[NDArray[np.float64], str]:
+    return np.array(one.arrival_ns, np.float64), ""
+
+
+def _ours(one: Series) -> tuple[NDArray[np.float64], str]:
+    clock, fit = DeviceClock(), None
+    stamps = np.full(len(one.device), np.nan)
+    for n, (device, arrival_ns) in enumerate(zip(one.device, one.arrival_ns, strict=True)):
+        fit = clock.take(fit, device, arrival_ns)
+        if fit.good:
+            stamps[n] = fit.stamp_ns
+    return stamps, said_of(fit) if fit is not None else ""
+
+
+def said_of(fit: Fit) -> str:
+    """What a fit has to say of the clock."""
+    counts = {
+        "twice": fit.duplicates, "out of order": fit.disordered, "wraps": fit.wraps, "resets": fit.resets,
+        "jumps": fit.jumps,
+    }  # fmt: skip
+    parts = [f"{count} {what}" for what, count in counts.items() if count]
+    return ", ".join([f"unit {fit.unit:.3g}" for _ in range(fit.unit > 0.0)] + parts)
+
+
+def _windowed(line: Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[float, float]]) -> Any:
+    """The same window as ours, a line fitted anew every half second, and nothing else."""
+
+    def dated(one: Series) -> tuple[NDArray[np.float64], str]:
+        x = np.array(one.device, np.float64)
+        y = np.array(one.arrival_ns, np.float64)
+        stamps = y.copy()
+        slope, level = 1.0, y[0] - x[0]
+        for n in range(len(x)):
+            if n % _EVERY == 0 and n >= 500:
+                begin = max(0, n - _WINDOW)
+                x0, y0 = x[begin], y[begin]
+                slope, level = line(x[begin:n] - x0, y[begin:n] - y0)
+                level += y0 - slope * x0
+            stamps[n] = level + slope * x[n]
+        return stamps, ""
+
+    return dated
+
+
+def _least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    dx = x - x.mean()
+    slope = float((dx * y).sum() / max((dx * dx).sum(), 1.0))
+    return slope, float(y.mean() - slope * x.mean())
+
+
+def _median(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """Slopes over half of the window, and the median of them (after Theil and Sen); the level likewise."""
+    half = len(x) // 2
+    apart = x[half:] - x[: len(x) - half]
+    slopes = (y[half:] - y[: len(y) - half])[apart != 0] / apart[apart != 0]
+    slope = float(np.median(slopes)) if len(slopes) else 1.0
+    return slope, float(np.median(y - slope * x))
+
+
+def _hull(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    points = dict(sorted(zip(x.astype(int).tolist(), y.astype(int).tolist(), strict=True), reverse=True))
+    support, slope = envelope(tuple(sorted(points.items())))
+    return slope, support[1] - slope * support[0]
+
+
+METHODS: dict[str, Callable[[Series], tuple[NDArray[np.float64], str]]] = {
+    "arrival": _arrival,
+    "least squares": _windowed(_least_squares),
+    "median": _windowed(_median),
+    "hull": _windowed(_hull),
+    "flowrec": _ours,
+}
+
+
+def show(figures: dict[str, Any]) -> None:
+    """Print the table."""
+    rows = [
+        (
+            row["case"],
+            row["method"],
+            *(_told(row[name]) for name in ("mean_s", "rms_s", "p99_s", "max_s", "step_s")),
+            str(row["backwards"]),
+            f"{row['us_per_frame']:.1f}",
+            row["said"],
+        )
+        for row in figures["rows"]
+    ]
+    table(
+        f"Errors of dates in us, {figures['rate_hz']:g} Hz for {figures['seconds']:g} s, {figures['skew_ppm']:g} ppm",
+        ("case", "fit", "mean", "rms", "p99", "max", "step", "backwards", "us/frame", "said"),
+        rows,
+    )
+
+
+def _told(error_s: float) -> str:
+    return f"{1e6 * error_s:.0f}" if abs(error_s) < 10.0 else f"{error_s:.0f} s"
