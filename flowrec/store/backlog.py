@@ -68,6 +68,23 @@ class Backlog:
         """Whether the next entry may be the image of a tick that was taken before."""
         return bool(self._images)
 
+    def drop_images(self) -> list[int]:
+        """Forget the images that wait; the stamps of their ticks."""
+        dropped: list[int] = []
+        with self._changed:
+            for image in self._images:
+                self.nbytes -= image.nbytes
+                dropped.append(image.stamp_ns)
+            self._images.clear()
+            for place, entry in enumerate(self._state):  # where nobody minds to wait, images travel with the rest
+                if "frame" in entry.news:
+                    # What they weigh is told of when the entry is done, as for all others.
+                    others = {name: message for name, message in entry.news.items() if name != "frame"}
+                    self._state[place] = entry._replace(news=others)
+                    dropped.append(entry.stamp_ns)
+            self._changed.notify_all()
+        return dropped
+
     def done(self, entry: Entry) -> None:
         """The entry has been dealt with: its bytes are free again."""
         with self._changed:

@@ -7,7 +7,7 @@ import errno
 import operator
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -151,12 +151,14 @@ class SessionWriter:
         image: News = {"frame": frame} if frame is not None else {}
         self._backlog.put(_entry(tick.stamp_ns, news), _entry(tick.stamp_ns, image))
 
-    def close(self, outcome: Mapping[str, str] | None = None) -> None:
+    def close(self, outcome: Mapping[str, str] | None = None, patience_s: float | None = None) -> None:
         """Finish the file and give it its name; a second call does nothing.
 
         Parameters
         ----------
         outcome : how the run ended, as text; numbers of ticks and of dropped frames are added.
+        patience_s : for how long images that wait may still be written, in s; what is left of them then is dropped
+            and counted. Everything else is always written. None: as long as it takes.
 
         Raises
         ------
@@ -166,7 +168,11 @@ class SessionWriter:
             return
         self._closed = True
         self._backlog.close()
+        self._thread.join(patience_s)
+        waiting = self._backlog.drop_images() if self._thread.is_alive() else []
         self._thread.join()
+        if waiting and self._failure is None:
+            self._tell_waiting(waiting)
         counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
         if self.missing_frames:
             counts["frames_missing_from_camera"] = str(self.missing_frames)
@@ -233,6 +239,15 @@ class SessionWriter:
         if told != now and (due or told[1:] != now[1:]):
             self._said = Drops(stamp_ns, FRAME_PATH, *now)
             news["drops"] = self._said
+
+    def _tell_waiting(self, stamps_ns: Sequence[int]) -> None:
+        """Count images that there was no time for; at the last tick, for no other comes. The thread has ended."""
+        self.dropped_frames += len(stamps_ns)
+        drops = Drops(self._last_ns, FRAME_PATH, self.dropped_frames, self.missing_frames, self._thinning.every)
+        try:
+            self._recorder.add(Entry(self._last_ns, {"drops": drops}, 0))
+        except OSError as error:
+            self._failure = error
 
     def _work(self) -> None:
         with contextlib.suppress(OSError, AttributeError):  # of Linux, where each thread has its own

@@ -58,6 +58,25 @@ def test_a_slow_disk_costs_evenly_spaced_images_and_nothing_else(tmp_path, monke
     assert 0 < drops[-1].by_backlog <= writer.dropped_frames and all(drop.by_camera == 0 for drop in drops)
 
 
+@pytest.mark.parametrize("block", [True, False])
+def test_a_run_that_must_end_soon_drops_the_images_that_wait_and_counts_them(tmp_path, monkeypatch, block):
+    slow_disk(monkeypatch, 2e6)
+    ticks = list(ticks_of(120, shape=(256, 256)))  # 8 MB, so 4 s of writing
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER, frames="raw", block=block)
+    for tick in ticks:
+        writer.write(tick)
+    began = time.monotonic()
+    writer.close({"outcome": "stopped"}, patience_s=0.3)
+    assert time.monotonic() - began < 3.0
+    reader = SessionReader(tmp_path / "s.mcap")
+    kept = [frame.index for frame in reader.messages("frame")]
+    again = list(reader.ticks())
+    assert len(again) == len(ticks) and kept == list(range(len(kept)))
+    assert all(told.track.same_as(found.track) for told, found in zip(ticks, again, strict=True))
+    assert 0 < writer.dropped_frames == len(ticks) - len(kept) == int(reader.outcome["dropped_frames"])
+    assert again[-1].drops.by_backlog == writer.dropped_frames
+
+
 def kept_by(disk_share, seconds=60.0, rate_hz=60.0, room_s=1.0):
     """What is kept, in a model of a queue of that many seconds and a disk that takes that share of the frames."""
     thinning, waiting, kept = Thinning(), 0.0, []
