@@ -54,6 +54,8 @@ class Recording:
     flush_s: float = 0.5  # at most this much of the end is lost when the process is killed, in wall or session time
     sync_s: float = 1.0  # the same when the power fails
     queue_mb: float = 256.0  # waiting for the disk; a live run thins out its frames from the half of it on
+    disk_floor_gb: float = 1.0  # with less than that left on the disk a run is ended in good order; 0: never
+    recover_leftovers: bool = True  # make whole sessions of what killed runs have left in the same folder
     operator: str = ""
     notes: str = ""
     sample: str = ""

@@ -50,7 +50,8 @@ class Coils:
         """The field and the currents at the time of a demand, and what the field is to do from then on.
 
         A robot that only rests keeps its field; when the run is finished, or no one knows where the robot is,
-        the amplitude goes down to zero; when it is `cut`, at once. How the field gets from one command to the next says rotation.py.
+        the amplitude goes down to zero; when it is `cut`, at once. How the field gets from one command to the next
+        says rotation.py.
         """
         if previous is not None and previous.stamp_ns == demand.stamp_ns:
             return previous

@@ -81,7 +81,9 @@ def _held(before: Mission | None, mission: Mission, tick: Tick) -> list[str]:
         demand = tick.demand
         off = f" by {demand.error_um:.0f} um" if demand is not None else ""
         why = ": the flow is faster than the robot" if demand is not None and demand.saturated else ""
-        lines.append(f"carried off the place where it is held{off}{why}" if mission.swept else "held in its place again")
+        lines.append(
+            f"carried off the place where it is held{off}{why}" if mission.swept else "held in its place again"
+        )
     return lines
 
 
