@@ -260,6 +260,8 @@ def run(
         report.outcome, report.note = tick.mission.outcome, tick.mission.note
     elif desk.reason:  # no tick came to say so
         report.outcome, report.note = "stopped", desk.reason
+    if desk.reason and tick.currents is not None and tick.currents.amplitude_mt > 0.0:
+        report.note += "; the coils were switched off before they were down their ramp"
     return report
 
 
