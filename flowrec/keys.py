@@ -114,17 +114,18 @@ class _Terminal:
         self._found: list[Any] | None = None
         self._lock = threading.RLock()
         self._left = False
-        self._suspend_before: Any = None
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> _Terminal:
         self.take_over()
         if threading.current_thread() is threading.main_thread():
-            self._suspend_before = signal.signal(signal.SIGTSTP, self._suspended)
+            for number, handler in ((signal.SIGTSTP, self._suspended), (signal.SIGQUIT, self._killed)):
+                self._handlers[number] = signal.signal(number, handler)
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._suspend_before is not None:
-            signal.signal(signal.SIGTSTP, self._suspend_before)
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
         with self._lock:
             self._left = True
             self._give_back()
@@ -160,6 +161,13 @@ class _Terminal:
             self._give_back()
         os.kill(os.getpid(), signal.SIGSTOP)
         self.take_over()
+
+    def _killed(self, number: int, _frame: FrameType | None) -> None:
+        """Ctrl-\\ kills at once, but does not take the echo of the shell with it."""
+        with self._lock:
+            self._give_back()
+        signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
 
 
 def _read(terminal: _Terminal, take: Callable[[str], None], over: threading.Event) -> None:

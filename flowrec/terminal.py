@@ -78,12 +78,15 @@ class _Pump:
         self._changed = threading.Condition()
         self._waiting: list[str] = []
         self._size = 0
-        self._closed = self._idle = False
+        self._closed = False
+        self._descriptor: int | None
         try:
             _stderr().flush()
             # The descriptor itself: a thread that is stuck in sys.stderr would hold its lock at the interpreter's end.
-            self._descriptor: int | None = os.dup(_stderr().fileno())
-        except (OSError, ValueError):  # no real file, as under a test
+            # A notebook or a test has put another object there, which knows better where its text goes.
+            own = _stderr() is sys.__stderr__
+            self._descriptor = os.dup(_stderr().fileno()) if own else None
+        except (OSError, ValueError):
             self._descriptor = None
         self._thread = threading.Thread(target=self._work, name="terminal", daemon=True)
         self._thread.start()
