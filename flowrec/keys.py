@@ -163,7 +163,7 @@ class _Terminal:
         self.take_over()
 
     def _killed(self, number: int, _frame: FrameType | None) -> None:
-        """Ctrl-\\ kills at once, but does not take the echo of the shell with it."""
+        """SIGQUIT kills at once, but does not take the echo of the shell with it."""
         with self._lock:
             self._give_back()
         signal.signal(number, signal.SIG_DFL)
