@@ -16,7 +16,9 @@ from flowrec.status import say, warn
 from flowrec.store import is_growing, recover
 from flowrec.store.names import PARTIAL_SUFFIX, SUFFIX
 
-_AT_ONCE_BYTES = 100_000_000  # about a second's work
+_REMAINS = SUFFIX + PARTIAL_SUFFIX
+_DRAFT = ".recovering" + _REMAINS
+_AT_ONCE_BYTES = 100_000_000  # two to four seconds' work
 _PATIENCE_S = 5.0  # for all of them together: a run is waiting
 _OFFERED = 3  # by name, the others by number
 
@@ -24,7 +26,9 @@ _OFFERED = 3  # by name, the others by number
 def leftovers(folder: Path) -> list[Path]:
     """Unfinished sessions in a folder that nobody is writing, the latest first."""
     try:
-        found = [path for path in folder.iterdir() if path.name.endswith(SUFFIX + PARTIAL_SUFFIX) and path.is_file()]
+        found = [path for path in folder.iterdir() if path.name.endswith(_REMAINS) and path.is_file()]
+        # A recovery that was killed left the draft and what it was to be made of; the latter is all there is to save.
+        found = [path for path in found if not path.name.endswith(_DRAFT)]
         waiting = [path for path in found if not is_growing(path)]
         return sorted(waiting, key=lambda path: path.stat().st_mtime_ns, reverse=True)
     except OSError:
