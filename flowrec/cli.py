@@ -79,6 +79,7 @@ def record(
     from flowrec.config import load_config, to_toml
     from flowrec.record import prepare, print_summary
     from flowrec.record import record as run_record
+    from flowrec.terminal import said_within
 
     settings = list(sets or [])
     if rig is not None:
@@ -95,11 +96,20 @@ def record(
         typer.echo(to_toml(prepare(chosen)[0]))
         return
     recorded = run_record(chosen, out, view, realtime, overwrite)
-    if as_json:
-        found: dict[str, Any] = {"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}
-        typer.echo(json.dumps(found | {"files": [str(file) for file in recorded.files]}))
-    else:
-        print_summary(recorded)
+
+    def summarize() -> None:
+        if as_json:
+            found: dict[str, Any] = {"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}
+            typer.echo(json.dumps(found | {"files": [str(file) for file in recorded.files]}))
+        else:
+            print_summary(recorded)
+
+    if recorded.stopped:
+        # The file is whole and the coils are off. A frozen terminal would keep us here for ever, and Python takes half
+        # a second to take itself apart.
+        said_within(0.3, summarize)
+        os._exit(recorded.exit_status)
+    summarize()
     raise typer.Exit(recorded.exit_status)
 
 

@@ -65,6 +65,8 @@ class Recording:
     snapshot_before_s: float | None = None
     snapshot_after_s: float = 10.0
     snapshot_mb: float = 1000.0  # in memory; where it is too little, fewer seconds before the event are kept
+    disk_floor_gb: float = 1.0  # with less than that left on the disk a run is ended in good order; 0: never
+    recover_leftovers: bool = True  # make whole sessions of what killed runs have left in the same folder
     operator: str = ""
     notes: str = ""
     sample: str = ""

@@ -220,6 +220,9 @@ class Mission(Message):
     finished: bool
     outcome: str  # reached, survey complete, unreachable, stopped, lost, ...; '' while under way
     note: str
+    held_since_ns: int | None = None  # when the operator told the robot to stay; None: not just now
+    held_ns: int = 0  # how long it was held in this phase before; that does not count against the phase's time
+    swept: bool = False  # held, and yet carried away: the flow is too fast for it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

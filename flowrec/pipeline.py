@@ -134,7 +134,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         _strength(p.coils, last),
         p.observer.method == "kalman_map",
     )
-    currents = p.coils.drive(last.currents, demand, robot, mission.finished)
+    asked = inputs.operator
+    cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == "zero"
+    currents = p.coils.drive(last.currents, demand, robot, mission.finished, cut)
     lap("control")
     tick = replace(
         last,

@@ -7,7 +7,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -16,19 +16,32 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.places import distance_um
 from flowrec.clocks import ClockWatch
 from flowrec.config import Config, resolve
+from flowrec.desk import Desk
+from flowrec.disk import DiskWatch, refuse_below
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
+from flowrec.keys import HELP as KEYS
+from flowrec.keys import listening
+from flowrec.leftovers import look_after
 from flowrec.messages import Demand, FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.space import no_room, too_swift
 from flowrec.priority import first_of_all
 from flowrec.rigs.simulated import SimulatedRig
-from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, StopSwitch, Worker, run
+from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
 from flowrec.session import length_mm, session_writer
 from flowrec.status import StatusLine, say, table, warn
 from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
+from flowrec.store.names import pieces, run_path
 from flowrec.units import seconds
+
+if TYPE_CHECKING:
+    from flowrec.view import LiveView
+
+# Of the 2 s that a run may take to end: the rest is for the coils (desk.py) and for Python itself.
+CLOSE_PATIENCE_S = 0.5  # for images that still wait to be written
+VIEW_PATIENCE_S = 0.2  # for a viewer to show the last of it
 
 View = Literal["spawn", "serve", "rrd", "none"]
 
@@ -47,9 +60,14 @@ class Recorded:
         """What can be given to other verbs: the run, or each of its snapshots."""
         return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
 
+    lost: str = ""  # why there is less of it than was wanted
+    stopped: bool = False  # by somebody who does not want to wait
+
     @property
     def exit_status(self) -> int:
-        """0 reached its end, 1 did not."""
+        """0 reached its end, 1 did not, 3 was cut short for want of room."""
+        if self.lost:
+            return 3
         return 0 if self.report.outcome in GOOD_ENDS else 1
 
 
@@ -177,29 +195,47 @@ def record(
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`; `view` is spawn, serve, rrd or none."""
     config, chip, pipeline = prepare(config)
-    path = out if out is not None else default_path(config)
+    path = _place(config, out, overwrite)
     fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
     rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
-    worker: Worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
-    if fields:
-        worker = Preloaded(worker, fields)
-    stop = StopSwitch()
+    folder, floor_gb = path.resolve().parent, config.recording.disk_floor_gb
+    desk = Desk()
     witness = Witness()
     clocks = ClockWatch()
+    low: list[str] = []
+
+    def disk_low(reason: str) -> None:
+        low.append(reason)
+        desk.stop(reason)
+
     with ExitStack() as stack:
+        # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
+        stack.enter_context(desk.armed())
         writer = stack.enter_context(
             session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True)
         )
         sinks: list[Sink] = [writer, witness]
-        if view in ("spawn", "serve"):
-            # Late: importing Rerun takes a second, and most runs do without.
-            from flowrec.export import scene_of
-            from flowrec.view import LiveView
+        live: LiveView | None = None
+        worker: Worker | None = None
+        with desk.left_when_late():
+            if view in ("spawn", "serve"):
+                # Late: importing Rerun takes a second, and most runs do without.
+                from flowrec.export import scene_of
+                from flowrec.view import LiveView
 
-            live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
-            say(live.message)
-            sinks.append(live)
-        status = stack.enter_context(StatusLine(path.resolve().parent, lambda: writer.bytes_written).shown())
+                live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
+                say(live.message)
+                sinks.append(live)
+            worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
+            stack.callback(worker.close)
+            if fields:
+                worker = Preloaded(worker, fields)
+        disk = stack.enter_context(DiskWatch(folder, lambda: writer.bytes_written, floor_gb, disk_low).watching())
+        board = stack.enter_context(listening(desk))
+        status = StatusLine(
+            lambda: writer.bytes_written, lambda: disk.text, lambda: board.note if board is not None else None
+        )
+        report = RunReport("stopped", desk.reason)
 
         def on_tick(tick: Tick) -> None:
             status(tick)
@@ -207,32 +243,42 @@ def record(
 
         # A run that does not keep real time never waits: it would keep a core for itself.
         priority = first_of_all() if realtime else nullcontext(enter_result=False)
-        with stop.armed(), priority as first:
-            report = run(
-                pipeline,
-                rig,
-                worker,
-                sinks,
-                stop=stop,
-                on_tick=on_tick,
-                queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
-                clocks=clocks,
-            )
+        with status.shown(), priority as first:
+            if board is not None:
+                say(KEYS)
+            if worker is not None:
+                report = run(
+                    pipeline,
+                    rig,
+                    worker,
+                    sinks,
+                    desk=desk,
+                    on_tick=on_tick,
+                    queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
+                    clocks=clocks,
+                )
         facts = facts_of(chip, report, witness.true_field)
-        facts["frames dropped"] = str(writer.dropped_frames)
         if math.isfinite(witness.rms_um) and config.control.method != "policy":  # which has no reference to be off
             facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
+        if board is not None and board.note:
+            facts["note not finished"] = board.note
+        facts["frames dropped"] = str(writer.dropped_frames)
         outcome = {key.replace(" ", "_"): value for key, value in facts.items()}
         outcome |= {"outcome": report.outcome, "note": report.note} | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
-        writer.close(outcome, why=bad)
+        writer.close(outcome, CLOSE_PATIENCE_S if desk.reason else None, why=bad)
         _say_remarks(writer)
+        if live is not None and desk.reason:
+            live.close(VIEW_PATIENCE_S)
+    facts["frames dropped"] = str(writer.dropped_frames)  # more may have been, for want of time
     files = tuple(writer.files)
     facts["file"] = files_told(path, files)
-    recorded = Recorded(path, report, facts, files)
-    if view == "rrd":
+    recorded = Recorded(path, report, facts, files, low[0] if low else "", bool(desk.reason))
+    if view == "rrd" and desk.reason:
+        facts["recording for Rerun"] = f"not made, the run was stopped; flowrec export {path} makes it"
+    elif view == "rrd":
         from flowrec.export import write_rrd_of
 
         for name in recorded.sessions:
@@ -256,6 +302,24 @@ def files_told(path: Path, files: tuple[Path, ...]) -> str:
     if len(files) == 1:
         return f"{files[0]} ({size})"
     return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
+
+
+def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
+    """Where the session goes, with the remains of earlier runs there looked after and room on the disk."""
+    folder = out.parent if out is not None else Path()
+    made: dict[Path, str] = {}
+    if config.recording.recover_leftovers:
+        besides = frozenset(pieces(out.resolve())) if out is not None and overwrite else frozenset()
+        made = look_after(folder, besides)
+    path = out if out is not None else default_path(config)
+    same = next((file for file in made if run_path(file) == path), None)
+    if same is not None and not overwrite:
+        raise SessionError(
+            f"{same}: was left by a run that did not finish and has just been recovered ({made[same]}); "
+            "choose another name for this run with --out"
+        )
+    refuse_below(config.recording.disk_floor_gb, path.resolve().parent)
+    return path
 
 
 def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dict[str, str]:
@@ -284,7 +348,11 @@ def print_summary(recorded: Recorded) -> None:
     """The table at the end of a run and what to do next."""
     table("Session", ("", "value"), list(recorded.facts.items()))
     sessions = recorded.sessions
-    if recorded.exit_status and sessions:
+    if recorded.lost:
+        say(
+            f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
+        )
+    elif recorded.exit_status and sessions:
         say(
             f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; "
             f"see flowrec view {sessions[-1]}"

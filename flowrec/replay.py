@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.compare import Comparison
 from flowrec.config import Config, with_sets
+from flowrec.desk import Desk
 from flowrec.errors import SessionError, UsageError
 from flowrec.estimation.smoother import observe, smooth
 from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.run import LockstepWorker, RunReport, Sink, StopSwitch, run
+from flowrec.run import LockstepWorker, RunReport, Sink, run
 from flowrec.session import open_session, session_writer
 from flowrec.status import progress, warn
 from flowrec.store import SessionReader, SessionWriter
@@ -189,7 +190,7 @@ def replay(
             checker.see(tick)
         done(seconds(tick.stamp_ns - first_ns))
 
-    stop = StopSwitch()
+    desk = Desk()
     first_ns = start_ns if start_ns is not None else reader.first_ns
     with ExitStack() as stack:
         sinks: list[Sink] = []
@@ -198,17 +199,19 @@ def replay(
             writer = stack.enter_context(session_writer(out, config, chip, parent=path, overwrite=overwrite))
             sinks.append(writer if frames else WithoutFrames(writer))
         done = stack.enter_context(progress(f"replaying {path.name}", max(seconds(reader.last_ns - first_ns), 1e-3)))
-        with stop.armed():
-            report = run(pipeline, rig, worker, sinks, start=start, stop=stop, on_tick=on_tick, end_when_finished=False)
+        with desk.armed():
+            report = run(pipeline, rig, worker, sinks, start=start, desk=desk, on_tick=on_tick, end_when_finished=False)
         if report.ticks == 0:
             raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
         last = report.last
-        if stale and not stop.reason:
+        if stale and not desk.reason:
             last = _closing_work(pipeline, config, report.last, rig.recorded, stale)
             if last is not report.last and sinks:
                 sinks[0].write(last)
         if writer is not None:
-            writer.close({"outcome": "replayed", "note": f"replay of {path.name}", "ticks": str(report.ticks)})
+            ended = "stopped" if desk.reason else "replayed"
+            note = f"replay of {path.name}" + (f", {desk.reason}" if desk.reason else "")
+            writer.close({"outcome": ended, "note": note, "ticks": str(report.ticks)})
     return Replayed(
         source=path,
         recorded_config=recorded_config,

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
-from types import FrameType
+from functools import partial
 from typing import Any, Protocol
 
-from flowrec import work as working
 from flowrec.clocks import ClockWatch
+from flowrec.desk import Desk
 from flowrec.errors import RigError
-from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Timing
+from flowrec.messages import Currents, FlowField, Route, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
+from flowrec.work_process import WorkProcess
 
 _SWITCH_S = 2e-5
 _PASSED_OVER = 50  # frames in a row, then the robot is out of control
@@ -112,11 +110,8 @@ class ProcessWorker:
     """Works in a process of its own, so that the control loop of a live run never waits for it."""
 
     def __init__(self, pipeline: Pipeline) -> None:
-        self._pool = ProcessPoolExecutor(
-            1, mp_context=get_context("spawn"), initializer=working.start_process, initargs=(pipeline,)
-        )
-        self._pool.submit(working.warm_up)
-        self._pending: tuple[str, Future[FlowField | Route]] | None = None
+        self._process = WorkProcess(pipeline)
+        self._fills = ""  # of the order that is being worked on
 
     def submit(self, order: Tick) -> None:
         assert order.mission is not None
@@ -127,17 +122,18 @@ class ProcessWorker:
             observations=order.observations,
             mission=order.mission,
         )
-        self._pending = (FILLS[order.mission.wanted], self._pool.submit(working.work_in_process, known))
+        self._fills = FILLS[order.mission.wanted]
+        self._process.submit(known)
 
     def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
-        if self._pending is None or not self._pending[1].done():
+        result = self._process.result() if self._fills else None
+        if result is None:
             return {}
-        name, future = self._pending
-        self._pending = None
-        return {name: replace(future.result(), stamp_ns=stamp_ns)}
+        fills, self._fills = self._fills, ""
+        return {fills: replace(result, stamp_ns=stamp_ns)}
 
     def close(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._process.close()
 
 
 class Preloaded:
@@ -161,29 +157,6 @@ class Preloaded:
 
 
 @dataclass(slots=True)
-class StopSwitch:
-    """Raised by Ctrl-C or SIGTERM, read by the loop, which then ends the run in good order."""
-
-    reason: str = ""
-
-    @contextmanager
-    def armed(self) -> Iterator[StopSwitch]:
-        """Catch SIGINT and SIGTERM; a second one gets through."""
-
-        def stop(number: int, _frame: FrameType | None) -> None:
-            if self.reason:
-                raise KeyboardInterrupt
-            self.reason = signal.Signals(number).name
-
-        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-
-@dataclass(slots=True)
 class RunReport:
     """How a run went, for the outcome record and the summary."""
 
@@ -203,19 +176,20 @@ def run(
     worker: Worker,
     sinks: Sequence[Sink],
     start: Tick | None = None,
-    stop: StopSwitch | None = None,
+    desk: Desk | None = None,
     on_tick: Callable[[Tick], None] | None = None,
     queue_state: Callable[[], tuple[float, int]] = lambda: (0.0, 0),
     end_when_finished: bool = True,
     clocks: ClockWatch | None = None,
 ) -> RunReport:
-    """Run until the rig ends, the mission is finished and the coils are at zero, or somebody stops it.
+    """Run until the rig ends, the mission is finished and the coils are at zero, or somebody stops it at the `desk`.
 
     `start` is the tick to resume from; `queue_state` tells MB waiting for the disk and frames dropped.
     A stage that fails leaves its inputs, and only those, as the last tick in the sinks. A frame whose stamp does not
     grow enters no stage and is counted; `clocks` has it told, with what else clocks do, in the record.
     """
     report = RunReport()
+    desk = desk if desk is not None else Desk()
     tick = start if start is not None else Tick()
     first_ns: int | None = None
     clock = time.perf_counter
@@ -237,13 +211,18 @@ def run(
         sys.setswitchinterval(_SWITCH_S)
         stack.callback(worker.close)
         stack.enter_context(rig)
+        stack.enter_context(desk.left_when_late())
         for arrived in _growing(rig.inputs(), tick.stamp_ns, report, clocks):
+            if desk.overdue or (desk.reason and not end_when_finished):
+                break
+            desk.ticking = True
             begin = mark = clock()
-            due: dict[str, Any] = dict(worker.due(arrived.stamp_ns))
-            inputs = replace(arrived, **due)
-            if stop is not None and stop.reason:
-                asked = OperatorEvent(inputs.stamp_ns, "stop", f"stopped by {stop.reason}")
-                inputs = replace(inputs, operator=asked)
+            stamp_ns = arrived.stamp_ns
+            none: Mapping[str, FlowField | Route] = {}
+            due: dict[str, Any] = dict(desk.unless_stopped(partial(worker.due, stamp_ns), none))
+            held = tick.mission is not None and tick.mission.held_since_ns is not None
+            asked = desk.next(stamp_ns, held) if end_when_finished else None
+            inputs = replace(arrived, **due) if asked is None else replace(arrived, **due, operator=asked)
             last = tick
             mark = clock()
             try:
@@ -280,12 +259,17 @@ def run(
             report.contacts = inputs.truth.contacts if inputs.truth is not None else report.contacts
             if on_tick is not None:
                 on_tick(recorded)
-            if end_when_finished and tick.mission.finished and tick.currents.amplitude_mt == 0.0:
+            at_rest = tick.mission.finished and tick.currents.amplitude_mt == 0.0
+            if end_when_finished and at_rest and not desk.pending:
                 break
     report.wall_s = clock() - began
     report.last = tick
     if tick.mission is not None and tick.mission.finished:
         report.outcome, report.note = tick.mission.outcome, tick.mission.note
+    elif desk.reason:  # no tick came to say so
+        report.outcome, report.note = "stopped", desk.reason
+    if desk.reason and tick.currents is not None and tick.currents.amplitude_mt > 0.0:
+        report.note += "; the coils were switched off before they were down their ramp"
     return report
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, TextIO, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -18,16 +16,22 @@ from rich.table import Table
 from rich.text import Text
 
 from flowrec.errors import printable
+from flowrec.terminal import Outlet
 from flowrec.units import seconds
 
 if TYPE_CHECKING:  # what only a running session needs is imported then: a table is to be there at once
     from rich.live import Live
 
-    from flowrec.messages import Tick
+    from flowrec.messages import Event, Tick
 
 _PATIENCE_S = 2.0  # without a tick, then a person wants to know why
+_PERIOD_S = 0.12
+_GOODBYE_S = 0.3  # for the last events to be shown
+_EVENTS_LIMIT = 1000
+_NOTE_SHOWN = 60  # characters of a long note, from its end
 
-console = Console(stderr=True, highlight=False)
+outlet = Outlet()
+console = Console(file=cast(TextIO, outlet), highlight=False)
 
 
 def say(text: str) -> None:
@@ -43,73 +47,94 @@ def warn(text: str) -> None:
 class StatusLine:
     """Phase, frame rate, latency, drops, queue, file and disk of a running session; events as they come.
 
-    On a terminal one line is kept up to date; elsewhere (a log, CI) only the events are printed.
+    On a terminal one line is kept up to date; elsewhere (a log, CI) only the events are printed. All of it is done by
+    threads: the loop only leaves its tick here, and does not mind a terminal that is frozen or gone.
+
+    Parameters
+    ----------
+    file_bytes : of the session so far.
+    disk : what is to be said of the disk.
+    note : the note that a person is typing just now; None: none is.
     """
 
-    def __init__(self, folder: Path, file_bytes: Callable[[], int]) -> None:
-        self._folder = folder
+    def __init__(
+        self,
+        file_bytes: Callable[[], int],
+        disk: Callable[[], str] = lambda: "",
+        note: Callable[[], str | None] = lambda: None,
+    ) -> None:
         self._file_bytes = file_bytes
+        self._disk = disk
+        self._note = note
         self._arrivals: deque[float] = deque(maxlen=120)
         self._latency_ms: deque[float] = deque(maxlen=240)
-        self._shown = 0.0
-        self._live: Live | None = None
+        self._events: deque[Event] = deque(maxlen=_EVENTS_LIMIT)
         self._last: Tick | None = None
 
     @contextmanager
     def shown(self) -> Iterator[StatusLine]:
         """Keep the line on the screen for the length of the context."""
         over = threading.Event()
-        threading.Thread(target=self._explain_waiting, args=(over,), name="status", daemon=True).start()
-        try:
-            if not console.is_terminal:
+        with outlet.aside():
+            thread = threading.Thread(target=self._show, args=(over,), name="status", daemon=True)
+            thread.start()
+            try:
                 yield self
-                return
-            from rich.live import Live
-
-            with Live(Text("starting"), console=console, refresh_per_second=8, transient=True) as live:
-                self._live = live
-                yield self
-        finally:
-            over.set()
-            self._live = None
-
-    def _explain_waiting(self, over: threading.Event) -> None:
-        """Say once why nothing moves: after an installation numba compiles each part when it is first used."""
-        began = time.perf_counter()
-        while not over.wait(0.5):
-            if time.perf_counter() - max([began, *list(self._arrivals)[-1:]]) > _PATIENCE_S:
-                say("working ... (the first run after an installation compiles its numerics, some 20 s in all)")
-                return
+            finally:
+                over.set()
+                thread.join(_GOODBYE_S)
 
     def __call__(self, tick: Tick) -> None:
         """Take note of one tick."""
-        now = time.perf_counter()
-        self._arrivals.append(now)
+        self._arrivals.append(time.perf_counter())
         if tick.timing is not None:
             self._latency_ms.append(tick.timing.total_ms)
         if tick.event is not None and (self._last is None or tick.event is not self._last.event):
-            colour = {"warning": "yellow", "error": "red"}.get(tick.event.level, "cyan")
-            text = escape(printable(tick.event.text))
-            console.print(f"[dim]{seconds(tick.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
+            self._events.append(tick.event)
         self._last = tick
-        if self._live is not None and now - self._shown > 0.12:
-            self._shown = now
-            self._live.update(self.text(tick))
+
+    def _show(self, over: threading.Event) -> None:
+        began, explained = time.perf_counter(), False
+        with ExitStack() as stack:
+            live: Live | None = None
+            if console.is_terminal:
+                from rich.live import Live
+
+                live = stack.enter_context(Live(Text("starting"), console=console, auto_refresh=False, transient=True))
+            while True:
+                last = over.wait(_PERIOD_S)
+                while self._events:
+                    _print(self._events.popleft())
+                if last:
+                    return
+                arrivals = list(self._arrivals)
+                if not explained and time.perf_counter() - max([began, *arrivals[-1:]]) > _PATIENCE_S:
+                    explained = True
+                    say("working ... (the first run after an installation compiles its numerics, some 20 s in all)")
+                if live is not None and self._last is not None:
+                    live.update(self.text(self._last), refresh=True)
 
     def text(self, tick: Tick) -> Text:
         """The line itself."""
+        note = self._note()
+        if note is not None:
+            line = Text("note: ", style="bold", no_wrap=True, overflow="ellipsis")
+            line.append(f"{note[-_NOTE_SHOWN:]}_", style="bold yellow")
+            line.append("   Enter keeps it, Esc drops it", style="dim")
+            return line
         import numpy as np
 
         mission, timing = tick.mission, tick.timing
         phase = mission.phase if mission is not None else "start"
         wait = f" ({mission.wanted.replace('_', ' ')} ...)" if mission is not None and mission.wanted else ""
-        span = self._arrivals[-1] - self._arrivals[0] if len(self._arrivals) > 1 else 0.0
-        rate = (len(self._arrivals) - 1) / span if span > 0 else 0.0
-        latency = np.percentile(self._latency_ms, [50, 99]) if self._latency_ms else (0.0, 0.0)
-        free_gb = shutil.disk_usage(self._folder).free / 1e9
+        arrivals, latencies = list(self._arrivals), list(self._latency_ms)
+        span = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0.0
+        rate = (len(arrivals) - 1) / span if span > 0 else 0.0
+        latency = np.percentile(latencies, [50, 99]) if latencies else (0.0, 0.0)
         queue_mb, drops = (timing.queue_mb, timing.dropped_frames) if timing is not None else (0.0, 0)
         error = tick.demand.error_um if tick.demand is not None else float("nan")
         parts = [
+            *(["HELD"] if mission is not None and mission.held_since_ns is not None else []),
             f"{phase}{wait}",
             f"t {seconds(tick.stamp_ns):.1f} s",
             f"{rate:.0f} fps",
@@ -118,9 +143,15 @@ class StatusLine:
             f"drops {drops}",
             f"queue {queue_mb:.0f} MB",
             f"file {self._file_bytes() / 1e6:.0f} MB",
-            f"disk {free_gb:.0f} GB left",
+            self._disk(),
         ]
         return Text("  ".join(parts), style="bold", no_wrap=True, overflow="ellipsis")
+
+
+def _print(event: Event) -> None:
+    colour = {"warning": "yellow", "error": "red"}.get(event.level, "cyan")
+    text = escape(printable(event.text))
+    console.print(f"[dim]{seconds(event.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
 
 
 @contextmanager

@@ -6,7 +6,6 @@ order gives the same result, live in a worker process or again in a replay.
 
 from __future__ import annotations
 
-import signal
 from dataclasses import replace
 
 import numpy as np
@@ -48,22 +47,6 @@ def work(pipeline: Pipeline, order: Tick) -> FlowField | Route:
     return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
 
 
-_process_pipeline: Pipeline | None = None
-
-
-def start_process(pipeline: Pipeline) -> None:
-    """Make this process a worker for one pipeline; Ctrl-C is the main process' business."""
-    global _process_pipeline  # noqa: PLW0603 - the pool hands every order to the same process
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _process_pipeline = pipeline
-
-
 def warm_up() -> None:
     """Pay for imports and compilation before the first order comes."""
     warm_up_planning()
-
-
-def work_in_process(order: Tick) -> FlowField | Route:
-    """`work` inside the worker process."""
-    assert _process_pipeline is not None
-    return work(_process_pipeline, order)

@@ -176,7 +176,8 @@ def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Gene
             shape = [length if isinstance(length, int) else lengths[length] for length in shapes[name]]
             values[name] = (100.0 * rng.random(shape)).astype(arrays[name])
         else:
-            values[name] = {int: number, float: 1.5, float | None: None, bool: True, str: "words"}[hint]
+            made = {int: number, float: 1.5, float | None: None, int | None: number, bool: True, str: "words"}
+            values[name] = made[hint]
     values |= {name: value for name, value in _UNTROUBLED.items() if name in values}
     return kind(**{**values, "stamp_ns": stamp_ns})
 

@@ -44,11 +44,14 @@ class Coils:
     ramp_s: float = 0.2  # from nothing to the full amplitude and back
     amplifier: Amplifier = field(default_factory=Amplifier)
 
-    def drive(self, previous: Currents | None, demand: Demand, robot: Robot, finished: bool) -> Currents:
+    def drive(
+        self, previous: Currents | None, demand: Demand, robot: Robot, finished: bool, cut: bool = False
+    ) -> Currents:
         """The field and the currents at the time of a demand, and what the field is to do from then on.
 
         A robot that only rests keeps its field; when the run is finished, or no one knows where the robot is,
-        the amplitude goes down to zero. How the field gets from one command to the next says rotation.py.
+        the amplitude goes down to zero; when it is `cut`, at once. How the field gets from one command to the next
+        says rotation.py.
         """
         if previous is not None and previous.stamp_ns == demand.stamp_ns:
             return previous
@@ -56,6 +59,8 @@ class Coils:
         now = course(*self.state_and_order(previous)).after(dt_s) if previous is not None else Rotation()
         full_mt, followed_hz = self.full_mt(robot), _followed_hz(robot)
         amplitude_mt = self._ramped_mt(now.amplitude_mt, dt_s, full_mt, finished or math.isnan(demand.error_um))
+        if cut:
+            amplitude_mt = 0.0
         # The torque goes with the field, and so does the frequency up to which the robot follows it.
         limit_hz = followed_hz * min(amplitude_mt / self.amplitude_mt, 1.0)
         speed_um_s = math.hypot(demand.velocity_um_s[0], demand.velocity_um_s[1])

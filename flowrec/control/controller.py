@@ -65,8 +65,8 @@ class _Aim:
     heading: Vector | None = None
 
     @staticmethod
-    def at_rest(place_um: Vector, position_um: Vector) -> _Aim:
-        return _Aim(place_um, place_um, np.zeros(2), 0.0, _distance(place_um, position_um))
+    def at_rest(place_um: Vector, position_um: Vector, progress_s: float) -> _Aim:
+        return _Aim(place_um, place_um, np.zeros(2), progress_s, _distance(place_um, position_um))
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,8 @@ class Controller:
         """The demand after this frame, never above what the robot can do.
 
         In the phases survey and navigate the reference runs along the route, from its start when the phase begins;
-        else it is the place where the phase found the robot. A finished mission asks for nothing.
+        else it is the place where the phase found the robot. A finished mission asks for nothing. While the operator
+        holds the robot on its way, the reference is the place where that found it; then it goes on along the route.
 
         Parameters
         ----------
@@ -131,9 +132,12 @@ class Controller:
         lag_s = 0.0 if observer_knows_map else self.observer_lag_s / _hurry(robot)
         belief = blend(field, estimate, sent, self.map_error, lag_s)
         point = roll_forward(estimate.position_um, sent, dt_s, robot.delay, belief)
-        if mission.finished or mission.phase not in _FOLLOWING or route is None or not len(route.waypoints_um):
+        on_way = not mission.finished and mission.phase in _FOLLOWING
+        if not on_way or route is None or not len(route.waypoints_um) or mission.held_since_ns is not None:
             place = self._place(previous, mission, estimate, point)
-            aim = _Aim.at_rest(place, estimate.position_um)
+            # Held on its way, the robot goes on from there afterwards.
+            left_s = previous.progress_s if on_way and previous is not None else 0.0
+            aim = _Aim.at_rest(place, estimate.position_um, left_s)
         elif self.method == "policy" and route.time_to_go_s is not None:
             spacing_um = route.time_to_go_um_per_px or um_per_px
             aim = self._homing(route, route.time_to_go_s, estimate, belief.at(point), point, robot, spacing_um, dt_s)
@@ -232,7 +236,7 @@ class Controller:
 
     @staticmethod
     def _place(previous: Demand | None, mission: Mission, estimate: Estimate, point: Vector) -> Vector:
-        """Where to stay: as near as the robot can stop to where the phase found it, or it was found after a loss.
+        """Where to stay: as near as the robot can stop to where phase or hold found it, or it was found after a loss.
 
         NaN while it has not been seen, or not for so long that nothing is asked of it any more.
         """
@@ -242,7 +246,10 @@ class Controller:
             return previous.reference_um
         if not estimate.seen and not previous.velocity_um_s.any():
             return np.full(2, np.nan)
-        return point if mission.since_ns > previous.stamp_ns else previous.reference_um
+        since_ns = mission.since_ns
+        if mission.held_since_ns is not None and mission.phase in _FOLLOWING:
+            since_ns = max(since_ns, mission.held_since_ns)
+        return point if since_ns > previous.stamp_ns else previous.reference_um
 
     def _law(
         self,

@@ -51,14 +51,20 @@ class Commander:
         `demand` is the one of the frame before: it tells how far the robot is from its route.
         """
         now_ns = track.stamp_ns
+        asked = operator.action if operator is not None and operator.stamp_ns == now_ns else ""
         if previous is None:
-            return self._first(now_ns, assumed)
+            first = self._first(now_ns, assumed)
+            return self._told(first, now_ns, operator, asked) if asked else first
         if previous.finished:
             return previous
-        if operator is not None and operator.stamp_ns == now_ns and operator.action in ("stop", "zero"):
-            return self._finish(previous, now_ns, "stopped", operator.text or f"operator: {operator.action}")
+        if (told := self._told(previous, now_ns, operator, asked)).finished:
+            return told
         if (verdict := self._lost(previous, track, now_ns)) is not None:
             return verdict
+        if told is not previous:
+            return told
+        if previous.held_since_ns is not None:
+            return self._swept(previous, now_ns, track, demand, robot)
         answer = self._answer(previous, assumed, refined, route)
         if previous.wanted and answer is None:
             return previous
@@ -81,11 +87,41 @@ class Commander:
             note="",
         )
 
+    def _told(self, mission: Mission, now_ns: int, operator: OperatorEvent | None, asked: str) -> Mission:
+        """What the operator's word makes of the mission; the mission itself where it makes no difference.
+
+        A held mission does not go on, whatever it waits for, and its limits of time wait with it.
+        """
+        if asked in ("stop", "zero"):
+            note = operator.text if operator is not None else ""
+            return self._finish(mission, now_ns, "stopped", note or f"operator: {asked}")
+        since_ns = mission.held_since_ns
+        if asked == "pause" and since_ns is None:
+            return replace(mission, stamp_ns=now_ns, held_since_ns=now_ns)
+        if asked == "resume" and since_ns is not None:
+            held_ns = mission.held_ns + now_ns - since_ns
+            return replace(mission, stamp_ns=now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
+        return mission
+
+    @staticmethod
+    def _swept(held: Mission, now_ns: int, track: Track, demand: Demand | None, robot: Robot) -> Mission:
+        """Whether a held robot is carried off its place: said from two radii on, taken back within one."""
+        if not track.seen or demand is None or not math.isfinite(demand.error_um):
+            return held
+        swept = demand.error_um > (1.0 if held.swept else 2.0) * robot.radius
+        return held if swept == held.swept else replace(held, stamp_ns=now_ns, swept=swept)
+
+    @staticmethod
+    def _passed_s(mission: Mission, now_ns: int) -> float:
+        """How long the phase has lasted, the time under a hold left out."""
+        held_ns = mission.held_ns if mission.held_since_ns is None else mission.held_ns + now_ns - mission.held_since_ns
+        return seconds(now_ns - mission.since_ns - held_ns)
+
     def _lost(self, previous: Mission, track: Track, now_ns: int) -> Mission | None:
         if track.seen:
             return None
         if previous.phase == "start":
-            if seconds(now_ns - previous.since_ns) > self.find_limit_s:
+            if self._passed_s(previous, now_ns) > self.find_limit_s:
                 return self._finish(
                     previous,
                     now_ns,
@@ -132,7 +168,7 @@ class Commander:
             return self._next_after("survey", previous, now_ns, estimate, "")
         if previous.phase == "survey":
             assert route is not None
-            late = seconds(now_ns - previous.since_ns) > self._limit_s(self.survey_limit_s, route)
+            late = self._passed_s(previous, now_ns) > self._limit_s(self.survey_limit_s, route)
             if late or self._at_end(estimate, route, demand, robot):
                 note = "survey cut short by its time limit" if late else ""
                 return self._next_after("survey", previous, now_ns, estimate, note)
@@ -165,7 +201,7 @@ class Commander:
         if track.seen and math.dist(estimate.position_um, previous.goal_um) <= tolerance_um:
             return self._finish(previous, now_ns, "reached", "")
         limit_s = self._limit_s(self.navigate_limit_s, route)
-        if seconds(now_ns - previous.since_ns) > limit_s:
+        if self._passed_s(previous, now_ns) > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
             return self._finish(previous, now_ns, "timeout", note)
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * robot.radius
@@ -199,7 +235,7 @@ class Commander:
 
     @staticmethod
     def _enter(previous: Mission, now_ns: int, phase: str, note: str) -> Mission:
-        return replace(previous, stamp_ns=now_ns, phase=phase, since_ns=now_ns, wanted="", note=note)
+        return replace(previous, stamp_ns=now_ns, phase=phase, since_ns=now_ns, wanted="", note=note, held_ns=0)
 
     @staticmethod
     def _order(previous: Mission, now_ns: int, phase: str, wanted: str, estimate: Estimate, note: str = "") -> Mission:
@@ -208,6 +244,7 @@ class Commander:
             stamp_ns=now_ns,
             phase=phase,
             since_ns=previous.since_ns if phase == previous.phase else now_ns,
+            held_ns=previous.held_ns if phase == previous.phase else 0,
             request=previous.request + 1,
             wanted=wanted,
             requested_ns=now_ns,
@@ -226,4 +263,7 @@ class Commander:
             finished=True,
             outcome=outcome,
             note=note,
+            held_since_ns=None,
+            held_ns=0,
+            swept=False,
         )

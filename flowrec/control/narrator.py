@@ -1,10 +1,11 @@
-"""What a person should hear about a tick: phase changes, adopted results, loss of the robot."""
+"""What a person should hear about a tick: phase changes, adopted results, the operator, loss of the robot."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from flowrec.messages import Event, Health, Tick
+from flowrec.messages import Event, Health, Mission, OperatorEvent, Tick
+from flowrec.units import seconds
 
 
 def narrate(last: Tick, tick: Tick) -> Event | None:
@@ -34,6 +35,13 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
         lines += _alarms(last.health, tick.health)
         if tick.health.alarm and (last.health is None or tick.health.alarm != last.health.alarm):
             level = "warning"
+    if tick.operator is not None and tick.operator is not last.operator:
+        lines += _said(tick.operator)
+    if mission is not None:
+        held = _held(before, mission, tick)
+        lines += held
+        if held and mission.swept:
+            level = "warning"
     if mission is not None and (before is None or mission.phase != before.phase):
         said = f"{mission.outcome}" if mission.finished else mission.phase
         lines.append(f"mission: {said}" + (f" ({mission.note})" if mission.note else ""))
@@ -47,6 +55,36 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
     if not lines:
         return None
     return Event(tick.stamp_ns, level, "; ".join(lines))
+
+
+def _said(operator: OperatorEvent) -> list[str]:
+    """What the operator did, where the mission does not tell it."""
+    said = {"mark": "mark", "note": "note", "zero": "field to zero at once"}
+    if operator.action not in said:
+        return []
+    text = f": {operator.text}" if operator.text and operator.action != "zero" else ""
+    return [f"operator: {said[operator.action]}{text}"]
+
+
+def _held(before: Mission | None, mission: Mission, tick: Tick) -> list[str]:
+    """A hold that begins, ends, or fails."""
+    since_ns = before.held_since_ns if before is not None else None
+    if mission.held_since_ns is None:
+        if since_ns is None or mission.finished:
+            return []
+        return [f"goes on after {seconds(tick.stamp_ns - since_ns):.1f} s"]
+    lines = []
+    if since_ns is None:
+        wait = f" (the {mission.wanted.replace('_', ' ')} that it waits for goes on)" if mission.wanted else ""
+        lines.append(f"held by the operator{wait}")
+    if before is not None and mission.swept != before.swept:
+        demand = tick.demand
+        off = f" by {demand.error_um:.0f} um" if demand is not None else ""
+        why = ": the flow is faster than the robot" if demand is not None and demand.saturated else ""
+        lines.append(
+            f"carried off the place where it is held{off}{why}" if mission.swept else "held in its place again"
+        )
+    return lines
 
 
 def _alarms(before: Health | None, health: Health) -> list[str]:

@@ -119,13 +119,13 @@ class LiveView:
             self._dropped += 1
         self._queue.append(tick)
 
-    def close(self) -> None:
+    def close(self, patience_s: float = _CLOSE_S) -> None:
         """Show what is left, for a moment, and let go. A window stays open."""
         if self._closing.is_set():
             return
         self._closing.set()
-        end = time.monotonic() + _CLOSE_S
-        self._thread.join(_CLOSE_S)
+        end = time.monotonic() + patience_s
+        self._thread.join(patience_s)
         process = self._process
         if process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):

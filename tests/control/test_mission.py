@@ -148,3 +148,42 @@ def test_a_mission_message_is_new_whenever_it_is_another_object() -> None:
     second = world.tick(assumed=field(1))
     assert second.stamp_ns > first.stamp_ns
     assert replace(second, stamp_ns=first.stamp_ns).request == 2
+
+
+def test_under_a_hold_nothing_goes_on_and_no_limit_of_time_runs() -> None:
+    world = World(phases=("navigate",), patience=2.0)
+    world.tick(assumed=field(0))
+    world.tick()
+    assert world.tick(operator="pause").wanted == "route"  # noted; the work goes on
+    assert world.tick(route=route(1)).phase == "plan"
+    world.tick(operator="resume")
+    assert world.tick().phase == "navigate"
+    for _ in range(5):
+        world.tick()
+    held = world.tick(operator="pause")
+    assert held.held_since_ns is not None
+    assert world.tick(operator="pause") is held
+    for _ in range(30):
+        assert world.tick(at=GOAL) is held  # not even the end is reached
+    assert world.tick(operator="resume").held_since_ns is None
+    outcomes = [world.tick().outcome for _ in range(10)]
+    assert outcomes.index("timeout") == 7  # of 2 x 4 s and 5 s the first 6 had passed
+
+
+def test_a_held_robot_that_is_carried_off_is_swept_until_it_is_back() -> None:
+    world = World(phases=("navigate",))
+    world.tick(assumed=field(0))
+    world.tick()
+    world.tick(route=route(1))
+    world.tick(operator="pause")
+    radius_um = ROBOT.radius
+    assert not world.tick(error_um=1.9 * radius_um).swept
+    assert world.tick(error_um=2.1 * radius_um).swept
+    assert world.tick(error_um=1.1 * radius_um).swept
+    assert not world.tick(error_um=0.9 * radius_um).swept
+    assert world.tick(operator="zero").outcome == "stopped"
+    assert world.mission.held_since_ns is None
+
+
+def test_a_stop_on_the_very_first_frame_is_heard() -> None:
+    assert World().tick(operator="stop").outcome == "stopped"
