@@ -34,7 +34,8 @@ def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[
     images = pictures(640, 512, 4)
     moments = random.Random(0)  # noqa: S311  moments, not secrets
     lost_s: list[float] = []
-    too_short = broken = parts = 0
+    faults: list[str] = []
+    too_short = parts = 0
     with tempfile.TemporaryDirectory(dir=folder) as name, progress("killing", count) as done:
         for number in range(count):
             path = Path(name) / f"{number}.mcap"
@@ -66,13 +67,16 @@ def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[
                             if tick.stamp_ns > begin_ns and tick.track is not None:
                                 stamps_ns.append(tick.stamp_ns)
                                 numbers.append(round(2 * float(tick.track.position_um[0])))
-                    broken += recover(saved).changed
+                    if recover(saved).changed:
+                        faults.append(f"{saved.name}: recovery changes what was recovered")
                 except SessionError as error:
-                    # A part that has only begun is none yet; the run is what came before.
-                    if "before its first whole tick" not in str(error) or piece != left[-1]:
-                        broken += 1
+                    # A part that has only begun, maybe without its head, is none yet; the run is what came before.
+                    begun = "nothing can be saved" in str(error) or "nothing was recorded" in str(error)
+                    if not begun or piece != left[-1]:
+                        faults.append(str(error))
             if numbers != list(range(len(numbers))):
-                broken += 1
+                hole = next(place for place, number in enumerate(numbers) if place != number)
+                faults.append(f"tick {hole} is missing of a run in {len(left)} files")
             if stamps_ns:
                 lost_s.append((killed_ns - stamps_ns[-1]) / 1e9)
             too_short += not stamps_ns
@@ -83,7 +87,8 @@ def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[
         "kills": count,
         "before_the_first_flush": too_short,
         "files": parts,
-        "broken": broken,
+        "broken": len(faults),
+        "faults": faults,
         "lost_s": {
             "median": float(np.median(lost_s)) if lost_s else float("nan"),
             "p99": float(np.percentile(lost_s, 99)) if lost_s else float("nan"),
