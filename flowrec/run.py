@@ -19,7 +19,7 @@ from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
 from flowrec.work_process import WorkProcess
 
-_SWITCH_S = 2e-5
+_SWITCH_S = 1e-4
 _PASSED_OVER = 50  # frames in a row, then the robot is out of control
 
 
