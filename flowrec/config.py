@@ -57,6 +57,7 @@ class Recording:
     region: Literal["whole", "robot"] = "whole"
     full_every_s: float = 10.0  # so often an image is whole even so, and whenever the robot was not in sight
     region_pad_px: int = 16  # kept around what the tracker read
+    leave_out: tuple[str, ...] = ()  # topics not to be recorded, as in ["/view/*", "/truth/*"]
     queue_mb: float = 256.0  # waiting for the disk; a live run thins out its frames from the half of it on
     # A run in several files: each of about so many MB, or of so many seconds, or both; else it is in one.
     split_mb: float | None = None

@@ -42,6 +42,7 @@ def session_writer(
         overwrite=overwrite,
         pieces=_pieces_of(config) if in_pieces else None,
         region=region_of(config, chip, again=parent is not None),
+        leave_out=config.recording.leave_out,
     )
 
 

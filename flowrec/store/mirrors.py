@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import functools
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -54,29 +55,35 @@ MIRRORS = (ROBOT_POSE, ROBOT_POINT, PATH, PATH_POINTS, FLOW_ASSUMED, FLOW_REFINE
 
 
 class Mirrors:
-    """Makes the derived messages of one session; remembers the colour scale."""
+    """Makes the derived messages of one session, but for `unwanted` topics; remembers the colour scale."""
 
-    def __init__(self) -> None:
+    def __init__(self, unwanted: frozenset[str] = frozenset()) -> None:
+        self._wanted = {mirror for mirror in MIRRORS if mirror.path not in unwanted}
         self.top_um_s: float | None = None  # speed at the bright end of the scale, set by the first field
         self._robot_ns = -_ROBOT_EVERY_NS
 
     def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, bytes]]:
         """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
+        for mirror, stamp_ns, make in self._due(news):
+            if mirror in self._wanted:
+                yield mirror, stamp_ns, make()
+
+    def _due(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Callable[[], bytes]]]:
         robot = news.get("estimate") or news.get("track")
         if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
             self._robot_ns = robot.stamp_ns
-            yield ROBOT_POSE, robot.stamp_ns, _pose_in_frame(robot)
-            yield ROBOT_POINT, robot.stamp_ns, _mark(robot)
+            yield ROBOT_POSE, robot.stamp_ns, partial(_pose_in_frame, robot)
+            yield ROBOT_POINT, robot.stamp_ns, partial(_mark, robot)
         route = news.get("route")
         if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
-            yield PATH, route.stamp_ns, _poses_in_frame(route)
-            yield PATH_POINTS, route.stamp_ns, _point_cloud(route)
+            yield PATH, route.stamp_ns, partial(_poses_in_frame, route)
+            yield PATH_POINTS, route.stamp_ns, partial(_point_cloud, route)
         for name, mirror in (("assumed", FLOW_ASSUMED), ("refined", FLOW_REFINED)):
             field = news.get(name)
             if isinstance(field, FlowField) and _drawable(field):
-                yield mirror, field.stamp_ns, self._preview(field)
+                yield mirror, field.stamp_ns, partial(self._preview, field)
                 if mirror is FLOW_REFINED:
-                    yield FLOW_REFINED_GRID, field.stamp_ns, _grid(field)
+                    yield FLOW_REFINED_GRID, field.stamp_ns, partial(_grid, field)
 
     def _preview(self, field: FlowField) -> bytes:
         speed = np.nan_to_num(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]), posinf=0.0)

@@ -38,6 +38,7 @@ class Making:
     flush_s, sync_s : how old at most what is not with the operating system, and not kept by the disk, may become.
     overwrite : replace what is there.
     region : which part of most images is kept (region.py); None: all.
+    unwanted : topics that are not recorded.
     """
 
     path: Path
@@ -47,6 +48,7 @@ class Making:
     sync_s: float
     overwrite: bool
     region: Region | None = None
+    unwanted: frozenset[str] = frozenset()
 
     def said(self, tally: Tally) -> dict[str, str]:
         """What is added to every outcome."""

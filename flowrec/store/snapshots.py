@@ -159,7 +159,7 @@ class Snapshots:
         self._settings = snapshot
         self._run = run
         self._number = 0
-        self._mirrors = Mirrors()
+        self._mirrors = Mirrors(making.unwanted)
         self._sequences: Counter[str] = Counter()
         self._free: list[Packer] = []
         self._ring: deque[tuple[_Segment, Tally]] = deque()  # without those that still wait for images

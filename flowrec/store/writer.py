@@ -8,7 +8,7 @@ import operator
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -18,6 +18,7 @@ import numpy as np
 from flowrec.errors import SessionError
 from flowrec.messages import Drops, Frame, Message, Tick, Track, array_fields
 from flowrec.store.backlog import Backlog, Entry, News
+from flowrec.store.choice import left_out
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
 from flowrec.store.layout import FRAME_PATH
@@ -90,6 +91,7 @@ class SessionWriter:
     queue_limit_bytes : how much may wait for the disk.
     pieces : a Split, after which the run X.mcap is in the files X.part001.mcap, X.part002.mcap, ..., each of which can
         be read alone; or a Snapshot: nothing is written but X.snap001.mcap, ... around events.
+    leave_out : topics that are not recorded (choice.py), in patterns such as `/view/*`.
     region : keep of most images only the window around the robot (region.py); None: all of all images.
 
     Attributes
@@ -114,6 +116,7 @@ class SessionWriter:
         queue_limit_bytes: int = 256 << 20,
         pieces: Split | Snapshot | None = None,
         region: Region | None = None,
+        leave_out: Iterable[str] = (),
     ) -> None:
         self.path = Path(path)
         self.ticks = 0  # written so far
@@ -130,10 +133,10 @@ class SessionWriter:
         self._last_ns = -1
         self._failure: BaseException | None = None
         self._closed = False
-        part = header.part
-        self._carried_ns = part.carried_ns if part is not None else None
+        unwanted = left_out(leave_out)
+        self._unwanted = [topic.field for topic in TOPICS if topic.path in unwanted]
         refuse_if_taken(self.path, overwrite=overwrite)
-        making = Making(self.path, header, ENCODINGS[frames], flush_s, sync_s, overwrite, region)
+        making = Making(self.path, header, ENCODINGS[frames], flush_s, sync_s, overwrite, region, unwanted)
         run = os.urandom(8).hex()  # the same in all pieces, and in no other run
         self.remarks: deque[str] = deque()
         self._output: _Output
@@ -185,6 +188,8 @@ class SessionWriter:
         counted = int(tick.stamp_ns != self._carried_ns)  # one that another part has recorded counts there
         self.ticks += counted
         news = self._news_of(tick)
+        for field in self._unwanted:
+            news.pop(field, None)
         if self._block:
             window = self._window_of(news.get("frame"), tick.track)
             entry = Entry(tick.stamp_ns, news, _weight(news), counted, window=window)
