@@ -18,6 +18,7 @@ from flowrec.errors import FlowrecError, printable
 from flowrec.messages import Clocks, Frame, Message, Timing
 from flowrec.store import is_growing, not_finite
 from flowrec.store.audit import Audit, audit
+from flowrec.store.choice import is_left_out
 from flowrec.store.joints import fault_of, goes_on, without_part
 from flowrec.store.names import part_number, part_path, pieces
 from flowrec.topics import BY_FIELD, TOPICS, Role
@@ -168,7 +169,7 @@ def _check_file(path: Path, progress: Callable[[int], None] | None) -> tuple[Ver
     _judge_end(verdict, found)
     _judge_content(verdict, found)
     _judge_times(verdict, found, reading, config)
-    _judge_images(verdict, found, reading)
+    _judge_images(verdict, found, reading, config)
     _judge_numbers(verdict, reading)
     _judge_clocks(verdict, found, reading.clocks)
     _judge_replay(verdict, found, reading)
@@ -471,11 +472,14 @@ def _judge_times(verdict: Verdict, found: Audit, reading: _Reading, config: Conf
         verdict.odd("rate", f"{rate_hz:.1f} frames a second where {wanted_hz:g} were asked for")
 
 
-def _judge_images(verdict: Verdict, found: Audit, reading: _Reading) -> None:
+def _judge_images(verdict: Verdict, found: Audit, reading: _Reading, config: Config | None) -> None:
     images = found.counts["frame"] - reading.repeated["frame"]
     elsewhere = not images and found.header is not None and bool(found.header.parent)
     if elsewhere:
         verdict.fact("images", "none: a replay, the recorded tracks stand in")
+        return
+    if not images and config is not None and is_left_out(BY_FIELD["frame"].path, config.recording.leave_out):
+        verdict.fact("images", "none: recording.leave_out, the recorded tracks stand in")
         return
     dropped = max(reading.dropped, _whole(found.outcome, "dropped_frames"), _whole(found.outcome, "frames_dropped"))
     verdict.fact("images", f"{images} for {reading.ticks} ticks; {dropped} dropped by the writer")

@@ -58,7 +58,9 @@ class Recording:
     full_every_s: float = 10.0  # so often an image is whole even so, and whenever the robot was not in sight
     region_pad_px: int = 16  # kept around what the tracker read
     leave_out: tuple[str, ...] = ()  # topics not to be recorded, as in ["/view/*", "/truth/*"]
-    queue_mb: float = 256.0  # waiting for the disk; a live run thins out its frames from the half of it on
+    # Waiting for the disk; a live run thins out its frames from the half of it on. None: two seconds of the camera's
+    # images, 256 MB at least and 1 GB at most: disks now and then stop for most of a second.
+    queue_mb: float | None = None
     # A run in several files: each of about so many MB, or of so many seconds, or both; else it is in one.
     split_mb: float | None = None
     split_s: float | None = None

@@ -15,6 +15,9 @@ from flowrec.messages import Route
 from flowrec.provenance import provenance
 from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
 
+_QUEUE_S = 2.0
+_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
+
 
 def session_writer(
     path: Path,
@@ -37,7 +40,7 @@ def session_writer(
         frames=frames_of(config),
         flush_s=config.recording.flush_s,
         sync_s=config.recording.sync_s,
-        queue_limit_bytes=int(config.recording.queue_mb * 1e6),
+        queue_limit_bytes=queue_bytes_of(config),
         block=not live,
         overwrite=overwrite,
         pieces=_pieces_of(config) if in_pieces else None,
@@ -64,6 +67,15 @@ def region_of(config: Config, chip: Chip, again: bool = False) -> Region | None:
     shape = (camera.height_px, camera.width_px)
     sight = config.tracker.sight(chip, calibration_of(config, chip), config.robot, shape)
     return Region(sight.pad_px + recording.region_pad_px, sight.everywhere_px, recording.full_every_s, cut=not again)
+
+
+def queue_bytes_of(config: Config) -> int:
+    """How much may wait for the disk, in bytes."""
+    camera, chosen_mb = config.camera, config.recording.queue_mb
+    if chosen_mb is not None:
+        return int(chosen_mb * 1e6)
+    images = int(_QUEUE_S * camera.width_px * camera.height_px * (camera.rate_hz or 0.0))
+    return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
 
 
 def frames_of(config: Config) -> str:

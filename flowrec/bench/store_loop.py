@@ -25,7 +25,8 @@ from flowrec.store import SessionWriter, Snapshot
 
 RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 2448, 2048
-_RING = 64
+_QUEUE_BYTES = round(2.0 * RATE_HZ * _WIDTH * _HEIGHT)  # as `flowrec record` has it for this camera
+_RING = 140  # images, more than the queue holds
 _SOAK_RATE_HZ = 100.0
 _RING_S = 30.0
 _WARM_S = 5.0  # until the queue, the pools and the caches have their size
@@ -104,7 +105,7 @@ def _writer(kind: str, path: Path) -> SessionWriter | BareThread | BareProcess |
         return BareThread()
     if kind == "a bare process":
         return BareProcess(_WIDTH * _HEIGHT)
-    return SessionWriter(path, made_up_header(), frames=kind, overwrite=True)
+    return SessionWriter(path, made_up_header(), frames=kind, overwrite=True, queue_limit_bytes=_QUEUE_BYTES)
 
 
 def _queue_of(writer: object) -> tuple[float, int]:

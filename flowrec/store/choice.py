@@ -15,6 +15,11 @@ _NEEDED = {topic.path for topic in TOPICS if topic.role in (Role.INPUT, Role.OUT
 _PATHS = [*(topic.path for topic in TOPICS), *(mirror.path for mirror in MIRRORS)]
 
 
+def is_left_out(path: str, patterns: Iterable[str]) -> bool:
+    """Whether one of the patterns stands for a topic."""
+    return any(fnmatchcase(path, pattern) for pattern in patterns)
+
+
 def left_out(patterns: Iterable[str]) -> frozenset[str]:
     """The topics, views for other programs among them, that names or patterns such as `/view/*` stand for.
 
@@ -24,7 +29,7 @@ def left_out(patterns: Iterable[str]) -> frozenset[str]:
     """
     chosen: set[str] = set()
     for pattern in patterns:
-        found = {path for path in _PATHS if fnmatchcase(path, pattern)}
+        found = {path for path in _PATHS if is_left_out(path, [pattern])}
         if not found:
             raise UsageError(
                 f"recording.leave_out: no topic is called {pattern!r}; flowrec info lists those of a session"
