@@ -128,6 +128,8 @@ def _inside(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
     for _ in range(rng.integers(1, 4)):
         at = int(rng.integers(len(pieces)))
         messages = list(pieces[at].messages)
+        if not messages:  # the only one has been taken out before
+            continue
         number = int(rng.integers(len(messages)))
         messages[number : number + 1] = _spoiled(messages[number], messages, rng)
         pieces[at] = replace(pieces[at], messages=tuple(messages))
