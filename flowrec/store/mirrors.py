@@ -16,10 +16,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.messages import Estimate, FlowField, Message, Route, Track, Vector
+from flowrec.store.form import Payload
 from flowrec.store.schemas import foxglove_schema
 from flowrec.store.standard import timestamp
+from flowrec.store.wire import head_of
 from flowrec.units import NS_PER_S
 
 _UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
@@ -62,13 +65,13 @@ class Mirrors:
         self.top_um_s: float | None = None  # speed at the bright end of the scale, set by the first field
         self._robot_ns = -_ROBOT_EVERY_NS
 
-    def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, bytes]]:
+    def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Payload]]:
         """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
         for mirror, stamp_ns, make in self._due(news):
             if mirror in self._wanted:
                 yield mirror, stamp_ns, make()
 
-    def _due(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Callable[[], bytes]]]:
+    def _due(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Callable[[], Payload]]]:
         robot = news.get("estimate") or news.get("track")
         if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
             self._robot_ns = robot.stamp_ns
@@ -85,16 +88,18 @@ class Mirrors:
                 if mirror is FLOW_REFINED:
                     yield FLOW_REFINED_GRID, field.stamp_ns, partial(_grid, field)
 
-    def _preview(self, field: FlowField) -> bytes:
-        speed = np.nan_to_num(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]), posinf=0.0)
+    def _preview(self, field: FlowField) -> Payload:
+        speed = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
+        np.nan_to_num(speed, copy=False, posinf=0.0)
         if self.top_um_s is None:
             self.top_um_s = float(speed.max()) or 1.0
-        grey = np.clip(speed * (255.0 / self.top_um_s), 0.0, 255.0).astype(np.uint8)
+        solid = speed == 0.0
+        speed *= 255.0 / self.top_um_s
+        grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
         colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
-        colours[speed == 0.0] = 0
-        _, png = cv2.imencode(".png", colours)
-        image = _wire("CompressedImage")(timestamp=timestamp(field.stamp_ns), format="png", data=png.tobytes())
-        return _serialized(image)
+        colours[solid] = 0
+        png = cv2.imencode(".png", colours)[1]
+        return _with_data("CompressedImage", png, timestamp=timestamp(field.stamp_ns), format="png")
 
 
 def _drawable(field: FlowField) -> bool:
@@ -114,12 +119,12 @@ def _pose(x_um: float, y_um: float) -> dict[str, dict[str, float]]:
     return {"position": {"x": x_um, "y": y_um, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 
 
-def _pose_in_frame(robot: Estimate | Track) -> bytes:
-    return _timestamp(robot.stamp_ns) + _placed(robot.position_um)
+def _pose_in_frame(robot: Estimate | Track) -> Payload:
+    return (_timestamp(robot.stamp_ns) + _placed(robot.position_um),)
 
 
-def _mark(robot: Estimate | Track) -> bytes:
-    return _timestamp(robot.stamp_ns) + _placed(robot.position_um) + _mark_points()
+def _mark(robot: Estimate | Track) -> Payload:
+    return (_timestamp(robot.stamp_ns) + _placed(robot.position_um) + _mark_points(),)
 
 
 @functools.lru_cache(maxsize=4)  # both views of the robot are of the same moment
@@ -145,27 +150,29 @@ def _mark_points() -> bytes:
     return _serialized(_wire("PointCloud")(point_stride=points.itemsize, fields=fields, data=points.tobytes()))
 
 
-def _poses_in_frame(route: Route) -> bytes:
+def _poses_in_frame(route: Route) -> Payload:
     poses = [_pose(x, y) for x, y in route.waypoints_um.tolist()]
-    return _serialized(_wire("PosesInFrame")(timestamp=timestamp(route.stamp_ns), poses=poses))
+    return (_serialized(_wire("PosesInFrame")(timestamp=timestamp(route.stamp_ns), poses=poses)),)
 
 
-def _point_cloud(route: Route) -> bytes:
+def _point_cloud(route: Route) -> Payload:
     points = np.zeros((len(route.waypoints_um), 3), "<f4")
     points[:, :2] = route.waypoints_um
-    cloud = _wire("PointCloud")(
+    return _with_data(
+        "PointCloud",
+        points,
         timestamp=timestamp(route.stamp_ns),
         pose=_pose(0.0, 0.0),
         point_stride=12,
         fields=_float_fields("x", "y", "z"),
-        data=points.tobytes(),
     )
-    return _serialized(cloud)
 
 
-def _grid(field: FlowField) -> bytes:
+def _grid(field: FlowField) -> Payload:
     width, size_um = field.velocity_um_s.shape[1], field.um_per_px
-    grid = _wire("Grid")(
+    return _with_data(
+        "Grid",
+        np.ascontiguousarray(field.velocity_um_s, "<f4"),
         timestamp=timestamp(field.stamp_ns),
         pose=_pose(-0.5 * size_um, -0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
         column_count=width,
@@ -173,9 +180,15 @@ def _grid(field: FlowField) -> bytes:
         row_stride=8 * width,
         cell_stride=8,
         fields=_float_fields("vx", "vy"),
-        data=field.velocity_um_s.astype("<f4", copy=False).tobytes(),
     )
-    return _serialized(grid)
+
+
+def _with_data(name: str, data: NDArray[Any], **values: Any) -> Payload:
+    """A message with a field `data` that is not copied: protobuf makes three of it, and fields are large."""
+    wire = _wire(name)
+    view = data.reshape(-1).view(np.uint8).data
+    number = wire.DESCRIPTOR.fields_by_name["data"].number
+    return (_serialized(wire(**values)) + head_of(number, len(view)), view)
 
 
 def _float_fields(*names: str) -> list[dict[str, Any]]:

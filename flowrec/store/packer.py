@@ -69,7 +69,7 @@ class Packer:
             sequence, payload = encode_record(message, codec)
             self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
         for mirror, stamp_ns, view in self._mirrors.of(entry.news):
-            self._append(mirror.path, entry.stamp_ns, stamp_ns, (view,), None)
+            self._append(mirror.path, entry.stamp_ns, stamp_ns, view, None)
         full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]
         if full:
             self.take([builder.seal() for builder in full])
