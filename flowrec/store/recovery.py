@@ -133,7 +133,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     finally:
         reader.close()
         for remains in (draft, partial_path(draft)):
-            remains.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a read-only disk has had its say above
+                remains.unlink(missing_ok=True)
     if partial and target == final:
         path.unlink()
     return Recovered(target, ticks, done.duration_s, sum(lost.nbytes for lost in found.lost), lost)
