@@ -69,7 +69,10 @@ class Mirrors:
         """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
         for mirror, stamp_ns, make in self._due(news):
             if mirror in self._wanted:
-                yield mirror, stamp_ns, make()
+                # What can not be drawn is drawn anyhow; to judge numbers is not the business of a view.
+                with np.errstate(all="ignore"):
+                    view = make()
+                yield mirror, stamp_ns, view
 
     def _due(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Callable[[], Payload]]]:
         robot = news.get("estimate") or news.get("track")

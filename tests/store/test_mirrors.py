@@ -1,10 +1,13 @@
 """Views for other programs."""
 
+import dataclasses
+
 import numpy as np
 
-from flowrec.messages import Estimate
+from flowrec.messages import Estimate, Route
 from flowrec.store.mirrors import ROBOT_POINT, ROBOT_POSE, Mirrors
 from flowrec.store.schemas import foxglove_schema
+from tests.store.made_up import field_of
 
 
 def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
@@ -16,3 +19,10 @@ def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
             assert (seen.pose.position.x, seen.pose.position.y, seen.pose.position.z) == (x_um, y_um, 0.0)
             assert seen.pose.orientation.w == 1.0
             assert seen.timestamp.seconds * 10**9 + seen.timestamp.nanos == stamp_ns
+
+
+def test_numbers_beyond_all_measure_are_drawn_without_a_warning():
+    way_um = np.array([[0.0, 1e300], [np.nan, -np.inf]])
+    route = Route(1, 0, "x", True, "", way_um, np.arange(2.0))
+    field = dataclasses.replace(field_of(1, np.random.default_rng(0)), velocity_um_s=np.full((4, 4, 2), 3e38, "<f4"))
+    assert len(list(Mirrors().of({"route": route, "refined": field}))) == 4
