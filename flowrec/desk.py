@@ -20,7 +20,8 @@ from flowrec.messages import OperatorEvent
 
 Result = TypeVar("Result")
 
-RAMP_PATIENCE_S = 0.8  # for the coils to come down their ramp by ticks; then the rig switches them off
+RAMP_PATIENCE_S = 0.8  # for the coils to come down their ramp by ticks; the next tick then takes all of the field away
+_TICK_PATIENCE_S = 0.3  # for that tick to come; then the loop is left, and the rig switches the coils off
 _PROD_S = 0.1
 _REASONS = {
     signal.SIGINT: "stopped by SIGINT: Ctrl-C",
@@ -48,7 +49,7 @@ class Desk:
         self._since_s = 0.0
         self._by: int | None = None  # the signal that asked for the end
         self._waiting: deque[tuple[str, str]] = deque()
-        self._armed = False
+        self._armed = self._cut = False
         self._leave_when_late = self._at_work = False
 
     # ---- for those who ask, from any thread
@@ -73,6 +74,9 @@ class Desk:
 
     def next(self, stamp_ns: int, held: bool) -> OperatorEvent | None:
         """The event of the tick of this stamp."""
+        if self._late() > RAMP_PATIENCE_S and not self._cut:
+            self._cut = True
+            return OperatorEvent(stamp_ns, "zero", self.reason)
         if not self._waiting:
             return None
         action, text = self._waiting.popleft()
@@ -87,8 +91,8 @@ class Desk:
 
     @property
     def overdue(self) -> bool:
-        """The run should have ended by now."""
-        return bool(self.reason) and time.monotonic() - self._since_s > RAMP_PATIENCE_S
+        """The run should have ended by now, and its field is gone."""
+        return self._cut
 
     @contextmanager
     def left_when_late(self) -> Iterator[None]:
@@ -112,6 +116,10 @@ class Desk:
         except Interrupted:
             self._at_work = False
             return otherwise
+
+    def _late(self) -> float:
+        """For how long the run has been asked to end, in s; 0: it has not."""
+        return time.monotonic() - self._since_s if self.reason else 0.0
 
     # ---- signals
 
@@ -143,7 +151,7 @@ class Desk:
         self.stop(_REASONS[signal.Signals(number)])
 
     def _prodded(self, _number: int, _frame: FrameType | None) -> None:
-        late = self.overdue or not self.ticking
+        late = self._late() > RAMP_PATIENCE_S + _TICK_PATIENCE_S or not self.ticking
         if self.reason and (self._at_work or (self._leave_when_late and late)):
             raise Interrupted
 

@@ -119,7 +119,7 @@ def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_for_a_whi
     command.press("\r ")
     command.until(lambda: b"HELD" in command.said)
     command.press(" q")
-    command.until(command.ended, 10)
+    command.until(command.ended, 60)  # a first run compiles
     assert command.status == 0
     assert termios.tcgetattr(command.keys) == command.before
     assert command.outcome() == ("stopped", "stopped by the operator (q)")
@@ -135,7 +135,7 @@ def test_a_frozen_terminal_neither_stops_the_run_nor_its_end(command: Command) -
     grown = size().st_size + 1_000_000
     command.until(lambda: size().st_size > grown)
     os.kill(command.pid, signal.SIGTERM)
-    command.until(command.ended, 10)
+    command.until(command.ended, 60)  # a first run compiles
     assert command.status == 0
     assert command.outcome() == ("stopped", "stopped by SIGTERM")
     assert termios.tcgetattr(command.keys) == command.before
@@ -146,5 +146,5 @@ def test_when_the_terminal_is_closed_the_run_ends_in_good_order(command: Command
     time.sleep(0.1)
     os.close(command.inner)
     os.close(command.keys)
-    command.until(command.ended, 10)
+    command.until(command.ended, 60)  # a first run compiles
     assert command.outcome() == ("stopped", "stopped by SIGHUP: the terminal was closed")
