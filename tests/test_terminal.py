@@ -31,6 +31,7 @@ class Command:
         self.said, self.frozen, self.status = b"", False, None
         self.pid = os.fork()
         if self.pid == 0:  # only what is safe after a fork, then another program
+            signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests themselves may run under nohup
             _login_tty(inner)
             words = [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(out), *WORDS]
             os.execvp(words[0], words)
