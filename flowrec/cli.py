@@ -198,7 +198,7 @@ def view(
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out)
     if as_json:
-        typer.echo(json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size}))
+        typer.echo(_rrd_told(session, rrd))
     if screenshot is not None:
         for problem in take(rrd, screenshot, time_s=time):
             say(problem)
@@ -220,7 +220,7 @@ def export(
 
     rrd = write_rrd_of(session, out)
     if as_json:
-        typer.echo(json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size}))
+        typer.echo(_rrd_told(session, rrd))
 
 
 @app.command()
@@ -370,6 +370,11 @@ def calibrate(
         typer.echo(json.dumps(verb.figures(fit)))
     else:
         verb.show(fit, out)
+
+
+def _rrd_told(session: Path, rrd: Path) -> str:
+    """What was written of a session, as JSON."""
+    return json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size})
 
 
 def _pieces(split: str | None, snapshot: str | None) -> list[str]:

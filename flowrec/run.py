@@ -19,7 +19,7 @@ from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
 from flowrec.work_process import WorkProcess
 
-_SWITCH_S = 1e-4
+SWITCH_S = 1e-4
 _PASSED_OVER = 50  # frames in a row, then the robot is out of control
 
 
@@ -208,7 +208,7 @@ def run(
         # Reader and writer threads need the interpreter for moments only; at the default of 5 ms each of their turns
         # may cost a tick as much.
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
-        sys.setswitchinterval(_SWITCH_S)
+        sys.setswitchinterval(SWITCH_S)
         stack.callback(worker.close)
         stack.enter_context(rig)
         stack.enter_context(desk.left_when_late())

@@ -14,6 +14,7 @@ import numpy as np
 
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.messages import FlowField, Image, OperatorEvent, Tick
+from flowrec.run import SWITCH_S
 from flowrec.status import progress, table
 from flowrec.store import SessionWriter, Snapshot, Split
 
@@ -22,7 +23,6 @@ _WIDTH, _HEIGHT = 1224, 1024  # what two cores that do other things as well keep
 _FIELD = (512, 640)  # rows and columns of a flow field: 4 MB with its pressure, to be told anew in every part
 _RING = 64
 _WARM = 30  # ticks until queue and memory have their size
-_SWITCH_S = 1e-4  # as the loop has it (run.py)
 _NEAR = 20  # ticks from a split on
 
 
@@ -60,7 +60,7 @@ def _fly(
     queue_mb = 0.0
     cpu_s = time.process_time()
     before_s = sys.getswitchinterval()
-    sys.setswitchinterval(_SWITCH_S)
+    sys.setswitchinterval(SWITCH_S)
     with SessionWriter(path, made_up_header(), frames="zstd", pieces=pieces, overwrite=True) as writer:
         began = time.perf_counter()
         for number, tick in enumerate(_ticks(images, round(duration_s * _RATE_HZ))):

@@ -69,11 +69,11 @@ class ClockWatch:
             self._late_s, self._latest_s = self._late_s + late_s, max(self._latest_s, late_s)
             self._frames += 1
         said = self._said
-        counts = (self._wall_jumps, self._passed_over, *_counts(fit))
-        told = said is not None and counts == (said.wall_jumps, said.passed_over, *_told(said))
+        known = fit if fit is not None else Fit(0, 0, 0)
+        counts = (self._wall_jumps, self._passed_over, *_faults(known))
+        told = said is not None and counts == (said.wall_jumps, said.passed_over, *_faults(said))
         if said is not None and told and stamp_ns < said.stamp_ns + self._every_ns:
             return said
-        known = fit if fit is not None else Fit(0, 0, 0)
         self._said = Clocks(
             stamp_ns=stamp_ns,
             monotonic_ns=monotonic_ns,
@@ -149,9 +149,6 @@ def faults_of(last: Clocks) -> list[tuple[str, int]]:
     return [(what, count) for what, count in every if count]
 
 
-def _counts(fit: Fit | None) -> tuple[float, ...]:
-    return (fit.duplicates, fit.disordered, fit.resets, fit.jumps, fit.unit) if fit is not None else (0, 0, 0, 0, 0.0)
-
-
-def _told(said: Clocks) -> tuple[float, ...]:
-    return (said.duplicates, said.disordered, said.resets, said.jumps, said.unit)
+def _faults(of: Fit | Clocks) -> tuple[float, ...]:
+    """What is told at once when it changes."""
+    return (of.duplicates, of.disordered, of.resets, of.jumps, of.unit)

@@ -20,14 +20,13 @@ from flowrec.store import standard
 from flowrec.store.encoder import encoder_of
 from flowrec.store.form import Codec, Payload
 from flowrec.store.frames import FRAME_CODECS, RAW_IMAGE
-from flowrec.store.schemas import FieldForm, array_schema, forms_of, schema_of
+from flowrec.store.schemas import ARRAY_DATA, FieldForm, array_schema, forms_of, schema_of
 from flowrec.store.wire import LARGE_BYTES, cut_out, own
 
 _M = TypeVar("_M", bound=Message)
 # Up to here a loop over the wire's values is quicker than numpy's general conversion.
 _SHORT_VECTOR = 64
 _LONG_VECTOR = 1 << 16
-_ARRAY_DATA = 3  # number of the field of flowrec.Array that holds the bytes
 
 
 _codecs: dict[type[Any], Codec] = {
@@ -151,9 +150,9 @@ def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
     assert dtype is not None
-    rest, found = cut_out(field, (_ARRAY_DATA,))
+    rest, found = cut_out(field, (ARRAY_DATA,))
     parsed = array_schema().wire.FromString(rest)
-    return _unpacked_array(parsed, dtype, found.get(_ARRAY_DATA))
+    return _unpacked_array(parsed, dtype, found.get(ARRAY_DATA))
 
 
 def _unpacked_array(parsed: Any, dtype: np.dtype[Any], cut: memoryview | None = None) -> NDArray[Any]:

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from flowrec.store.form import Payload
-from flowrec.store.schemas import FieldForm, forms_of
-from flowrec.store.wire import BYTES, FIXED64, VARINT, tag, varint
+from flowrec.store.schemas import ARRAY_DATA, FieldForm, forms_of
+from flowrec.store.wire import BYTES, FIXED64, VARINT, head_of, tag, varint
 
 _DOUBLE = struct.Struct("<d")
 _F8 = np.dtype("<f8")
@@ -133,7 +133,7 @@ def _array(number: int, _optional: bool) -> _Put:
         if not size:
             parts.append(head + varint(len(front)) + front)
             return
-        front += tag(3, BYTES) + varint(size)
+        front += head_of(ARRAY_DATA, size)
         parts.append(head + varint(len(front) + size) + front)
         if size >= _UNCOPIED_BYTES and value.flags.c_contiguous:
             parts.append(value.reshape(-1).view(np.uint8).data)

@@ -12,8 +12,9 @@ from flowrec.errors import SessionError
 from flowrec.store.head import Head
 from flowrec.store.header import Part, SessionHeader
 from flowrec.store.mcap_file import is_growing
-from flowrec.store.names import part_number, part_path, partial_path, parts, pieces
+from flowrec.store.names import PARTIAL_SUFFIX, part_number, part_path, partial_path, parts, pieces
 from flowrec.store.source import UnfinishedError
+from flowrec.units import seconds
 
 _COUNTS = ("ticks", "dropped_frames", "frames_missing_from_camera")  # of an outcome: each part tells its own
 
@@ -122,7 +123,7 @@ def files_of(path: Path) -> list[Path]:
 
 def unfinished_of(path: Path) -> list[Path]:
     """What was begun of the run X.mcap and not finished: its file, parts and snapshots."""
-    return [file for file in pieces(path) if file.name.endswith(partial_path(path).suffix)]
+    return [file for file in pieces(path) if file.name.endswith(PARTIAL_SUFFIX)]
 
 
 def _refuse_unfinished(path: Path, found: Sequence[Path]) -> None:
@@ -174,7 +175,7 @@ def fault_of(piece: Piece, number: int, before: Piece | None) -> str | None:
     if part.carried_ns is None:
         return f"does not say where {before.path.name} ended"
     if part.carried_ns != before.last_ns:
-        gap_s = (part.carried_ns - before.last_ns) / 1e9
+        gap_s = seconds(part.carried_ns - before.last_ns)
         return f"goes on {abs(gap_s):.3f} s {'after' if gap_s > 0 else 'before'} the end of {before.path.name}"
     if piece.first_ns != part.carried_ns:
         return "does not begin with the tick that it says to repeat"

@@ -213,17 +213,7 @@ class Parts:
         if self._numbered:
             path = part_path(path, number)
             header = replace(header, part=Part(self._run, number, carried_ns=carried_ns))
-        recorder = Recorder(
-            path,
-            header,
-            frames=making.frames,
-            mirrors=self._mirrors,
-            flush_s=making.flush_s,
-            sync_s=making.sync_s,
-            overwrite=making.overwrite,
-            region=making.region,
-            wait=carried_ns is None,
-        )
+        recorder = Recorder(path, header, making, self._mirrors, wait=carried_ns is None)
         return _Part(self, number, recorder)
 
     def _continued(self, part: _Part) -> dict[str, str]:

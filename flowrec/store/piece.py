@@ -50,6 +50,16 @@ class Making:
     region: Region | None = None
     unwanted: frozenset[str] = frozenset()
 
+    @property
+    def sync_every_s(self) -> float:
+        """A message waits up to half of the time for the next fsync to begin, and the other half until it is done."""
+        return self.sync_s / 2
+
+    @property
+    def flush_every_s(self) -> float:
+        """Begun a fifth early, a flush is over in time also on a busy machine."""
+        return 0.8 * min(self.flush_s, self.sync_every_s)
+
     def said(self, tally: Tally) -> dict[str, str]:
         """What is added to every outcome."""
         if self.frames.lossless:
@@ -66,9 +76,7 @@ class Piece:
     ----------
     path : its name.
     header : goes first into it.
-    frames : how images travel.
-    overwrite : replace what is there.
-    region : which part of most images is kept; None: all.
+    making : what it is made with.
 
     Attributes
     ----------
@@ -79,26 +87,18 @@ class Piece:
     PieceError : from any method, when the disk refuses.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        header: SessionHeader,
-        frames: FrameEncoding,
-        *,
-        overwrite: bool,
-        region: Region | None = None,
-    ) -> None:
+    def __init__(self, path: Path, header: SessionHeader, making: Making) -> None:
         self.path = path
         self.partial_path = partial_path(path)
         self.broken = False
-        self._overwrite = overwrite
+        self._overwrite = making.overwrite
         try:
-            self._file = McapFile(self.partial_path, truncate=overwrite)
+            self._file = McapFile(self.partial_path, truncate=making.overwrite)
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         try:
             self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
-            for record in (*records_of(header), *declarations(frames, region)):
+            for record in (*records_of(header), *declarations(making.frames, making.region)):
                 self._file.add(record)
         except OSError as error:
             self._file.close()

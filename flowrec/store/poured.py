@@ -33,9 +33,9 @@ class Poured:
     def __init__(self, path: Path, header: SessionHeader, making: Making, *, limit_bytes: int) -> None:
         self.path = path
         self.finished = False
-        self._piece = Piece(path, header, making.frames, overwrite=making.overwrite, region=making.region)
+        self._piece = Piece(path, header, making)
         self._limit_bytes = limit_bytes
-        self._sync_every_s = making.sync_s / 2
+        self._sync_every_s = making.sync_every_s
         self._synced_s, self._synced_size = time.monotonic(), 0
         self._waiting_bytes = 0
         self._written = threading.Condition()

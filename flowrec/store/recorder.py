@@ -10,12 +10,10 @@ from pathlib import Path
 from flowrec.errors import SessionError
 from flowrec.store.backlog import Entry
 from flowrec.store.chunk import Sealed, kept
-from flowrec.store.frames import FrameEncoding
 from flowrec.store.header import SessionHeader
 from flowrec.store.mirrors import Mirrors
 from flowrec.store.packer import Packer
-from flowrec.store.piece import Piece, PieceError
-from flowrec.store.region import Region
+from flowrec.store.piece import Making, Piece, PieceError
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
@@ -31,6 +29,9 @@ class Recorder:
 
     Parameters
     ----------
+    path, header : of the file.
+    making : what it is made with.
+    mirrors : makes the views for other programs.
     wait : until the disk keeps the head; else it does so with what comes next.
 
     Attributes
@@ -46,23 +47,16 @@ class Recorder:
         self,
         path: Path,
         header: SessionHeader,
-        *,
-        frames: FrameEncoding,
+        making: Making,
         mirrors: Mirrors,
-        flush_s: float,
-        sync_s: float,
-        overwrite: bool,
+        *,
         wait: bool = True,
-        region: Region | None = None,
     ) -> None:
-        # A message waits up to half of the time for the next fsync to begin, and the other half until it is done.
-        self._sync_every_s = sync_s / 2
-        # Begun a fifth early, a flush is over in time also on a busy machine.
-        self._flush_s = 0.8 * min(flush_s, self._sync_every_s)
+        self._sync_every_s, self._flush_s = making.sync_every_s, making.flush_every_s
         self._mirrors = mirrors
-        self._piece = Piece(path, header, frames, overwrite=overwrite, region=region)
-        self._frames = frames
-        self._packer = Packer(frames, mirrors, self._piece.add_chunks)
+        self._piece = Piece(path, header, making)
+        self._frames = making.frames
+        self._packer = Packer(making.frames, mirrors, self._piece.add_chunks)
         self.first_bytes = self._piece.size
         self._beginning: Future[None] | None = None
         self._held: list[Sealed] = []

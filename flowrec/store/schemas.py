@@ -29,6 +29,8 @@ _SCALARS: dict[Any, Any] = {
 }
 _ARRAY_FILE = "flowrec/Array.proto"
 
+ARRAY_DATA = 3  # number of the field of flowrec.Array that holds the bytes
+
 _pool = descriptor_pool.DescriptorPool()
 _files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
@@ -90,7 +92,7 @@ def array_schema() -> Schema:
     message = file.message_type.add(name="Array")
     message.field.add(name="shape", number=1, type=_Field.TYPE_UINT32, label=_Field.LABEL_REPEATED)
     message.field.add(name="dtype", number=2, type=_Field.TYPE_STRING, label=_Field.LABEL_OPTIONAL)
-    message.field.add(name="data", number=3, type=_Field.TYPE_BYTES, label=_Field.LABEL_OPTIONAL)
+    message.field.add(name="data", number=ARRAY_DATA, type=_Field.TYPE_BYTES, label=_Field.LABEL_OPTIONAL)
     return _add(file, "flowrec.Array")
 
 

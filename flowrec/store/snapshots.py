@@ -168,7 +168,7 @@ class Snapshots:
         self._ending: list[_Taken] = []
         self._ended_bytes = 0
         self._flushed_s, self._flushed_ns = time.monotonic(), 0
-        self._flush_s = 0.8 * min(making.flush_s, making.sync_s / 2)
+        self._flush_s = making.flush_every_s
         self._dropped = 0
         self._dropped_ns: int | None = None
         self._stretches = Stretches(self._segment({}, None))
@@ -373,7 +373,7 @@ class Snapshots:
         """Whether a file can be made here; better now than at the event."""
         making = self._making
         path = snapshot_path(making.path, 1)
-        piece = Piece(path, making.header, making.frames, overwrite=making.overwrite, region=making.region)
+        piece = Piece(path, making.header, making)
         piece.close()
         piece.partial_path.unlink(missing_ok=True)
 

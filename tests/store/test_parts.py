@@ -231,8 +231,13 @@ def test_recover_makes_a_run_whole_whatever_is_left_of_its_last_part(run, whole,
     assert [again.changed for again in recover_run(run)] == [False]
 
 
-def test_the_verbs_take_the_run(run, whole, tmp_path, monkeypatch):
+@pytest.fixture
+def rrd_only_begun(monkeypatch):
+    """What Rerun makes of a session is tested elsewhere, and takes its time."""
     monkeypatch.setattr("flowrec.export.write_rrd", lambda target, *_, **__: target.touch())
+
+
+def test_the_verbs_take_the_run(run, whole, tmp_path, rrd_only_begun):
     verdict = check(run)
     assert (verdict.word, verdict.exit_status, len(verdict.parts)) == ("good", 0, 4), verdict.lines()
     assert verdict.facts["parts"] == "4, each begins where the one before ends"
@@ -282,8 +287,7 @@ def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut
     assert SessionReader(tmp_path / "again.mcap").header.parent["sha256"] == session_sha256([files[-1]])
 
 
-def test_recover_and_export_answer_in_json(run, monkeypatch):
-    monkeypatch.setattr("flowrec.export.write_rrd", lambda target, *_, **__: target.touch())
+def test_recover_and_export_answer_in_json(run, rrd_only_begun):
     partial = partial_path(part_path(run, 4))
     part_path(run, 4).rename(partial)
     done = CliRunner().invoke(app, ["recover", str(run), "--json"], catch_exceptions=False)
