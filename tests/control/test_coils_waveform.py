@@ -16,6 +16,7 @@ from flowrec.control.rotation import Order, Rotation, course
 from flowrec.control.waveform import block, outputs, tail
 from flowrec.messages import Demand
 from flowrec.robot import Robot
+from flowrec.units import wrap_rad
 
 SKEWED = ((2.1, 0.1, -0.05), (0.08, 1.9, 0.1), (0.02, -0.1, 1.5))
 BIAS = np.array([0.02, -0.01, -0.045])
@@ -169,3 +170,29 @@ def test_a_turn_waits_for_half_a_revolution_at_most_and_a_turn_back_for_nothing(
     assert back.slew_s == 0.0 and back.heading_rad(0.0) == pytest.approx(0.2 - math.pi)
     off = course(replace(state, amplitude_mt=0.0), Order(20.0, 1.5, 4.0, 20.0))
     assert off.slew_s == 0.0 and off.spin == 1 and float(off.plane(0.0)) == 1.5
+
+
+@settings(max_examples=200, deadline=None)
+@given(angles, angles, angles, share, st.sampled_from([0.5, 20.0, 30.0]))
+@example(3.0, -3.0, 0.3, 1.0, 0.5)  # across the cut of the angle, forward
+@example(-3.0, 3.0, 0.3, 1.0, 0.5)
+@example(-3.0, 0.2, 0.3, 1.0, 0.5)  # and backward
+@example(3.1, -0.2, 0.3, 1.0, 0.5)
+def test_the_plane_turns_the_shorter_way_and_by_a_quarter_turn_at_most(plane, heading, phase, amplitude, frequency):
+    state = Rotation(phase % (2 * math.pi), plane, 0.1 + amplitude)
+    order = Order(frequency, heading, state.amplitude_mt, 30.0)
+    way = course(state, order)
+    assert abs(way.plane_end_rad - plane) <= 0.5 * math.pi + 1e-8
+    assert abs(way.slew_rad_s) * way.slew_s <= 0.5 * math.pi + 1e-8
+    # Where it ends the robot travels as it was told to.
+    end = way.heading_rad(way.slew_s + 1e-9)
+    assert math.cos(end - heading) == pytest.approx(1.0, abs=1e-9)
+    # No direction is special: with everything turned by an angle the course is the same, but for that angle.
+    turn = 1.0
+    turned = course(
+        replace(state, plane_rad=wrap_rad(plane + turn)), replace(order, heading_rad=wrap_rad(heading + turn))
+    )
+    if abs(abs(way.plane_end_rad - plane) - 0.5 * math.pi) > 1e-6:  # to a quarter turn both ways are as short
+        assert turned.spin == way.spin
+        assert turned.slew_s == pytest.approx(way.slew_s, abs=1e-9)
+        assert turned.slew_rad_s * turned.slew_s == pytest.approx(way.slew_rad_s * way.slew_s, abs=1e-6)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from flowrec.estimation import Kalman, Luenberger, Observer, Sampler
 from flowrec.messages import Applied, Estimate, FlowField, Track
@@ -79,6 +80,33 @@ def test_with_the_right_noise_the_normalised_innovation_squared_is_two() -> None
     _, estimates, _, _ = swim(observer, 10.0, 120.0, flow_noise=1000.0, swirl=0.0)
     nis = np.array([estimate.nis for estimate in estimates[60:]])
     assert abs(np.nanmean(nis) - 2.0) < 3.0 * 2.0 / math.sqrt(len(nis))
+
+
+def test_the_process_noise_is_that_of_van_loans_integral() -> None:
+    # d(x, v) = (v, 0) dt + (s dW1, q dW2): exp of [[-A, Q], [0, A^T]] dt holds the covariance of one step (Van Loan,
+    # 1978). For q = 1, s = 0 that is [[dt^3 / 3, dt^2 / 2], [dt^2 / 2, dt]].
+    q, drift, dt = 1700.0, 40.0, 1.0 / RATE_HZ
+    kalman = Kalman(position_noise_um=5.0, flow_noise_um2_s3=q, drift_um2_s=drift)
+    first = kalman.estimate(None, track(0, np.zeros(2)), applied(0, np.zeros(2)), ROBOT)
+    _, covariance, _, step = kalman.predict(first, track(1, np.zeros(2)), applied(1, np.zeros(2)), ROBOT)
+    model, spread = np.zeros((4, 4)), np.diag([drift, drift, q, q])
+    model[:2, 2:] = np.eye(2)
+    block = expm(np.block([[-model, spread], [np.zeros((4, 4)), model.T]]) * dt)
+    exact = block[4:, 4:].T @ block[:4, 4:]
+    assert exact[0, 2] == pytest.approx(0.5 * q * dt**2)
+    # Seconds to the ninth decimal, as stamps have them.
+    np.testing.assert_allclose(covariance - step @ first.covariance @ step.T, exact, rtol=1e-6, atol=1e-9)
+
+
+def test_two_frames_without_the_robot_widen_the_belief_as_one_of_both_lengths() -> None:
+    kalman = Kalman(position_noise_um=5.0, flow_noise_um2_s3=1700.0)
+    _, estimates, _, _ = swim(Observer(kalman=kalman), 5.0, 2.0)
+    last, none, nowhere = estimates[-1], np.zeros(2), np.full(2, np.nan)
+    once = kalman.estimate(last, track(61, nowhere, seen=False), applied(61, none), ROBOT)
+    twice = kalman.estimate(last, track(60, nowhere, seen=False), applied(60, none), ROBOT)
+    twice = kalman.estimate(twice, track(61, nowhere, seen=False), applied(61, none), ROBOT)
+    np.testing.assert_allclose(twice.covariance, once.covariance, rtol=1e-6)
+    np.testing.assert_allclose(twice.position_um, once.position_um, rtol=1e-6)
 
 
 def vortex(share: float = 1.0, spacing_um: float = 20.0) -> FlowField:
@@ -224,3 +252,24 @@ def test_observations_are_spaced_out_and_honest_about_their_noise() -> None:
     true = 0.2 * across(rows.position_um)
     pulls = (rows.flow_um_s - true) / rows.std_um_s[:, None]
     assert np.sqrt(np.mean(np.square(pulls[5:]))) < 1.5
+
+
+def test_an_observation_of_a_lagging_filter_is_placed_where_the_robot_was() -> None:
+    # Flow across the way, growing along it: v = (0, g x). A filter that takes it for constant, with the steady gains
+    # K_x and K_v, follows a ramp K_x / K_v late, so what it states belongs to x - c K_x / K_v. The ramp lasts.
+    growth, pace = 0.5, 200.0  # 1/s, um/s
+    kalman = Kalman(position_noise_um=5.0, flow_noise_um2_s3=4000.0, drift_um2_s=0.0)
+    before, rows = None, None
+    for index in range(180):
+        here = np.array([pace * index / RATE_HZ, 0.0])
+        # Held on a straight line against the flow at the middle of the step.
+        against = growth * (here[0] - 0.5 * pace / RATE_HZ) / RATE_HZ
+        moved = np.array([pace / RATE_HZ, -against]) if index else np.zeros(2)
+        estimate = kalman.estimate(before, track(index, here), applied(index, moved), ROBOT)
+        rows, before = Sampler().collect(rows, before, estimate, ROBOT), estimate
+    assert rows is not None and before is not None
+    late = slice(len(rows.position_um) // 2, None)
+    missed = rows.flow_um_s[late, 1] - growth * rows.position_um[late, 0]
+    lag_um_s = growth * pace * float(before.covariance[0, 0] / before.covariance[0, 2])
+    assert lag_um_s > 10.0, "without a correction much would be missed"
+    assert np.abs(missed).max() < 0.1 * lag_um_s

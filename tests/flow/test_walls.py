@@ -78,6 +78,41 @@ def test_a_plane_channel_at_any_angle_is_solved_without_error_when_its_walls_are
     assert np.abs(channel.errors(pressure)).max() < 5e-4
 
 
+@pytest.mark.parametrize("depth_px", [1.0, 3.0])
+@pytest.mark.parametrize("degrees", [0.0, 7.0, 20.0, 31.0, 45.0])
+def test_a_shallow_channel_at_any_angle_has_the_resistance_of_brinkmans_equation(degrees, depth_px):
+    # mu u'' - 12 mu u / H^2 = dp/dx between walls at +-a, of mean speed U: with r = sqrt(12) / H
+    # dp/dx = -mu r^2 U / (1 - tanh(r a) / (r a)), here over the slope -3 mu U / a^2 without friction.
+    channel = Oblique(8.0, degrees, (0.13, 0.27))
+    drawn = analytic(channel.distance, channel.chip.mask.shape, 2)
+    chip = replace(channel.chip, depth_um=depth_px * UM_PER_PX)
+    _, _, pressure = solved(chip, 2, drawn)
+    ra = np.sqrt(12.0) / depth_px * channel.width / 2
+    exact = ra**2 / (1.0 - np.tanh(ra) / ra) / 3.0
+    slope, drop = channel.errors(pressure)
+    assert slope + 1.0 == pytest.approx(exact, rel=0.01)
+    assert drop + 1.0 == pytest.approx(exact, rel=0.01)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 7.0, 20.0, 31.0, 45.0])
+def test_a_very_shallow_channel_flows_as_fast_in_cut_faces_as_in_its_middle(degrees):
+    # Depth much below the width: v = -H^2 / (12 mu) grad p, the same everywhere but for H / sqrt(12) beside the walls,
+    # here 0.07 px.
+    channel = Oblique(8.0, degrees, (0.13, 0.27))
+    drawn = analytic(channel.distance, channel.chip.mask.shape, 1)
+    equations, moving, _ = solved(replace(channel.chip, depth_um=0.25 * UM_PER_PX), 1, drawn)
+    j, i = np.nonzero(equations.grid.number_u >= 0)
+    faces = equations.grid.number_u[j, i]
+    share = equations.grid.share[faces]
+    core = np.abs(channel.places(i - 0.5, j)[0]) < channel.length / 8
+    speed = moving[faces] / share / (SPEED * 1e-6 * np.cos(channel.angle))
+    whole, cut = speed[core & (share == 1.0)], speed[core & (share < 1.0) & (share > 0.1)]
+    assert len(cut) > 5
+    assert whole.min() > 0.97 and whole.max() < 1.02
+    # The mean over an open part that is narrow holds more of what the wall slows.
+    assert cut.min() > 0.8 and cut.max() < 1.0
+
+
 @pytest.mark.parametrize(("width", "mean", "largest"), [(8.0, 0.01, 0.03), (4.0, 0.02, 0.08)])
 def test_a_mask_of_an_oblique_channel_has_its_resistance_at_every_angle(width, mean, largest):
     offsets = np.random.default_rng(3).uniform(0.0, 1.0, (14, 2))

@@ -11,7 +11,7 @@ from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver, kept, sample
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
-from flowrec.refine.model_error import ModelError
+from flowrec.refine.model_error import ModelError, around
 
 
 def test_assimilation_recovers_the_truth_from_noisy_observations(twin):
@@ -148,6 +148,28 @@ def test_copies_of_an_observation_count_once_and_a_std_that_is_too_small_is_wide
     busy = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
     score = (widened.velocity_um_s - case.true.velocity_um_s)[busy] / widened.std_um_s[busy]
     assert np.abs(score).max() < 4.0
+
+
+def test_many_observations_in_one_square_say_no_more_of_the_model_than_one_and_in_many_squares_they_do(twin):
+    # The stem is 8 px wide; where the observations' own noise is far below the model's error only that counts.
+    case = twin()
+    settings = Assimilate(model=ModelError(coarse_share=0.1), doubt_walls=False)
+
+    def posterior_std(columns, rows):
+        points = 10.0 * np.array([[x, y] for x in columns for y in rows], float)
+        flow = sample(case.assumed, points) + 0.3 * np.random.default_rng(0).standard_normal(points.shape)
+        observed = Observations(0, points, flow, np.full(len(points), 0.3))
+        refined = Refiner(assimilate=settings).refine(case.assumed, observed, case.chip, case.solver)
+        # What the parameters add to the model's own error at that place.
+        number = np.count_nonzero(case.chip.mask[:24]) + np.count_nonzero(case.chip.mask[24, :5])
+        left = 0.1 * around(case.chip.mask, case.assumed.velocity_um_s[case.chip.mask].astype(float))[number]
+        return np.sqrt(refined.std_um_s[24, 5, 0] ** 2 - left**2)
+
+    one = posterior_std([8], [24])
+    square = posterior_std(range(8, 12), range(24, 27))
+    squares = posterior_std(range(2, 14, 4), range(20, 28))
+    assert square > 0.9 * one
+    assert squares < 0.6 * one
 
 
 @pytest.mark.parametrize("which", ["one", "two that contradict", "std of 0", "huge std"])

@@ -1,0 +1,60 @@
+"""What is believed beforehand against the solver itself: the flow of a chip whose fluid is as the belief says."""
+
+import numpy as np
+import pytest
+
+from flowrec.flow import FlowSolver
+from flowrec.refine.prior import Prior, Widths
+
+WIDTHS = Widths(0.25, 0.0, 0.10, 0.30, 0.10, 0.0, 0.0)
+
+
+def seen(field, chip):
+    return field.velocity_um_s[chip.mask].astype(float)
+
+
+@pytest.fixture
+def driven(twin):
+    """A chip that an inlet and two pressures drive about as much."""
+    return twin(assumed=(100.0, 0.004, -0.004)).chip
+
+
+def test_a_thicker_fluid_moves_the_flow_as_the_solver_says_at_the_same_pressures(driven):
+    solver = FlowSolver(convection=False)
+    response = solver.response(driven)
+    prior = Prior.of(WIDTHS, driven, 0.01)
+    count = len(driven.openings)
+    z = np.zeros(len(prior.spread))
+    z[count] = 1.0
+    predicted = np.tensordot(prior.offset(z), response.modes, axes=1)
+    step = 0.02
+    thick, thin = (
+        seen(solver.solve(driven.with_boundary(driven.boundary_values, float(np.exp(sign * step)))), driven)
+        for sign in (1, -1)
+    )
+    slope = 0.30 * (thick - thin) / (2.0 * step)
+    assert np.abs(slope).max() > 2.0, "the pressures drive some of the flow"
+    np.testing.assert_allclose(predicted, slope, atol=2e-3 * np.abs(slope).max())
+
+
+def test_the_chip_of_a_belief_has_the_flow_that_the_linear_model_predicts(driven):
+    solver = FlowSolver(convection=False)
+    response = solver.response(driven)
+    prior = Prior.of(WIDTHS, driven, 0.01)
+    rng = np.random.default_rng(4)
+    for _ in range(4):
+        z = 0.5 * rng.standard_normal(len(prior.spread))
+        believed = prior.chip(driven, z)
+        np.testing.assert_allclose(believed.viscosity_mpa_s, np.exp(0.30 * z[len(driven.openings)]))
+        predicted = response.linear(prior.offset(z))
+        # Exact: without inertia the flow is linear in the parameters.
+        np.testing.assert_allclose(predicted, seen(solver.solve(believed), driven), atol=1e-3)
+
+
+def test_a_belief_in_the_viscosity_alone_leaves_a_pressure_where_it_is(driven):
+    prior = Prior.of(WIDTHS, driven, 0.01)
+    z = np.zeros(len(prior.spread))
+    z[len(driven.openings)] = 0.01
+    believed = prior.chip(driven, z)
+    # The product of two changes is left, of second order.
+    np.testing.assert_allclose(believed.boundary_values, driven.boundary_values, rtol=2.0 * (0.30 * 0.01) ** 2)
