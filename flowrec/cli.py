@@ -143,7 +143,7 @@ def replay(
     if verify:
         same, lines = verb.verdict(done)
         if as_json:
-            typer.echo(json.dumps({"session": str(session), "same": same, "lines": lines}))
+            typer.echo(json.dumps({"session": str(session), **verb.verdict_json(done)}))
         else:
             for line in lines:
                 typer.echo(line)
@@ -344,15 +344,18 @@ def compare(
 
     comparison = compare_sessions(SessionReader(first), SessionReader(second))
     if as_json:
-        typer.echo(json.dumps({"identical": comparison.identical, "ticks": comparison.ticks}))
+        typer.echo(json.dumps({"first_session": str(first), "second_session": str(second)} | comparison.as_json()))
     else:
+        for line in comparison.lines():
+            typer.echo(line)
         if comparison.first is not None:
             typer.echo(f"first difference: {comparison.first}")
+        same = "identical" if comparison.identical else "the same within tolerance"
         typer.echo(
             f"{comparison.ticks} ticks: "
-            + ("identical" if comparison.identical else f"{comparison.different_ticks} of them differ")
+            + (same if comparison.same else f"{comparison.different_ticks} of them differ")
         )
-    raise typer.Exit(0 if comparison.identical else 3)
+    raise typer.Exit(0 if comparison.same else 3)
 
 
 @app.command()

@@ -7,15 +7,16 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
-from flowrec.compare import Comparison
+from flowrec.compare import Comparison, Side
 from flowrec.config import Config, with_sets
 from flowrec.desk import Desk
-from flowrec.errors import SessionError, UsageError
+from flowrec.errors import SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
 from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
@@ -177,8 +178,9 @@ def replay(
     order = _order_under_way(reader, start)
     if order is not None:
         worker.submit(order)
-    checker = WorkerCheck(pipeline, start, order) if verify else None
-    comparison, commands = Comparison(), CommandDifference()
+    sides = Side.of("recorded", reader), Side("replayed", "the replay")
+    checker = WorkerCheck(pipeline, start, order, Comparison(sides=sides)) if verify else None
+    comparison, commands = Comparison(sides=sides), CommandDifference()
     truth: list[FlowField] = [] if start.true_field is None else [start.true_field]
 
     def on_tick(tick: Tick) -> None:
@@ -289,18 +291,20 @@ class WithoutFrames:
 class WorkerCheck:
     """Does each recorded work order again and compares the adopted result with its topic's tolerance."""
 
-    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None) -> None:
+    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None, comparison: Comparison) -> None:
         self._pipeline = pipeline
         self._made: dict[int, FlowField | Route] = {}
         self._asked = start.mission.request if start.mission is not None else 0
         self._last = start
-        self.comparison = Comparison()
+        self._taken = {0}  # results that can not be made again; 0: fields of an earlier session
+        self.comparison = comparison
         self.results: list[str] = []
         if order is None or order.mission is None:
             return
         wanted, seen = order.mission.wanted, order.observations
         if wanted == "refine" and seen is not None and seen.stamp_ns > order.mission.requested_ns:
             # Ordered before this piece of a run begins, from fewer observations than are repeated in it.
+            self._taken.add(order.mission.request)
             self.results.append(f"{BY_FIELD[FILLS[wanted]].path}: ordered in the part before, taken as recorded")
         else:
             self._made[order.mission.request] = work(pipeline, order)
@@ -309,16 +313,14 @@ class WorkerCheck:
         """Take note of one tick: new orders are worked on, adopted results compared."""
         for name in ("assumed", "refined", "route"):
             adopted = getattr(tick, name)
-            if adopted is None or adopted is getattr(self._last, name) or adopted.request not in self._made:
+            if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._taken:
                 continue
-            made = replace(self._made.pop(adopted.request), stamp_ns=adopted.stamp_ns)
+            made = self._made.pop(adopted.request, None)
+            made = replace(made, stamp_ns=tick.stamp_ns) if made is not None else None
             topic = BY_FIELD[name]
-            differs = self.comparison.add_pair(topic, adopted, made, tick.stamp_ns)
-            count = self.comparison.topics[topic.path]
-            same = "identical" if adopted.same_as(made) else f"within tolerance ({count.first})"
-            self.results.append(
-                f"{topic.path} {adopted.method}: {'DIFFERENT: ' + str(count.first) if differs else same}"
-            )
+            found = self.comparison.add_pair(topic, adopted, made, tick.stamp_ns)
+            how = "identical" if found is None else f"{'DIFFERENT' if found.beyond else 'within tolerance'}: {found}"
+            self.results.append(printable(f"{topic.path} {adopted.method}: {how}"))
         mission = tick.mission
         if mission is not None and mission.wanted and mission.request > self._asked:
             self._asked = mission.request
@@ -388,27 +390,34 @@ def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
 def verdict(done: Replayed) -> tuple[bool, list[str]]:
     """Lines that say how the replay compares with the recording, and whether it is the same."""
     comparison = done.comparison
-    lines = []
-    for topic, count in comparison.topics.items():
-        total = count.identical + count.within_tolerance + count.different
-        lines.append(
-            f"{topic:20s} {count.identical} of {total} identical"
-            + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
-            + (f", {count.different} DIFFERENT" if count.different else "")
-        )
-    same = comparison.same
+    lines = comparison.lines()
+    same, first = comparison.same, comparison.first
+    identical = comparison.identical
     if done.worker_check is not None:
+        results = done.worker_check.comparison
         lines.extend(done.worker_check.results)
-        same = same and done.worker_check.same
+        same, identical, first = same and results.same, identical and results.identical, first or results.first
     if done.frames_missing:
         lines.append(f"{done.frames_missing} frames are not in the file; their recorded tracks stood in")
-    if comparison.first is not None:
-        lines.append(f"first difference: {comparison.first}")
+    if first is not None:
+        lines.append(f"first difference: {first}")
     lines.append(
         f"{comparison.ticks} ticks: "
-        + ("every tick identical" if comparison.identical else "the same within tolerance" if same else "NOT the same")
+        + ("every tick identical" if identical else "the same within tolerance" if same else "NOT the same")
     )
     return same, lines
+
+
+def verdict_json(done: Replayed) -> dict[str, Any]:
+    """What `verdict` says, in numbers too."""
+    same, lines = verdict(done)
+    found = done.comparison.as_json()
+    if done.worker_check is not None:
+        results = done.worker_check.comparison.as_json()
+        found["topics"] |= results["topics"]
+        found["first"] = found["first"] or results["first"]
+        found["identical"] = found["identical"] and results["identical"]
+    return found | {"same": same, "lines": lines}
 
 
 def default_out(path: Path) -> Path:

@@ -23,6 +23,7 @@ class Contents(Head):
     ----------
     fields : field of Tick by channel number, for the topics that this flowrec knows.
     schemas : name of the schema by channel number, for the same.
+    recorded_fields : by field of Tick, the fields that its messages have in this file; an older file lacks some.
     """
 
     def _open(self, summary: Summary | None) -> None:
@@ -31,6 +32,7 @@ class Contents(Head):
             channel.id: BY_PATH[channel.topic].field for channel in self.channels.values() if channel.topic in BY_PATH
         }
         self.schemas: dict[int, str] = {}
+        self.recorded_fields: dict[str, frozenset[str]] = {}
         for channel in self.fields:
             self._check_schema(channel)
 
@@ -49,8 +51,11 @@ class Contents(Head):
     def _check_schema(self, channel_number: int) -> None:
         channel = self._summary.channels[channel_number]
         found = self._summary.schemas[channel.schema_id]
-        expected = codec_of(BY_PATH[channel.topic].type, found.name).schema
+        kind = BY_PATH[channel.topic].type
+        expected = codec_of(kind, found.name).schema
         self.schemas[channel_number] = found.name
+        ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
+        self.recorded_fields[self.fields[channel_number]] = ours_all
         same_kind = (found.name, found.encoding, channel.message_encoding) == (expected.name, "protobuf", "protobuf")
         # The standard schemas may gain fields and comments with a new foxglove-sdk and stay what they are.
         if same_kind and (found.data == expected.data or not expected.name.startswith("flowrec.")):
@@ -59,6 +64,8 @@ class Contents(Head):
             theirs, ours = _fields_of(found.data), _fields_of(expected.data)
         # A field that has come since is empty in an older file; where the message allows for that, it is read.
         if same_kind and theirs <= ours and {name for name, _ in ours - theirs} <= _may_be_missing(channel.topic):
+            there = {name.removeprefix(f"{kind.__name__}.") for name, _ in theirs}
+            self.recorded_fields[self.fields[channel_number]] = ours_all & there
             return
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(

@@ -86,6 +86,11 @@ class SessionReader:
         return {BY_PATH[path].field: count for path, count in self._run.counts().items() if path in BY_PATH}
 
     @property
+    def recorded_fields(self) -> dict[str, frozenset[str]]:
+        """Names of the message fields that the file has, by field of Tick, for the topics that it declares."""
+        return self._file(0).contents.recorded_fields
+
+    @property
     def duration_s(self) -> float:
         """From the first tick to the last, in s."""
         return seconds(self.last_ns - self.first_ns)
