@@ -7,7 +7,6 @@ work in the loop's own thread, the desk interrupts the loop by a signal: the end
 
 from __future__ import annotations
 
-import contextlib
 import signal
 import time
 from collections import deque
@@ -154,20 +153,3 @@ class Desk:
         late = self._late() > RAMP_PATIENCE_S + _TICK_PATIENCE_S or not self.ticking
         if self.reason and (self._at_work or (self._leave_when_late and late)):
             raise Interrupted
-
-
-@contextmanager
-def at_most(seconds: float) -> Iterator[None]:
-    """Leave the block by `Interrupted` when it takes longer; in the main thread, before a desk is armed."""
-
-    def over(_number: int, _frame: FrameType | None) -> None:
-        raise Interrupted
-
-    before = signal.signal(signal.SIGALRM, over)
-    signal.setitimer(signal.ITIMER_REAL, seconds, _PROD_S)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(Interrupted):
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
+import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flowrec.desk import Interrupted, at_most
+from flowrec import child
 from flowrec.errors import FlowrecError
 from flowrec.status import say, warn
 from flowrec.store import is_growing, recover
@@ -20,6 +24,8 @@ _REMAINS = SUFFIX + PARTIAL_SUFFIX
 _DRAFT = ".recovering" + _REMAINS
 _AT_ONCE_BYTES = 100_000_000  # two to four seconds' work
 _PATIENCE_S = 5.0  # for all of them together: a run is waiting
+_TIDY_S = 1.0  # for a recovery that is given up to remove its draft
+_REFUSED = 3  # exit status of that process where it says in one line why nothing can be recovered
 _OFFERED = 3  # by name, the others by number
 
 
@@ -59,19 +65,14 @@ def look_after(folder: Path, besides: frozenset[Path] = frozenset()) -> dict[Pat
                 offered.append(path)
                 continue
             try:
-                with at_most(left_s):
-                    done = recover(path)
-            except Interrupted:
+                done, came = _recover_apart(path, left_s)
+            except subprocess.TimeoutExpired:
                 offered.append(path)
             except FlowrecError as error:
                 warn(f"left from a run that did not finish: {error}")
-            except Exception as error:  # noqa: BLE001  nothing in an old file may keep a new run from beginning
-                warn(f"{path}: left from a run that did not finish, and recovering it failed ({error!r})")
             else:
-                made[done.path] = f"{done.ticks} ticks, {done.duration_s:.1f} s" + (
-                    f"; lost: {done.lost}" if done.lost else ""
-                )
-                say(f"recovered {done.path} from a run that did not finish: {made[done.path]}")
+                made[done] = came
+                say(f"recovered {done} from a run that did not finish: {came}")
     for path in offered[:_OFFERED]:
         warn(
             f"{path} ({_size(path) / 1e6:.0f} MB) is left from a run that did not finish; "
@@ -80,6 +81,56 @@ def look_after(folder: Path, besides: frozenset[Path] = frozenset()) -> dict[Pat
     if len(offered) > _OFFERED:
         warn(f"{len(offered) - _OFFERED} more like it in {folder}; flowrec ls {folder} names them")
     return made
+
+
+def _recover_apart(path: Path, limit_s: float) -> tuple[Path, str]:
+    """Recover in a process of its own: the session that was made, and what came of it.
+
+    Whatever an old file does to that process (threads that hang, memory that runs out), this one starts a live run.
+
+    Raises
+    ------
+    TimeoutExpired : it took longer; that process has ended, the remains are as they were.
+    FlowrecError : nothing could be recovered.
+    """
+    try:
+        process = subprocess.Popen(  # noqa: S603 - our own module
+            child.command("flowrec.leftovers", str(path.resolve())),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,  # Ctrl-C ends this process, and then this one ends that one
+            env=child.environment(),
+        )
+    except OSError as error:
+        raise FlowrecError(f"{path}: recovering it does not start ({error.strerror or error})") from error
+    try:
+        out, said = process.communicate(timeout=limit_s)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_TIDY_S)
+            process.kill()
+            process.communicate()
+    if process.returncode:
+        last = (said.strip().splitlines() or [f"exit status {process.returncode}"])[-1]
+        raise FlowrecError(last if process.returncode == _REFUSED else f"{path}: recovering it failed ({last})")
+    name, came = json.loads(out)
+    return path.with_name(name), came
+
+
+def _main(path: Path) -> None:
+    """The process that recovers one file."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the draft is removed on the way out
+    try:
+        done = recover(path)
+    except FlowrecError as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(_REFUSED)
+    lost = f"; lost: {done.lost}" if done.lost else ""
+    json.dump([done.path.name, f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}"], sys.stdout)
 
 
 def _size(path: Path) -> int:
@@ -107,3 +158,7 @@ def _alone_in(folder: Path) -> Iterator[bool]:
         yield alone
     finally:
         os.close(descriptor)
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]))

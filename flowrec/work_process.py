@@ -17,10 +17,9 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, BinaryIO
 
-import flowrec
+from flowrec import child
 from flowrec.errors import FlowrecError
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import Pipeline
@@ -47,13 +46,13 @@ class WorkProcess:
         self._printed = b""
         self._orders.put(pipeline)
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "flowrec.work_process"],
+            self._process = subprocess.Popen(  # noqa: S603 - our own module
+                child.command("flowrec.work_process"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 start_new_session=True,  # Ctrl-C and a closed terminal end the run, and then the run ends this
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(_search_path())},
+                env=child.environment(),
             )
         except OSError as error:
             raise FlowrecError(
@@ -159,17 +158,6 @@ class WorkProcess:
         except OSError as error:
             return f"what it printed can not be kept ({error.strerror or error})"
         return f"see {name} for what it printed"
-
-
-def _search_path() -> list[str]:
-    """Where this process finds its modules, without the working directory: its files must not shadow a library.
-
-    Where flowrec itself is imported from the working directory (a checkout), it stays.
-    """
-    home = str(Path(flowrec.__file__).resolve().parent.parent)
-    here = str(Path.cwd())
-    kept = [place for place in sys.path if place and (place == home or str(Path(place).resolve()) != here)]
-    return kept if home in kept else [home, *kept]
 
 
 def _told(error: BaseException) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -217,6 +219,26 @@ def test_what_a_killed_run_left_is_recovered_at_the_next_start_and_its_name_is_t
     assert "junk.mcap.partial" in told
     assert look_after(tmp_path) == {}  # nothing more to be done, and the junk keeps nobody from anything
     assert junk.exists()
+
+
+def test_remains_are_looked_after_in_any_thread(session: Path, tmp_path: Path) -> None:
+    (tmp_path / "left.mcap.partial").write_bytes(session.read_bytes()[: session.stat().st_size // 2])
+    with ThreadPoolExecutor() as pool:
+        assert list(pool.submit(look_after, tmp_path).result()) == [tmp_path / "left.mcap"]
+
+
+def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left = tmp_path / "left.mcap.partial"
+    left.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
+    threads, files = set(threading.enumerate()), len(list(Path("/dev/fd").iterdir()))
+    monkeypatch.setattr("flowrec.leftovers._PATIENCE_S", 0.05)
+    assert look_after(tmp_path) == {}
+    assert f"flowrec recover {left}" in capsys.readouterr().err.replace("\n", "")
+    assert set(threading.enumerate()) == threads
+    assert len(list(Path("/dev/fd").iterdir())) == files
+    assert [path.name for path in tmp_path.iterdir()] == [left.name]
 
 
 def test_remains_that_are_too_large_are_offered_and_left_alone(

@@ -9,10 +9,8 @@ the difference between the last tick that went through and the tick that goes ne
 from __future__ import annotations
 
 import contextlib
-import os
 import pickle
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -23,6 +21,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
+from flowrec import child
 from flowrec.messages import Frame, Tick
 from flowrec.view import viewer
 from flowrec.view.scene import Scene
@@ -64,7 +63,7 @@ class LiveView:
         if viewer.executable() is None:
             self._gone = True
             return "no live view: Rerun's viewer is not installed (pip install rerun-sdk); the run goes on without"
-        command = [sys.executable, "-m", "flowrec.view.feed", str(self._port), "window" if window else "serve"]
+        command = child.command("flowrec.view.feed", str(self._port), "window" if window else "serve")
         try:
             with self._log.open("wb") as log:
                 self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -73,7 +72,7 @@ class LiveView:
                     stdout=log,
                     stderr=log,
                     start_new_session=True,  # Ctrl-C ends the run, and then the run ends this
-                    env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                    env=child.environment(),
                 )
         except OSError as error:
             self._gone = True
