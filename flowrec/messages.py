@@ -18,6 +18,8 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.errors import RigError
+
 # The second word is the wire form: a `vector` becomes a repeated double that viewers can plot,
 # an `array` keeps its shape and its bytes.
 Vector = Annotated[NDArray[np.float64], "vector"]
@@ -80,11 +82,26 @@ class Message:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame(Message):
-    """One camera image. The stamp is the middle of the exposure."""
+    """One camera image. The stamp is the middle of the exposure.
+
+    Raises
+    ------
+    RigError : the image is not one of 8-bit grey levels. Nothing is converted: that would change what was seen.
+    """
 
     stamp_ns: int
     index: int
     image: Image  # (h, w) grey levels
+
+    def __post_init__(self) -> None:
+        image = np.asarray(self.image)
+        if image.dtype != np.uint8 or image.ndim != 2:
+            shape = " x ".join(map(str, image.shape))
+            raise RigError(
+                f"frame {self.index}: an image of {image.dtype} and shape {shape}, where uint8 and shape height x "
+                "width is expected: it can not be kept exactly; set the camera to 8-bit grey levels (Mono8)"
+            )
+        Message.__post_init__(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +116,15 @@ class Applied(Message):
     # (2,) revolutions along x and y since the previous frame: the integral of f (cos phi, sin phi) dt.
     # Times um per revolution it is the robot's own displacement, whatever delay or switching lay in between.
     turns: Vector
+    # Stamp of the first frame of those in a row that have the same image as this one: this frame's stamp where the
+    # image is new. Compared on arrival, as files may hold images in part or not exactly. None: not compared (older
+    # files), and then nothing is concluded from a loss of sight but what the number of frames says.
+    image_since_ns: int | None = None
+
+    @property
+    def repeats_image(self) -> bool:
+        """Whether the camera sent the image of the frame before once more."""
+        return self.image_since_ns is not None and self.image_since_ns < self.stamp_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,6 +182,7 @@ class Track(Message):
     lost_frames: int  # in a row
     radius_px: float  # of the robot's image, tracked slowly
     roi_px: Vector  # (4,) x0, y0, x1, y1 of the searched region
+    seen_ns: int | None = None  # stamp of the latest frame in which it was seen; None: never so far, or not said
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,6 +250,9 @@ class Mission(Message):
     held_since_ns: int | None = None  # when the operator told the robot to stay; None: not just now
     held_ns: int = 0  # how long it was held in this phase before; that does not count against the phase's time
     swept: bool = False  # held, and yet carried away: the flow is too fast for it
+    blind_since_ns: int | None = None  # when the robot was told to stay because it was out of sight; None: it is not
+    blind: str = ""  # why it is out of sight, for people
+    field_off: bool = False  # out of sight for so long that there must be no field
 
 
 @dataclass(frozen=True, slots=True, eq=False)

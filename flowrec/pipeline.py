@@ -25,7 +25,7 @@ from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEv
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
-from flowrec.vision import Tracker
+from flowrec.vision import Tracker, missed
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,7 @@ class Pipeline:
     calibration: Calibration
     robot: Robot
     clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
+    image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
     tracker: Tracker
     observer: Observer
     health: HealthMonitor
@@ -77,6 +78,7 @@ def assemble(config: Config, chip: Chip) -> Pipeline:
         calibration=calibration_of(config, chip),
         robot=config.robot,
         clearance_um=clearance_um(chip.mask, chip.um_per_px),
+        image_shape=(config.camera.height_px, config.camera.width_px),
         tracker=config.tracker,
         observer=config.observer,
         health=config.health,
@@ -97,6 +99,20 @@ def _strength(coils: Coils, last: Tick) -> float:
     return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
 
 
+def _seen(p: Pipeline, previous: Track | None, inputs: Inputs) -> Track:
+    """Where the robot is, and when it was last seen. An image that repeats the one before tells neither."""
+    if inputs.applied.repeats_image and previous is not None:
+        return missed(previous, inputs.stamp_ns)
+    if inputs.frame is None:
+        assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
+        return inputs.track
+    track = p.tracker.track(previous, inputs.frame, p.chip, p.calibration, p.robot)
+    if inputs.applied.image_since_ns is None:
+        return track
+    before_ns = previous.seen_ns if previous is not None else None
+    return replace(track, seen_ns=track.stamp_ns if track.seen else before_ns)
+
+
 def _no_lap(_stage: str) -> None:
     """Ignore the end of a stage."""
 
@@ -107,11 +123,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     assumed = inputs.assumed or last.assumed
     refined = inputs.refined or last.refined
     route = inputs.route or last.route
-    if inputs.frame is not None:
-        track = p.tracker.track(last.track, inputs.frame, p.chip, p.calibration, p.robot)
-    else:
-        assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
-        track = inputs.track
+    track = _seen(p, last.track, inputs)
     lap("track")
     estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, refined or assumed)
     # The robot as it is felt, where the observer estimates how far it rolls per revolution.
@@ -120,7 +132,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
     mission = p.commander.decide(
-        last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, robot
+        last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, robot, inputs.applied
     )
     demand = p.controller.control(
         last.demand,
@@ -136,6 +148,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     )
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == "zero"
+    cut = cut or mission.field_off
     currents = p.coils.drive(last.currents, demand, robot, mission.finished, cut)
     lap("control")
     tick = replace(

@@ -15,6 +15,7 @@ from flowrec.desk import Desk
 from flowrec.errors import RigError
 from flowrec.messages import Currents, FlowField, Route, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step
+from flowrec.rigs.arrival import Arrivals
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
 from flowrec.work_process import WorkProcess
@@ -186,7 +187,8 @@ def run(
 
     `start` is the tick to resume from; `queue_state` tells MB waiting for the disk and frames dropped.
     A stage that fails leaves its inputs, and only those, as the last tick in the sinks. A frame whose stamp does not
-    grow enters no stage and is counted; `clocks` has it told, with what else clocks do, in the record.
+    grow enters no stage and is counted; `clocks` has it told, with what else clocks do, in the record. Frames are
+    checked on arrival where `end_when_finished`, so not in a replay: its inputs hold what was found.
     """
     report = RunReport()
     desk = desk if desk is not None else Desk()
@@ -212,7 +214,8 @@ def run(
         stack.callback(worker.close)
         stack.enter_context(rig)
         stack.enter_context(desk.left_when_late())
-        for arrived in _growing(rig.inputs(), tick.stamp_ns, report, clocks):
+        growing = _growing(rig.inputs(), tick.stamp_ns, report, clocks)
+        for arrived in map(Arrivals(pipeline.image_shape).check, growing) if end_when_finished else growing:
             if desk.overdue or (desk.reason and not end_when_finished):
                 break
             desk.ticking = True

@@ -114,8 +114,9 @@ class Controller:
         """The demand after this frame, never above what the robot can do.
 
         In the phases survey and navigate the reference runs along the route, from its start when the phase begins;
-        else it is the place where the phase found the robot. A finished mission asks for nothing. While the operator
-        holds the robot on its way, the reference is the place where that found it; then it goes on along the route.
+        else it is the place where the phase found the robot. A finished mission asks for nothing. While the robot is
+        held on its way, by the operator or because it is out of sight, the reference is the place where that found it;
+        then it goes on along the route.
 
         Parameters
         ----------
@@ -133,7 +134,7 @@ class Controller:
         belief = blend(field, estimate, sent, self.map_error, lag_s)
         point = roll_forward(estimate.position_um, sent, dt_s, robot.delay, belief)
         on_way = not mission.finished and mission.phase in _FOLLOWING
-        if not on_way or route is None or not len(route.waypoints_um) or mission.held_since_ns is not None:
+        if not on_way or route is None or not len(route.waypoints_um) or _held_since_ns(mission) is not None:
             place = self._place(previous, mission, estimate, point)
             # Held on its way, the robot goes on from there afterwards.
             left_s = previous.progress_s if on_way and previous is not None else 0.0
@@ -246,9 +247,9 @@ class Controller:
             return previous.reference_um
         if not estimate.seen and not previous.velocity_um_s.any():
             return np.full(2, np.nan)
-        since_ns = mission.since_ns
-        if mission.held_since_ns is not None and mission.phase in _FOLLOWING:
-            since_ns = max(since_ns, mission.held_since_ns)
+        since_ns, held_ns = mission.since_ns, _held_since_ns(mission)
+        if held_ns is not None and mission.phase in _FOLLOWING:
+            since_ns = max(since_ns, held_ns)
         return point if since_ns > previous.stamp_ns else previous.reference_um
 
     def _law(
@@ -279,6 +280,11 @@ class Controller:
         if left_um_s < 0.02 * robot.speed_limit_um_s:
             return np.zeros(2)
         return shortened(demand_um_s, left_um_s)[0]
+
+
+def _held_since_ns(mission: Mission) -> int | None:
+    """When the robot was told to stay, by the operator or for want of sight, whichever came first; None: it is not."""
+    return min((ns for ns in (mission.held_since_ns, mission.blind_since_ns) if ns is not None), default=None)
 
 
 def _hurry(robot: Robot) -> float:

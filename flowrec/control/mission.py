@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.messages import Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
+from flowrec.messages import Applied, Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -30,8 +30,10 @@ class Commander:
     navigate_limit_s: float = 300.0
     patience: float = 3.0  # no route is followed for longer than this many times its planned time, and 5 s
     orders_limit: int = 20  # solved, refined and planned so often and still blown off: it is no use
-    find_limit_s: float = 3.0  # to see the robot for the first time
+    find_limit_s: float = 3.0  # to see the robot for the first time, or again after the field was switched off
     lost_limit_frames: int = 90  # in a row without seeing it before the run gives up
+    hold_after_s: float = 0.5  # without sight of the robot: it stays where it is ...
+    zero_after_s: float = 1.4  # ... and the field is switched off until it is seen again
     replan_error_um: float | None = None  # None: six radii; blown this far off the route, plan anew
 
     def decide(
@@ -45,10 +47,12 @@ class Commander:
         operator: OperatorEvent | None,
         demand: Demand | None,
         robot: Robot,
+        applied: Applied | None = None,
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
-        `demand` is the one of the frame before: it tells how far the robot is from its route.
+        `demand` is the one of the frame before: it tells how far the robot is from its route. Where `applied` does
+        not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
         """
         now_ns = track.stamp_ns
         asked = operator.action if operator is not None and operator.stamp_ns == now_ns else ""
@@ -63,6 +67,10 @@ class Commander:
             return verdict
         if told is not previous:
             return told
+        if applied is not None and (sight := self._blinded(previous, track, applied)) is not previous:
+            return sight
+        if previous.blind_since_ns is not None:
+            return previous
         if previous.held_since_ns is not None:
             return self._swept(previous, now_ns, track, demand, robot)
         answer = self._answer(previous, assumed, refined, route)
@@ -130,8 +138,34 @@ class Commander:
                     "and of the size in robot.radius_um?",
                 )
         elif track.lost_frames > self.lost_limit_frames:
-            return self._finish(previous, now_ns, "lost", f"robot not seen in {track.lost_frames} frames")
+            why = f"{previous.blind}, " if previous.blind else "robot not seen in "
+            return self._finish(previous, now_ns, "lost", f"{why}{track.lost_frames} frames")
         return None
+
+    def _blinded(self, previous: Mission, track: Track, applied: Applied) -> Mission:
+        """Hold, then no field, then the end for a robot that is out of sight; on its way again when it is seen.
+
+        Where it was carried meanwhile, a route that is too far off is planned anew, as after any other disturbance.
+        """
+        now_ns, seen_ns, image_ns = track.stamp_ns, track.seen_ns, applied.image_since_ns
+        if seen_ns is None or image_ns is None:  # never seen, so nothing is driven yet; or an older file
+            return previous
+        if track.seen:
+            if previous.blind_since_ns is None:
+                return previous
+            return replace(previous, stamp_ns=now_ns, blind_since_ns=None, blind="", field_off=False)
+        unseen_s = seconds(now_ns - seen_ns)
+        why = f"robot not seen since {seconds(seen_ns):.1f} s"
+        if applied.repeats_image:
+            why = f"the camera repeats one image since {seconds(image_ns):.1f} s"
+        if unseen_s >= self.zero_after_s + self.find_limit_s:
+            return self._finish(previous, now_ns, "lost", why)
+        if unseen_s >= self.zero_after_s and not previous.field_off:
+            since_ns = now_ns if previous.blind_since_ns is None else previous.blind_since_ns
+            return replace(previous, stamp_ns=now_ns, blind_since_ns=since_ns, blind=why, field_off=True)
+        if unseen_s >= self.hold_after_s and previous.blind_since_ns is None:
+            return replace(previous, stamp_ns=now_ns, blind_since_ns=now_ns, blind=why)
+        return previous
 
     @staticmethod
     def _answer(
@@ -266,4 +300,7 @@ class Commander:
             held_since_ns=None,
             held_ns=0,
             swept=False,
+            blind_since_ns=None,
+            blind="",
+            field_off=False,
         )

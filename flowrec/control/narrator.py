@@ -28,7 +28,12 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
         else:
             level = "warning"
             lines.append(f"no route ({tick.route.method}): {tick.route.reason}")
-    if tick.track is not None and last.track is not None and tick.track.seen != last.track.seen:
+    if (
+        tick.track is not None
+        and last.track is not None
+        and tick.track.seen != last.track.seen
+        and not any(each.applied is not None and each.applied.repeats_image for each in (last, tick))
+    ):
         lines.append("robot seen" if tick.track.seen else "robot lost from view")
         level = "info" if tick.track.seen else "warning"
     if tick.health is not None and tick.health is not last.health:
@@ -42,6 +47,15 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
         lines += held
         if held and mission.swept:
             level = "warning"
+        if before is not None and not mission.finished and mission.blind_since_ns != before.blind_since_ns:
+            if mission.blind_since_ns is None:
+                lines.append("robot in sight again: the mission goes on")
+            else:
+                lines.append(f"{mission.blind}: the robot is held")
+                level = "warning"
+        if before is not None and mission.field_off and not before.field_off:
+            lines.append(f"{mission.blind}: field off")
+            level = "error"
     if mission is not None and (before is None or mission.phase != before.phase):
         said = f"{mission.outcome}" if mission.finished else mission.phase
         lines.append(f"mission: {said}" + (f" ({mission.note})" if mission.note else ""))

@@ -100,8 +100,6 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
 
 
 def _shape(frame: Frame) -> tuple[int, int]:
-    if frame.image.ndim != 2:
-        raise ValueError(f"an image of shape {frame.image.shape}")
     if frame.image.size > PIXELS_LIMIT:
         raise ValueError(f"an image of {frame.image.size} pixels, more than {PIXELS_LIMIT}, which the reader takes")
     height, width = frame.image.shape

@@ -1,5 +1,5 @@
 """Frame to Track."""
 
-from flowrec.vision.tracker import Sight, Tracker
+from flowrec.vision.tracker import Sight, Tracker, missed
 
-__all__ = ["Sight", "Tracker"]
+__all__ = ["Sight", "Tracker", "missed"]

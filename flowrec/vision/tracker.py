@@ -9,7 +9,7 @@ the whole channel the darkest of those, for debris is paler.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -199,6 +199,11 @@ class Tracker:
             return None
         size = math.log(radius_px / expected) / math.hypot(self.size_tolerance, _SIZE_PX / expected)
         return _Disc(fx, fy, radius_px, darkness, alike, alike * math.exp(-0.5 * size * size))
+
+
+def missed(previous: Track, stamp_ns: int) -> Track:
+    """The track after a frame that shows nothing new."""
+    return replace(previous, stamp_ns=stamp_ns, seen=False, lost_frames=previous.lost_frames + 1)
 
 
 def _coarse_step(nominal_px: float) -> int:

@@ -226,7 +226,7 @@ def test_a_clock_that_goes_backwards_is_refused(tmp_path):
 
 def test_a_frame_that_can_not_be_stored_is_told_and_what_came_before_is_kept(tmp_path):
     writer = SessionWriter(tmp_path / "s.mcap", HEADER)
-    writer.write(Tick(5, frame=Frame(5, -1, np.zeros((2, 2)))))
+    writer.write(Tick(5, frame=Frame(5, -1, np.zeros((2, 2), np.uint8))))
     with pytest.raises(SessionError, match=r"not in 32 bit; `flowrec recover .*s\.mcap\.partial`"):
         writer.close()
     assert not writer.path.exists() and writer.partial_path.exists()
