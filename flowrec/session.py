@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from flowrec.config import Config, calibration_of, config_from_toml, to_toml
 from flowrec.messages import Route
 from flowrec.provenance import provenance
 from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
+from flowrec.store.head import Head
 
 _QUEUE_S = 2.0
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
@@ -33,10 +35,14 @@ def session_writer(
 
     A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
     """
-    named = {"file": parent.name, "sha256": session_sha256(files_of(parent))} if parent is not None else None
+    header = session_header(config, chip)
+    if parent is not None:
+        files = files_of(parent)
+        named = {"file": parent.name, "sha256": session_sha256(files)}
+        header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
     return SessionWriter(
         path,
-        session_header(config, chip, named),
+        header,
         frames=frames_of(config),
         flush_s=config.recording.flush_s,
         sync_s=config.recording.sync_s,
@@ -47,6 +53,11 @@ def session_writer(
         region=region_of(config, chip, again=parent is not None),
         leave_out=config.recording.leave_out,
     )
+
+
+def _start_unix_ns(file: Path) -> int:
+    with Head(file) as head:
+        return head.source.start_unix_ns
 
 
 def _pieces_of(config: Config) -> Split | Snapshot:
@@ -88,8 +99,8 @@ def frames_of(config: Config) -> str:
     return encoding_for(camera.width_px, camera.height_px, camera.rate_hz or 0.0)
 
 
-def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None = None) -> SessionHeader:
-    """Everything that must be in a file before its first frame."""
+def session_header(config: Config, chip: Chip) -> SessionHeader:
+    """Everything that must be in a file before its first frame; the session clock starts now."""
     png, toml = chip_files(chip)
     facts = provenance(config.recording.anonymous) | {
         "operator": config.recording.operator,
@@ -99,7 +110,7 @@ def session_header(config: Config, chip: Chip, parent: Mapping[str, str] | None 
     }
     if config.refine.weights_sha256:
         facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
-    return SessionHeader(to_toml(config), png, toml, facts, dict(parent or {}))
+    return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]))
 
 
 def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:

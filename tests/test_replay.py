@@ -94,6 +94,7 @@ def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp
     assert after < 0.5 * before
     written = SessionReader(tmp_path / "refined.mcap")
     assert written.header.parent["file"] == session.name
+    assert written.header.start_unix_ns == SessionReader(session).header.start_unix_ns > 0
     assert written.tick_before(written.last_ns).refined.same_as(done.replayed.refined)  # type: ignore[union-attr]
 
 

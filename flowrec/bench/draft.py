@@ -136,7 +136,10 @@ def small_draft() -> Draft:
     chip = load_chip(config.chip)
     said = session_header(_plain(resolve(config, chip)), chip)
     facts = {"flowrec": "0", "wall_time": "2026-01-01T00:00:00+00:00", "wall_ns": "1", "monotonic_ns": "1"}
-    records: list[Any] = [*records_of(replace(said, provenance=facts)), *declarations(ENCODINGS["zstd"])]
+    records: list[Any] = [
+        *records_of(replace(said, provenance=facts, start_unix_ns=0)),
+        *declarations(ENCODINGS["zstd"]),
+    ]
     head = tuple(_parts(records))
     rng = np.random.default_rng(0)
     sent: dict[str, list[list[Sent]]] = {group: [] for group in (FRAMES, STATE)}

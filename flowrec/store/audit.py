@@ -140,6 +140,7 @@ class _Reading:
         self._found = found
         self._fields = contents.fields
         self._schemas = contents.schemas
+        self._start_unix_ns = contents.source.start_unix_ns
         self._see = see
         self._last_ns: dict[str, int] = {}
         self._last_stamp_ns: dict[str, int] = {}
@@ -159,7 +160,8 @@ class _Reading:
             self._last_ns[name] = record.log_ns
             try:
                 assert isinstance(record.payload, memoryview)
-                message = decode(BY_FIELD[name].type, record.payload, record.sequence, self._schemas[record.channel])
+                schema = self._schemas[record.channel]
+                message = decode(BY_FIELD[name].type, record.payload, record.sequence, schema, self._start_unix_ns)
                 wrong = misfit(message)
             except SessionError as error:
                 wrong = str(error)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -53,16 +54,19 @@ def encode(message: Message) -> bytes:
     return b"".join(encode_record(message)[1])
 
 
-def encode_record(message: Message, codec: Codec | None = None) -> tuple[int | None, Payload]:
+def encode_record(message: Message, codec: Codec | None = None, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
     """The MCAP sequence that a message must have, if any, and its payload in parts, large arrays uncopied.
 
-    `codec` is the one of its type where nothing else is said.
+    `codec` is the one of its type where nothing else is said. `start_unix_ns` is that of the session: foxglove's
+    schemas say Unix time, flowrec's own the session clock.
 
     Raises
     ------
     SessionError : a value that does not fit the message's declaration, such as an int beyond 64 bit.
     """
     codec = codec or codec_of(type(message))
+    if start_unix_ns and codec.says_unix_time:
+        message = replace(message, stamp_ns=message_stamp(message) + start_unix_ns)  # type: ignore[type-var]
     try:
         try:
             return codec.sequence(message), codec.encode(message)
@@ -74,15 +78,26 @@ def encode_record(message: Message, codec: Codec | None = None) -> tuple[int | N
         raise SessionError(f"a {kind} at {stamp_ns} ns can not be stored: {error}") from error
 
 
-def decode(message_type: type[_M], payload: bytes | memoryview, sequence: int = 0, schema: str = "") -> _M:
+def decode(
+    message_type: type[_M],
+    payload: bytes | memoryview,
+    sequence: int = 0,
+    schema: str = "",
+    start_unix_ns: int = 0,
+) -> _M:
     """One message from its bytes; `sequence` is MCAP's, where a Frame keeps its index; `schema` as in `codec_of`.
+
+    `start_unix_ns` as in `encode_record`.
 
     Raises
     ------
     SessionError : bytes that are no such message.
     """
     try:
-        message: _M = codec_of(message_type, schema).decode(payload, sequence)
+        codec = codec_of(message_type, schema)
+        message: _M = codec.decode(payload, sequence)
+        if start_unix_ns and codec.says_unix_time:
+            message = replace(message, stamp_ns=message_stamp(message) - start_unix_ns)  # type: ignore[type-var]
     except (DecodeError, ValueError, TypeError, OverflowError) as error:
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
     return message

@@ -136,7 +136,7 @@ class FileReader:
         field = self._fields[record.channel]
         try:
             schema = self.contents.schemas[record.channel]
-            message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema)
+            message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema, self._source.start_unix_ns)
             wrong = misfit(message)
         except SessionError as error:
             wrong = str(error)
@@ -153,7 +153,8 @@ class FileReader:
         if record.channel not in self._frame_channels or isinstance(record.payload, Message) or not self._lossless:
             return record
         try:
-            frame = decode(Frame, record.payload, record.sequence, self.contents.schemas[record.channel])
+            schema = self.contents.schemas[record.channel]
+            frame = decode(Frame, record.payload, record.sequence, schema, self._source.start_unix_ns)
         except SessionError:
             return record
         sound = not misfit(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)

@@ -30,3 +30,8 @@ class Codec:
     encode: Callable[[Any], Payload]
     decode: Callable[[bytes | memoryview, int], Any]
     sequence: Callable[[Any], int | None] = _unnumbered
+
+    @property
+    def says_unix_time(self) -> bool:
+        """Whether it is one of foxglove's schemas, whose `timestamp` every viewer reads as Unix time."""
+        return self.schema.name.startswith("foxglove.")

@@ -16,6 +16,7 @@ from mcap.records import ChunkIndex, Statistics
 import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.header import (
+    CONFIG_FILE,
     FORMAT_VERSION,
     OUTCOME,
     PROFILE,
@@ -82,6 +83,11 @@ class Head:
         self.outcome = metadata.get(OUTCOME, {})
         with self.source.parsing(0):
             self.part = part_from(metadata)
+            for index in self._summary.attachments:
+                if index.name == CONFIG_FILE:
+                    self.source.start_at(index.log_time)
+            if summary is None:  # what scan.py has made is on the session clock
+                self._summary.set_back(self.source.start_unix_ns)
         self.chunks: list[ChunkIndex] = self._summary.chunks
         self.channels, self.attachments = self._summary.channels, self._summary.attachments
         self.metadata = self._summary.metadata
@@ -115,7 +121,7 @@ class Head:
         self._bound("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
         attachments = {index.name: self.source.attachment(index) for index in wanted}
         try:
-            return header_from(self._metadata(), attachments)
+            return header_from(self._metadata(), attachments, self.source.start_unix_ns)
         except KeyError as error:
             raise self.source.damaged(0, f"the record {error} is missing") from error
         except ValueError as error:

@@ -61,6 +61,9 @@ class SessionHeader:
     parent : name and hash of the session that this one replays; empty for a live run.
     weights : network weights by file name.
     part : which piece of a run this is; None where the run is in one file.
+    start_unix_ns : Unix time of stamp 0 of the session clock. In the file, log times, publish times and the timestamps
+        of foxglove's messages are Unix times: stamps plus this. 0 in files of the first release: there they are stamps.
+        It is the log time of the attachments, because those, unlike metadata, have a checksum.
     """
 
     config_toml: str
@@ -70,6 +73,7 @@ class SessionHeader:
     parent: Mapping[str, str] = field(default_factory=dict)
     weights: Mapping[str, bytes] = field(default_factory=dict)
     part: Part | None = None
+    start_unix_ns: int = 0
 
 
 def records_of(header: SessionHeader) -> Iterator[Metadata | Attachment]:
@@ -79,15 +83,21 @@ def records_of(header: SessionHeader) -> Iterator[Metadata | Attachment]:
     yield Metadata(PARENT, dict(header.parent))
     if header.part is not None:
         yield Metadata(PART, _said(header.part))
-    yield _attachment(CONFIG_FILE, "application/toml", header.config_toml.encode())
-    yield _attachment(CHIP_IMAGE_FILE, "image/png", header.chip_png)
-    yield _attachment(CHIP_FILE, "application/toml", header.chip_toml.encode())
-    for name, data in sorted(header.weights.items()):
-        yield _attachment(_WEIGHTS + name, "application/octet-stream", data)
+    attachments = [
+        (CONFIG_FILE, "application/toml", header.config_toml.encode()),
+        (CHIP_IMAGE_FILE, "image/png", header.chip_png),
+        (CHIP_FILE, "application/toml", header.chip_toml.encode()),
+        *((_WEIGHTS + name, "application/octet-stream", data) for name, data in sorted(header.weights.items())),
+    ]
+    for name, media_type, data in attachments:
+        start = header.start_unix_ns
+        yield Attachment(create_time=start, log_time=start, name=name, media_type=media_type, data=data)
 
 
-def header_from(metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes]) -> SessionHeader:
-    """A header from its records by name.
+def header_from(
+    metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[str, bytes], start_unix_ns: int = 0
+) -> SessionHeader:
+    """A header from its records by name, and the log time of its attachment CONFIG_FILE.
 
     Raises
     ------
@@ -103,6 +113,7 @@ def header_from(metadata: Mapping[str, Mapping[str, str]], attachments: Mapping[
         parent=dict(metadata.get(PARENT, {})),
         weights={name.removeprefix(_WEIGHTS): data for name, data in attachments.items() if name.startswith(_WEIGHTS)},
         part=part_from(metadata),
+        start_unix_ns=start_unix_ns,
     )
 
 
@@ -136,8 +147,3 @@ def belongs(name: str) -> bool:
 def _said(part: Part) -> dict[str, str]:
     said = {"run": part.run, "number": str(part.number), "kind": part.kind, "why": part.why}
     return said if part.carried_ns is None else said | {"carried_ns": str(part.carried_ns)}
-
-
-def _attachment(name: str, media_type: str, data: bytes) -> Attachment:
-    # No time of its own: an attachment's time would stretch the time line of a viewer.
-    return Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)

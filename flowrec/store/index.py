@@ -38,6 +38,24 @@ class Summary:
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
 
+    def set_back(self, start_ns: int) -> None:
+        """Turn the times of the chunks, which are Unix times, into stamps of a session that started at `start_ns`.
+
+        Raises
+        ------
+        ValueError : one is before the start.
+        """
+        if not self.chunks or not start_ns:
+            return
+        assert self.statistics is not None  # summary_from has seen to it, and that its times are those of the chunks
+        self.statistics.message_start_time -= start_ns
+        self.statistics.message_end_time -= start_ns
+        if self.statistics.message_start_time < 0:
+            raise ValueError("a chunk begins before the session")
+        for chunk in self.chunks:
+            chunk.message_start_time -= start_ns
+            chunk.message_end_time -= start_ns
+
     def places(self) -> Iterator[tuple[int, int]]:
         """Offset and length of everything that is listed."""
         for chunk in self.chunks:

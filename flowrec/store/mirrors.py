@@ -58,12 +58,22 @@ MIRRORS = (ROBOT_POSE, ROBOT_POINT, PATH, PATH_POINTS, FLOW_ASSUMED, FLOW_REFINE
 
 
 class Mirrors:
-    """Makes the derived messages of one session, but for `unwanted` topics; remembers the colour scale."""
+    """Makes the derived messages of one session, but for `unwanted` topics; remembers the colour scale.
 
-    def __init__(self, unwanted: frozenset[str] = frozenset()) -> None:
+    To be used by one thread. `start_unix_ns` of the session is added to the timestamps in the messages.
+    """
+
+    def __init__(self, unwanted: frozenset[str] = frozenset(), start_unix_ns: int = 0) -> None:
+        self._unwanted, self._start_unix_ns = unwanted, start_unix_ns
         self._wanted = {mirror for mirror in MIRRORS if mirror.path not in unwanted}
         self.top_um_s: float | None = None  # speed at the bright end of the scale, set by the first field
         self._robot_ns = -_ROBOT_EVERY_NS
+
+    def twin(self) -> Mirrors:
+        """One for another thread that goes on from here, with the scale that is known by now."""
+        twin = Mirrors(self._unwanted, self._start_unix_ns)
+        twin.top_um_s, twin._robot_ns = self.top_um_s, self._robot_ns
+        return twin
 
     def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Payload]]:
         """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
@@ -75,23 +85,24 @@ class Mirrors:
                 yield mirror, stamp_ns, view
 
     def _due(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Callable[[], Payload]]]:
+        start = self._start_unix_ns
         robot = news.get("estimate") or news.get("track")
         if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
             self._robot_ns = robot.stamp_ns
-            yield ROBOT_POSE, robot.stamp_ns, partial(_pose_in_frame, robot)
-            yield ROBOT_POINT, robot.stamp_ns, partial(_mark, robot)
+            yield ROBOT_POSE, robot.stamp_ns, partial(_pose_in_frame, robot, robot.stamp_ns + start)
+            yield ROBOT_POINT, robot.stamp_ns, partial(_mark, robot, robot.stamp_ns + start)
         route = news.get("route")
         if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
-            yield PATH, route.stamp_ns, partial(_poses_in_frame, route)
-            yield PATH_POINTS, route.stamp_ns, partial(_point_cloud, route)
+            yield PATH, route.stamp_ns, partial(_poses_in_frame, route, route.stamp_ns + start)
+            yield PATH_POINTS, route.stamp_ns, partial(_point_cloud, route, route.stamp_ns + start)
         for name, mirror in (("assumed", FLOW_ASSUMED), ("refined", FLOW_REFINED)):
             field = news.get(name)
             if isinstance(field, FlowField) and _drawable(field):
-                yield mirror, field.stamp_ns, partial(self._preview, field)
+                yield mirror, field.stamp_ns, partial(self._preview, field, field.stamp_ns + start)
                 if mirror is FLOW_REFINED:
-                    yield FLOW_REFINED_GRID, field.stamp_ns, partial(_grid, field)
+                    yield FLOW_REFINED_GRID, field.stamp_ns, partial(_grid, field, field.stamp_ns + start)
 
-    def _preview(self, field: FlowField) -> Payload:
+    def _preview(self, field: FlowField, unix_ns: int) -> Payload:
         speed = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
         np.nan_to_num(speed, copy=False, posinf=0.0)
         if self.top_um_s is None:
@@ -102,7 +113,7 @@ class Mirrors:
         colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
         colours[solid] = 0
         png = cv2.imencode(".png", colours)[1]
-        return _with_data("CompressedImage", png, timestamp=timestamp(field.stamp_ns), format="png")
+        return _with_data("CompressedImage", png, timestamp=timestamp(unix_ns), format="png")
 
 
 def _drawable(field: FlowField) -> bool:
@@ -122,18 +133,18 @@ def _pose(x_um: float, y_um: float) -> dict[str, dict[str, float]]:
     return {"position": {"x": x_um, "y": y_um, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 
 
-def _pose_in_frame(robot: Estimate | Track) -> Payload:
-    return (_timestamp(robot.stamp_ns) + _placed(robot.position_um),)
+def _pose_in_frame(robot: Estimate | Track, unix_ns: int) -> Payload:
+    return (_timestamp(unix_ns) + _placed(robot.position_um),)
 
 
-def _mark(robot: Estimate | Track) -> Payload:
-    return (_timestamp(robot.stamp_ns) + _placed(robot.position_um) + _mark_points(),)
+def _mark(robot: Estimate | Track, unix_ns: int) -> Payload:
+    return (_timestamp(unix_ns) + _placed(robot.position_um) + _mark_points(),)
 
 
 @functools.lru_cache(maxsize=4)  # both views of the robot are of the same moment
-def _timestamp(stamp_ns: int) -> bytes:
+def _timestamp(unix_ns: int) -> bytes:
     """The field `timestamp`, which has the same number in PoseInFrame and PointCloud."""
-    return _serialized(_wire("PoseInFrame")(timestamp=timestamp(stamp_ns)))
+    return _serialized(_wire("PoseInFrame")(timestamp=timestamp(unix_ns)))
 
 
 def _placed(position_um: Vector) -> bytes:
@@ -153,30 +164,30 @@ def _mark_points() -> bytes:
     return _serialized(_wire("PointCloud")(point_stride=points.itemsize, fields=fields, data=points.tobytes()))
 
 
-def _poses_in_frame(route: Route) -> Payload:
+def _poses_in_frame(route: Route, unix_ns: int) -> Payload:
     poses = [_pose(x, y) for x, y in route.waypoints_um.tolist()]
-    return (_serialized(_wire("PosesInFrame")(timestamp=timestamp(route.stamp_ns), poses=poses)),)
+    return (_serialized(_wire("PosesInFrame")(timestamp=timestamp(unix_ns), poses=poses)),)
 
 
-def _point_cloud(route: Route) -> Payload:
+def _point_cloud(route: Route, unix_ns: int) -> Payload:
     points = np.zeros((len(route.waypoints_um), 3), "<f4")
     points[:, :2] = route.waypoints_um
     return _with_data(
         "PointCloud",
         points,
-        timestamp=timestamp(route.stamp_ns),
+        timestamp=timestamp(unix_ns),
         pose=_pose(0.0, 0.0),
         point_stride=12,
         fields=_float_fields("x", "y", "z"),
     )
 
 
-def _grid(field: FlowField) -> Payload:
+def _grid(field: FlowField, unix_ns: int) -> Payload:
     width, size_um = field.velocity_um_s.shape[1], field.um_per_px
     return _with_data(
         "Grid",
         np.ascontiguousarray(field.velocity_um_s, "<f4"),
-        timestamp=timestamp(field.stamp_ns),
+        timestamp=timestamp(unix_ns),
         pose=_pose(-0.5 * size_um, -0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
         column_count=width,
         cell_size={"x": size_um, "y": size_um},

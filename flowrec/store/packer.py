@@ -35,6 +35,7 @@ class Packer:
     frames : how images travel.
     mirrors : makes the views; one for all pieces of a run, for it remembers their scale of colours.
     take : is given chunks that are full, or sealed on demand; they are to be used before it returns.
+    start_unix_ns : of the session (header.py), which is added to all times that MCAP and foxglove know.
 
     Attributes
     ----------
@@ -42,8 +43,9 @@ class Packer:
     sequences : the next number of each path, of those that the writer counts.
     """
 
-    def __init__(self, frames: FrameEncoding, mirrors: Mirrors, take: Take) -> None:
+    def __init__(self, frames: FrameEncoding, mirrors: Mirrors, take: Take, start_unix_ns: int) -> None:
         self.take = take
+        self._start_unix_ns = start_unix_ns
         self.sequences: Counter[str] = Counter()
         self._frames = frames
         self._mirrors = mirrors
@@ -66,7 +68,7 @@ class Packer:
             codec = self._frames.codec if isinstance(message, Frame) else None
             if isinstance(message, Frame) and entry.window is not None:
                 message = self._blank.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
-            sequence, payload = encode_record(message, codec)
+            sequence, payload = encode_record(message, codec, self._start_unix_ns)
             self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
         for mirror, stamp_ns, view in self._mirrors.of(entry.news):
             self._append(mirror.path, entry.stamp_ns, stamp_ns, view, None)
@@ -91,5 +93,6 @@ class Packer:
         builder = self._builders[slot.group]
         if builder.size and builder.size + size > CHUNK_LIMIT_BYTES - _CHUNK_ROOM_BYTES:
             self.take([builder.seal()])
+        log_unix_ns, publish_unix_ns = log_ns + self._start_unix_ns, publish_ns + self._start_unix_ns
         # The stamp itself travels in the payload; MCAP knows no time before zero.
-        builder.add(slot.channel, sequence, log_ns, max(0, publish_ns), payload)
+        builder.add(slot.channel, sequence, log_unix_ns, max(0, publish_unix_ns), payload)

@@ -101,7 +101,7 @@ class Parts:
         self._making = making
         self._split = split
         self._run = run
-        self._mirrors = Mirrors(making.unwanted)
+        self._mirrors = Mirrors(making.unwanted, making.header.start_unix_ns)
         self._until_ns: int | None = None
         self._ended_bytes = 0
         self._ending: deque[tuple[Recorder, Future[None]]] = deque()

@@ -56,7 +56,8 @@ class Recorder:
         self._mirrors = mirrors
         self._piece = Piece(path, header, making)
         self._frames = making.frames
-        self._packer = Packer(making.frames, mirrors, self._piece.add_chunks)
+        self._start_unix_ns = header.start_unix_ns
+        self._packer = Packer(making.frames, mirrors, self._piece.add_chunks, header.start_unix_ns)
         self.first_bytes = self._piece.size
         self._beginning: Future[None] | None = None
         self._held: list[Sealed] = []
@@ -115,7 +116,7 @@ class Recorder:
         """Let one tick come first. Large flow fields take a while, in which chunks of what follows are held back."""
         self._packer.take = self._hold
         self._packer.sequences.update(BY_FIELD[field].path for field in entry.news)
-        packer = Packer(self._frames, self._mirrors, self._piece.add_chunks)
+        packer = Packer(self._frames, self._mirrors.twin(), self._piece.add_chunks, self._start_unix_ns)
         self._beginning = self._beside.submit(_begin, packer, entry)
 
     def wait_for_beginning(self) -> None:

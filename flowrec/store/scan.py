@@ -24,7 +24,7 @@ from mcap.records import (
 )
 
 from flowrec.errors import SessionError
-from flowrec.store.header import OUTCOME
+from flowrec.store.header import CONFIG_FILE, OUTCOME
 from flowrec.store.index import Summary, declare
 from flowrec.store.mcap_file import MAGIC
 from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Record, Source
@@ -158,6 +158,9 @@ class Scan:
 
     def _take_attachment(self, source: Source, offset: int, length: int) -> None:
         found = source.attachment_at(offset, length)
+        if found.name == CONFIG_FILE:
+            with source.parsing(offset):
+                source.start_at(found.log_ns)
         self.summary.attachments.append(
             AttachmentIndex(
                 offset=offset,

@@ -159,7 +159,7 @@ class Snapshots:
         self._settings = snapshot
         self._run = run
         self._number = 0
-        self._mirrors = Mirrors(making.unwanted)
+        self._mirrors = Mirrors(making.unwanted, making.header.start_unix_ns)
         self._sequences: Counter[str] = Counter()
         self._free: list[Packer] = []
         self._ring: deque[tuple[_Segment, Tally]] = deque()  # without those that still wait for images
@@ -253,7 +253,7 @@ class Snapshots:
         if self._free:
             packer = self._free.pop()
         else:
-            packer = Packer(self._making.frames, self._mirrors, _nowhere)
+            packer = Packer(self._making.frames, self._mirrors, _nowhere, self._making.header.start_unix_ns)
             packer.sequences = self._sequences
         return _Segment(self, packer, known, carried_ns)
 
@@ -319,7 +319,7 @@ class Snapshots:
         self._taken = taken = _Taken(file, stamp_ns + self._after_ns, [why], short if self._short else {})
         if first.carried_ns is not None:
             # Numbered as if they had been written just before what follows.
-            packer = Packer(making.frames, self._mirrors, _nowhere)
+            packer = Packer(making.frames, self._mirrors.twin(), _nowhere, making.header.start_unix_ns)
             packer.sequences = Counter({path: (number - 1) % 2**32 for path, number in first.sequences.items()})
             file.begin_with(packer, carried(first.carried_ns, first.known))
             file.put(first.image)

@@ -78,7 +78,7 @@ class DamageError(SessionError):
 
 
 class Record(NamedTuple):
-    """One message as it lies in a chunk."""
+    """One message as it lies in a chunk, `log_ns` on the session clock."""
 
     log_ns: int
     channel: int
@@ -99,6 +99,10 @@ class AttachmentBody(NamedTuple):
 class Source:
     """A finished MCAP file. Reads are independent of each other and may come from several threads.
 
+    Attributes
+    ----------
+    start_unix_ns : of the session (header.py), as soon as somebody has read it; log times are told less by it.
+
     Raises
     ------
     SessionError : on opening or reading, whatever is wrong with the file.
@@ -106,6 +110,7 @@ class Source:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.start_unix_ns = 0
         if path.is_dir():
             raise SessionError(f"{path}: is a directory, not a session; name a .mcap file in it (`flowrec ls {path}`)")
         try:
@@ -121,6 +126,17 @@ class Source:
         except BaseException:
             self.close()
             raise
+
+    def start_at(self, unix_ns: int) -> None:
+        """Set `start_unix_ns`.
+
+        Raises
+        ------
+        ValueError : it is no time.
+        """
+        if unix_ns >= 1 << 63:
+            raise ValueError(f"a session that starts at {unix_ns} ns of Unix time")
+        self.start_unix_ns = unix_ns
 
     def read(self, offset: int, length: int) -> bytes:
         """That many bytes, no fewer."""
@@ -258,8 +274,10 @@ class Source:
                     if length < _MESSAGE_HEAD.size:
                         raise ValueError(f"a message of {length} bytes")
                     channel, sequence, log_ns, _publish_ns = _MESSAGE_HEAD.unpack_from(content, at)
+                    if log_ns < self.start_unix_ns:
+                        raise ValueError("a message from before the session")
                     payload = view[at + _MESSAGE_HEAD.size : at + length]
-                    found.append(Record(log_ns, channel, sequence, payload))
+                    found.append(Record(log_ns - self.start_unix_ns, channel, sequence, payload))
         return found
 
     def messages(self, index: ChunkIndex) -> list[Record]:

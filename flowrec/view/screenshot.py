@@ -14,6 +14,8 @@ import numpy as np
 from rerun.experimental import ViewerClient, ViewerState
 
 from flowrec.errors import FlowrecError
+from flowrec.store.head import Head
+from flowrec.store.source import ForeignError
 from flowrec.units import nanoseconds
 from flowrec.view import viewer
 from flowrec.view.entities import SESSION_TIME
@@ -51,7 +53,8 @@ def screenshot(
             at_ns = (ends_ns[SESSION_TIME] or 0) if time_s is None else nanoseconds(time_s)
             client.set_time(SESSION_TIME, duration=np.timedelta64(at_ns, "ns"), play_state="paused")
         elif _LOG_TIME in ends_ns and time_s is not None:
-            client.set_time(_LOG_TIME, timestamp=np.datetime64(nanoseconds(time_s), "ns"), play_state="paused")
+            at_ns = _start_unix_ns(path) + nanoseconds(time_s)
+            client.set_time(_LOG_TIME, timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
         time.sleep(max(_SETTLE_S, began + _NOTICES_S - time.monotonic()))
         out_png.parent.mkdir(parents=True, exist_ok=True)
         out_png.write_bytes(client.take_screenshot())
@@ -60,6 +63,15 @@ def screenshot(
             for view in client.get_state().views
             for report in view.reports
         ]
+
+
+def _start_unix_ns(path: Path) -> int:
+    """Unix time of session time 0; 0 for a file of another program, whose times are as they are."""
+    try:
+        with Head(path) as head:
+            return head.source.start_unix_ns
+    except ForeignError:
+        return 0
 
 
 @contextlib.contextmanager

@@ -25,12 +25,14 @@ from flowrec.messages import (
 from flowrec.store import SessionHeader
 
 PERIOD_NS = 16_666_667
+START_UNIX_NS = 1_790_000_000_123_456_789
 HEADER = SessionHeader(
     config_toml='name = "made up"\n',
     chip_png=b"\x89PNG not really",
     chip_toml="um_per_px = 2.0\n",
     provenance={"host": "lab", "operator": "Zoë", "seed": "7"},
     weights={"unet.safetensors": bytes(range(256))},
+    start_unix_ns=START_UNIX_NS,
 )
 
 

@@ -17,7 +17,7 @@ from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
 from flowrec.store import SessionReader, SessionWriter
 from flowrec.store.schemas import foxglove_schema
-from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
 TICKS = list(ticks_of(150))
 
@@ -153,6 +153,49 @@ def test_the_official_reader_sees_every_message_in_order(path):
         assert sum(1 for _ in NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)) == len(
             times
         )
+
+
+def seen_by_others(path):
+    """Log and publish time, and the payload's own timestamp where it is one of foxglove's, by topic."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        found, summary = {}, reader.get_summary()
+        for schema, channel, message in reader.iter_messages():
+            payload_ns = None
+            if schema.name.startswith("foxglove."):
+                parsed = foxglove_schema(schema.name.removeprefix("foxglove.")).wire.FromString(message.data)
+                payload_ns = parsed.timestamp.ToNanoseconds()
+            found.setdefault(channel.topic, []).append((message.log_time, message.publish_time, payload_ns))
+        return found, summary.statistics
+
+
+def test_other_programs_read_unix_times_and_flowrec_reads_session_stamps(path):
+    found, statistics = seen_by_others(path)
+    times = [START_UNIX_NS + tick.stamp_ns for tick in TICKS]
+    assert found["/camera/frame"] == found["/view/robot_pose"] == [(time, time, time) for time in times]
+    assert found["/robot/track"] == [(time, time, None) for time in times]
+    assert (statistics.message_start_time, statistics.message_end_time) == (times[0], times[-1])
+    assert found["/run/events"] == found["/view/flow_assumed"] == [(times[0], times[0], times[0])]
+    events = list(SessionReader(path).messages("event"))
+    assert [event.stamp_ns for event in events] == [TICKS[0].stamp_ns]
+
+
+def test_a_session_is_dated_by_the_day_on_which_it_was_recorded(session):
+    found, statistics = seen_by_others(session)
+    with SessionReader(session) as reader:
+        began_ns, last_ns = int(reader.header.provenance["wall_ns"]), reader.last_ns
+    assert statistics.message_start_time >= began_ns and statistics.message_end_time == began_ns + last_ns
+    assert all(time >= began_ns for messages in found.values() for time, _, _ in messages)
+
+
+def test_a_session_that_does_not_say_when_it_started_has_stamps_for_times(tmp_path):
+    path = tmp_path / "old.mcap"
+    with SessionWriter(path, replace(HEADER, start_unix_ns=0), block=True) as writer:
+        for tick in TICKS[:20]:
+            writer.write(tick)
+    found, _ = seen_by_others(path)
+    assert [time for time, _, _ in found["/robot/track"]] == [tick.stamp_ns for tick in TICKS[:20]]
+    assert all(itertools.starmap(same, zip(TICKS[:20], SessionReader(path).ticks(), strict=True)))
 
 
 def test_other_viewers_get_pose_path_and_previews_on_one_scale(path):

@@ -26,7 +26,7 @@ from flowrec.store.names import part_path, pieces
 from flowrec.store.scan import scan
 from flowrec.store.source import Source
 from flowrec.units import seconds
-from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_disk import slow_disk
 from tests.store.test_trouble import names_in
 
@@ -50,7 +50,7 @@ def messages_in(path):
         reader = make_reader(stream, validate_crcs=True)
         told = {metadata.name: metadata.metadata for metadata in reader.iter_metadata()}
         found = [
-            (channel.topic, message.log_time, message.publish_time, message.data)
+            (channel.topic, message.log_time - START_UNIX_NS, message.publish_time - START_UNIX_NS, message.data)
             for _, channel, message in reader.iter_messages()
         ]
         assert reader.get_summary().statistics.message_count == len(found)
