@@ -77,17 +77,16 @@ def record(
     from flowrec.record import record as run_record
     from flowrec.terminal import said_within
 
-    settings = list(sets or [])
-    if rig is not None:
-        settings.append(f"rig={rig}")
-    if goal is not None:
-        settings.append(f"mission.goal={_point(goal)}")
-    if seed is not None:
-        settings.append(f"simulated.seed={seed}")
-    if duration is not None:
-        settings.append(f"duration_s={duration}")
-    settings += _pieces(split, snapshot)
-    chosen = load_config(config, settings)
+    typed = {
+        "rig": ("--rig", rig),
+        "mission.goal": ("--goal", None if goal is None else _point(goal)),
+        "simulated.seed": ("--seed", seed),
+        "duration_s": ("--duration", duration),
+        **_pieces(split, snapshot),
+    }
+    given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
+    settings = [*(sets or []), *(f"{key}={value}" for key, (_, value) in given.items())]
+    chosen = load_config(config, settings, {key: flag for key, (flag, _) in given.items()})
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return
@@ -380,17 +379,18 @@ def _rrd_told(session: Path, rrd: Path) -> str:
     return json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size})
 
 
-def _pieces(split: str | None, snapshot: str | None) -> list[str]:
-    """`--split` and `--snapshot` as settings."""
+def _pieces(split: str | None, snapshot: str | None) -> dict[str, tuple[str, float]]:
+    """`--split` and `--snapshot` as settings: flag and value by key."""
     from flowrec.units import amounts
 
-    settings: list[str] = []
+    settings: dict[str, tuple[str, float]] = {}
     try:
         if split is not None:
             asked = amounts(split)
             if len(asked["s"]) > 1 or len(asked["mb"]) > 1:
                 raise ValueError("one size, one time, or both")
-            settings += [f"recording.split_{unit}={value}" for unit, values in asked.items() for value in values]
+            for unit, values in asked.items():
+                settings |= {f"recording.split_{unit}": ("--split", value) for value in values}
     except ValueError as error:
         raise typer.BadParameter(f"{error}; as in --split 2GB,10min", param_hint="--split") from error
     try:
@@ -399,7 +399,7 @@ def _pieces(split: str | None, snapshot: str | None) -> list[str]:
             if asked["mb"] or not 1 <= len(asked["s"]) <= 2:
                 raise ValueError("the time before and, if 10 s is not it, the time after")
             keys = ("recording.snapshot_before_s", "recording.snapshot_after_s")
-            settings += [f"{key}={value}" for key, value in zip(keys, asked["s"], strict=False)]
+            settings |= {key: ("--snapshot", value) for key, value in zip(keys, asked["s"], strict=False)}
     except ValueError as error:
         raise typer.BadParameter(f"{error}; as in --snapshot 30s,10s", param_hint="--snapshot") from error
     return settings

@@ -8,12 +8,11 @@ resolved configuration, so a replay needs nothing else.
 from __future__ import annotations
 
 import difflib
-import functools
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 import tomli_w
@@ -23,14 +22,16 @@ from scipy.ndimage import label
 from flowrec.chip import ChipSettings, check_point, median_width_um
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.chip.files import CHIP_KEYS
 from flowrec.chip.places import opening_point_um
 from flowrec.control import Coils, Controller
-from flowrec.control.mission import PHASES, Commander
+from flowrec.control.mission import Commander
 from flowrec.errors import UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.planning.space import Swift
+from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.settings import CameraSettings, Simulated
@@ -43,7 +44,7 @@ class Worker:
 
     # A simulated run that does not keep real time adopts each result exactly this long after it was ordered, so
     # that the same seed gives the same session; a live run adopts it on the first frame after it is done.
-    adopt_after_s: float = 0.5
+    adopt_after_s: Annotated[float, Range(0.0, 3600.0)] = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,24 +52,28 @@ class Recording:
     """How a session is written."""
 
     frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"  # auto: what the camera's rate allows
-    flush_s: float = 0.5  # at most this much of the end is lost when the process is killed, in wall or session time
-    sync_s: float = 1.0  # the same when the power fails
+    # at most this much of the end is lost when the process is killed, in wall or session time
+    flush_s: Annotated[float, Range(0.0, 3600.0)] = 0.5
+    sync_s: Annotated[float, Range(0.0, 3600.0)] = 1.0  # the same when the power fails
     # robot: of most images only what the tracker read, the rest black; replays with the same tracker stay exact
     region: Literal["whole", "robot"] = "whole"
-    full_every_s: float = 10.0  # so often an image is whole even so, and whenever the robot was not in sight
-    region_pad_px: int = 16  # kept around what the tracker read
+    # so often an image is whole even so, and whenever the robot was not in sight
+    full_every_s: Annotated[float, Range(0.0, 1e6)] = 10.0
+    region_pad_px: Annotated[int, Range(0, 10_000)] = 16  # kept around what the tracker read
     leave_out: tuple[str, ...] = ()  # topics not to be recorded, as in ["/view/*", "/truth/*"]
     # Waiting for the disk; a live run thins out its frames from the half of it on. None: two seconds of the camera's
     # images, 256 MB at least and 1 GB at most: disks now and then stop for most of a second.
-    queue_mb: float | None = None
+    queue_mb: Annotated[float, Range(1e-3, 1e6)] | None = None
     # A run in several files: each of about so many MB, or of so many seconds, or both; else it is in one.
-    split_mb: float | None = None
-    split_s: float | None = None
+    split_mb: Annotated[float, Range(0.0, 1e9)] | None = None
+    split_s: Annotated[float, Range(0.0, 1e7)] | None = None
     # Nothing is written but what is around events: so many seconds before and after. None: everything is.
-    snapshot_before_s: float | None = None
-    snapshot_after_s: float = 10.0
-    snapshot_mb: float = 1000.0  # in memory; where it is too little, fewer seconds before the event are kept
-    disk_floor_gb: float = 1.0  # with less than that left on the disk a run is ended in good order; 0: never
+    snapshot_before_s: Annotated[float, Range(0.0, 1e6)] | None = None
+    snapshot_after_s: Annotated[float, Range(0.0, 1e6)] = 10.0
+    # in memory; where it is too little, fewer seconds before the event are kept
+    snapshot_mb: Annotated[float, Range(1e-3, 1e6)] = 1000.0
+    # with less than that left on the disk a run is ended in good order; 0: never
+    disk_floor_gb: Annotated[float, Range(0.0, 1e6)] = 1.0
     recover_leftovers: bool = True  # make whole sessions of what killed runs have left in the same folder
     operator: str = ""
     notes: str = ""
@@ -88,7 +93,7 @@ class Config:
     """A whole run, one section per room."""
 
     rig: Literal["simulated"] = "simulated"
-    duration_s: float | None = None  # None: until the mission is finished
+    duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None  # None: until the mission is finished
     chip: ChipSettings = field(default_factory=ChipSettings)
     robot: Robot = field(default_factory=Robot)
     camera: CameraSettings = field(default_factory=CameraSettings)
@@ -110,25 +115,64 @@ class Config:
 
 
 _ADAPTER = TypeAdapter(Config)
+_NOT_TOML = {
+    ".yaml": "YAML",
+    ".yml": "YAML",
+    ".json": "JSON",
+    ".mcap": "a session",
+    ".png": "the mask of a chip (--set chip.path=...)",
+    ".npz": "a vessel case (--set chip.path=...)",
+}
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
-_hints = functools.cache(get_type_hints)
 
 
-def load_config(path: Path | None = None, sets: Iterable[str] = ()) -> Config:
-    """Defaults, then the TOML file, then each `key=value` of `sets` (value as in TOML, or a bare word)."""
-    tree: dict[str, Any] = {}
-    if path is not None:
-        tree = _read_toml(path)
-    _apply_sets(tree, sets)
-    return _config_from(tree, str(path) if path is not None else "--set")
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where settings come from, for errors: the flag that was typed, or else the file."""
+
+    file: str
+    flags: Mapping[str, str] = field(default_factory=dict)  # by key
+
+    def __call__(self, *keys: str) -> str:
+        """The flag that set a key, a part of it or its section; the file where none did."""
+        for key in keys:
+            for typed, flag in self.flags.items():
+                if f"{typed}.".startswith(f"{key}.") or f"{key}.".startswith(f"{typed}."):
+                    return flag
+        return self.file
+
+
+def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mapping[str, str] | None = None) -> Config:
+    """Defaults, then the TOML file, then each `key=value` of `sets` (value as in TOML, or a bare word).
+
+    `flags` names the flags, by key, of settings that were not typed as `--set`.
+
+    Raises
+    ------
+    UsageError : one line that names the flag or the file, the key, its range and the nearest valid value.
+    """
+    tree = _read_toml(path) if path is not None else {}
+    origin = Origin(str(path) if path is not None else "--set", _apply_sets(tree, sets) | dict(flags or {}))
+    config = _config_from(tree, origin)
+    check_config(config, origin)
+    return config
 
 
 def config_from_toml(text: str, where: str) -> Config:
-    """The Config that `to_toml` wrote; `where` names its origin in errors."""
+    """The Config that `to_toml` wrote; `where` names its origin in errors.
+
+    A recording is readable whatever it was made with: ranges are checked only where sizes and scales depend on them.
+    """
+    origin = Origin(where)
     try:
-        return _config_from(tomllib.loads(text), where)
+        config = _config_from(tomllib.loads(text), origin)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
+    for fault in faults(config):
+        if fault.key.startswith(("chip.", "camera.", "robot.", "coils.")):
+            raise UsageError(f"{where}: {fault}")
+    config.coils.check(where)
+    return config
 
 
 def to_toml(config: Config) -> str:
@@ -136,11 +180,16 @@ def to_toml(config: Config) -> str:
     return tomli_w.dumps(_without_none(asdict(config)))
 
 
-def with_sets(config: Config, sets: Iterable[str]) -> Config:
-    """The configuration with some `key=value` changed."""
+def with_sets(config: Config, sets: Iterable[str], flags: Mapping[str, str] | None = None) -> Config:
+    """The configuration with some `key=value` changed; `flags` as in `load_config`.
+
+    A recorded configuration may hold settings outside of their ranges; only what is changed is checked.
+    """
     tree = _without_none(asdict(config))
-    _apply_sets(tree, sets)
-    return _config_from(tree, "--set")
+    origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
+    changed = _config_from(tree, origin)
+    check_config(changed, origin, frozenset(faults(config)))
+    return changed
 
 
 def resolve(config: Config, chip: Chip) -> Config:
@@ -150,6 +199,7 @@ def resolve(config: Config, chip: Chip) -> Config:
     where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow;
     40 ms from command to motion, or as long as it takes at v_max through a fifth of a channel.
     """
+    check_config(config)
     camera, robot = config.camera, config.robot
     channel_um = median_width_um(chip)
     width_um, height_um = chip.size_um
@@ -163,9 +213,6 @@ def resolve(config: Config, chip: Chip) -> Config:
     if robot.max_speed_um_s is None:
         peak = float(np.linalg.norm(config.flow.solve(chip).velocity_um_s, axis=-1).max())
         robot = replace(robot, max_speed_um_s=max(600.0, round(1.3 * peak, 1)))
-    assert robot.max_speed_um_s is not None
-    if robot.max_speed_um_s <= 0:
-        raise UsageError(f"robot.max_speed_um_s = {robot.max_speed_um_s:g}: the robot must move; give a positive speed")
     assert robot.max_speed_um_s is not None
     if robot.delay_s is None:
         crossing_s = 0.2 * channel_um / robot.max_speed_um_s
@@ -239,14 +286,21 @@ def _refuse_apart(chip: Chip, mission: Commander) -> None:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
+    begin = "flowrec record --dry-run > my.toml writes one to begin with"
+    kind = _NOT_TOML.get(path.suffix.lower())
+    if kind is not None:
+        raise UsageError(f"{path}: is {kind} by its name, and a configuration is a TOML file; {begin}")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        tree = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
     except FileNotFoundError as error:
-        raise UsageError(f"{path}: no such configuration; examples are in sessions/") from error
+        raise UsageError(f"{path}: no such configuration; {begin}") from error
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: can not be read as a TOML configuration ({error})") from error
     except (ValueError, RecursionError) as error:
         raise UsageError(f"{path}: not valid TOML ({error}); mend that line") from error
+    if tree.keys() & set(CHIP_KEYS) and not tree.keys() & hints(Config).keys():
+        raise UsageError(f"{path}: describes a chip; a run on it is flowrec record --set chip.path={path}")
+    return tree
 
 
 def _value(text: str) -> Any:
@@ -257,13 +311,16 @@ def _value(text: str) -> Any:
         return text
 
 
-def _apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> None:
-    """Put each `key=value` into the tree."""
+def _apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> dict[str, str]:
+    """Put each `key=value` into the tree; the keys, with the flag."""
+    flags = {}
     for text in sets:
         key, equals, value = text.partition("=")
         if not equals:
             raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
         _put(tree, key.strip().split("."), _value(value.strip()))
+        flags[key.strip()] = "--set"
+    return flags
 
 
 def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
@@ -275,88 +332,89 @@ def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
     tree[keys[-1]] = value
 
 
-def _config_from(tree: dict[str, Any], where: str) -> Config:
+def _config_from(tree: dict[str, Any], origin: Origin) -> Config:
+    """The settings of a tree, each of its type; ranges are not looked at."""
     phases = tree.get("mission", {}).get("phases") if isinstance(tree.get("mission", {}), dict) else None
     if isinstance(phases, str):
         tree["mission"]["phases"] = [phase.strip() for phase in phases.split(",") if phase.strip()]
-    _refuse_unknown(tree, Config, "", where)
+    _refuse_unknown(tree, Config, "", origin)
     try:
-        config = _ADAPTER.validate_python(tree)
+        return _ADAPTER.validate_python(tree)
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith(("tuple", "str", "function")))
-        raise UsageError(f"{where}: {key} = {first['input']!r}: {first['msg'].lower()}") from error
-    for phase in config.mission.phases:
-        if phase not in PHASES:
-            raise UsageError(f"{where}: mission.phases: no phase {phase!r}; choose from {', '.join(PHASES)}")
-    _refuse_nonsense(config, where)
-    return config
+        key = ".".join(part for part in map(str, first["loc"]) if not part.startswith(("tuple", "str", "function")))
+        raise UsageError(f"{origin(key)}: {_not_of_its_type(key, first['input'], first['msg'].lower())}") from error
 
 
-def _refuse_nonsense(config: Config, where: str) -> None:
-    """Numbers that no run can be made of."""
-    positive = {
-        "robot.radius_um": config.robot.radius_um,
-        "robot.um_per_rev": config.robot.um_per_rev,
-        "robot.max_speed_um_s": config.robot.max_speed_um_s,
-        "robot.step_out_hz": config.robot.step_out_hz,
-        "camera.um_per_px": config.camera.um_per_px,
-        "camera.rate_hz": config.camera.rate_hz,
-        "camera.width_px": config.camera.width_px,
-        "camera.height_px": config.camera.height_px,
-        "chip.um_per_px": config.chip.um_per_px,
-        "duration_s": config.duration_s,
-        "recording.snapshot_mb": config.recording.snapshot_mb,
-    }
-    for key, value in positive.items():
-        if value is not None and not value > 0:
-            raise UsageError(f"{where}: {key} = {value:g}: must be more than zero")
-    for key in ("full_every_s", "region_pad_px"):
-        value = getattr(config.recording, key)
-        if not value >= 0:
-            raise UsageError(f"{where}: recording.{key} = {value:g}: can not be less than zero")
-    config.coils.check(where)
+def _not_of_its_type(key: str, value: Any, complaint: str) -> str:
+    """What is wrong with a value that has not the type of its key, with the nearest one that has."""
+    known = dict(_all_hints(Config, ""))
+    while key not in known and "." in key:  # a place in a tuple
+        key = key.rpartition(".")[0]
+    hint = known.get(key)
+    names, valid = _names_of(hint), range_of(hint)
+    if names:
+        near = difflib.get_close_matches(str(value), names, 1, 0.0)[0]
+        return f"{key} = {value!r}: must be one of {', '.join(names)}; the nearest is {near}"
+    if valid is not None and isinstance(value, (int, float)):
+        if value in valid:
+            return f"{key} = {value!r}: must be a whole number {valid}; the nearest is {round(value)}"
+        return str(Fault(key, value, valid))
+    return f"{key} = {value!r}: {complaint}" + (f"; a number {valid} is wanted" if valid is not None else "")
+
+
+def _names_of(hint: Any) -> list[str]:
+    """The names that a setting can take; none where it takes others things."""
+    if get_origin(hint) is Literal:
+        return list(map(str, get_args(hint)))
+    return [name for part in get_args(hint) for name in _names_of(part)]
+
+
+def check_config(config: Config, origin: Origin | None = None, known: frozenset[Fault] = frozenset()) -> None:
+    """Raise UsageError, in one line, for settings outside of their ranges, and for settings that exclude each other.
+
+    `origin` tells where a key was set; faults in `known` are let pass.
+    """
+    origin = origin or Origin("configuration")
+    for fault in faults(config):
+        if fault not in known:
+            raise UsageError(f"{origin(fault.key)}: {fault}")
+    config.coils.check(origin("coils"))
     recording = config.recording
-    not_negative = {
-        "recording.split_mb": recording.split_mb,
-        "recording.split_s": recording.split_s,
-        "recording.snapshot_before_s": recording.snapshot_before_s,
-        "recording.snapshot_after_s": recording.snapshot_after_s,
-    }
-    for key, value in not_negative.items():
-        if value is not None and not value >= 0:
-            raise UsageError(f"{where}: {key} = {value:g}: must not be negative; 0 switches it off")
     if recording.snapshot_before_s and (recording.split_mb or recording.split_s):
         raise UsageError(
-            f"{where}: recording.snapshot_before_s keeps single moments and recording.split_* all of a run; set one of "
-            "them to 0"
+            f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
+            "all of a run; set one of them to 0"
         )
     if config.control.method == "policy" and config.plan.method != "time_field":
         raise UsageError(
-            f"{where}: control.method = 'policy' goes down the time to go, which plan.method = {config.plan.method!r} "
-            "does not know; set plan.method = 'time_field', or control.method = 'vector'"
+            f"{origin('control.method', 'plan.method')}: control.method = 'policy' goes down the time to go, which "
+            f"plan.method = {config.plan.method!r} does not know; set plan.method = 'time_field', or "
+            "control.method = 'vector'"
         )
 
 
-def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, where: str) -> None:
-    hints = _hints(section)
+def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, origin: Origin) -> None:
+    known = hints(section)
     for key, value in tree.items():
-        if key not in hints:
-            near = difflib.get_close_matches(prefix + key, list(_all_keys(Config, "")), n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + name for name in hints)}"
-            raise UsageError(f"{where}: unknown key {prefix + key}; {hint}")
-        inner = hints[key]
+        if key not in known:
+            near = difflib.get_close_matches(prefix + key, [key for key, _ in _all_hints(Config, "")], n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + name for name in known)}"
+            raise UsageError(f"{origin(prefix + key)}: unknown key {prefix + key}; {hint}")
+        inner = known[key]
         if is_dataclass(inner) and isinstance(inner, type):
             if not isinstance(value, dict):
+                where = origin(prefix + key)
                 raise UsageError(f"{where}: {prefix + key} is a section, not a value; set one of its keys")
-            _refuse_unknown(value, inner, f"{prefix}{key}.", where)
+            _refuse_unknown(value, inner, f"{prefix}{key}.", origin)
 
 
-def _all_keys(section: type, prefix: str) -> Iterable[str]:
-    for key, inner in _hints(section).items():
-        yield prefix + key
+def _all_hints(section: type, prefix: str) -> Iterable[tuple[str, Any]]:
+    """Every key of the configuration, sections included, with its type."""
+    for key, inner in hints(section).items():
+        yield prefix + key, inner
         if is_dataclass(inner) and isinstance(inner, type):
-            yield from _all_keys(inner, f"{prefix}{key}.")
+            yield from _all_hints(inner, f"{prefix}{key}.")
 
 
 def _without_none(value: Any) -> Any:

@@ -58,16 +58,17 @@ class Change:
     def apply(self, config: Config) -> Config:
         """The recorded configuration with the changes; a what-if never replans on a robot that can not follow."""
         plan, controller = _that_go_together(self.plan, self.controller, config)
-        words = {
-            "refine.method": self.refine,
-            "plan.method": plan,
-            "observer.method": self.observer,
-            "control.method": controller,
+        typed = {
+            "refine.method": ("--refine", self.refine),
+            "plan.method": ("--plan", plan),
+            "observer.method": ("--observer", self.observer),
+            "control.method": ("--controller", controller),
         }
-        sets = [f"{key}={value}" for key, value in words.items() if value is not None] + list(self.sets)
+        given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
+        sets = [*(f"{key}={value}" for key, (_, value) in given.items()), *self.sets]
         if not sets:
             return config
-        changed = with_sets(config, sets)
+        changed = with_sets(config, sets, {key: flag for key, (flag, _) in given.items()})
         phases = changed.mission.phases
         if self.refine is not None and "refine" not in phases:
             phases = tuple(dict.fromkeys((*phases, "refine", "plan")))

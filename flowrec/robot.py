@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from flowrec.ranges import PositiveShare, Range
 
 USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
 
@@ -15,12 +18,13 @@ class Robot:
     None means: chosen to fit the chip when the configuration is resolved.
     """
 
-    radius_um: float | None = None
-    um_per_rev: float = 25.0  # k: distance rolled per revolution of the field
-    max_speed_um_s: float | None = None  # v_max, relative to the fluid
-    step_out_hz: float | None = None  # above it the robot no longer follows the field
-    step_out_margin: float = 0.9  # share of the step-out frequency that is ever commanded
-    delay_s: float | None = None  # from command to motion; 0.04 where the channel leaves time for it
+    radius_um: Annotated[float, Range(0.05, 1e4)] | None = None
+    um_per_rev: Annotated[float, Range(0.01, 1e5)] = 25.0  # k: distance rolled per revolution of the field
+    max_speed_um_s: Annotated[float, Range(0.01, 1e6)] | None = None  # v_max, relative to the fluid
+    step_out_hz: Annotated[float, Range(0.01, 1e5)] | None = None  # above it the robot no longer follows the field
+    step_out_margin: PositiveShare = 0.9  # share of the step-out frequency that is ever commanded
+    # from command to motion; 0.04 where the channel leaves time for it
+    delay_s: Annotated[float, Range(0.0, 10.0)] | None = None
 
     @property
     def radius(self) -> float:

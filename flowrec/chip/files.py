@@ -45,7 +45,7 @@ MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the rea
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
 _NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um", "inlet_speed_um_s")
-_CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "opening")
+CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "opening")
 _OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
 
 
@@ -79,7 +79,7 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
         table = tomllib.loads(toml_text)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
-    _refuse_unknown(table, _CHIP_KEYS, where)
+    _refuse_unknown(table, CHIP_KEYS, where)
     number = {key: _number(table, key, where) for key in _NUMBERS}
     scale = number["um_per_px"] if um_per_px is None else um_per_px
     if scale is None:

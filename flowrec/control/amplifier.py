@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from flowrec.ranges import Range
 
 Coilwise = tuple[float, float, float]  # one number for each coil: x, y, z
 _H_PER_MH = 1e-3
@@ -21,12 +23,13 @@ class Amplifier:
     """
 
     kind: Literal["current", "voltage"] = "current"
-    a_per_v: Coilwise = (1.0, 1.0, 1.0)  # g of a current amplifier
-    v_per_v: Coilwise = (1.0, 1.0, 1.0)  # gain of a voltage amplifier
-    resistance_ohm: Coilwise = (2.0, 2.0, 2.0)  # of each coil with its leads; for a voltage amplifier
-    inductance_mh: Coilwise = (5.0, 5.0, 5.0)
-    max_voltage_v: float = 10.0  # of the outputs, not of the coils
-    output_hz: float = 20_000.0  # samples per second of each output
+    a_per_v: Annotated[Coilwise, Range(1e-6, 1e6)] = (1.0, 1.0, 1.0)  # g of a current amplifier
+    v_per_v: Annotated[Coilwise, Range(1e-6, 1e6)] = (1.0, 1.0, 1.0)  # gain of a voltage amplifier
+    # of each coil with its leads; for a voltage amplifier
+    resistance_ohm: Annotated[Coilwise, Range(0.0, 1e5)] = (2.0, 2.0, 2.0)
+    inductance_mh: Annotated[Coilwise, Range(0.0, 1e5)] = (5.0, 5.0, 5.0)
+    max_voltage_v: Annotated[float, Range(1e-3, 1e4)] = 10.0  # of the outputs, not of the coils
+    output_hz: Annotated[float, Range(100.0, 1e7)] = 20_000.0  # samples per second of each output
 
     @property
     def ohm(self) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +15,7 @@ from flowrec.control.reach import WORST_CONDITION, Reach, named
 from flowrec.control.rotation import Order, Rotation, course
 from flowrec.errors import UsageError
 from flowrec.messages import Currents, Demand
+from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -37,11 +38,13 @@ class Coils:
     mode: Literal["roller", "helix"] = "roller"
     surface: Literal["floor", "ceiling"] = "floor"  # which one a roller rolls on
     handedness: Literal["right", "left"] = "right"  # of a helix
-    amplitude_mt: float = 4.0  # B0
-    mt_per_a: Matrix3 = ((2.1, 0.0, 0.0), (0.0, 1.9, 0.0), (0.0, 0.0, 1.5))  # field at the robot by coil currents
-    bias_mt: Coilwise = (0.0, 0.0, 0.0)  # field without currents: the earth's, the microscope's
-    max_current_a: float = 5.0  # of each coil
-    ramp_s: float = 0.2  # from nothing to the full amplitude and back
+    amplitude_mt: Annotated[float, Range(1e-3, 1e3)] = 4.0  # B0
+    # field at the robot by coil currents
+    mt_per_a: Annotated[Matrix3, Range(-1e4, 1e4)] = ((2.1, 0.0, 0.0), (0.0, 1.9, 0.0), (0.0, 0.0, 1.5))
+    # field without currents: the earth's, the microscope's
+    bias_mt: Annotated[Coilwise, Range(-1e3, 1e3)] = (0.0, 0.0, 0.0)
+    max_current_a: Annotated[float, Range(1e-3, 1e3)] = 5.0  # of each coil
+    ramp_s: Annotated[float, Range(0.0, 60.0)] = 0.2  # from nothing to the full amplitude and back
     amplifier: Amplifier = field(default_factory=Amplifier)
 
     def drive(
@@ -136,34 +139,13 @@ class Coils:
         return currents, self.amplifier.held_v(currents, 1.0 / rate)
 
     def check(self, where: str) -> None:
-        """Refuse settings that no field can be made with; `where` names their origin.
+        """Refuse settings, each within its range, that together make no field; `where` names their origin.
 
         Raises
         ------
         UsageError : one line, the key first.
         """
         amplifier = self.amplifier
-        positive = {
-            "amplitude_mt": (self.amplitude_mt,),
-            "max_current_a": (self.max_current_a,),
-            "amplifier.a_per_v": amplifier.a_per_v,
-            "amplifier.v_per_v": amplifier.v_per_v,
-            "amplifier.max_voltage_v": (amplifier.max_voltage_v,),
-            "amplifier.output_hz": (amplifier.output_hz,),
-        }
-        at_least_zero = {
-            "ramp_s": (self.ramp_s,),
-            "amplifier.resistance_ohm": amplifier.resistance_ohm,
-            "amplifier.inductance_mh": amplifier.inductance_mh,
-        }
-        for key, values in (positive | at_least_zero).items():
-            for value in values:
-                if not (math.isfinite(value) and (value > 0.0 or (value == 0.0 and key in at_least_zero))):
-                    need = "zero or more" if key in at_least_zero else "more than zero"
-                    raise UsageError(f"{where}: coils.{key} = {value:g}: must be {need}")
-        for key in ("mt_per_a", "bias_mt"):
-            if not np.isfinite(getattr(self, key)).all():
-                raise UsageError(f"{where}: coils.{key} = {getattr(self, key)}: must be finite numbers")
         _, strength, across = np.linalg.svd(np.array(self.mt_per_a).T)
         if strength[-1] * WORST_CONDITION <= strength[0]:
             raise UsageError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from flowrec.control.reference import bearable_pace, governed_pace, nearest_on, 
 from flowrec.control.walls import guarded, least_room
 from flowrec.flow import sample
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
+from flowrec.ranges import PositiveShare, Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -86,17 +87,24 @@ class Controller:
     """
 
     method: Method = "vector"
-    kp_per_s: float = 3.0  # of vector
-    ff_fb_kp_per_s: float = 1.0  # of ff_fb, as in the paper
-    lag_free_radii: float = 0.5  # the robot may be this far off before the reference slows down,
-    lag_full_radii: float = 3.0  # and waits for it from here on
-    pace_share: float = 0.95  # of the robot's limit that the reference may ask for; the rest is left to feedback
-    map_error: float = 0.3  # share of the flow's speed that the map is thought to be wrong by
-    observer_lag_s: float = 0.3  # how far behind a changing flow an observer without a map is thought to be
-    guard_radii: float = 1.1  # clearance kept from walls, in robot radii; 0: no wall guard
-    guard_per_s: float = 12.0  # how fast the room left above that may be used up
-    hold_radii: float = 0.5  # so near to the goal, or a frame's way, the policy hands over to vector
-    blind_s: float = 0.5  # while the robot is not seen the demand dies away with this time constant
+    kp_per_s: Annotated[float, Range(0.0, 1e3)] = 3.0  # of vector
+    ff_fb_kp_per_s: Annotated[float, Range(0.0, 1e3)] = 1.0  # of ff_fb, as in the paper
+    # the robot may be this far off before the reference slows down,
+    lag_free_radii: Annotated[float, Range(0.0, 1e3)] = 0.5
+    lag_full_radii: Annotated[float, Range(0.01, 1e3)] = 3.0  # and waits for it from here on
+    # of the robot's limit that the reference may ask for; the rest is left to feedback
+    pace_share: PositiveShare = 0.95
+    # share of the flow's speed that the map is thought to be wrong by
+    map_error: Annotated[float, Range(0.0, 10.0)] = 0.3
+    # how far behind a changing flow an observer without a map is thought to be
+    observer_lag_s: Annotated[float, Range(0.0, 60.0)] = 0.3
+    # clearance kept from walls, in robot radii; 0: no wall guard
+    guard_radii: Annotated[float, Range(0.0, 100.0)] = 1.1
+    guard_per_s: Annotated[float, Range(0.01, 1e4)] = 12.0  # how fast the room left above that may be used up
+    # so near to the goal, or a frame's way, the policy hands over to vector
+    hold_radii: Annotated[float, Range(0.0, 1e3)] = 0.5
+    # while the robot is not seen the demand dies away with this time constant
+    blind_s: Annotated[float, Range(1e-3, 60.0)] = 0.5
 
     def control(
         self,

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 
 from flowrec.messages import Applied, Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
+from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
-PHASES = ("survey", "refine", "plan", "navigate")
+Phase = Literal["survey", "refine", "plan", "navigate"]
+PHASES: tuple[Phase, ...] = get_args(Phase)
+Coordinate = Annotated[float, Range(-1e9, 1e9)]
+Place = tuple[Coordinate, Coordinate] | str
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,19 +27,27 @@ class Commander:
     are points (x, y) in um on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
     """
 
-    phases: tuple[str, ...] = PHASES
-    start: tuple[float, float] | str = "inlet"
-    goal: tuple[float, float] | str = "outlet"
-    goal_tolerance_um: float | None = None  # None: the robot's radius
-    survey_limit_s: float = 120.0
-    navigate_limit_s: float = 300.0
-    patience: float = 3.0  # no route is followed for longer than this many times its planned time, and 5 s
-    orders_limit: int = 20  # solved, refined and planned so often and still blown off: it is no use
-    find_limit_s: float = 3.0  # to see the robot for the first time, or again after the field was switched off
-    lost_limit_frames: int = 90  # in a row without seeing it before the run gives up
-    hold_after_s: float = 0.5  # without sight of the robot: it stays where it is ...
-    zero_after_s: float = 1.4  # ... and the field is switched off until it is seen again
-    replan_error_um: float | None = None  # None: six radii; blown this far off the route, plan anew
+    phases: tuple[Phase, ...] = PHASES
+    start: Place = "inlet"
+    goal: Place = "outlet"
+    goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
+    survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0
+    navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
+    # no route is followed for longer than this many times its planned time, and 5 s
+    patience: Annotated[float, Range(0.1, 1e3)] = 3.0
+    # solved, refined and planned so often and still blown off: it is no use
+    orders_limit: Annotated[int, Range(1, 1_000_000)] = 20
+    find_limit_s: Annotated[float, Range(0.01, 1e5)] = (
+        3.0  # to see the robot for the first time, or again after the field was switched off
+    )
+    # in a row without seeing it before the run gives up
+    lost_limit_frames: Annotated[int, Range(1, 1_000_000_000)] = 90
+    # without sight of the robot: it stays where it is ...
+    hold_after_s: Annotated[float, Range(0.0, 60.0)] = 0.5
+    # ... and the field is switched off until it is seen again
+    zero_after_s: Annotated[float, Range(0.0, 60.0)] = 1.4
+    # None: six radii; blown this far off the route, plan anew
+    replan_error_um: Annotated[float, Range(1.0, math.inf)] | None = None
 
     def decide(
         self,

@@ -15,12 +15,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.flow import sample
 from flowrec.messages import Estimate, FlowField, Health
+from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -33,15 +35,18 @@ _SLOW_SHARE = 0.1  # of v_max: a share of a slower flow than that says nothing
 class HealthMonitor:
     """Settings of the alarms."""
 
-    window_s: float = 3.0  # of the means of NIS and of lost frames
-    nis_sigma: float = 8.0  # alarm where the mean NIS is above 2 by so many standard deviations of a mean of white ones
-    lost_share: float = 0.3  # alarm above this share of frames without the robot
-    periods: float = 2.0  # of its frequency that a resonator remembers, but a second at least
-    pulsation_share: float = 0.15  # alarm above this share of the flow ...
-    line_share: float = 0.5  # ... if the line is this share of the flow's unrest
-    settle_s: float = 2.0  # no `pulsation` before the flow was known for so long
-    settled_share: float = 0.1  # nothing is listened to while the flow's sigma is above this share of v_max
-    ends_at: float = 0.8  # an alarm ends below this share of its thresholds
+    window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # of the means of NIS and of lost frames
+    # alarm where the mean NIS is above 2 by so many standard deviations of a mean of white ones
+    nis_sigma: Annotated[float, Range(0.1, 1e6)] = 8.0
+    lost_share: Share = 0.3  # alarm above this share of frames without the robot
+    # of its frequency that a resonator remembers, but a second at least
+    periods: Annotated[float, Range(0.5, 1e3)] = 2.0
+    pulsation_share: Annotated[float, Range(1e-3, 1e3)] = 0.15  # alarm above this share of the flow ...
+    line_share: Share = 0.5  # ... if the line is this share of the flow's unrest
+    settle_s: Annotated[float, Range(0.0, 3600.0)] = 2.0  # no `pulsation` before the flow was known for so long
+    # nothing is listened to while the flow's sigma is above this share of v_max
+    settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1
+    ends_at: Share = 0.8  # an alarm ends below this share of its thresholds
 
     def watch(
         self,

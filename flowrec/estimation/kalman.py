@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -22,6 +23,7 @@ from filterpy.kalman import KalmanFilter
 from flowrec.estimation.motion import ISOTROPIC, Floats, Layout, noise, onward, slope_of
 from flowrec.flow import sample
 from flowrec.messages import Applied, Estimate, FlowField, Matrix, Track
+from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -40,17 +42,21 @@ _SURPRISE_LIMIT = 4.0  # sigma: one wild measurement is no trend
 class Kalman:
     """Settings; None is scaled to the robot."""
 
-    position_noise_um: float | None = None  # one sigma of a measured position; None: 2 % of the radius
+    # one sigma of a measured position; None: 2 % of the radius
+    position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
     # q of a plain random walk of the flow in time, um2/s3, in place of all that follows up to `watch_radii`.
-    flow_noise_um2_s3: float | None = None
-    flow_change: float = 2e-3  # variance of the flow's change over a way of one radius, as a share of its square
-    slope_change: float = 2e-5  # the same of its slopes times the radius
-    map_share: float = 0.25  # of the flow, and so of its changes, that a map misses
-    agility: float = 1.0  # all changes' variances times this: the knob of `flowrec bench observer --session`
-    watch_radii: float = 2.2  # innovations are averaged over the time that the robot needs for this way at v_max
-    drift_um2_s: float = 4.0  # of the position: Brownian motion and uneven rolling
-    gate_nis: float = 25.0  # a measurement less likely than this is not used at once ...
-    gate_growth: float = 4.0  # ... but the position's variance is multiplied, so that a real jump is soon believed
+    flow_noise_um2_s3: Annotated[float, Range(0.0, 1e12)] | None = None
+    flow_change: Share = 2e-3  # variance of the flow's change over a way of one radius, as a share of its square
+    slope_change: Share = 2e-5  # the same of its slopes times the radius
+    map_share: Annotated[float, Range(0.0, 10.0)] = 0.25  # of the flow, and so of its changes, that a map misses
+    # all changes' variances times this: the knob of `flowrec bench observer --session`
+    agility: Annotated[float, Range(1e-6, 1e6)] = 1.0
+    # innovations are averaged over the time that the robot needs for this way at v_max
+    watch_radii: Annotated[float, Range(0.01, 1e3)] = 2.2
+    drift_um2_s: Annotated[float, Range(0.0, 1e6)] = 4.0  # of the position: Brownian motion and uneven rolling
+    gate_nis: Annotated[float, Range(1.0, 1e9)] = 25.0  # a measurement less likely than this is not used at once ...
+    # ... but the position's variance is multiplied, so that a real jump is soon believed
+    gate_growth: Annotated[float, Range(1.0, 1e6)] = 4.0
     # Also estimate the robot's um per revolution. It shows only against its heading: see `estimate`.
     estimate_gain: bool = False
 

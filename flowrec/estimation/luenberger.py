@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from flowrec.messages import Applied, Estimate, Track
+from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -16,8 +18,9 @@ from flowrec.units import seconds
 class Luenberger:
     """With xhat' = u + vhat it is a first-order low pass on the measured drift, discretised exactly."""
 
-    gain_per_s: float = 1.0  # L_p, the same on both axes
-    position_noise_um: float | None = None  # one sigma, for the stated covariance only; None: 4 % of the radius
+    gain_per_s: Annotated[float, Range(1e-3, 1e4)] = 1.0  # L_p, the same on both axes
+    # one sigma, for the stated covariance only; None: 4 % of the radius
+    position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
 
     def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
         """The position is the measured one; the covariance is nominal: noise through the low pass, no dynamics."""

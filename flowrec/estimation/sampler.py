@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from flowrec.estimation.kalman import behind_s, memory_s
 from flowrec.estimation.trimmed import Trimmed
 from flowrec.messages import Estimate, Observations
+from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import nanoseconds, seconds
 
@@ -25,12 +26,13 @@ class Sampler:
     the filter remembers do not count the same noise twice.
     """
 
-    spacing_radii: float = 0.8  # least way between two observations, in radii of the robot
-    memories: float = 2.0  # and least time, in memories of the filter
-    settled_share: float = 0.1  # no observation while the flow's sigma is above this share of the robot's top speed
-    floor_um_s: float = 2.0  # no observation claims a smaller sigma
-    rolling_share: float = 0.02  # of the robot's own speed, one sigma: rolled off course, which passes for flow
-    capacity: int = 2000  # the oldest go first
+    spacing_radii: Annotated[float, Range(0.0, 1e3)] = 0.8  # least way between two observations, in radii of the robot
+    memories: Annotated[float, Range(0.0, 1e3)] = 2.0  # and least time, in memories of the filter
+    # no observation while the flow's sigma is above this share of the robot's top speed
+    settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1
+    floor_um_s: Annotated[float, Range(1e-3, 1e4)] = 2.0  # no observation claims a smaller sigma
+    rolling_share: Share = 0.02  # of the robot's own speed, one sigma: rolled off course, which passes for flow
+    capacity: Annotated[int, Range(1, 100_000)] = 2000  # the oldest go first
     # trimmed: as in the paper, before a refinement uses them; smoothed: by the RTS smoother, in a replay only.
     method: Literal["filter", "trimmed", "smoothed"] = "filter"
     trimmed: Trimmed = field(default_factory=Trimmed)

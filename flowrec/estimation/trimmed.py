@@ -9,12 +9,13 @@ fast and nothing is wrong, so we discard within a window that slides along the w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.messages import Observations
+from flowrec.ranges import Range
 
 Floats = NDArray[np.float64]
 
@@ -23,10 +24,10 @@ Floats = NDArray[np.float64]
 class Trimmed:
     """Settings of the paper's treatment."""
 
-    discarded_share: float = 0.2  # at the top, and as many at the bottom
+    discarded_share: Annotated[float, Range(0.0, 0.49)] = 0.2  # at the top, and as many at the bottom
     over: Literal["window", "survey"] = "window"
-    window: int = 9  # observations along the way
-    degree: int = 2  # of the polynomial in the way travelled
+    window: Annotated[int, Range(1, 1001)] = 9  # observations along the way
+    degree: Annotated[int, Range(0, 9)] = 2  # of the polynomial in the way travelled
 
     def treat(self, observations: Observations) -> Observations:
         """As many observations at the same places, smoothed; those that are not finite numbers are left out.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from flowrec.flow.modes import FlowModes
 from flowrec.flow.response import FlowResponse, respond
 from flowrec.flow.system import NotConvergedError, System, depth_friction, system
 from flowrec.messages import FlowField
+from flowrec.ranges import OneOf, Range
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
 
 CLOSE = 1e-9  # residuals below are rounding, which differs from machine to machine: the digits would be noise
@@ -23,9 +25,9 @@ CLOSE = 1e-9  # residuals below are rounding, which differs from machine to mach
 class FlowSolver:
     """Steady incompressible flow by finite volumes on a staggered grid (science.md, section 1)."""
 
-    k: int = 1  # subcells per pixel side: 1, 2 or 4
-    max_iterations: int = 40
-    tolerance: float = 1e-9  # last Newton step over the fastest velocity
+    k: Annotated[int, OneOf(1, 2, 4)] = 1  # subcells per pixel side: 1, 2 or 4
+    max_iterations: Annotated[int, Range(1, 10_000)] = 40
+    tolerance: Annotated[float, Range(1e-14, 0.1)] = 1e-9  # last Newton step over the fastest velocity
     convection: bool = True  # False: Stokes flow
 
     def solve(self, chip: Chip) -> FlowField:
@@ -81,7 +83,7 @@ class FlowSolver:
 
     def _equations(self, chip: Chip) -> tuple[System, _Scales]:
         if self.k not in (1, 2, 4):
-            raise FlowError(f"solver.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
+            raise FlowError(f"flow.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
         _check(chip)
         return system(chip, self.k), _Scales.of(chip, self.k, self.convection)
 
@@ -101,8 +103,8 @@ class FlowSolver:
             reynolds = scales.inertia * self.k * widest * fastest
             raise FlowError(
                 f"flow on chip '{chip.name}' did not converge (Re about {reynolds:.3g}, last step {failure.step:.1e} "
-                f"after {self.max_iterations} iterations): try a larger solver.k or solver.max_iterations, "
-                "check units of speed and viscosity, or set solver.convection = false"
+                f"after {self.max_iterations} iterations): try a larger flow.k or flow.max_iterations, "
+                "check units of speed and viscosity, or set flow.convection = false"
             ) from None
 
     def _field(self, chip: Chip, equations: System, scales: _Scales, moving: Floats) -> FlowField:

@@ -6,7 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from dataclasses import field as setting
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,7 @@ from flowrec.planning.space import (
 )
 from flowrec.planning.terrain import Terrain, interpolated
 from flowrec.planning.time_field import descend, time_field, with_band
+from flowrec.ranges import OneOf, PositiveShare, Range, Share, check_ranges
 from flowrec.robot import Robot
 
 Method = Literal["time_field", "astar_time", "astar_paper", "astar_length", "rrt", "rrt_star"]
@@ -68,18 +69,23 @@ class Planner:
 
     method: Method = "time_field"
     cost: Cost = "time"
-    idle_speed_um_s: float | None = None  # swimming at this speed takes as much power as being there; None: half of V
-    clearance_margin_um: float | None = None  # kept from the walls beside the robot's radius; None: half of it
+    # swimming at this speed takes as much power as being there; None: half of V
+    idle_speed_um_s: Annotated[float, Range(0.01, 1e6)] | None = None
+    # kept from the walls beside the robot's radius; None: half of it
+    clearance_margin_um: Annotated[float, Range(0.0, 1e4)] | None = None
     swift: Swift = setting(default_factory=Swift)  # more is kept where the flow is swift
-    speed_share: float = 0.85  # of the robot's speed limit; the rest is left to the controller
-    policy_share: float = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
+    speed_share: PositiveShare = 0.85  # of the robot's speed limit; the rest is left to the controller
+    policy_share: PositiveShare = 1.0  # of the robot's speed limit in the route's time to go: a policy keeps no reserve
     # Of that margin in the time to go. Against the flow the fastest way is along the wall, and a policy, which no
     # reference drags there, keeps off it by itself; a robot that tracks a route needs all of the margin.
-    policy_margin_share: float = 0.2
-    robust_deviations: float = 1.0  # of the flow, by which it may be worse than believed; fewer where no way is left
-    flow_error_share: float = 0.05  # one deviation of a flow that does not know its own, as a share of its speed
-    reach_px: int = 3  # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
-    paper_radius_px: float = 3.5  # neighbours of astar_paper
+    policy_margin_share: Share = 0.2
+    # of the flow, by which it may be worse than believed; fewer where no way is left
+    robust_deviations: Annotated[float, Range(0.0, 100.0)] = 1.0
+    # one deviation of a flow that does not know its own, as a share of its speed
+    flow_error_share: Annotated[float, Range(0.0, 10.0)] = 0.05
+    # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
+    reach_px: Annotated[int, OneOf(1, 2, 3)] = 3
+    paper_radius_px: Annotated[float, Range(1.0, 100.0)] = 3.5  # neighbours of astar_paper
     refine: bool = True  # the path of time_field and astar_time
     rrt: Rrt = setting(default_factory=Rrt)
 
@@ -126,13 +132,7 @@ class Planner:
     def _check(self) -> None:
         if self.cost == "energy" and self.method != "time_field":
             raise UsageError(f"plan: {self.method} knows no energy; cost = 'energy' goes with method = 'time_field'")
-        if self.idle_speed_um_s is not None and not self.idle_speed_um_s > 0.0:
-            raise UsageError(
-                f"plan: idle_speed_um_s is {self.idle_speed_um_s:g} and must be more than zero: a robot that needs no "
-                "power to be there would never arrive"
-            )
-        if self.robust_deviations < 0.0 or self.flow_error_share < 0.0:
-            raise UsageError("plan: robust_deviations and flow_error_share must not be negative")
+        check_ranges(self, "plan")
 
     def _by_time_field(
         self, space: Space, field: FlowField, start: End, goal: End, speed_um_s: float

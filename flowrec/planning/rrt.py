@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from flowrec.errors import UsageError
 from flowrec.planning.space import Space
 from flowrec.planning.zermelo import line_is_clear, segment_cost
+from flowrec.ranges import Range, Seed, Share
 
 Points = NDArray[np.float64]
 
@@ -29,10 +30,10 @@ Points = NDArray[np.float64]
 class Rrt:
     """Settings of both trees."""
 
-    seed: int = 0
-    iterations: int = 20000  # at most; rrt stops at its first way
-    range_px: float = 12.0  # longest branch
-    goal_bias: float = 0.05  # share of the samples that are the goal itself
+    seed: Seed = 0
+    iterations: Annotated[int, Range(1, 100_000_000)] = 20000  # at most; rrt stops at its first way
+    range_px: Annotated[float, Range(0.1, 1e5)] = 12.0  # longest branch
+    goal_bias: Share = 0.05  # share of the samples that are the goal itself
 
     def search(self, space: Space, start: Points, goal: Points, speed: float | None) -> Points | None:
         """(n, 2) px from start to goal, None when the iterations do not suffice; the fastest at a `speed` (px/s).

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError, UsageError
 from flowrec.messages import FlowField
 from flowrec.planning.zermelo import bilinear, line_is_clear
+from flowrec.ranges import Range
 from flowrec.robot import Robot
 
 Points = NDArray[np.float64]
@@ -93,10 +95,12 @@ class Drift:
 class Swift:
     """What makes a flow too swift to be steered in; times are set when a run is resolved, and 0 where nobody did."""
 
-    map_error: float = 0.2  # share of the flow's speed that the map is thought to be wrong by
-    heading_error_rad: float = 0.1  # by which the robot is thought to roll off its heading: three of its sigmas
-    frame_s: float | None = None  # None: the camera's
-    latency_s: float | None = None  # from command to motion; None: the robot's
+    # share of the flow's speed that the map is thought to be wrong by
+    map_error: Annotated[float, Range(0.0, 10.0)] = 0.2
+    # by which the robot is thought to roll off its heading: three of its sigmas
+    heading_error_rad: Annotated[float, Range(0.0, 0.5 * math.pi)] = 0.1
+    frame_s: Annotated[float, Range(0.0, 10.0)] | None = None  # None: the camera's
+    latency_s: Annotated[float, Range(0.0, 10.0)] | None = None  # from command to motion; None: the robot's
 
     def drift(self, robot: Robot, speed_um_s: float) -> Drift:
         """Of a robot that swims at a speed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,7 @@ from flowrec.planning.lattice import backtrack, directions, search
 from flowrec.planning.relax import relax
 from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route
 from flowrec.planning.space import Space, Swift, attach_start, joined_ends, margin_remark, margins_um, open_space
+from flowrec.ranges import PositiveShare, Range
 from flowrec.robot import Robot
 
 _METHOD = "survey"
@@ -30,13 +32,15 @@ class SurveyPlanner:
     through every junction and can neither stop nor circle.
     """
 
-    distance_um: float | None = None  # None: the share below of the longest way downstream
-    share: float | None = None  # None: an eighth; half where several inlets or outlets are to be told apart
-    speed_share: float = 0.5  # of the robot's speed limit: slower than travelling, for more to be seen on the way
-    clearance_margin_um: float | None = None  # None: half of the robot's radius
+    distance_um: Annotated[float, Range(1.0, 1e7)] | None = None  # None: the share below of the longest way downstream
+    share: PositiveShare | None = None  # None: an eighth; half where several inlets or outlets are to be told apart
+    # of the robot's speed limit: slower than travelling, for more to be seen on the way
+    speed_share: PositiveShare = 0.5
+    clearance_margin_um: Annotated[float, Range(0.0, 1e4)] | None = None  # None: half of the robot's radius
     swift: Swift = field(default_factory=Swift)  # as the planner's
-    middle_pull: float = 2.0  # how much dearer, as a share, a pixel next to the wall is than one in the middle
-    outlet_gap_radii: float = 3.0  # left between the end of the route and any opening
+    # how much dearer, as a share, a pixel next to the wall is than one in the middle
+    middle_pull: Annotated[float, Range(0.0, 1e3)] = 2.0
+    outlet_gap_radii: Annotated[float, Range(0.0, 1e3)] = 3.0  # left between the end of the route and any opening
 
     def plan(
         self, field: FlowField, start_um: ArrayLike, chip: Chip, robot: Robot, distance_um: float | None = None

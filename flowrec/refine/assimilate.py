@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from flowrec.flow import FlowSolver
 from flowrec.flow.kept import cells_of, chip_key, kept
 from flowrec.flow.response import FlowResponse, State, fluid_image
 from flowrec.messages import FlowField
+from flowrec.ranges import Range
 from flowrec.refine.mask_doubt import other_walls
 from flowrec.refine.model_error import ModelError
 from flowrec.refine.prior import Prior, Widths
@@ -38,17 +40,18 @@ CROWD_PX = 4  # observations in a square of this size share the model's error
 class Assimilate:
     """Settings of the assimilation. Prior widths are one standard deviation."""
 
-    inlet_std_share: float = 0.25  # of the assumed inlet speed
-    pump_std_share: float = 0.0  # the same, common to all inlets
-    outlet_std_share: float = 0.10  # of the largest assumed |pressure|
-    viscosity_std_share: float = 0.30  # of the assumed viscosity
-    density_std_share: float = 0.10  # of the assumed density
-    depth_std_share: float = 0.0  # of the chip's depth, where it has one
-    inlet_shape_std: float = 0.0  # skew and flatness of the inlets' profiles, of the inlet speed
+    inlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.25  # of the assumed inlet speed
+    pump_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0  # the same, common to all inlets
+    outlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10  # of the largest assumed |pressure|
+    viscosity_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.30  # of the assumed viscosity
+    density_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10  # of the assumed density
+    depth_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0  # of the chip's depth, where it has one
+    # skew and flatness of the inlets' profiles, of the inlet speed
+    inlet_shape_std: Annotated[float, Range(0.0, 10.0)] = 0.0
     model: ModelError = field(default_factory=ModelError)
     doubt_walls: bool = True  # try walls a pixel off where the observations contradict the chip's
-    max_steps: int = 8  # of the full equations with frozen factors
-    tolerance: float = 2e-3  # last such step over the fastest speed
+    max_steps: Annotated[int, Range(1, 1_000)] = 8  # of the full equations with frozen factors
+    tolerance: Annotated[float, Range(1e-12, 1.0)] = 2e-3  # last such step over the fastest speed
 
     def fit(self, assumed: FlowField, sight: Sight, chip: Chip, solver: FlowSolver) -> FlowField:
         """Posterior mean field with its standard deviation, boundary values and viscosity.

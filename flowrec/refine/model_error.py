@@ -8,6 +8,7 @@ of it is added to the flow.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.response import FlowResponse, fluid_image
+from flowrec.ranges import Range
 from flowrec.refine.sight import Floats
 
 
@@ -28,11 +30,16 @@ class ModelError:
     an infinitely fine grid of the same staircase the share would be 0.3 / (1 - 0.3).
     """
 
-    share: float = 0.30  # of D that is added: 0.32 over 24 crops of real vessels, 0.37 over 12 drawn ones
-    share_std: float = 0.15  # one standard deviation of it: 0.04 from chip to chip, more from one solver to another
-    left_share: float = 0.12  # of D around a pixel: one standard deviation of what is left there; 0.09 to 0.10 there
-    speed_share: float = 0.003  # of the speed around a pixel: the same, where both grids agree by chance
-    coarse_share: float = 0.02  # of the speed around a pixel: all of it, where there is no coarser grid (k = 1)
+    # of D that is added: 0.32 over 24 crops of real vessels, 0.37 over 12 drawn ones
+    share: Annotated[float, Range(0.0, 10.0)] = 0.30
+    # one standard deviation of it: 0.04 from chip to chip, more from one solver to another
+    share_std: Annotated[float, Range(0.0, 10.0)] = 0.15
+    # of D around a pixel: one standard deviation of what is left there; 0.09 to 0.10 there
+    left_share: Annotated[float, Range(0.0, 10.0)] = 0.12
+    # of the speed around a pixel: the same, where both grids agree by chance
+    speed_share: Annotated[float, Range(1e-6, 10.0)] = 0.003
+    # of the speed around a pixel: all of it, where there is no coarser grid (k = 1)
+    coarse_share: Annotated[float, Range(1e-6, 10.0)] = 0.02
 
     def of(self, chip: Chip, solver: FlowSolver, response: FlowResponse) -> GridError:
         """Of the flow at `response`, and of its modes. D is that of Stokes flow: inertia hardly changes it."""

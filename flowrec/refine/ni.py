@@ -9,7 +9,7 @@ nothing was observed only the equations speak, and those are fulfilled by fluid 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import median_width_um
 from flowrec.messages import FlowField
+from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.case import MULTIPLE
 from flowrec.refine.crop import Crop
 from flowrec.refine.judge import RELATIVE_NOISE, TAIL
@@ -33,15 +34,16 @@ class Ni:
     """Settings of N/I."""
 
     observations: Literal["soft", "hard"] = "soft"  # hard: as printed, the pixel takes the measured value
-    iterations: int = 150
-    largest_work_mpx: float = 6.0  # iterations times pixels in millions: larger fields get fewer iterations
-    patience: int = 30  # iterations without a better loss before it stops
-    learning_rate: float = 3e-3
-    observation_weight: float = 0.1  # of the mean log-likelihood against the mean squared residual
-    base_channels: int = 16
+    iterations: Annotated[int, Range(1, 1_000_000)] = 150
+    # iterations times pixels in millions: larger fields get fewer iterations
+    largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 6.0
+    patience: Annotated[int, Range(1, 1_000_000)] = 30  # iterations without a better loss before it stops
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
+    observation_weight: Weight = 0.1  # of the mean log-likelihood against the mean squared residual
+    base_channels: Annotated[int, Range(1, 512)] = 16
     device: Device = "cpu"
-    threads: int = 1
-    seed: int = 0
+    threads: Threads = 1
+    seed: Seed = 0
 
     def fit(self, assumed: FlowField, sight: Sight, chip: Chip) -> FlowField:
         """A field from observations and equations alone; of `assumed` only stamp and labels are used.

@@ -13,13 +13,14 @@ balancing 0.083 after the one and 0.084 after the other. With weights "none" and
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.messages import FlowField
+from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.case import Case
 from flowrec.refine.judge import doubt, misfit
 from flowrec.refine.sight import Floats, Sight
@@ -44,16 +45,18 @@ class PiUnet:
     finish: Literal["balance", "none"] = "balance"  # with soft observations
     observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value, noise and all
     near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as printed, the initial values stay
-    iterations: int | None = None  # None: 80 with random weights, none with trained ones
-    largest_work_mpx: float = 4.0  # iterations times pixels in millions: larger fields get fewer iterations
-    patience: int = 25  # iterations without a better loss before it stops
-    learning_rate: float = 3e-3
-    observation_weight: float = 0.03  # of the mean log-likelihood against the mean squared residual
-    base_channels: int = 16  # of the network with random weights
+    # None: 80 with random weights, none with trained ones
+    iterations: Annotated[int, Range(0, 1_000_000)] | None = None
+    # iterations times pixels in millions: larger fields get fewer iterations
+    largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 4.0
+    patience: Annotated[int, Range(1, 1_000_000)] = 25  # iterations without a better loss before it stops
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
+    observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
+    base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
     device: Device = "cpu"
     # More than one only on idle cores: torch spins at its barriers, and on two shared cores two are ten times slower.
-    threads: int = 1
-    seed: int = 0
+    threads: Threads = 1
+    seed: Seed = 0
 
     @property
     def weights_sha256(self) -> str:

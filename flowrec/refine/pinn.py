@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import median_width_um
 from flowrec.errors import FlowError
 from flowrec.messages import FlowField
+from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.collocation import Collocation
 from flowrec.refine.sight import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
@@ -40,23 +41,26 @@ BLOCK = 100  # iterations over which the noisy loss is averaged before it is jud
 class Pinn:
     """Settings of the PINN."""
 
-    iterations: int = 1000
-    patience: int = 300  # iterations without a loss that is lower by a hundredth before it stops
-    points: int = 512  # of the fluid, drawn anew for every iteration; half as many of the walls
-    width: int = 64
-    depth: int = 4
-    features: int = 64  # sines and cosines of the coordinates that the first layer sees
-    wavenumber: float = 0.5  # of those, radians per median channel width, one standard deviation
-    learning_rate: float = 3e-3
-    momentum_weight: float = 0.1  # weights are those of mean squares
-    continuity_weight: float = 30.0  # a leak is worse than a wrong force: it breaks the share of every branch beyond
-    observation_weight: float = 10.0
-    wall_weight: float = 10.0
-    inlet_weight: float = 1.0
-    outlet_weight: float = 1.0
+    iterations: Annotated[int, Range(1, 1_000_000)] = 1000
+    # iterations without a loss that is lower by a hundredth before it stops
+    patience: Annotated[int, Range(1, 1_000_000)] = 300
+    # of the fluid, drawn anew for every iteration; half as many of the walls
+    points: Annotated[int, Range(16, 1_000_000)] = 512
+    width: Annotated[int, Range(1, 4_096)] = 64
+    depth: Annotated[int, Range(1, 64)] = 4
+    features: Annotated[int, Range(1, 4_096)] = 64  # sines and cosines of the coordinates that the first layer sees
+    # of those, radians per median channel width, one standard deviation
+    wavenumber: Annotated[float, Range(1e-3, 1e3)] = 0.5
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
+    momentum_weight: Weight = 0.1  # weights are those of mean squares
+    continuity_weight: Weight = 30.0  # a leak is worse than a wrong force: it breaks the share of every branch beyond
+    observation_weight: Weight = 10.0
+    wall_weight: Weight = 10.0
+    inlet_weight: Weight = 1.0
+    outlet_weight: Weight = 1.0
     device: Device = "cpu"
-    threads: int = 1
-    seed: int = 0
+    threads: Threads = 1
+    seed: Seed = 0
 
     def fit(self, assumed: FlowField, sight: Sight, chip: Chip) -> FlowField:
         """The network's mean over each pixel; of `assumed` only stamp and labels are used.

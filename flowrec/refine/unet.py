@@ -15,6 +15,7 @@ import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.messages import FlowField
+from flowrec.ranges import Threads
 from flowrec.refine.case import Case
 from flowrec.refine.sight import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
@@ -27,7 +28,7 @@ class Unet:
 
     weights: str = ""  # path of a .safetensors file; '' for those that are shipped
     device: Device = "cpu"
-    threads: int = 1
+    threads: Threads = 1
 
     @property
     def path(self) -> Path:

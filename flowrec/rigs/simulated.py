@@ -26,6 +26,7 @@ from flowrec.errors import RigError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
 from flowrec.pipeline import Inputs, Pipeline
+from flowrec.ranges import check_ranges
 from flowrec.rigs.camera_clock import CameraClock
 from flowrec.rigs.debris import Debris
 from flowrec.rigs.microscope import Microscope
@@ -114,7 +115,8 @@ class SimulatedRig:
         true_field: FlowField | None = None,
         coils: Coils | None = None,
     ) -> None:
-        _refuse_nonsense(camera, simulated)
+        check_ranges(camera, "camera")
+        check_ranges(simulated, "simulated")
         check_point(chip, start_um, "start", robot.radius)
         self._chip = chip
         self._robot = robot
@@ -262,35 +264,3 @@ def _order(command: Currents) -> Order:
     """What a command asks of the field; its amplitude, already on a ramp, at once."""
     c = command
     return Order(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz)
-
-
-def _refuse_nonsense(camera: CameraSettings, simulated: Simulated) -> None:
-    """Raise RigError for numbers that no world can be made of."""
-    positive = {
-        "camera.width_px": camera.width_px,
-        "camera.height_px": camera.height_px,
-        "camera.photons_per_level": camera.photons_per_level,
-        "camera.background": camera.background,
-        "camera.rate_hz": _DEFAULT_RATE_HZ if camera.rate_hz is None else camera.rate_hz,
-        "simulated.k": simulated.k,
-    }
-    for name, value in positive.items():
-        if not (math.isfinite(value) and value > 0):
-            raise RigError(f"{name} = {value:g}: the simulated rig needs more than zero")
-    at_least_zero = {
-        "camera.debris": camera.debris,
-        "camera.exposure_s": camera.exposure_s,
-        "camera.blur_px": camera.blur_px,
-        "camera.read_noise": camera.read_noise,
-        "simulated.position_noise_um": simulated.position_noise_um,
-        "simulated.seed": simulated.seed,
-        "simulated.delay_s": simulated.delay_s or 0.0,
-        "simulated.pulsation_hz": simulated.pulsation_hz,
-        "simulated.arrival_jitter_s": simulated.arrival_jitter_s,
-    }
-    for name, value in at_least_zero.items():
-        if not (math.isfinite(value) and value >= 0):
-            raise RigError(f"{name} = {value:g}: the simulated rig can not take less than zero")
-    for name in ("inlet_speed_error", "viscosity_error", "pulsation_share"):
-        if not 0 <= getattr(simulated, name) < 1:
-            raise RigError(f"simulated.{name} = {getattr(simulated, name):g}: it is a share, from 0 to below 1")

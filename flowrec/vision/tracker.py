@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
 from flowrec.messages import Frame, Image, Track
+from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
 from flowrec.vision.appearance import edge_px, template
@@ -69,17 +71,21 @@ class Sight:
 class Tracker:
     """Finds the robot; its memory is the previous Track. Lengths that belong to the robot are in its radii."""
 
-    least_score: float = 0.55  # likeness times agreement of size, 0 to 1, to be taken for the robot while locked
-    acquire_score: float = 0.65  # the same when it was not seen just before: there is more to be mistaken
-    acquire_likeness: float = 0.82  # and the likeness alone: touching pieces of debris have its size, not its shape
-    least_contrast: float = 6.0  # darkness of the robot in grey levels
-    size_tolerance: float = 0.25  # one sigma of ln(seen radius / expected radius)
-    search_radii: float = 2.0  # how far from the last position to look, besides what v_max allows ...
-    search_px: float = 8.0  # ... and at least so many pixels
-    reach_speed: float = 3.0  # farthest drift since the last frame, in v_max dt: its own speed and the flow's
-    reacquire_after: int = 10  # frames without the robot, then the whole channel is searched
-    wall_margin_um: float = 18.0  # this near to a wall its own image spoils that of the robot
-    candidates: int = 6  # measured at most per image
+    least_score: Share = 0.55  # likeness times agreement of size, 0 to 1, to be taken for the robot while locked
+    acquire_score: Share = 0.65  # the same when it was not seen just before: there is more to be mistaken
+    acquire_likeness: Share = 0.82  # and the likeness alone: touching pieces of debris have its size, not its shape
+    least_contrast: Annotated[float, Range(0.0, 255.0)] = 6.0  # darkness of the robot in grey levels
+    size_tolerance: Annotated[float, Range(0.01, 10.0)] = 0.25  # one sigma of ln(seen radius / expected radius)
+    # how far from the last position to look, besides what v_max allows ...
+    search_radii: Annotated[float, Range(0.0, 1e3)] = 2.0
+    search_px: Annotated[float, Range(1.0, 1e4)] = 8.0  # ... and at least so many pixels
+    # farthest drift since the last frame, in v_max dt: its own speed and the flow's
+    reach_speed: Annotated[float, Range(0.0, 1e3)] = 3.0
+    # frames without the robot, then the whole channel is searched
+    reacquire_after: Annotated[int, Range(0, 1_000_000)] = 10
+    # this near to a wall its own image spoils that of the robot
+    wall_margin_um: Annotated[float, Range(0.0, 1e4)] = 18.0
+    candidates: Annotated[int, Range(1, 1_000)] = 6  # measured at most per image
 
     def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
         """The robot in this frame; `seen` False keeps the last position (the image's centre before the first)."""

@@ -169,14 +169,14 @@ def test_a_current_amplifier_is_told_volts_in_proportion_to_the_current_and_kept
     [
         ("mt_per_a", "[[2.0, 0.0, 2.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]", "no currents make a field along z"),
         ("mt_per_a", "[[2.0, 2.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]", r"along \(-0.45, 0.89, 0.00\)"),
-        ("amplitude_mt", "0.0", "must be more than zero"),
-        ("max_current_a", "0", "must be more than zero"),
-        ("ramp_s", "-0.1", "must be zero or more"),
-        ("bias_mt", "[nan, 0.0, 0.0]", "must be finite"),
-        ("amplifier.a_per_v", "[1.0, 0.0, 1.0]", "must be more than zero"),
-        ("amplifier.max_voltage_v", "-10.0", "must be more than zero"),
-        ("amplifier.kind", "magic", "'current' or 'voltage'"),
-        ("surface", "wall", "'floor' or 'ceiling'"),
+        ("amplitude_mt", "0.0", "must be from 0.001"),
+        ("max_current_a", "0", "must be from 0.001"),
+        ("ramp_s", "-0.1", "must be from 0 to"),
+        ("bias_mt", "[nan, 0.0, 0.0]", "must be from -1000"),
+        ("amplifier.a_per_v", "[1.0, 0.0, 1.0]", "must be from 1e-06"),
+        ("amplifier.max_voltage_v", "-10.0", "must be from 0.001"),
+        ("amplifier.kind", "magic", "one of current, voltage"),
+        ("surface", "wall", "one of floor, ceiling"),
     ],
 )
 def test_coils_that_can_not_be_are_refused_before_anything_is_switched_on(key, value, says):

@@ -9,7 +9,7 @@ import pytest
 from flowrec.chip import ChipSettings, load_chip
 from flowrec.chip.calibration import Calibration
 from flowrec.control import Coils
-from flowrec.errors import ChipError, RigError
+from flowrec.errors import ChipError, RigError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Currents, FlowField
 from flowrec.rigs.simulated import SimulatedRig, true_chip
@@ -242,9 +242,9 @@ def test_a_world_that_can_not_be_is_refused_in_one_line():
         rig_with(start=(1000.0, 100.0))
     with pytest.raises(ChipError, match="nearer to a wall than 50 um"):
         rig_with(start=(1000.0, 450.0))
-    with pytest.raises(RigError, match=r"camera\.photons_per_level = 0"):
+    with pytest.raises(UsageError, match=r"camera\.photons_per_level = 0"):
         rig_with(camera=replace(CAMERA, photons_per_level=0.0))
-    with pytest.raises(RigError, match=r"inlet_speed_error = 1\.5"):
+    with pytest.raises(UsageError, match=r"inlet_speed_error = 1\.5"):
         rig_with(simulated=replace(EXACT, inlet_speed_error=1.5))
     other = FlowSolver(1).solve(load_chip(ChipSettings("bifurcation")))
     with pytest.raises(RigError, match="solve it on this chip"):
