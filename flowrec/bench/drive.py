@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.jit import compiled
 from flowrec.messages import FlowField, Route
-from flowrec.planning.jit import compiled
 from flowrec.planning.zermelo import bilinear
 
 Raster = NDArray[np.float64]

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.jit import compiled
+from flowrec.jit import compiled
 from flowrec.planning.zermelo import bilinear, line_is_clear, step_time
 
 Raster = NDArray[np.float64]

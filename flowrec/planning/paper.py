@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from flowrec.planning.jit import compiled
+from flowrec.jit import compiled
 from flowrec.planning.zermelo import line_is_clear
 
 Points = NDArray[np.float64]

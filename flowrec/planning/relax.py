@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.jit import compiled
+from flowrec.jit import compiled
 from flowrec.planning.zermelo import bilinear, lowest_clearance, segment_cost
 
 Points = NDArray[np.float64]

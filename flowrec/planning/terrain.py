@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.jit import compiled
+from flowrec.jit import compiled
 
 Points = NDArray[np.float64]
 Raster = NDArray[np.float64]

@@ -18,7 +18,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.jit import compiled
+from flowrec.jit import compiled
 from flowrec.planning.terrain import Terrain
 from flowrec.planning.zermelo import bilinear, line_is_clear, segment_cost, step_cost, step_energy
 

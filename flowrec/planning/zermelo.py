@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.jit import compiled
+from flowrec.jit import compiled
 
 Raster = NDArray[np.float64]
 

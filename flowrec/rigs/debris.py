@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
+from flowrec.jit import compiled
 from flowrec.rigs.swimmer import bilinear
 
 
-@njit(cache=True)
+@compiled
 def _drift(
     points: NDArray[np.float64],
     radii: NDArray[np.float64],

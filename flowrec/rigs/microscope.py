@@ -12,12 +12,12 @@ import math
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.clearance import clearance_um
+from flowrec.jit import compiled
 from flowrec.messages import Image
 from flowrec.settings import CameraSettings
 
@@ -25,7 +25,7 @@ _POOL = 1 << 20
 _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
 
 
-@njit(cache=True)
+@compiled
 def _draw(
     scene: NDArray[np.float32],
     column: float,
@@ -64,7 +64,7 @@ def _draw(
     return x0, y0, x1, y1
 
 
-@njit(cache=True)
+@compiled
 def _expose(
     scene: NDArray[np.float32],
     pool: NDArray[np.int8],

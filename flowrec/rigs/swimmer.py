@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flowrec.jit import compiled
 from flowrec.robot import Robot
 from flowrec.settings import Simulated
 
@@ -20,7 +20,7 @@ _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 
 _MEMORY_S = 1.0  # of the wander
 
 
-@njit(cache=True)
+@compiled
 def bilinear(raster: NDArray[np.float32], x: float, y: float) -> float:
     """Value of a raster (h, w) at pixel coordinates, held constant beyond its outermost pixel centres."""
     height, width = raster.shape
@@ -33,7 +33,7 @@ def bilinear(raster: NDArray[np.float32], x: float, y: float) -> float:
     return float((1 - b) * top + b * bottom)
 
 
-@njit(cache=True)
+@compiled
 def _swim(
     x: float,
     y: float,

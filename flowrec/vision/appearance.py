@@ -6,15 +6,16 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from flowrec.jit import compiled
 
 RIM_SHARE = 0.35  # brightness of the rim as a share of the disc's darkness, where nothing better is known
 _STEEP = 2.2
 _RIM_AT, _RIM_WIDTH = 2.0, 1.1  # in edge widths outside the outline
 
 
-@njit(cache=True)
+@compiled
 def profile(s: float) -> tuple[float, float, float, float]:
     """Disc (1 inside, 0 outside) and rim at s edge widths outside the outline, and their derivatives by s."""
     disc = 1.0 / (1.0 + math.exp(min(max(_STEEP * s, -40.0), 40.0)))

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from flowrec.jit import compiled
 from flowrec.vision.appearance import RIM_SHARE, profile
 
 _X, _Y, _RADIUS, _EDGE, _LEVEL, _SLOPE_X, _SLOPE_Y, _DARKNESS, _RIM = range(9)
@@ -26,7 +26,7 @@ _TRUST = 6.0
 _LARGE = 1e200
 
 
-@njit(cache=True)
+@compiled
 def fit_disc(
     image: NDArray[np.uint8],
     distance_px: NDArray[np.float32],
@@ -86,13 +86,13 @@ def fit_disc(
     return best[_X] + x, best[_Y] + y, best[_RADIUS], best[_DARKNESS], likeness
 
 
-@njit(cache=True)
+@compiled
 def disc_reach(radius_px: float, edge_px: float) -> float:
     """How far from where a disc is looked for pixels take part in the fit."""
     return 1.25 * radius_px + 3.5 * edge_px
 
 
-@njit(cache=True)
+@compiled
 def _samples(
     image: NDArray[np.uint8],
     distance_px: NDArray[np.float32],
@@ -126,7 +126,7 @@ def _samples(
     return across[:n], down[:n], grey[:n]
 
 
-@njit(cache=True)
+@compiled
 def _start(
     across: NDArray[np.float64],
     down: NDArray[np.float64],
@@ -152,7 +152,7 @@ def _start(
     return start
 
 
-@njit(cache=True)
+@compiled
 def _equations(
     across: NDArray[np.float64],
     down: NDArray[np.float64],
@@ -204,7 +204,7 @@ def _equations(
     return cost, trusted_squares / max(trusted, 1e-9), likeness
 
 
-@njit(cache=True)
+@compiled
 def _prior(
     normal: NDArray[np.float64], slope: NDArray[np.float64], which: int, miss: float, sigma: float, unit: float
 ) -> float:
@@ -214,7 +214,7 @@ def _prior(
     return unit * miss * miss / (sigma * sigma)
 
 
-@njit(cache=True)
+@compiled
 def _solve(normal: NDArray[np.float64], right: NDArray[np.float64], damping: float) -> None:
     """Solve the damped normal equations in place, by Cholesky's factors in the lower triangle."""
     for a in range(_PARAMETERS):

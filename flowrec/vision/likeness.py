@@ -9,13 +9,14 @@ Compiled, because the region is small on most frames and calls of numpy would co
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from flowrec.jit import compiled
 
 _LEAST_SHARE = 0.5  # of the template that must lie on pixels that count
 
 
-@njit(cache=True)
+@compiled
 def likeness(
     image: NDArray[np.uint8],
     distance_px: NDArray[np.float32],
@@ -110,7 +111,7 @@ def likeness(
     return found
 
 
-@njit(cache=True)
+@compiled
 def _add(to: NDArray[np.float32], factor: np.float32, what: NDArray[np.float32]) -> None:
     """Add a multiple of the first part of an array to another: a loop that runs several numbers at a time."""
     for i in range(len(to)):
