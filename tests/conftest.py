@@ -1,14 +1,22 @@
-"""Missions that several tests look at, flown once."""
+"""What several test files use: missions that are flown once, waiting, and the profile of hypothesis."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from flowrec.config import load_config
 from flowrec.record import Recorded, record
 
+# A busy machine is no failure.
+settings.register_profile("flowrec", deadline=None)
+settings.load_profile("flowrec")
+
+HANG_S = 120.0  # a wait as long as this one hangs; no test asserts how quick something is
 SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1"]
 
 
@@ -22,3 +30,11 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 @pytest.fixture(scope="session")
 def session(mission: Recorded) -> Path:
     return mission.path
+
+
+def until(happened: Callable[[], object], told: Callable[[], str] = lambda: "waited in vain") -> None:
+    """Wait for something that another thread or process does; `told` says what was seen where it does not happen."""
+    end = time.monotonic() + HANG_S
+    while not happened():
+        assert time.monotonic() < end, told()
+        time.sleep(0.005)

@@ -6,7 +6,6 @@ import json
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import cv2
@@ -14,10 +13,10 @@ import numpy as np
 import pytest
 
 from flowrec.cli import with_default_refine
-from tests.conftest import SMALL
+from tests.conftest import HANG_S, SMALL, until
 
 
-def flowrec(*words: object, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+def flowrec(*words: object, timeout: float = HANG_S) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "flowrec", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
 
@@ -101,11 +100,9 @@ def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:
         text=True,
     )
     partial = out.with_name(out.name + ".partial")
-    deadline = time.monotonic() + 60
-    while not (partial.exists() and partial.stat().st_size > 2_000_000) and time.monotonic() < deadline:
-        time.sleep(0.1)
+    until(lambda: partial.exists() and partial.stat().st_size > 2_000_000)
     process.send_signal(signal.SIGTERM)
-    _, said = process.communicate(timeout=20)
+    _, said = process.communicate(timeout=HANG_S)
     assert process.returncode == 0, said
     assert "SIGTERM" in said
     assert not partial.exists()

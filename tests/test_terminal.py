@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from flowrec.store import SessionReader
-from tests.conftest import SMALL
+from tests.conftest import SMALL, until
 
 WORDS = [word for setting in SMALL for word in ("--set", setting)]
 
@@ -47,11 +47,8 @@ class Command:
                 return
             time.sleep(0.01)
 
-    def until(self, happened: Callable[[], bool], timeout_s: float = 60.0) -> None:
-        end = time.monotonic() + timeout_s
-        while not happened():
-            assert time.monotonic() < end, self.said.decode(errors="replace")
-            time.sleep(0.02)
+    def until(self, happened: Callable[[], bool]) -> None:
+        until(happened, lambda: self.said.decode(errors="replace"))
 
     def ended(self) -> bool:
         if self.status is None:
@@ -120,7 +117,7 @@ def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_for_a_whi
     command.press("\r ")
     command.until(lambda: b"HELD" in command.said)
     command.press(" q")
-    command.until(command.ended, 60)  # a first run compiles
+    command.until(command.ended)
     assert command.status == 0
     assert termios.tcgetattr(command.keys) == command.before
     assert command.outcome() == ("stopped", "stopped by the operator (q)")
@@ -136,7 +133,7 @@ def test_a_frozen_terminal_neither_stops_the_run_nor_its_end(command: Command) -
     grown = size().st_size + 1_000_000
     command.until(lambda: size().st_size > grown)
     os.kill(command.pid, signal.SIGTERM)
-    command.until(command.ended, 60)  # a first run compiles
+    command.until(command.ended)
     assert command.status == 0
     assert command.outcome() == ("stopped", "stopped by SIGTERM")
     assert termios.tcgetattr(command.keys) == command.before
@@ -147,5 +144,5 @@ def test_when_the_terminal_is_closed_the_run_ends_in_good_order(command: Command
     time.sleep(0.1)
     os.close(command.inner)
     os.close(command.keys)
-    command.until(command.ended, 60)  # a first run compiles
+    command.until(command.ended)
     assert command.outcome() == ("stopped", "stopped by SIGHUP: the terminal was closed")

@@ -24,7 +24,7 @@ from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, run
 from flowrec.session import session_writer
 from flowrec.store import SessionReader, recover
-from tests.conftest import SMALL
+from tests.conftest import SMALL, until
 
 S = 1_000_000_000
 SHORT = [*SMALL, "duration_s=2.0", "camera.debris=0"]
@@ -193,19 +193,17 @@ def test_a_clock_really_set_back_an_hour_neither_delays_a_flush_nor_touches_a_st
     said = {**os.environ, "LD_PRELOAD": str(shim), "SET_WHEN": str(when), "PYTHONPATH": os.pathsep.join(sys.path)}
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(path)], env=said)
     partial = path.with_name("s.mcap.partial")
-    deadline = time.monotonic() + 60
-    while not (partial.exists() and partial.stat().st_size > 100_000) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    until(lambda: partial.exists() and partial.stat().st_size > 100_000)
     when.touch()
-    time.sleep(1.5)
-    killed_ns = time.monotonic_ns()
+    # A flush that waited for the wall clock would come in an hour; here four come after the clock was set.
+    for _ in range(4):
+        size = partial.stat().st_size
+        until(lambda size=size: partial.stat().st_size > size)
     child.send_signal(signal.SIGKILL)
     child.wait()
     saved = recover(partial)
     ticks = list(SessionReader(saved.path).ticks())
     stamps = [tick.stamp_ns for tick in ticks]
-    # 0.5 s are promised; a machine under test may be late by as much again.
-    assert killed_ns - stamps[-1] < S
     assert np.all(np.diff(stamps) > 0)
     last = ticks[-1].clocks
     assert last.wall_jumps == 1 and last.wall_set_s == pytest.approx(-3600.0, abs=0.01)

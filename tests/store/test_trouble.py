@@ -1,6 +1,7 @@
 """Paths that can not be written, disks that fail, runs that are killed, files that are damaged or foreign."""
 
 import errno
+import resource
 import signal
 import subprocess
 import sys
@@ -104,25 +105,29 @@ def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatc
 
 KILLED = """
 import sys, time
+from dataclasses import replace
 from flowrec.store import SessionWriter
 sys.path.insert(0, sys.argv[2])
 from made_up import HEADER, ticks_of
-writer = SessionWriter(sys.argv[1], HEADER, flush_s=0.1)
-for number, tick in enumerate(ticks_of(10_000, shape=(8, 8))):
-    writer.write(tick)
-    print(number, flush=True)
-    time.sleep(0.005)
+writer = SessionWriter(sys.argv[1], HEADER, flush_s=10.0, sync_s=20.0)
+for number, tick in enumerate(ticks_of(150, shape=(8, 8))):
+    writer.write(replace(tick, stamp_ns=(number + 1) * 10**9))
+    while writer.queue_bytes:
+        time.sleep(0.001)
+print("handed over", flush=True)
+sys.stdin.read()
 """
 
 
 def test_a_killed_run_loses_no_more_than_the_last_moments(tmp_path):
     path = tmp_path / "s.mcap"
     with subprocess.Popen(
-        [sys.executable, "-c", KILLED, path, Path(__file__).parent], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", KILLED, path, Path(__file__).parent],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as run:
-        said = 0
-        while said < 150:
-            said = int(run.stdout.readline())
+        assert run.stdout.readline() == "handed over\n"
         run.send_signal(signal.SIGKILL)
         run.stdout.read()
     assert names_in(tmp_path) == ["s.mcap.partial"]
@@ -138,8 +143,8 @@ def test_a_killed_run_loses_no_more_than_the_last_moments(tmp_path):
                     counts[topics[record.channel_id]] += 1
         except McapError:
             pass  # the end, wherever it is
-    # Half a second, five times what is promised here: the machine may be busy with other tests.
-    assert min(counts["/camera/frame"], counts["/robot/estimate"]) > 150 - 100
+    # A tick a second, much quicker than that: what is not older than 10 s in stamps may be missing.
+    assert min(counts["/camera/frame"], counts["/robot/estimate"]) > 150 - 10
 
 
 def test_what_is_no_session_is_named_as_what_it_is(tmp_path, session):
@@ -218,7 +223,7 @@ def test_a_file_from_before_a_message_gained_a_field_that_may_be_missing_is_read
 
 
 def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
-    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 28))
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 29))
 
     def plant(self, sealed):
         plain(self, [replace(chunk, data=bomb, uncompressed_size=1000) for chunk in sealed])
@@ -227,10 +232,10 @@ def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
     monkeypatch.setattr(McapFile, "add_chunks", plant)
     with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
         writer.write(TICKS[0])
-    began = time.process_time()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(SessionError, match="zstd announces another size"):
         list(SessionReader(tmp_path / "s.mcap").ticks())
-    assert time.process_time() - began < 1.0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 << 10
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

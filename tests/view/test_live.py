@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 import subprocess
-import time
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from rerun.chunk import RrdReader
 
 from flowrec.messages import Frame, Tick
 from flowrec.view import LiveView, Scene, viewer
+from tests.conftest import HANG_S, until
 
 LISTENING = "0A"
 LOOPBACK = "0100007F"
@@ -49,30 +50,12 @@ def listeners(pid: int) -> list[tuple[str, int]]:
     return [(address, int(port, 16)) for address, port in found]
 
 
-def until(done: Callable[[], object], limit_s: float = 15.0) -> None:
-    end = time.monotonic() + limit_s
-    while not done():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
-
-
-def slowest_s(live: LiveView, ticks: list[Tick], count: int) -> float:
-    """The longest of many writes, at ten times the speed of a camera."""
-    worst = 0.0
-    for i in range(count):
-        tick = replace(ticks[i % len(ticks)], stamp_ns=i)
-        began = time.perf_counter()
-        live.write(tick)
-        worst = max(worst, time.perf_counter() - began)
-        if i % 20 == 0:
-            time.sleep(0.005)
-    return worst
-
-
-def closes_within_s(live: LiveView) -> float:
-    began = time.perf_counter()
-    live.close()
-    return time.perf_counter() - began
+def returns(call: Callable[[], object]) -> bool:
+    """Whether a call returns at all: one that waits for a viewer that is stopped never does."""
+    thread = threading.Thread(target=call, daemon=True)
+    thread.start()
+    thread.join(HANG_S)
+    return not thread.is_alive()
 
 
 @pytest.mark.parametrize("blow", [signal.SIGSTOP, signal.SIGKILL])
@@ -84,11 +67,12 @@ def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
     until(lambda: listeners(live.pid or 0))
     live.write(ticks[0])
     os.kill(live.pid, blow)
-    assert slowest_s(live, ticks, 2000) < 0.05
+    # More than the queue and the pipe hold.
+    assert returns(lambda: [live.write(replace(ticks[i % len(ticks)], stamp_ns=i)) for i in range(4000)])
     assert live.dropped > 1000
     if blow == signal.SIGKILL:
         assert "the run goes on without" in live.message
-    assert closes_within_s(live) < 5.0
+    assert returns(live.close)
 
 
 def test_a_live_view_listens_on_this_machine_only_and_ends_with_the_run(scene: Scene, ticks: list[Tick]) -> None:
@@ -121,7 +105,6 @@ def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
         )
         for i, tick in enumerate(ticks[:60]):
             live.write(replace(tick, frame=Frame(tick.stamp_ns, i, image)))
-            time.sleep(0.01)
     until(lambda: listener.poll() is not None)
     robot, images, scale = [], [], []
     for chunk in RrdReader(received).stream():
@@ -134,7 +117,7 @@ def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
             else:
                 images += batch.column("EncodedImage:blob").to_pylist()
     assert robot == list(range(60))
-    assert 3 <= len(images) <= 40  # throttled
+    assert 1 <= len(images) < 60  # only the last image of what is handed over together
     preview = cv2.imdecode(np.array(images[-1][0], np.uint8), cv2.IMREAD_GRAYSCALE)
     assert preview.shape == (427, 534)
     assert scale[-1] == [[3.0, 3.0, 1.0]]
