@@ -72,10 +72,11 @@ def record(
     as_json: AsJson = False,
 ) -> None:
     """Run a mission (survey, refine, plan, navigate) and record every stage of it."""
+    from flowrec.toml_file import read_toml
+
+    if config is not None:
+        read_toml(config)  # a file that is none is refused before the imports below, which take a second
     from flowrec.config import load_config, to_toml
-    from flowrec.record import prepare, print_summary
-    from flowrec.record import record as run_record
-    from flowrec.terminal import said_within
 
     typed = {
         "rig": ("--rig", rig),
@@ -87,6 +88,10 @@ def record(
     given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
     settings = [*(sets or []), *(f"{key}={value}" for key, (_, value) in given.items())]
     chosen = load_config(config, settings, {key: flag for key, (flag, _) in given.items()})
+    from flowrec.record import prepare, print_summary
+    from flowrec.record import record as run_record
+    from flowrec.terminal import said_within
+
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return

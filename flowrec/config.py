@@ -35,6 +35,7 @@ from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.settings import CameraSettings, Simulated
+from flowrec.toml_file import read_toml
 from flowrec.vision import Tracker
 
 
@@ -115,14 +116,6 @@ class Config:
 
 
 _ADAPTER = TypeAdapter(Config)
-_NOT_TOML = {
-    ".yaml": "YAML",
-    ".yml": "YAML",
-    ".json": "JSON",
-    ".mcap": "a session",
-    ".png": "the mask of a chip (--set chip.path=...)",
-    ".npz": "a vessel case (--set chip.path=...)",
-}
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 
 
@@ -151,7 +144,7 @@ def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mappi
     ------
     UsageError : one line that names the flag or the file, the key, its range and the nearest valid value.
     """
-    tree = _read_toml(path) if path is not None else {}
+    tree = _read_config(path) if path is not None else {}
     origin = Origin(str(path) if path is not None else "--set", _apply_sets(tree, sets) | dict(flags or {}))
     config = _config_from(tree, origin)
     check_config(config, origin)
@@ -285,19 +278,8 @@ def _refuse_apart(chip: Chip, mission: Commander) -> None:
         )
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
-    begin = "flowrec record --dry-run > my.toml writes one to begin with"
-    kind = _NOT_TOML.get(path.suffix.lower())
-    if kind is not None:
-        raise UsageError(f"{path}: is {kind} by its name, and a configuration is a TOML file; {begin}")
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
-    except FileNotFoundError as error:
-        raise UsageError(f"{path}: no such configuration; {begin}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: can not be read as a TOML configuration ({error})") from error
-    except (ValueError, RecursionError) as error:
-        raise UsageError(f"{path}: not valid TOML ({error}); mend that line") from error
+def _read_config(path: Path) -> dict[str, Any]:
+    tree = read_toml(path)
     if tree.keys() & set(CHIP_KEYS) and not tree.keys() & hints(Config).keys():
         raise UsageError(f"{path}: describes a chip; a run on it is flowrec record --set chip.path={path}")
     return tree

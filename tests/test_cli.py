@@ -121,3 +121,25 @@ def test_info_tells_how_a_session_ended(session: Path) -> None:
     facts = json.loads(flowrec("info", session, "--json").stdout)
     assert facts["facts"]["outcome"] == "reached"
     assert facts["topics"]["/camera/frame"] > 100
+
+
+HEAVY = {"torch", "rerun", "filterpy", "matplotlib", "scipy.stats"}
+STAGES = {"numpy", "scipy", "numba", "cv2"}
+
+
+@pytest.mark.parametrize(
+    ("words", "unwanted"),
+    [
+        (("--version",), HEAVY | STAGES),
+        (("record", "nosuch.toml"), HEAVY | STAGES),
+        (("record", "--set", "robot.nosuch=1"), HEAVY | {"flowrec.record"}),
+        (("ls", "."), HEAVY | STAGES),
+        (("info", "nosuch.mcap"), HEAVY | STAGES),
+    ],
+)
+def test_a_verb_imports_no_library_that_it_does_not_need(words: tuple[str, ...], unwanted: set[str]) -> None:
+    command = [sys.executable, "-X", "importtime", "-m", "flowrec", *words]
+    said = subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    imported = {line.rsplit("|", 1)[1].strip() for line in said.splitlines() if line.startswith("import time:")}
+    assert "flowrec.cli" in imported
+    assert not imported & unwanted

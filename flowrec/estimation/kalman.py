@@ -12,13 +12,13 @@ by how much they do.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from flowrec.estimation.motion import ISOTROPIC, Floats, Layout, noise, onward, slope_of
 from flowrec.flow import sample
@@ -77,7 +77,7 @@ class Kalman:
         state, covariance, layout, _ = self.predict(previous, track, applied, robot, field)
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
         # State and covariance are set anew for every step: all that the filter knows is in the messages.
-        kalman = _filter(layout.size, sigma_um)
+        kalman = copy.copy(_filter(layout.size, sigma_um))  # several threads may replay at a time
         kalman.x, kalman.P = state, covariance
         nis = math.nan
         surprise = np.zeros(2) if previous is None or previous.surprise.size == 0 else previous.surprise
@@ -213,8 +213,10 @@ def _usual(layout: Layout, robot: Robot) -> tuple[Floats, Floats]:
 
 
 @lru_cache(maxsize=16)
-def _filter(size: int, sigma_um: float) -> KalmanFilter:
-    """A filter for positions with this noise; making one costs as much as using it."""
+def _filter(size: int, sigma_um: float) -> Any:
+    """A filter for positions with this noise, to be copied before use; making one costs as much as using it."""
+    from filterpy.kalman import KalmanFilter  # late: it imports scipy.stats and matplotlib, 0.3 s of CPU time
+
     kalman = KalmanFilter(dim_x=size, dim_z=2)
     kalman.H = np.eye(2, size)
     kalman.R = np.eye(2) * sigma_um**2
