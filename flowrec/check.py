@@ -168,6 +168,7 @@ def _check_file(path: Path, progress: Callable[[int], None] | None) -> tuple[Ver
     config = _judge_head(verdict, found)
     _judge_end(verdict, found)
     _judge_content(verdict, found)
+    _judge_digest(verdict, found)
     _judge_times(verdict, found, reading, config)
     _judge_images(verdict, found, reading, config)
     _judge_numbers(verdict, reading)
@@ -445,6 +446,16 @@ def _judge_content(verdict: Verdict, found: Audit) -> None:
         f"{count} messages on {len(found.counts)} topics in {found.size_bytes / 1e6:.1f} MB"
         + ("; index and statistics agree with what was read" if agrees else ""),
     )
+
+
+def _judge_digest(verdict: Verdict, found: Audit) -> None:
+    if found.edits is None:
+        verdict.fact("digest", "none: recorded by an older flowrec" if found.finished else "none: not finished")
+        return
+    for text in found.edits:
+        verdict.bad("digest", f"{text}: edited or damaged after the recording")
+    if not found.edits:
+        verdict.fact("digest", "head and messages are those that were recorded")
 
 
 def _judge_times(verdict: Verdict, found: Audit, reading: _Reading, config: Config | None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.config import config_from_toml
-from flowrec.errors import printable
+from flowrec.errors import UsageError, printable
 from flowrec.messages import Message, Tick
 from flowrec.store import SessionReader
 from flowrec.store.choice import is_left_out
@@ -42,17 +42,15 @@ class Side:
 
     @classmethod
     def of(cls, word: str, reader: SessionReader) -> Side:
-        """A session: without the topics that it leaves out, and the fields that its own schemas do not have.
-
-        Raises
-        ------
-        UsageError : its configuration can not be read.
-        """
-        config = config_from_toml(reader.header.config_toml, f"{reader.path}: config.toml inside")
+        """A session: without the topics that it leaves out, and the fields that its own schemas do not have."""
+        try:
+            left_out = config_from_toml(reader.header.config_toml, f"{reader.path}").recording.leave_out
+        except UsageError:  # the configuration of another flowrec: then every topic that it declares counts
+            left_out = ()
         copy = bool(reader.header.parent)
         recorded = dict(reader.recorded_fields)
         for name in recorded.keys() - reader.counts.keys():
-            if (copy and name == "frame") or is_left_out(BY_FIELD[name].path, config.recording.leave_out):
+            if (copy and name == "frame") or is_left_out(BY_FIELD[name].path, left_out):
                 del recorded[name]
         return cls(word, reader.path.name, recorded, copy)
 

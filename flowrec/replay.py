@@ -24,7 +24,7 @@ from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, run
 from flowrec.session import open_session, session_writer
 from flowrec.status import progress, warn
-from flowrec.store import SessionReader, SessionWriter
+from flowrec.store import SessionReader, SessionWriter, digest_faults
 from flowrec.topics import BY_FIELD
 from flowrec.units import nanoseconds, seconds
 from flowrec.work import FILLS, work
@@ -127,6 +127,7 @@ class Replayed:
     frames_missing: int
     commands: CommandDifference
     worker_check: WorkerCheck | None  # of --verify
+    digest: tuple[bool, list[str]] | None  # likewise: whether the file is as it was recorded, and lines that say so
 
 
 def stale_results(recorded: Config, changed: Config) -> frozenset[str]:
@@ -228,6 +229,7 @@ def replay(
         frames_missing=rig.frames_missing,
         commands=commands,
         worker_check=checker,
+        digest=intact(reader) if verify else None,
     )
 
 
@@ -388,6 +390,19 @@ def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
     return last.estimate.position_um
 
 
+def intact(reader: SessionReader) -> tuple[bool, list[str]]:
+    """Whether the session's files hold what was recorded, by their digests, and lines that say so."""
+    lines = []
+    same = True
+    for file, faults in digest_faults(reader.path).items():
+        if faults is None:
+            lines.append(printable(f"{file.name}: no digest, recorded by an older flowrec"))
+        elif faults:
+            same = False
+            lines += [printable(f"{file.name}: DIFFERENT from its digest: {fault}") for fault in faults]
+    return same, lines or ["all messages and the head are as the digest says"]
+
+
 def verdict(done: Replayed) -> tuple[bool, list[str]]:
     """Lines that say how the replay compares with the recording, and whether it is the same."""
     comparison = done.comparison
@@ -398,13 +413,16 @@ def verdict(done: Replayed) -> tuple[bool, list[str]]:
         results = done.worker_check.comparison
         lines.extend(done.worker_check.results)
         same, identical, first = same and results.same, identical and results.identical, first or results.first
+    if done.digest is not None:
+        same = same and done.digest[0]
+        lines.extend(done.digest[1])
     if done.frames_missing:
         lines.append(f"{done.frames_missing} frames are not in the file; their recorded tracks stood in")
     if first is not None:
         lines.append(f"first difference: {first}")
     lines.append(
         f"{comparison.ticks} ticks: "
-        + ("every tick identical" if identical else "the same within tolerance" if same else "NOT the same")
+        + ("NOT the same" if not same else "every tick identical" if identical else "the same within tolerance")
     )
     return same, lines
 
@@ -418,7 +436,11 @@ def verdict_json(done: Replayed) -> dict[str, Any]:
         found["topics"] |= results["topics"]
         found["first"] = found["first"] or results["first"]
         found["identical"] = found["identical"] and results["identical"]
-    return found | {"same": same, "lines": lines}
+    return (
+        found
+        | {"same": same, "digest_faults": [] if done.digest is None or done.digest[0] else done.digest[1]}
+        | {"lines": lines}
+    )
 
 
 def default_out(path: Path) -> Path:

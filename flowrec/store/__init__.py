@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flowrec.store.audit import digest_faults
     from flowrec.store.frames import encoding_for
     from flowrec.store.header import SessionHeader
     from flowrec.store.joints import files_of
@@ -28,6 +29,7 @@ _HOME = {
     "SessionWriter": "writer",
     "Snapshot": "snapshots",
     "Split": "parts",
+    "digest_faults": "audit",
     "encoding_for": "frames",
     "files_of": "joints",
     "is_growing": "mcap_file",
@@ -47,6 +49,7 @@ __all__ = [
     "SessionWriter",
     "Snapshot",
     "Split",
+    "digest_faults",
     "encoding_for",
     "files_of",
     "is_growing",

@@ -13,8 +13,10 @@ from flowrec.errors import SessionError
 from flowrec.messages import Message
 from flowrec.store.codec import decode, message_stamp
 from flowrec.store.contents import Contents
+from flowrec.store.digest import Digests
+from flowrec.store.head import Head
 from flowrec.store.header import SessionHeader
-from flowrec.store.joints import Piece
+from flowrec.store.joints import Piece, files_of
 from flowrec.store.region import Region
 from flowrec.store.scan import Scan, scan
 from flowrec.store.shapes import misfit
@@ -47,6 +49,7 @@ class Audit:
     stamps_backwards : the same of the stamps that the source itself gave.
     undecodable : by field, messages that make no sense; `first_undecodable` says why.
     region : which part of most images was kept (region.py); None: they are whole.
+    edits : what differs from the digest that was recorded; None where there is no digest, or no end.
     missing : by field, messages that should be between others, told by their numbers; not of images.
     """
 
@@ -69,6 +72,7 @@ class Audit:
     stamps_backwards: Counter[str] = field(default_factory=Counter)
     undecodable: Counter[str] = field(default_factory=Counter)
     first_undecodable: str = ""
+    edits: list[str] | None = None
     missing: Counter[str] = field(default_factory=Counter)
     region: Region | None = None
 
@@ -128,8 +132,26 @@ def audit(
                 gaps = [gap for gap in scanned.gaps[channel] if gap.before_ns > found.first_ns]
                 found.missing[name] += sum(gap.messages for gap in gaps)
         if found.finished:
+            found.edits = reading.digests.faults(contents)
             for fatal, text in _disagreements(contents, scanned):
                 (found.contradictions if fatal else found.disagreements).append(text)
+    return found
+
+
+def digest_faults(path: Path) -> dict[Path, list[str] | None]:
+    """Read all files of a session and compare them with their digests: what differs by file; None: it has no digest.
+
+    Raises
+    ------
+    SessionError : a file can not be read.
+    """
+    found: dict[Path, list[str] | None] = {}
+    for file in files_of(path):
+        with Head(file) as head:
+            digests = Digests(head.source.start_unix_ns)
+            if head.digest is not None:
+                scan(head.source, digests.take)
+            found[file] = digests.faults(head)
     return found
 
 
@@ -141,6 +163,7 @@ class _Reading:
         self._fields = contents.fields
         self._schemas = contents.schemas
         self._start_unix_ns = contents.source.start_unix_ns
+        self.digests = Digests(contents.source.start_unix_ns)
         self._see = see
         self._last_ns: dict[str, int] = {}
         self._last_stamp_ns: dict[str, int] = {}
@@ -148,6 +171,7 @@ class _Reading:
 
     def take(self, offset: int, records: list[Record]) -> None:
         found = self._found
+        self.digests.take(offset, records)
         for record in records:
             name = self._fields.get(record.channel)
             if name is None:

@@ -12,6 +12,7 @@ import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 
+from flowrec.store.digest import added, of_message
 from flowrec.store.form import Payload
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
@@ -25,10 +26,11 @@ _LARGE_BYTES = 1 << 16  # from here on numpy copies, which leaves the interprete
 
 @dataclass(frozen=True, slots=True)
 class ChannelIndex:
-    """Where the messages of one channel are in a chunk: log time and offset in turn."""
+    """Where the messages of one channel are in a chunk: log time and offset in turn; and their digest (digest.py)."""
 
     channel: int
     entries: array[int]
+    digest: int
 
     def __len__(self) -> int:
         return len(self.entries) // 2
@@ -75,6 +77,7 @@ class ChunkBuilder:
         self.size = 0  # bytes before compression
         self._memory = bytearray(1 << 18)
         self._index: dict[int, array[int]] = {}
+        self._digests: dict[int, int] = {}
         self._first_ns = self._last_ns = 0
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL) if compressed else None
 
@@ -102,6 +105,8 @@ class ChunkBuilder:
             else:
                 np.copyto(np.frombuffer(self._memory, np.uint8, len(part), at), np.frombuffer(part, np.uint8))
             at += len(part)
+        content = memoryview(self._memory)[self.size + _MESSAGE_HEAD.size : end]
+        self._digests[channel] = added(self._digests.get(channel, 0), of_message(sequence, log_ns, content))
         self.size = end
 
     def seal(self) -> Sealed:
@@ -114,9 +119,11 @@ class ChunkBuilder:
             message_end_time=self._last_ns,
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=self.size,
-            indexes=[ChannelIndex(channel, entries) for channel, entries in self._index.items()],
+            indexes=[
+                ChannelIndex(channel, entries, self._digests[channel]) for channel, entries in self._index.items()
+            ],
         )
-        self.size, self._index = 0, {}
+        self.size, self._index, self._digests = 0, {}, {}
         if len(self._memory) > _KEPT_BYTES and self._compressor:
             self._memory = bytearray(1 << 18)  # a flow field comes once a minute
         return sealed

@@ -17,6 +17,7 @@ import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.header import (
     CONFIG_FILE,
+    DIGEST,
     FORMAT_VERSION,
     OUTCOME,
     PROFILE,
@@ -49,6 +50,7 @@ class Head:
     outcome : how the run ended.
     part : which piece of a run the file is; None where the run is in one file.
     flowrec_version : of the program that wrote it.
+    digest : of the content, as it was recorded (digest.py); None in files of the first release.
     channels, attachments, metadata : what else is listed.
 
     Raises
@@ -81,6 +83,7 @@ class Head:
         self.flowrec_version = metadata[SESSION].get("flowrec_version", "?")
         self._check_version(metadata[SESSION].get("format_version", ""))
         self.outcome = metadata.get(OUTCOME, {})
+        self.digest = metadata.get(DIGEST)
         with self.source.parsing(0):
             self.part = part_from(metadata)
             for index in self._summary.attachments:

@@ -19,6 +19,7 @@ PARENT = "flowrec.parent"
 PART = "flowrec.part"
 OUTCOME = "flowrec.outcome"
 VIEW = "flowrec.view"
+DIGEST = "flowrec.digest"
 
 CONFIG_FILE = "config.toml"
 CHIP_IMAGE_FILE = "chip.png"

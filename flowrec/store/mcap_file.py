@@ -34,6 +34,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from flowrec.store.digest import added, of_record, record_of
+
 if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
     from flowrec.store.chunk import Sealed
 
@@ -55,12 +57,14 @@ class McapFile:
         self.size = 0
         self._crc = 0
         self._schemas: list[McapRecord] = []
-        self._channels: list[McapRecord] = []
+        self._channels: list[Channel] = []
         self._chunks = bytearray()  # their indexes, as they will stand in the summary: a long run has millions
         self._chunk_count = 0
         self._attachments: list[McapRecord] = []
         self._metadata: list[McapRecord] = []
         self._counts: dict[int, int] = {}
+        self._digests: dict[int, int] = {}
+        self._head_digest = 0
         self._span: tuple[int, int] | None = None
         self._file = path.open("wb" if truncate else "xb", buffering=0)
         # While we live, nobody may take the growing file for the remains of a run; a few file systems know no locks.
@@ -79,6 +83,7 @@ class McapFile:
         elif isinstance(record, Channel):
             self._channels.append(record)
             self._counts[record.id] = 0
+            self._digests[record.id] = 0
         elif isinstance(record, Metadata):
             self._metadata.append(MetadataIndex(offset=self.size, length=len(data), name=record.name))
         else:
@@ -93,7 +98,14 @@ class McapFile:
                     media_type=record.media_type,
                 )
             )
+        if isinstance(record, Metadata | Attachment):
+            self._head_digest = added(self._head_digest, of_record(record))
         self._append(data)
+
+    def add_digest(self) -> None:
+        """The digest of all that was added, as the last record of its kind."""
+        topics = [(channel.topic, self._counts[channel.id], self._digests[channel.id]) for channel in self._channels]
+        self.add(record_of(self._head_digest, topics))
 
     def add_chunks(self, sealed: Iterable[Sealed]) -> None:
         """Sealed chunks with their indexes, all in one write, so that a flushed file holds whole ticks."""
@@ -110,6 +122,7 @@ class McapFile:
                 offsets[index.channel] = at
                 at += len(parts[-1])
                 self._counts[index.channel] += len(index)
+                self._digests[index.channel] = added(self._digests[index.channel], index.digest)
             place = ChunkIndex(
                 chunk_length=length,
                 chunk_start_offset=start,

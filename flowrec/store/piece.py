@@ -128,6 +128,7 @@ class Piece:
             if top_um_s is not None:
                 self._file.add(Metadata(VIEW, {"speed_scale_um_s": repr(top_um_s)}))
             self._file.add(Metadata(OUTCOME, dict(outcome)))
+            self._file.add_digest()
             self._file.finish()
             self._file.sync()
             if self.path.exists() and (not self._overwrite or self.path.is_dir()):
