@@ -1,6 +1,7 @@
 """The command line: thin verbs, late imports, errors in one line.
 
-Exit status: 0 done, 1 failed, 2 bad usage, 3 done but something was lost or differs.
+Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
+3 done but something was lost or differs.
 """
 
 from __future__ import annotations
@@ -100,6 +101,7 @@ def record(
     def summarize() -> None:
         if as_json:
             found: dict[str, Any] = {"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}
+            found["derived"] = dict(recorded.derived)
             typer.echo(json.dumps(found | {"files": [str(file) for file in recorded.files]}))
         else:
             print_summary(recorded)

@@ -26,7 +26,7 @@ from flowrec.chip.files import CHIP_KEYS
 from flowrec.chip.places import opening_point_um
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import Commander
-from flowrec.errors import UsageError
+from flowrec.errors import UnreachableError, UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
@@ -116,6 +116,7 @@ class Config:
 
 
 _ADAPTER = TypeAdapter(Config)
+SIMULATED = "simulated"
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 
 
@@ -190,9 +191,16 @@ def resolve(config: Config, chip: Chip) -> Config:
 
     A robot that nobody described is made to suit the chip: radius 50 um, or a fifth of the median channel width
     where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow;
-    40 ms from command to motion, or as long as it takes at v_max through a fifth of a channel.
+    40 ms from command to motion, or as long as it takes at v_max through a fifth of a channel. All that is for the
+    simulated rig only; `derived` lists it.
+
+    Raises
+    ------
+    UsageError : settings outside of their ranges; on a real rig also what has to be measured and was not given.
+    UnreachableError : start and goal lie in channels that do not meet.
     """
     check_config(config)
+    _refuse_unmeasured(config)
     camera, robot = config.camera, config.robot
     channel_um = median_width_um(chip)
     width_um, height_um = chip.size_um
@@ -235,6 +243,31 @@ def resolve(config: Config, chip: Chip) -> Config:
     return replace(resolved, mission=mission)
 
 
+def derived(asked: Config, resolved: Config) -> dict[str, float]:
+    """The numbers that nobody gave or that were changed while a configuration was resolved, by key."""
+    was, now = _flat(asdict(asked), ""), _flat(asdict(resolved), "")
+    return {key: value for key, value in now.items() if isinstance(value, (int, float)) and value != was[key]}
+
+
+def _flat(tree: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+def _refuse_unmeasured(config: Config) -> None:
+    """Only a simulated robot and camera can be made to fit the chip."""
+    rig: str = config.rig
+    given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
+    missing = [key for key, value in given.items() if value is None]
+    if rig != SIMULATED and missing:
+        raise UsageError(
+            f"rig = {rig!r}: {', '.join(missing)} not given; measure them and set each: only the simulated rig's robot "
+            "and camera are made to fit the chip"
+        )
+
+
 def _timed(swift: Swift, robot: Robot, rate_hz: float) -> Swift:
     return replace(
         swift,
@@ -272,9 +305,9 @@ def _refuse_apart(chip: Chip, mission: Commander) -> None:
         row, column = round(y / chip.um_per_px), round(x / chip.um_per_px)
         ends.append(channels[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)])
     if ends[0] != ends[1]:
-        raise UsageError(
-            f"mission.goal = {mission.goal}: lies in another channel than the start {mission.start}; the mask of "
-            f"{chip.name} has {count} channels that do not meet; choose a goal in the same one"
+        raise UnreachableError(
+            f"unreachable: mission.goal = {mission.goal} lies in another channel than the start {mission.start}; the "
+            f"mask of {chip.name} has {count} channels that do not meet; choose a goal in the same one"
         )
 
 

@@ -29,6 +29,10 @@ class UsageError(FlowrecError):
     exit_status = 2
 
 
+class UnreachableError(FlowrecError):
+    """No way leads from the start to the goal. Exit status 1, as for a run that finds it out on its way."""
+
+
 class ChipError(UsageError):
     """A mask, opening or calibration that no flow can be computed on."""
 

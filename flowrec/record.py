@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,10 +16,10 @@ from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.chip.places import distance_um
 from flowrec.clocks import ClockWatch
-from flowrec.config import Config, resolve
+from flowrec.config import Config, derived, resolve
 from flowrec.desk import Desk
 from flowrec.disk import DiskWatch, refuse_below
-from flowrec.errors import SessionError, UsageError
+from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
 from flowrec.keys import HELP as KEYS
@@ -60,6 +61,7 @@ class Recorded:
         """What can be given to other verbs: the run, or each of its snapshots."""
         return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
 
+    derived: Mapping[str, float] = field(default_factory=dict)  # settings that nobody gave, by key
     lost: str = ""  # why there is less of it than was wanted
     stopped: bool = False  # by somebody who does not want to wait
 
@@ -71,8 +73,8 @@ class Recorded:
         return 0 if self.report.outcome in GOOD_ENDS else 1
 
 
-# Ends that are what was asked for; `unreachable` is an honest answer, said before anything was risked.
-GOOD_ENDS = ("reached", "unreachable", "survey complete", "refine complete", "plan complete", "stopped", "time over")
+# Ends that are what was asked for.
+GOOD_ENDS = ("reached", "survey complete", "refine complete", "plan complete", "stopped", "time over")
 
 
 class Witness:
@@ -108,7 +110,10 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
             "'filter' or 'trimmed'"
         )
     chip = load_chip(config.chip)
-    config = resolve(config, chip)
+    asked, config = config, resolve(config, chip)
+    made = derived(asked, config)
+    if made:
+        say(f"derived for the simulated rig: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
     refuse_adrift(config, chip)
     assert config.robot.max_speed_um_s is not None
     full_mt = config.coils.full_mt(config.robot)
@@ -134,7 +139,7 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
 
 
 def refuse_adrift(config: Config, chip: Chip) -> None:
-    """Raise UsageError where the robot would be let in for nothing: by the assumed flow, before anything is driven.
+    """Raise UnreachableError where the assumed flow leaves no way to the goal, before anything is driven.
 
     So it is where it can not be held at the start, or is out of an outlet before the coils are up: their field, and
     with it the speed that they can drive, grows to all of it in the time of the ramp. And so it is where no way to the
@@ -146,17 +151,17 @@ def refuse_adrift(config: Config, chip: Chip) -> None:
     drift = config.plan.swift.drift(robot, limit_um_s)
     reason = too_swift(chip, field, start, start, robot.radius, drift)
     if reason:
-        raise UsageError(f"unreachable: the robot can not be held at the start: {reason}")
+        raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
     if {"plan", "navigate"} & set(config.mission.phases):
         goal = np.asarray(config.mission.goal, np.float64)
         reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius, drift)
         if reason:
-            raise UsageError(f"unreachable: {reason}")
+            raise UnreachableError(f"unreachable: {reason}")
     flow_um_s = float(np.hypot(*sample(field, start)))
     swept_um = flow_um_s * (drift.blind_s + 0.5 * config.coils.ramp_s * min(flow_um_s / limit_um_s, 1.0))
     for opening in chip.openings:
         if opening.kind == "outlet" and distance_um(chip, opening, start) < swept_um + robot.radius:
-            raise UsageError(
+            raise UnreachableError(
                 f"unreachable: the start {start[0]:.0f},{start[1]:.0f} um is too near the outlet {opening.side} "
                 f"{opening.first}-{opening.last}: a flow of {flow_um_s:.0f} um/s carries the robot {swept_um:.0f} um "
                 "before the coils are up; start farther in, or shorten coils.ramp_s"
@@ -194,7 +199,9 @@ def record(
     config: Config, out: Path | None = None, view: View = "none", realtime: bool = False, overwrite: bool = False
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`; `view` is spawn, serve, rrd or none."""
+    asked = config
     config, chip, pipeline = prepare(config)
+    made = derived(asked, config)
     path = _place(config, out, overwrite)
     fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
     rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
@@ -212,7 +219,7 @@ def record(
         # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
         stack.enter_context(desk.armed())
         writer = stack.enter_context(
-            session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True)
+            session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made)
         )
         sinks: list[Sink] = [writer, witness]
         live: LiveView | None = None
@@ -275,7 +282,7 @@ def record(
     facts["frames dropped"] = str(writer.dropped_frames)  # more may have been, for want of time
     files = tuple(writer.files)
     facts["file"] = files_told(path, files)
-    recorded = Recorded(path, report, facts, files, low[0] if low else "", bool(desk.reason))
+    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(desk.reason))
     if view == "rrd" and desk.reason:
         facts["recording for Rerun"] = f"not made, the run was stopped; flowrec export {path} makes it"
     elif view == "rrd":

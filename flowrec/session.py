@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,12 +31,16 @@ def session_writer(
     live: bool = False,
     overwrite: bool = False,
     in_pieces: bool = False,
+    derived: Mapping[str, float] | None = None,
 ) -> SessionWriter:
     """A new session file with its head written. `parent` is the session that it replays, named by content.
 
     A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
+    `derived`: settings that nobody gave, by key; they are named in the head.
     """
     header = session_header(config, chip)
+    if derived:
+        header = replace(header, provenance={**header.provenance, "derived": json.dumps(dict(derived))})
     if parent is not None:
         files = files_of(parent)
         named = {"file": parent.name, "sha256": session_sha256(files)}

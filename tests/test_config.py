@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import ast
+import json
+import re
+import sys
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
 
+import flowrec
 from flowrec.chip import load_chip
+from flowrec.cli import main
 from flowrec.config import Config, config_from_toml, load_config, resolve, to_toml, with_sets
-from flowrec.errors import UsageError
+from flowrec.errors import FlowrecError, UsageError
+from flowrec.record import Recorded
+from flowrec.store import SessionReader
 
 
 def test_a_configuration_survives_its_own_toml() -> None:
@@ -62,3 +71,100 @@ def test_a_place_that_the_chip_does_not_have_is_refused_with_those_it_has() -> N
     config = load_config(None, ["mission.goal=outlet:9"])
     with pytest.raises(UsageError, match=r"outlet:9.*it has"):
         resolve(config, load_chip(config.chip))
+
+
+KEY = re.compile(r"(?<![\w/.*{])([a-z_]{2,}(?:\.[a-z_0-9]+)+)")
+SOURCES = sorted(Path(flowrec.__file__).parent.rglob("*.py"))
+
+
+def keys(settings: object, prefix: str = "") -> set[str]:
+    found = set()
+    for field in fields(settings):  # type: ignore[arg-type]
+        value, key = getattr(settings, field.name), prefix + field.name
+        found |= {key, *(keys(value, f"{key}.") if is_dataclass(value) else ())}
+    return found
+
+
+def messages(source: Path) -> list[str]:
+    """What is raised, warned of or said, as written in the source."""
+    found = []
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+        called = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
+        told = node.exc if isinstance(node, ast.Raise) else node if called in ("warn", "say", "bad", "odd") else None
+        if told is not None:
+            found += [s.value for s in ast.walk(told) if isinstance(s, ast.Constant) and isinstance(s.value, str)]
+    return found
+
+
+def test_every_key_that_a_message_names_exists() -> None:
+    known = keys(Config())
+    named = {key: text for source in SOURCES for text in messages(source) for key in KEY.findall(text)}
+    assert len(named) > 20
+    unknown = {key: text for key, text in named.items() if key not in known and not key.endswith(".py")}
+    assert unknown == {}
+
+
+def test_every_key_that_the_readme_names_exists() -> None:
+    known, text = keys(Config()), (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+    sections = {field.name for field in fields(Config())}
+    named = {key.rstrip("._") for key in KEY.findall(text) if key.split(".")[0] in sections}
+    files = {key for key in named if key.endswith((".png", ".csv", ".toml", ".mcap"))}
+    assert named - known - files == set()
+
+
+def run_main(words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["flowrec", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code, capsys.readouterr().err.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "swift",
+    [["chip.inlet_speed_um_s=60000"], ["robot.max_speed_um_s=600", "chip.inlet_speed_um_s=3000"]],
+)
+def test_a_goal_that_is_found_unreachable_before_the_run_fails_as_one_found_during_it(
+    swift: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [word for setting in swift for word in ("--set", setting)]
+    status, line = run_main(["record", "--dry-run", *words], monkeypatch, capsys)
+    assert (status, line[:22]) == (1, "flowrec: unreachable: ")
+
+
+def test_a_goal_in_another_channel_is_unreachable() -> None:
+    config = load_config(None, ["chip.name=straight", "robot.max_speed_um_s=600"])
+    chip = load_chip(config.chip)
+    mask = chip.mask.copy()
+    mask[:, mask.shape[1] // 2] = False
+    with pytest.raises(FlowrecError, match="lies in another channel") as caught:
+        resolve(config, replace(chip, mask=mask))
+    assert caught.value.exit_status == 1
+
+
+def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> None:
+    config = replace(Config(), rig="bench")  # type: ignore[arg-type]
+    chip = load_chip(config.chip)
+    with pytest.raises(UsageError) as caught:
+        resolve(config, chip)
+    for key in ("robot.radius_um", "robot.max_speed_um_s", "robot.delay_s", "camera.um_per_px"):
+        assert key in str(caught.value)
+    robot = replace(config.robot, radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, delay_s=0.04)
+    camera = replace(config.camera, um_per_px=10.0, rate_hz=30.0)
+    assert resolve(replace(config, robot=robot, camera=camera), chip).robot == robot
+
+
+def test_what_was_derived_is_said_and_kept_in_the_file(
+    mission: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = json.loads(SessionReader(mission.path).header.provenance.get("derived", "{}"))
+    assert kept.get("robot.max_speed_um_s") == 600.0
+    assert kept["robot.radius_um"] == 60.0  # three of its pixels
+    assert kept == dict(mission.derived)
+    assert "robot.um_per_rev" not in kept
+    monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--dry-run", "--set", "robot.radius_um=50"])
+    with pytest.raises(SystemExit):
+        main()
+    said = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("derived"))
+    assert "robot.max_speed_um_s = 600" in said
+    assert "robot.radius_um" not in said
