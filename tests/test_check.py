@@ -9,12 +9,12 @@ import pytest
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
-from flowrec.bench.draft import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from flowrec.check import check
 from flowrec.cli import app
 from flowrec.errors import SessionError
 from flowrec.store import SessionReader, SessionWriter, recover
 from flowrec.store.layout import SLOTS
+from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from tests.store.made_up import HEADER, ticks_of
 
 DRAFT = small_draft()

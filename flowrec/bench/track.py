@@ -85,36 +85,36 @@ def measure(seeds: int = 5, figure: Path | None = None) -> dict[str, Any]:
     """Every law in both worlds, and the laws where step-out binds, with and without retiming."""
     if figure is not None:
         need_matplotlib()
-    flights: dict[tuple[str, str], list[Flight]] = {}
+    flown: dict[tuple[str, str], list[Flight]] = {}
     total = len(LAWS) * len(WORLDS) + 2 * len(STEP_OUTS_UM_S) * len(PACES)
     bound: list[Score] = []
     with progress("tracking", total) as done:
         for world_name, world in WORLDS.items():
             for name, law in LAWS.items():
-                flights[name, world_name] = _fly(law, _FIXED, world, seeds)
-                done(len(flights))
+                flown[name, world_name] = flights(law, _FIXED, world, seeds)
+                done(len(flown))
         for top_um_s in STEP_OUTS_UM_S:
             world = replace(ALL, step_out_um_s=top_um_s)
             for name in ("paper, with compensation", "vector, kalman_map"):
                 for pace, controller in PACES.items():
-                    made = _fly(LAWS[name], controller, world, seeds)
-                    bound.append(_score(f"{name}; {pace}", f"step-out at {top_um_s:g} um/s", made))
-                    done(len(flights) + len(bound))
+                    made = flights(LAWS[name], controller, world, seeds)
+                    bound.append(score(f"{name}; {pace}", f"step-out at {top_um_s:g} um/s", made))
+                    done(len(flown) + len(bound))
     if figure is not None:
-        first = {name: flights[name, "ideal"][0] for name in FIRST}
-        ours = {name: flights[name, "all"][0] for name in OURS}
+        first = {name: flown[name, "ideal"][0] for name in FIRST}
+        ours = {name: flown[name, "all"][0] for name in OURS}
         draw(figure, lemniscate(1).waypoints_um - CENTRE_UM, first, ours)
     return {
         "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
         "seeds": seeds,
         "v_max_um_s": V_MAX_UM_S,
         "worlds": {name: asdict(world) for name, world in WORLDS.items()},
-        "rows": [asdict(_score(name, world, made)) for (name, world), made in flights.items()],
+        "rows": [asdict(score(name, world, made)) for (name, world), made in flown.items()],
         "step_out": [asdict(score) for score in bound],
     }
 
 
-def _fly(law: Law, pace: Controller, world: World, seeds: int) -> list[Flight]:
+def flights(law: Law, pace: Controller, world: World, seeds: int) -> list[Flight]:
     """One run per seed; without noise all are the same."""
     # What a parked robot's track would say of the camera.
     kalman = Kalman(position_noise_um=world.noise_um if world.noise_um > 0.0 else None)
@@ -123,21 +123,22 @@ def _fly(law: Law, pace: Controller, world: World, seeds: int) -> list[Flight]:
     return [fly(controller, observer, robot, world, seed) for seed in range(seeds if world.noise_um > 0.0 else 1)]
 
 
-def _score(name: str, world: str, flights: list[Flight]) -> Score:
-    steady = flights[0].time_s >= PERIOD_S
+def score(name: str, world: str, flown: list[Flight]) -> Score:
+    """Means over flights."""
+    steady = flown[0].time_s >= PERIOD_S
     curve = KDTree(lemniscate(1).waypoints_um - CENTRE_UM)  # marked every 3 um
-    converged = [_converged_s(flight) for flight in flights]
-    off = [curve.query(flight.position_um[steady])[0] for flight in flights]
+    converged = [_converged_s(flight) for flight in flown]
+    off = [curve.query(flight.position_um[steady])[0] for flight in flown]
     return Score(
         law=name,
         world=world,
-        rmse_um=_mean([_rms(flight.error_um) for flight in flights]),
-        steady_um=_mean([_rms(flight.error_um[steady]) for flight in flights]),
+        rmse_um=_mean([_rms(flight.error_um) for flight in flown]),
+        steady_um=_mean([_rms(flight.error_um[steady]) for flight in flown]),
         off_curve_um=_mean([_rms(distance) for distance in off]),
         converged_s=None if None in converged else _mean([value for value in converged if value is not None]),
-        observer_um_s=_mean([_rms(flight.flow_miss_um_s[steady]) for flight in flights]),
-        progress=_mean([flight.progress_s[-1] / flight.time_s[-1] for flight in flights]),
-        demand_um_s=max(float(np.hypot(*flight.demand_um_s.T).max()) for flight in flights),
+        observer_um_s=_mean([_rms(flight.flow_miss_um_s[steady]) for flight in flown]),
+        progress=_mean([flight.progress_s[-1] / flight.time_s[-1] for flight in flown]),
+        demand_um_s=max(float(np.hypot(*flight.demand_um_s.T).max()) for flight in flown),
     )
 
 

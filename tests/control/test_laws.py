@@ -6,14 +6,13 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from flowrec.bench.track import ALL, FIRST, IDEAL, LAWS, PACES, _fly, _score
 from flowrec.control import Controller
 from flowrec.control.controller import Method
 from flowrec.control.laws import ff_fb_law, ff_fb_literal_law
 from flowrec.control.prediction import blend
 from flowrec.control.reference import bearable_pace, nearest_on
 from flowrec.messages import Estimate, Route
-from tests.control.plant import ROBOT, field_of, fly, lemniscate, mission, straight
+from tests.control.plant import ROBOT, field_of, fly, mission, straight
 
 STILL = field_of(lambda x, y: (0.0 * x, 0.0 * y))
 WEAK = replace(ROBOT, max_speed_um_s=300.0)
@@ -149,22 +148,3 @@ def test_an_observer_that_knows_the_map_is_not_thought_to_lag_behind_it():
     np.testing.assert_allclose(blend(corner, corrected, sent, 0.3, 0.0).at(place), [20.0, 330.0], atol=1.0)
     doubted = blend(corner, corrected, sent, 0.3, 0.3).at(place)
     assert np.hypot(*(doubted - [0.0, 300.0])) < 10.0, "as one that lags it is hardly believed just behind a corner"
-
-
-def test_the_papers_three_curves_come_in_its_order_and_vector_is_better_than_all():
-    rows = {name: _score(name, "", _fly(LAWS[name], PACES["as planned"], IDEAL, 1)) for name in FIRST}
-    compensated, without, observed = (rows[name] for name in FIRST)
-    assert compensated.rmse_um < observed.rmse_um < without.rmse_um
-    assert compensated.converged_s is not None and observed.converged_s is not None
-    assert compensated.converged_s < observed.converged_s and without.converged_s is None
-    name = "vector, kalman_map"
-    assert _score(name, "", _fly(LAWS[name], PACES["as planned"], ALL, 1)).steady_um < 6.0
-
-
-def test_where_step_out_binds_a_slowed_reference_is_followed_as_closely_as_ever():
-    world, law = replace(ALL, step_out_um_s=500.0), LAWS["vector, kalman_map"]
-    hasty, slowed = (
-        _score("", "", _fly(law, PACES[pace], world, 1)) for pace in ("as planned", "no faster than can be")
-    )
-    assert slowed.steady_um < 7.0 < 100.0 < hasty.steady_um
-    assert lemniscate().arrival_s[-1] == 80.0 and 0.8 < slowed.progress < 1.0

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.bench.lemniscate import vortex_map
-from flowrec.bench.observer import ROBOT, Case, drive, observe
 from flowrec.control.narrator import narrate
 from flowrec.estimation import HealthMonitor, Kalman, Observer
 from flowrec.messages import Estimate, Health, Tick
 from flowrec.store.codec import encode
+from tests.estimation.lap import ROBOT, driven, vortex
 
 KALMAN = Observer(kalman=Kalman(position_noise_um=3.0))
 
@@ -33,8 +32,7 @@ def first(health: list[Health], name: str) -> float:
 
 @pytest.mark.parametrize("mapped", [False, True])
 def test_a_steady_flow_raises_no_alarm(mapped: bool) -> None:
-    run = drive(Case("steady", 3.0), laps=1)
-    health = watched(observe(KALMAN, run), vortex_map(0.1) if mapped else None)
+    health = watched(driven(3.0).observed(KALMAN), vortex(1.1) if mapped else None)
     assert {each.alarm for each in health} == {""}
     assert abs(health[-1].nis - 2.0) < 0.5
     assert len(encode(health[-1])) < 1000
@@ -42,21 +40,20 @@ def test_a_steady_flow_raises_no_alarm(mapped: bool) -> None:
 
 @pytest.mark.parametrize("hertz", [0.5, 1.0, 2.0])
 def test_a_pulsating_flow_is_told_within_seconds_with_its_frequency_and_strength(hertz: float) -> None:
-    run = drive(Case("pulsating", 3.0, pulsation=0.5, pulsation_hz=hertz), laps=1)
-    health = watched(observe(KALMAN, run), vortex_map(0.1))
+    lap = driven(3.0, pulsation=0.5, pulsation_hz=hertz)
+    health = watched(lap.observed(KALMAN), vortex(1.1))
     assert first(health, "pulsation") < 3.0 + 2.0 / hertz
     assert health[-1].pulsation_hz == pytest.approx(hertz, rel=0.08)
     assert 0.25 < health[-1].pulsation_share < 0.75
 
 
 def test_noise_beyond_what_was_stated_is_told_by_the_nis() -> None:
-    run = drive(Case("noisy", 6.0), laps=1)
-    health = watched(observe(KALMAN, run))
+    health = watched(driven(6.0).observed(KALMAN))
     assert first(health, "nis") < 10.0
 
 
 def test_a_robot_out_of_sight_is_an_alarm_that_ends_when_it_is_back() -> None:
-    estimates = observe(KALMAN, drive(Case("steady", 3.0), laps=1))[:600]
+    estimates = driven(3.0).observed(KALMAN)[:600]
     gone = [
         replace(each, seen=False, nis=math.nan) if 200 <= index < 290 else each for index, each in enumerate(estimates)
     ]

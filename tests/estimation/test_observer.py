@@ -12,11 +12,7 @@ from scipy.linalg import expm
 
 from flowrec.estimation import Kalman, Luenberger, Observer, Sampler
 from flowrec.messages import Applied, Estimate, FlowField, Track
-from flowrec.robot import Robot
-
-ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
-RATE_HZ = 30.0
-MIDDLE = np.array([2200.0, 1200.0])  # of the vortex, um
+from tests.estimation.lap import RATE_HZ, ROBOT, across, lemniscate, vortex
 
 
 def track(index: int, position: NDArray[np.float64], seen: bool = True) -> Track:
@@ -25,18 +21,6 @@ def track(index: int, position: NDArray[np.float64], seen: bool = True) -> Track
 
 def applied(index: int, moved_um: NDArray[np.float64]) -> Applied:
     return Applied(round(index * 1e9 / RATE_HZ), 0.0, 0.0, 0.0, np.zeros(3), moved_um / ROBOT.um_per_rev)
-
-
-def lemniscate(time_s: float) -> NDArray[np.float64]:
-    """The reference of the paper's tracking study, once around in 40 s."""
-    sine, cosine = math.sin(2 * math.pi * time_s / 40.0), math.cos(2 * math.pi * time_s / 40.0)
-    return MIDDLE + np.array([1800.0 * cosine, 1500.0 * sine * cosine]) / (1.0 + sine**2)
-
-
-def across(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(..., 2) the vortex of strength 1/s."""
-    x, y = position[..., 0] - MIDDLE[0], position[..., 1] - MIDDLE[1]
-    return np.stack((-y, x), -1)
 
 
 def swim(
@@ -107,15 +91,6 @@ def test_two_frames_without_the_robot_widen_the_belief_as_one_of_both_lengths() 
     twice = kalman.estimate(twice, track(61, nowhere, seen=False), applied(61, none), ROBOT)
     np.testing.assert_allclose(twice.covariance, once.covariance, rtol=1e-6)
     np.testing.assert_allclose(twice.position_um, once.position_um, rtol=1e-6)
-
-
-def vortex(share: float = 1.0, spacing_um: float = 20.0) -> FlowField:
-    """The swirling flow as a map, `share` of its strength; the chip's origin is (0, 0) as ever."""
-    y, x = np.mgrid[0:120, 0:220] * spacing_um
-    velocity = share * 0.2 * np.stack((-(y - MIDDLE[1]), x - MIDDLE[0]), -1)
-    return FlowField(
-        0, 0, "map", spacing_um, velocity, np.zeros(velocity.shape[:2]), None, np.zeros(0), 1.0, 1000.0, ""
-    )
 
 
 def test_at_ten_um_noise_kalman_has_less_than_half_the_error_of_the_best_luenberger() -> None:

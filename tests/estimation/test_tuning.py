@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.bench.lemniscate import vortex_map
-from flowrec.bench.observer import ROBOT, Case, drive, observe, rmse
 from flowrec.errors import UsageError
 from flowrec.estimation import Kalman, Observer, smooth
 from flowrec.estimation.tuning import moving_noise, parked_noise, tune
 from flowrec.messages import Applied, Track
+from tests.estimation.lap import ROBOT, driven, vortex
 
 
 def test_the_noise_of_a_parked_robot_is_found_under_its_drift_and_despite_jumps() -> None:
@@ -31,7 +30,7 @@ def test_the_noise_of_a_parked_robot_is_found_under_its_drift_and_despite_jumps(
 
 
 def test_tuning_finds_the_noise_of_a_driven_robot_and_brings_the_nis_to_two() -> None:
-    run = drive(Case("driven", 6.0), laps=1)
+    run = driven(6.0)
     run.tracks[:] = run.tracks[:600]
     run.applied[:] = run.applied[:600]
     assert moving_noise(run.tracks, run.applied, ROBOT) == pytest.approx(6.0, rel=0.1)
@@ -45,24 +44,24 @@ def test_tuning_finds_the_noise_of_a_driven_robot_and_brings_the_nis_to_two() ->
 
 
 def test_the_gain_is_found_where_the_headings_vary() -> None:
-    run = drive(Case("gain", 10.0, gain=1.1), laps=1)
-    field = vortex_map(0.0)
+    run = driven(10.0, gain=1.1)
+    field = vortex()
     fixed = Kalman(position_noise_um=10.0)
     felt = replace(fixed, estimate_gain=True)
-    blind = observe(Observer("kalman_map", kalman=fixed), run, field)
-    found = observe(Observer("kalman_map", kalman=felt), run, field)
+    blind = run.observed(Observer("kalman_map", kalman=fixed), field)
+    found = run.observed(Observer("kalman_map", kalman=felt), field)
     assert blind[-1].um_per_rev is None
     assert found[-1].um_per_rev == pytest.approx(1.1 * ROBOT.um_per_rev, rel=0.02)
     assert found[-1].covariance.shape == (5, 5)
     flows = [np.array([each.flow_um_s for each in estimates]) for estimates in (blind, found)]
-    assert rmse(run, flows[0]) > 20.0
-    assert rmse(run, flows[1]) < 5.0
-    mapless = observe(Observer(kalman=felt), run)
-    assert rmse(run, np.array([each.flow_um_s for each in mapless])) < 0.65 * rmse(run, flows[0])
+    assert run.rmse(flows[0]) > 20.0
+    assert run.rmse(flows[1]) < 5.0
+    mapless = run.observed(Observer(kalman=felt))
+    assert run.rmse(np.array([each.flow_um_s for each in mapless])) < 0.65 * run.rmse(flows[0])
 
 
 def test_on_a_straight_way_the_gain_is_not_pretended_to_be_known() -> None:
-    run = drive(Case("gain", 5.0), laps=1)
+    run = driven(5.0)
     felt = Kalman(position_noise_um=5.0, estimate_gain=True)
     still = [replace(each, turns=np.zeros(2)) for each in run.applied[:200]]
     last = None
@@ -73,6 +72,6 @@ def test_on_a_straight_way_the_gain_is_not_pretended_to_be_known() -> None:
 
 
 def test_the_smoother_is_within_five_um_s_on_the_lemniscate() -> None:
-    run = drive(Case("10 um"), laps=1)
+    run = driven(10.0)
     smoothed = smooth(run.tracks, run.applied, Kalman(position_noise_um=10.0), ROBOT)
-    assert rmse(run, smoothed.flow_um_s) < 5.0
+    assert run.rmse(smoothed.flow_um_s) < 5.0

@@ -13,20 +13,6 @@ import pytest
 import zstandard
 from typer.testing import CliRunner
 
-from flowrec.bench.draft import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK_INDEX,
-    MESSAGE,
-    METADATA,
-    PERIOD_NS,
-    SCHEMA,
-    TICKS,
-    made_up,
-    record,
-    small_draft,
-    text,
-)
 from flowrec.check import check
 from flowrec.chip.files import chip_from_files
 from flowrec.cli import app
@@ -40,6 +26,20 @@ from flowrec.store.codec import encode_record
 from flowrec.store.layout import SLOTS
 from flowrec.store.shapes import misfit, not_finite, shapes_of
 from flowrec.topics import TOPICS
+from tests.store.drafts import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK_INDEX,
+    MESSAGE,
+    METADATA,
+    PERIOD_NS,
+    SCHEMA,
+    TICKS,
+    made_up,
+    record,
+    small_draft,
+    text,
+)
 
 _CHUNK_OPCODE = 6
 DRAFT = small_draft()

@@ -1,15 +1,16 @@
 """What is kept of a run around an event, and nothing else."""
 
+import resource
 import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from flowrec.bench.store_loop import memory_mb
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
 from flowrec.store import SessionReader, SessionWriter, Snapshot, recover
@@ -48,6 +49,11 @@ def fly_until_the_pump_falls_off(writer):
         for tick in QUIET[:30]:
             writer.write(tick)
         raise RuntimeError("the pump fell off")
+
+
+def memory_mb():
+    """Resident memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
 
 
 def span_of(path):

@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+import torch
+
+from flowrec.bench.lessons import prepare, read_lessons
+from flowrec.bench.train import Training, train
+from flowrec.errors import UsageError
+from flowrec.refine import weights
+from flowrec.refine.case import Case
+from flowrec.refine.network import trained_network
+from flowrec.refine.scene import Scene, turn
+from flowrec.refine.sight import sight
+
+
+@pytest.fixture(scope="module")
+def lessons(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("lessons")
+    return folder, list(prepare(folder, 8))
+
+
+def test_a_short_training_lowers_the_error_on_lessons_it_has_not_seen(lessons, tmp_path):
+    folder, _ = lessons
+    out = tmp_path / "weights.safetensors"
+    figures = train(folder, out, Training(lessons=8, steps=16, judged_every=8, learning_rate=4e-3, averaged=0.8))
+    assert figures["best"] < figures["before"]
+    assert figures["loss"][-1] < figures["loss"][0]
+    weights.read_weights(out, trained_network())
+    assert weights.facts_of(out)["kind"] == "pi_unet"
+    assert out.stat().st_size < 3e6
+
+
+def test_the_same_seed_trains_the_same_bytes(lessons, tmp_path):
+    folder, _ = lessons
+    for name in ("a", "b"):
+        train(folder, tmp_path / name, Training("unet", lessons=8, steps=2, judged_every=2))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_a_vessel_case_is_not_taken_for_a_lesson(lessons, tmp_path):
+    with np.load(lessons[1][0]) as data:
+        np.savez(tmp_path / "case.npz", **{key: data[key] for key in data.files if not key.startswith("assumed_")})
+    with pytest.raises(UsageError, match="not a lesson"):
+        read_lessons([tmp_path / "case.npz"])
+
+
+def test_a_turned_scene_is_the_scene_of_the_turned_flow(lessons):
+    lesson = read_lessons(lessons[1][:1])[0]
+    seen = sight(lesson.observe(np.random.default_rng(0)), lesson.chip.mask, lesson.chip.um_per_px)
+    scene = Scene.of([Case.of(lesson.assumed, seen, lesson.chip, cropped=False)])
+    back = scene
+    for quarters, mirrored in ((1, False), (2, True), (0, True), (1, False)):
+        back = back.turned(quarters, mirrored)
+    assert torch.equal(back.velocity, scene.velocity) and torch.equal(back.near, scene.near)
+    # A flow to the right over a quarter turn against the clock goes up: y points down.
+    right = torch.tensor([1.0, 0.0])[None, :, None, None].expand(1, 2, 4, 4)
+    assert turn(right, 1, False)[0, :, 0, 0].tolist() == [0.0, -1.0]
