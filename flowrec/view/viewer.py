@@ -10,8 +10,17 @@ import sys
 from pathlib import Path
 
 LOOPBACK = "127.0.0.1"  # Rerun's own default is every interface
-# Marks the viewer as started by a program: it asks no questions on its first run.
-_ENVIRONMENT = {"RERUN_APP_ONLY": "true"}
+_ENVIRONMENT = {
+    "RERUN_APP_ONLY": "true",  # started by a program: it asks no questions on its first run
+    # It reports nothing about its use to tel.rerun.io: CI turns the analytics off, whatever the user's own setting is.
+    "CI": "true",
+    "FORCE_RERUN_ANALYTICS": "false",
+    "TELEMETRY_ENABLED": "false",
+    # No variable turns off its question to api.github.com for a newer version. A proxy that is not there does; what it
+    # loads and the loopback need none.
+    "ALL_PROXY": f"http://{LOOPBACK}:9",
+    "NO_PROXY": "",
+}
 
 
 def executable() -> Path | None:

@@ -12,6 +12,7 @@ from flowrec.errors import FlowrecError
 from flowrec.messages import Tick
 from flowrec.view import Scene, open_viewer, screenshot, viewer, write_rrd
 from flowrec.view.screenshot import screenshot as take
+from tests.conftest import until
 
 
 def test_without_a_screen_there_is_a_line_that_says_how_to_see_the_file(
@@ -39,7 +40,30 @@ def test_the_window_is_bound_to_this_machine(monkeypatch: pytest.MonkeyPatch, tm
     assert command[-1] == str(tmp_path / "session.rrd")
 
 
-def test_a_screenshot_shows_all_views_without_complaint(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+def test_the_viewer_is_started_without_its_analytics_and_without_a_way_to_other_hosts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program, told = tmp_path / "rerun", tmp_path / "environment"
+    program.write_text(f"#!/bin/sh\nenv > {told}.part; mv {told}.part {told}\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(program))
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
+    monkeypatch.setenv("NO_PROXY", "*")
+    assert open_viewer(tmp_path / "session.rrd") == ""
+    until(told.exists)
+    environment = dict(line.split("=", 1) for line in told.read_text().splitlines() if "=" in line)
+    assert environment.get("CI") == "true"
+    assert environment["FORCE_RERUN_ANALYTICS"] == environment["TELEMETRY_ENABLED"] == "false"
+    assert environment["ALL_PROXY"] == "http://127.0.0.1:9"
+    assert environment["NO_PROXY"] == ""
+
+
+def test_a_screenshot_shows_all_views_without_complaint_and_rerun_takes_no_notes_of_its_use(
+    tmp_path: Path, scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
     write_rrd(tmp_path / "session.rrd", scene, ticks)
     try:
         problems = screenshot(tmp_path / "session.rrd", tmp_path / "out" / "shot.png", time_s=1.5, size=(1280, 800))
@@ -47,6 +71,8 @@ def test_a_screenshot_shows_all_views_without_complaint(tmp_path: Path, scene: S
         if "no graphics" not in str(error):
             raise
         pytest.skip(str(error))
+    finally:
+        assert not (tmp_path / "home" / ".config" / "rerun" / "analytics.json").exists()
     assert problems == []
     picture = cv2.imread(str(tmp_path / "out" / "shot.png"))
     assert picture is not None
