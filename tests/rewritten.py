@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
-from mcap.records import Channel, Message, Schema
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 Edit = Callable[[Channel, Message, Any], bool]  # edits the decoded message; True where it did
+EditHead = Callable[[Attachment | Metadata], None]
 
 
 def parser_of(schema: Schema) -> Any:
@@ -23,28 +24,47 @@ def parser_of(schema: Schema) -> Any:
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
 
 
-def rewrite(source: Path, target: Path, edit: Edit | None = None, chunk_bytes: int = 1 << 20) -> int:
-    """Copy a session message by message; returns how many messages were edited."""
+def rewrite(
+    source: Path,
+    target: Path,
+    edit: Edit | None = None,
+    edit_head: EditHead = lambda _: None,
+    *,
+    keep_digest: bool = True,
+    drop: str = "",
+    notes: dict[str, str] | None = None,
+) -> int:
+    """Copy a session message by message; returns how many messages were edited.
+
+    `drop` names a topic whose messages are left out, `notes` are added as a metadata record of another program.
+    """
     edited = 0
     with source.open("rb") as read, target.open("wb") as write:
         reader = make_reader(read)
         header, summary = reader.get_header(), reader.get_summary()
         assert summary is not None
-        writer = Writer(write, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
+        writer = Writer(write, chunk_size=1 << 20, compression=CompressionType.ZSTD)
         writer.start(header.profile, header.library)
         for attachment in reader.iter_attachments():
+            edit_head(attachment)
             writer.add_attachment(
                 attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
             )
         for record in reader.iter_metadata():
-            writer.add_metadata(record.name, record.metadata)
+            edit_head(record)
+            if keep_digest or record.name != "flowrec.digest":
+                writer.add_metadata(record.name, record.metadata)
         schemas = {n: writer.register_schema(s.name, s.encoding, s.data) for n, s in summary.schemas.items()}
         parsers = {n: parser_of(s) for n, s in summary.schemas.items()}
         channels = {
             n: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
             for n, c in summary.channels.items()
         }
+        if notes is not None:
+            writer.add_metadata("lab.notes", notes)
         for _, channel, message in reader.iter_messages():
+            if channel.topic == drop:
+                continue
             data = message.data
             if edit is not None:
                 wire = parsers[channel.schema_id].FromString(data)
@@ -59,3 +79,48 @@ def rewrite(source: Path, target: Path, edit: Edit | None = None, chunk_bytes: i
 def array_of(wire: Any) -> np.ndarray:
     """A flowrec.Array as a numpy array that can be changed."""
     return np.frombuffer(wire.data, np.dtype(wire.dtype)).reshape(tuple(wire.shape)).copy()
+
+
+def leaves_of(wire: Any, path: str = "") -> list[tuple[str, Callable[[], None]]]:
+    """Each single value in a message, by its name, with something that changes it."""
+    found: list[tuple[str, Callable[[], None]]] = []
+    for field in wire.DESCRIPTOR.fields:
+        name = f"{path}{field.name}"
+        if field.is_repeated:
+            if field.message_type is not None:
+                found += leaves_of(getattr(wire, field.name)[0], f"{name}[0].") if getattr(wire, field.name) else []
+            else:
+                found.append((name, lambda field=field: _change_first(getattr(wire, field.name), field)))
+        elif field.message_type is not None:
+            found += leaves_of(getattr(wire, field.name), f"{name}.") if wire.HasField(field.name) else []
+        else:
+            found.append(
+                (name, lambda field=field: setattr(wire, field.name, _other(getattr(wire, field.name), field)))
+            )
+    return found
+
+
+def _change(wire: Any, field: Any) -> None:
+    setattr(wire, field.name, _other(getattr(wire, field.name), field))
+
+
+def _change_first(values: Any, field: Any) -> None:
+    if len(values):
+        values[0] = _other(values[0], field)
+    else:
+        values.append(_other(field.default_value or 0, field))
+
+
+def _other(value: Any, field: Any) -> Any:
+    """Another value of the same kind, close to the first."""
+    if isinstance(value, str):
+        return value + "x"
+    if isinstance(value, bytes):
+        return bytes([value[0] ^ 1]) + value[1:] if value else b"x"
+    if isinstance(value, bool):
+        return not value
+    if field.enum_type is not None:
+        return next(one.number for one in field.enum_type.values if one.number != value)
+    if isinstance(value, int):
+        return value + 1
+    return value * 1.001 + 0.001 if value == value else 0.5
