@@ -38,3 +38,14 @@ def until(happened: Callable[[], object], told: Callable[[], str] = lambda: "wai
     while not happened():
         assert time.monotonic() < end, told()
         time.sleep(0.005)
+
+
+@pytest.fixture(scope="session")
+def realtime_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A survey, a refinement and a plan in real time, with a worker process: results come when they are done.
+
+    A replay that does not know when each was adopted would wait for 100 s.
+    """
+    path = tmp_path_factory.mktemp("realtime") / "realtime.mcap"
+    sets = [*SMALL, "mission.phases=survey,refine,plan", "worker.adopt_after_s=100"]
+    return record(load_config(None, sets), path, realtime=True).path

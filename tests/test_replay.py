@@ -51,6 +51,36 @@ def test_a_replay_from_any_time_is_identical(session: Path, share: float) -> Non
     assert done.comparison.identical, str(done.comparison.first)
 
 
+@pytest.mark.parametrize("where", ["the start", "an order under way", "the survey", "the end"])
+def test_a_recording_in_real_time_verifies_from_any_time(realtime_session: Path, where: str) -> None:
+    reader = SessionReader(realtime_session)
+    adopted = sorted(verb.adoption_stamps(reader).values())
+    start_ns = {
+        "the start": None,
+        "an order under way": adopted[1] - 1,
+        "the survey": adopted[1] + 100_000_000,
+        "the end": adopted[-1] - 1,
+    }[where]
+    from_s = start_ns / 1e9 if start_ns is not None else None
+    done = verb.replay(realtime_session, Change(), from_s=from_s, verify=True)
+    same, lines = verb.verdict(done)
+    assert same and done.comparison.identical, lines
+    assert done.worker_check is not None
+    made = sum(stamp_ns >= (start_ns or 0) for stamp_ns in adopted)
+    assert len(done.worker_check.results) == made >= 1, lines
+
+
+def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
+    realtime_session: Path, tmp_path: Path
+) -> None:
+    recorded = verb.adoption_stamps(SessionReader(realtime_session))
+    assert len(recorded) == 4  # solved, surveyed, refined, planned
+    out = tmp_path / "again.mcap"
+    done = verb.replay(realtime_session, Change(refine="assimilate"), out=out)
+    assert verb.adoption_stamps(SessionReader(out)) == recorded
+    assert done.comparison.same
+
+
 @dataclass(frozen=True, slots=True)
 class Forgetful(Observer):
     """An observer that breaks the stage contract: it counts its calls outside the messages."""

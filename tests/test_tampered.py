@@ -177,6 +177,9 @@ def test_the_replay_itself_finds_an_edit_of_each_topic_that_it_computes(session:
     assert status == 3
     topics = json.loads(said)["topics"]
     assert {topic for topic in computed if topics[topic]["different"] == 1} == computed
+    # Which is which.
+    text = topics["/run/events"]["first"]
+    assert text["recorded"] == text["replayed"] + "x"
 
 
 @pytest.mark.parametrize(
