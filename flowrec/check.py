@@ -15,6 +15,7 @@ from flowrec.chip import chip_from_files
 from flowrec.clocks.watch import CRYSTAL_PPM, camera_told, faults_of, skew_ppm
 from flowrec.config import Config, config_from_toml
 from flowrec.errors import FlowrecError, printable
+from flowrec.figures import Figures, finite
 from flowrec.messages import Clocks, Frame, Message, Timing
 from flowrec.store import is_growing, not_finite
 from flowrec.store.audit import Audit, audit
@@ -64,6 +65,7 @@ class Verdict:
     path : the file.
     findings : what is not as it should be.
     facts : what was looked at, for people, by name.
+    figures : the same in numbers, with the unit in the key.
     topics : messages read, by topic.
     gaps : the longest times without a frame, in order of time; `gap_count` has all of them.
     parts : the verdicts on its parts, where it is a run in parts.
@@ -72,6 +74,7 @@ class Verdict:
     path: Path
     findings: list[Finding] = field(default_factory=list)
     facts: dict[str, str] = field(default_factory=dict)
+    figures: Figures = field(default_factory=dict)
     topics: dict[str, int] = field(default_factory=dict)
     gaps: list[Gap] = field(default_factory=list)
     gap_count: int = 0
@@ -121,6 +124,7 @@ class Verdict:
             "exit_status": self.exit_status,
             "findings": [{"level": f.level, "about": f.about, "text": f.text} for f in self.findings],
             "facts": self.facts,
+            "figures": self.figures,
             "topics": self.topics,
             "gap_count": self.gap_count,
             "gaps": [{"at_s": gap.at_s, "length_s": gap.length_s} for gap in self.gaps],
@@ -204,6 +208,13 @@ def _check_run(path: Path, judged: Sequence[tuple[Verdict, Audit, _Reading]]) ->
         counts.subtract(reading.repeated)
     run.topics = {BY_FIELD[name].path: count for name, count in counts.items() if count}
     ticks, size_mb = sum(reading.ticks for _, _, reading in judged), sum(a.size_bytes for _, a, _ in judged) / 1e6
+    run.figures = {key: run.parts[-1].figures.get(key) for key in ("outcome", "note")} | {
+        "messages": counts.total(),
+        "size_bytes": sum(found.size_bytes for _, found, _ in judged),
+        "duration_s": seconds(last.last_ns - judged[0][1].first_ns),
+        "ticks": ticks,
+        "frames": counts["frame"],
+    }
     run.fact("outcome", run.parts[-1].facts["outcome"])
     run.fact("content", f"{counts.total()} messages on {len(run.topics)} topics in {size_mb:.1f} MB")
     run.fact("length", f"{seconds(last.last_ns - judged[0][1].first_ns):.2f} s, {ticks} ticks")
@@ -400,6 +411,7 @@ def _judge_end(verdict: Verdict, found: Audit) -> None:
     how = found.outcome.get("outcome", "")
     note = found.outcome.get("note") or found.outcome.get("reason", "")
     told = f" ({note})" if note and how != "cut" else ""  # of a cut one the findings tell
+    verdict.figures |= {"outcome": how, "note": note}
     verdict.fact("outcome", (how or "not recorded") + told)
     if not found.finished:
         if is_growing(found.path):
@@ -441,6 +453,7 @@ def _judge_content(verdict: Verdict, found: Audit) -> None:
             verdict.odd("content", f"{count} messages of {BY_FIELD[name].path} are missing on the way")
     count = found.counts.total()
     agrees = found.finished and not (found.contradictions or found.disagreements or found.lost)
+    verdict.figures |= {"messages": count, "size_bytes": found.size_bytes}
     verdict.fact(
         "content",
         f"{count} messages on {len(found.counts)} topics in {found.size_bytes / 1e6:.1f} MB"
@@ -461,6 +474,7 @@ def _judge_digest(verdict: Verdict, found: Audit) -> None:
 def _judge_times(verdict: Verdict, found: Audit, reading: _Reading, config: Config | None) -> None:
     rate_hz = NS_PER_S / reading.period_ns if reading.period_ns else math.nan
     rate = f", {rate_hz:.1f} Hz" if reading.period_ns else ""
+    verdict.figures |= {"duration_s": found.duration_s, "ticks": reading.ticks, "rate_hz": finite(rate_hz)}
     verdict.fact("length", f"{found.duration_s:.2f} s, {reading.ticks} ticks{rate}")
     if not (found.backwards.total() or found.stamps_backwards.total() or reading.index_backwards):
         verdict.fact("time", "in order on every topic")
@@ -493,6 +507,7 @@ def _judge_images(verdict: Verdict, found: Audit, reading: _Reading, config: Con
         verdict.fact("images", "none: recording.leave_out, the recorded tracks stand in")
         return
     dropped = max(reading.dropped, _whole(found.outcome, "dropped_frames"), _whole(found.outcome, "frames_dropped"))
+    verdict.figures |= {"frames": images, "frames_dropped": dropped}
     verdict.fact("images", f"{images} for {reading.ticks} ticks; {dropped} dropped by the writer")
     if found.region is not None:
         windows = found.outcome.get(

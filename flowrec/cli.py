@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -52,7 +52,7 @@ def root(
 
 @app.command()
 def record(
-    config: Annotated[Path | None, typer.Argument(help="Configuration (TOML); examples in sessions/.")] = None,
+    config: Annotated[Path | None, typer.Argument(help="Configuration (TOML); --dry-run prints one.")] = None,
     rig: Annotated[str | None, typer.Option(help="Which rig: simulated.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
@@ -100,9 +100,9 @@ def record(
 
     def summarize() -> None:
         if as_json:
-            found: dict[str, Any] = {"path": str(recorded.path), "outcome": recorded.report.outcome, **recorded.facts}
-            found["derived"] = dict(recorded.derived)
-            typer.echo(json.dumps(found | {"files": [str(file) for file in recorded.files]}))
+            files = [str(file) for file in recorded.files]
+            found = {"path": str(recorded.path), **recorded.facts, "derived": dict(recorded.derived), "files": files}
+            typer.echo(json.dumps(found))
         else:
             print_summary(recorded)
 
@@ -138,6 +138,7 @@ def replay(
 ) -> None:
     """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
     from flowrec import replay as verb
+    from flowrec.figures import comparison_for_people
     from flowrec.status import say, table
     from flowrec.whatif import before_and_after
 
@@ -167,12 +168,13 @@ def replay(
                     "out": str(target),
                     "wall_s": done.report.wall_s,
                     "duration_s": done.report.duration_s,
+                    "ticks": done.report.ticks,
                     "rows": [{"quantity": a, "recorded": b, "replayed": c} for a, b, c in rows],
                 }
             )
         )
     else:
-        table(f"Replay of {session.name}", ("", "recorded", "replayed"), rows)
+        table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
         report = done.report
         say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {target}")
         if done.replayed.field is not None and done.replayed.field.note:
@@ -235,7 +237,7 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
-    from flowrec.listing import describe
+    from flowrec.listing import describe, facts_for_people
 
     facts, topics = describe(session)
     if as_json:
@@ -243,7 +245,7 @@ def info(
         return
     from flowrec.status import table
 
-    table(session.name, ("", "value"), list(facts.items()))
+    table(session.name, ("", "value"), facts_for_people(facts))
     table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
 
 

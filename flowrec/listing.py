@@ -6,6 +6,7 @@ behind them take long to import.
 
 from __future__ import annotations
 
+import json
 import struct
 import tomllib
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import SessionError
+from flowrec.figures import name_of, of_text, shown
 from flowrec.store.head import Head
 from flowrec.store.header import Part, SessionHeader
 from flowrec.store.joints import Run
@@ -24,10 +26,12 @@ from flowrec.units import seconds
 _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16
+_SAID_ELSE = ("reason", "duration")  # the second of older files, a sentence
+_CLOCK_READINGS = ("wall_ns", "monotonic_ns")
 
 
-def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
-    """Facts about a session for people, and its message counts by topic.
+def describe(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """Facts about a session, numbers with their units in the keys, and its message counts by topic.
 
     Reads no message, but for those that the parts of a run repeat.
     """
@@ -36,29 +40,66 @@ def describe(path: Path) -> tuple[dict[str, str], dict[str, int]]:
     outcome = run.outcome
     config = _table(header.config_toml, f"{path}: config.toml inside")
     said = header.provenance
-    facts = {
-        "outcome": outcome.get("outcome", "unknown") + _bracketed(_why(outcome)),
-        "duration": f"{_duration_s(run):.1f} s",
-        "size": f"{_size(run) / 1e6:.1f} MB" + (f" in {len(run.pieces)} parts" if run.in_parts else ""),
-        "chip": _chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
+    facts: dict[str, Any] = {
+        "outcome": outcome.get("outcome", "unknown"),
+        "note": _why(outcome),
+        "duration_s": _duration_s(run),
+        "size_bytes": _size(run),
+        "parts": len(run.pieces) if run.in_parts else None,
+        **_chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
         "rig": _at(config, "rig"),
-        "phases": " -> ".join(map(str, _listed_at(config, "mission", "phases"))) or "?",
-        "stages": ", ".join(_at(config, stage, "method") for stage in ("observer", "refine", "plan", "control")),
+        "phases": list(map(str, _listed_at(config, "mission", "phases"))),
+        **{stage: _at(config, stage, "method") for stage in ("observer", "refine", "plan", "control")},
         "recorded": said.get("wall_time", "unknown"),
-        "by": f"flowrec {said.get('flowrec', '?')}" + _bracketed(said.get("git_commit", "")[:10]),
+        "flowrec": said.get("flowrec", "?"),
+        "commit": said.get("git_commit"),
+        "local_changes": said.get("git_changed", str("git_diff" in said)) == "True" if "git_commit" in said else None,
+        **of_text({key: said[key] for key in ("seed", "operator", "sample", "notes") if key in said}),
+        "derived": _derived(said.get("derived", "{}")),
+        "piece": _piece(run.part, path) if run.part is not None else None,
+        "replay_of": header.parent.get("file", "?") if header.parent else None,
     }
-    if run.part is not None:
-        facts["piece"] = _piece(run.part, path)
     for key, code in said.items():
         if key.startswith("weights."):
             facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
     if _at(config, "recording", "region") == "robot" and "frames_windows" not in outcome:
-        facts["frames windows"] = "most images hold what the tracker read, and are black elsewhere"
-    if header.parent:
-        facts["replay of"] = header.parent.get("file", "?")
-    hidden = ("outcome", "note", "duration", "wall_ns", "monotonic_ns")
-    facts |= {key.replace("_", " "): value for key, value in outcome.items() if key not in hidden}
-    return facts, run.counts()
+        facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
+    told = of_text(outcome)
+    return facts | {key: value for key, value in told.items() if key not in (*facts, *_SAID_ELSE)}, run.counts()
+
+
+def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The facts of `describe` in words, what is not known left out."""
+    stages = ("observer", "refine", "plan", "control")
+    width_um, height_um = facts.get("chip_width_um"), facts.get("chip_height_um")
+    size = f", {width_um / 1000:.2f} x {height_um / 1000:.2f} mm" if width_um and height_um else ""
+    changed = ", with local changes" if facts["local_changes"] else ""
+    words = {
+        "outcome": facts["outcome"] + _bracketed(facts["note"]),
+        "size_bytes": shown("size_bytes", facts["size_bytes"])
+        + (f" in {facts['parts']} parts" if facts["parts"] else ""),
+        "chip": f"{facts['chip']}{size}, {facts['chip_openings']} openings",
+        "phases": " -> ".join(facts["phases"]) or "?",
+        "observer": ", ".join(facts[stage] for stage in stages),
+        "derived": ", ".join(f"{key} = {value}" for key, value in facts["derived"].items()),
+        "flowrec": facts["flowrec"] + _bracketed((facts["commit"] or "")[:10] + changed),
+    }
+    names = {"observer": "stages", "flowrec": "by flowrec"}
+    without = (
+        "note",
+        "parts",
+        "commit",
+        "local_changes",
+        "chip_width_um",
+        "chip_height_um",
+        "chip_openings",
+        "duration",
+    )
+    return [
+        (names.get(key, name_of(key)), words.get(key) or shown(key, value))
+        for key, value in facts.items()
+        if key not in (*without, *stages[1:], *_CLOCK_READINGS) and value not in (None, "", {})
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,15 +176,23 @@ def _table(text: str, where: str) -> dict[str, Any]:
         raise SessionError(f"{where}: is not valid TOML ({error}); the file is damaged or was edited") from error
 
 
-def _chip(said: Mapping[str, Any], png: bytes) -> str:
-    parts = [str(said.get("name", "?"))]
+def _chip(said: Mapping[str, Any], png: bytes) -> dict[str, Any]:
+    facts: dict[str, Any] = {"chip": str(said.get("name", "?"))}
     scale_um = said.get("um_per_px")
     if isinstance(scale_um, float) and len(png) >= _PNG_SIZE_AT + _PNG_SIZE.size:
         width_px, height_px = _PNG_SIZE.unpack_from(png, _PNG_SIZE_AT)
-        parts.append(f"{width_px * scale_um / 1000:.2f} x {height_px * scale_um / 1000:.2f} mm")
+        facts |= {"chip_width_um": width_px * scale_um, "chip_height_um": height_px * scale_um}
     openings = said.get("opening")
-    parts.append(f"{len(openings) if isinstance(openings, list) else 0} openings")
-    return ", ".join(parts)
+    return facts | {"chip_openings": len(openings) if isinstance(openings, list) else 0}
+
+
+def _derived(text: str) -> dict[str, Any]:
+    """Settings that nobody gave, by key; none where the file was edited."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _at(tree: object, *keys: str) -> str:

@@ -6,6 +6,7 @@ Recorded first in every file, so that a result can be traced to the code that ma
 from __future__ import annotations
 
 import getpass
+import json
 import platform
 import subprocess
 from datetime import UTC, datetime
@@ -48,16 +49,30 @@ def provenance(anonymous: bool = False) -> dict[str, str]:
             facts[f"package.{package}"] = version(package)
         except PackageNotFoundError:
             facts[f"package.{package}"] = "not installed"
+    return facts | _code(anonymous)
+
+
+def _code(anonymous: bool) -> dict[str, str]:
+    """The commit, and what differs from it: asked of git in a checkout, else as the wheel was built."""
     source = Path(flowrec.__file__).resolve().parent
     commit = _git(source, "rev-parse", "HEAD")
     # Only a checkout of flowrec itself counts, not a repository that a virtual environment happens to lie in.
-    if commit and _git(source, "ls-files", "--error-unmatch", "__init__.py"):
-        facts["git_commit"] = commit
-        diff = "" if anonymous else _git(source, "diff", "HEAD", "--", ".")
-        if diff:
-            cut = f"\n... cut at {_DIFF_LIMIT} characters" if len(diff) > _DIFF_LIMIT else ""
-            facts["git_diff"] = diff[:_DIFF_LIMIT] + cut
+    if not (commit and _git(source, "ls-files", "--error-unmatch", "__init__.py")):
+        return _built(source / "_build.json")
+    facts = {"git_commit": commit, "git_changed": str(bool(_git(source, "status", "--porcelain", "--", ".")))}
+    diff = "" if anonymous else _git(source, "diff", "HEAD", "--", ".")
+    if diff:
+        cut = f"\n... cut at {_DIFF_LIMIT} characters" if len(diff) > _DIFF_LIMIT else ""
+        facts["git_diff"] = diff[:_DIFF_LIMIT] + cut
     return facts
+
+
+def _built(file: Path) -> dict[str, str]:
+    """What hatch_build.py wrote into the wheel; nothing where it was not built from a checkout."""
+    try:
+        return {key: str(value) for key, value in json.loads(file.read_text(encoding="utf-8")).items()}
+    except FileNotFoundError:
+        return {}
 
 
 def _user() -> str:

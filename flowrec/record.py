@@ -20,6 +20,7 @@ from flowrec.config import Config, derived, resolve
 from flowrec.desk import Desk
 from flowrec.disk import DiskWatch, refuse_below
 from flowrec.errors import SessionError, UnreachableError, UsageError
+from flowrec.figures import Figures, as_text, finite, rows_for_people
 from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
 from flowrec.keys import HELP as KEYS
@@ -31,7 +32,7 @@ from flowrec.planning.space import no_room, too_swift
 from flowrec.priority import first_of_all
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
-from flowrec.session import length_mm, session_writer
+from flowrec.session import length_um, session_writer
 from flowrec.status import StatusLine, say, table, warn
 from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
 from flowrec.store.names import pieces, run_path
@@ -53,7 +54,7 @@ class Recorded:
 
     path: Path  # of the run, also where it is in several files
     report: RunReport
-    facts: dict[str, str]
+    facts: Figures  # numbers with their units in the keys
     files: tuple[Path, ...] = ()  # in order; none where a run was to be kept around events, and none came
 
     @property
@@ -265,13 +266,12 @@ def record(
                     clocks=clocks,
                 )
         facts = facts_of(chip, report, witness.true_field)
-        if math.isfinite(witness.rms_um) and config.control.method != "policy":  # which has no reference to be off
-            facts["tracking error"] = f"{witness.rms_um:.1f} um rms"
+        if config.control.method != "policy":  # which has no reference to be off
+            facts["tracking_error_um"] = finite(witness.rms_um)
+        facts["frames_dropped"] = writer.dropped_frames
         if board is not None and board.note:
-            facts["note not finished"] = board.note
-        facts["frames dropped"] = str(writer.dropped_frames)
-        outcome = {key.replace(" ", "_"): value for key, value in facts.items()}
-        outcome |= {"outcome": report.outcome, "note": report.note} | clocks.outcome()
+            facts["note_not_finished"] = board.note
+        outcome = as_text(facts) | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
@@ -279,17 +279,16 @@ def record(
         _say_remarks(writer)
         if live is not None and desk.reason:
             live.close(VIEW_PATIENCE_S)
-    facts["frames dropped"] = str(writer.dropped_frames)  # more may have been, for want of time
+    facts["frames_dropped"] = writer.dropped_frames  # more may have been, for want of time
     files = tuple(writer.files)
-    facts["file"] = files_told(path, files)
     recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(desk.reason))
     if view == "rrd" and desk.reason:
-        facts["recording for Rerun"] = f"not made, the run was stopped; flowrec export {path} makes it"
+        say(f"the run was stopped: no .rrd was made; flowrec export {path} makes it")
     elif view == "rrd":
         from flowrec.export import write_rrd_of
 
         for name in recorded.sessions:
-            facts["recording for Rerun"] = str(write_rrd_of(name))
+            facts["rrd"] = str(write_rrd_of(name))
     return recorded
 
 
@@ -329,31 +328,37 @@ def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
     return path
 
 
-def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> dict[str, str]:
-    """The summary of a run, in the order in which a person wants it."""
-    facts = {"outcome": report.outcome + (f" ({report.note})" if report.note else "")}
+def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
+    """What a run came to, in the order in which a person wants it; flow errors are shares of the true flow."""
+    facts: Figures = {
+        "outcome": report.outcome,
+        "note": report.note,
+        "duration_s": report.duration_s,
+        "wall_s": report.wall_s,
+        "ticks": report.ticks,
+    }
     last = report.last
-    facts["duration"] = f"{report.duration_s:.1f} s, {report.ticks} frames, computed in {report.wall_s:.1f} s"
     if last.mission is not None and last.route is not None and last.route.reachable and last.mission.phase == "done":
-        facts["route"] = (
-            f"{length_mm(last.route):.2f} mm, planned {last.route.arrival_s[-1]:.1f} s ({last.route.method})"
-        )
+        facts["planner"] = last.route.method
+        facts["route_length_um"] = length_um(last.route)
+        facts["planned_s"] = float(last.route.arrival_s[-1])
         if last.mission.outcome == "reached":
-            facts["navigation"] = f"{seconds(last.mission.since_ns - last.route.stamp_ns):.1f} s"
+            facts["navigation_s"] = seconds(last.mission.since_ns - last.route.stamp_ns)
     if true_field is not None:
-        facts["wall contacts"] = str(report.contacts)
+        facts["contacts"] = report.contacts
         for name, field in (("assumed", last.assumed), ("refined", last.refined)):
             if field is not None:
-                error = relative_rmse(field, true_field, chip.mask)
-                facts[f"{name} flow error"] = f"{100 * error.v:.1f} % of the true flow ({field.method})"
+                facts[f"{name}_method"] = field.method
+                facts[f"{name}_flow_error"] = finite(float(relative_rmse(field, true_field, chip.mask).v))
     if last.observations is not None:
-        facts["flow observations"] = str(len(last.observations.position_um))
+        facts["observations"] = len(last.observations.position_um)
     return facts
 
 
 def print_summary(recorded: Recorded) -> None:
     """The table at the end of a run and what to do next."""
-    table("Session", ("", "value"), list(recorded.facts.items()))
+    files = ("file", files_told(recorded.path, recorded.files))
+    table("Session", ("", "value"), [*rows_for_people(recorded.facts), files])
     sessions = recorded.sessions
     if recorded.lost:
         say(

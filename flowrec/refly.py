@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flowrec.errors import UsageError
+from flowrec.figures import Row
 from flowrec.messages import FlowField
 from flowrec.pipeline import assemble
 from flowrec.replay import Replayed, planned_from
@@ -18,10 +19,10 @@ from flowrec.status import say
 from flowrec.units import seconds
 
 
-def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tuple[str, str, str]]:
+def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[Row]:
     """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
 
-    Both start where the recorded route began and use the same seed; rows of quantity, recorded, replayed.
+    Both start where the recorded route began and use the same seed; rows of key, recorded, replayed.
     """
     flow = done.replayed.field
     if flow is None or done.recorded.mission is None or done.recorded.route is None:
@@ -57,19 +58,21 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[tup
                 writer.close({"outcome": report.outcome, "note": f"refly of {done.source.name}"})
     was, now = reports["recorded"], reports["replayed"]
     return [
-        ("reflown: outcome", was.outcome, now.outcome),
-        ("reflown: navigation", _navigation_s(was), _navigation_s(now)),
-        ("reflown: wall contacts", str(was.contacts), str(now.contacts)),
+        ("reflown_outcome", was.outcome, now.outcome),
+        ("reflown_navigation_s", _navigation_s(was), _navigation_s(now)),
+        ("reflown_planned_s", _planned_s(was), _planned_s(now)),
+        ("reflown_contacts", was.contacts, now.contacts),
     ]
 
 
-def _navigation_s(report: RunReport) -> str:
+def _navigation_s(report: RunReport) -> float | None:
     """Time from the adopted route to the end."""
     mission, route = report.last.mission, report.last.route
-    if mission is None or route is None or not mission.finished:
-        return "-"
-    return (
-        f"{seconds(mission.since_ns - route.stamp_ns):.1f} s (planned {route.arrival_s[-1]:.1f} s)"
-        if len(route.arrival_s)
-        else "-"
-    )
+    if mission is None or route is None or not mission.finished or not len(route.arrival_s):
+        return None
+    return seconds(mission.since_ns - route.stamp_ns)
+
+
+def _planned_s(report: RunReport) -> float | None:
+    route = report.last.route
+    return float(route.arrival_s[-1]) if route is not None and len(route.arrival_s) else None

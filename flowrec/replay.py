@@ -18,6 +18,7 @@ from flowrec.config import Config, with_sets
 from flowrec.desk import Desk
 from flowrec.errors import SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
+from flowrec.figures import as_text
 from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
@@ -215,7 +216,8 @@ def replay(
         if writer is not None:
             ended = "stopped" if desk.reason else "replayed"
             note = f"replay of {path.name}" + (f", {desk.reason}" if desk.reason else "")
-            writer.close({"outcome": ended, "note": note, "ticks": str(report.ticks)})
+            figures = {"duration_s": report.duration_s, "wall_s": report.wall_s, "ticks": report.ticks}
+            writer.close(as_text({"outcome": ended, "note": note, **figures}))
     return Replayed(
         source=path,
         recorded_config=recorded_config,

@@ -134,6 +134,6 @@ def session_sha256(files: Sequence[Path]) -> str:
     return digest.hexdigest()
 
 
-def length_mm(route: Route) -> float:
-    """Length of a route in mm."""
-    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum()) / 1000.0
+def length_um(route: Route) -> float:
+    """Length of a route in um."""
+    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())

@@ -215,7 +215,8 @@ def _listed(tables: Any, where: str) -> tuple[Opening, ...]:
         ends = [table.get("first"), table.get("last")]
         if side is None or kind is None or any(type(end) is not int for end in ends):
             raise ChipError(
-                f"{here}: side, first, last (whole pixels) and kind are wanted; see the example in sessions/chips"
+                f'{here}: side, first, last (whole pixels) and kind are wanted, as in side = "left", first = 91, '
+                'last = 109, kind = "inlet", speed_um_s = 180.0'
             )
         key, other = ("speed_um_s", "pressure_pa") if kind == "inlet" else ("pressure_pa", "speed_um_s")
         if other in table:

@@ -242,7 +242,7 @@ def test_the_verbs_take_the_run(run, whole, tmp_path, rrd_only_begun):
     assert (verdict.word, verdict.exit_status, len(verdict.parts)) == ("good", 0, 4), verdict.lines()
     assert verdict.facts["parts"] == "4, each begins where the one before ends"
     assert verdict.topics == {BY_FIELD[field].path: count for field, count in whole.counts.items()} == describe(run)[1]
-    assert "in 4 parts" in describe(run)[0]["size"]
+    assert describe(run)[0]["parts"] == 4
     assert "part 2 of the run x, goes on from 1.17 s" in describe(part_path(run, 2))[0]["piece"]
     (row,) = list_sessions(run.parent)
     assert (row.name, row.outcome, row.parts) == ("x.mcap", "reached", 4)

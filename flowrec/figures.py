@@ -1,0 +1,92 @@
+"""What a run, a replay or a file comes to: numbers whose keys carry the unit. Words are made of them when shown."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+
+Value = str | int | float | bool | None
+Figures = dict[str, Value]
+Row = tuple[str, Value, Value]  # key, recorded, replayed
+
+# Numbers without a unit; every other number ends with one of _UNITS.
+_COUNTS = frozenset(
+    {"ticks", "contacts", "observations", "frames_dropped", "dropped_frames", "frames_missing_from_camera", "seed"}
+)
+_UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns", "_error": "", "_rad": "rad"}
+_LONGEST = 25  # characters of a number in a file: more is none of ours
+_OLD_SHARE = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
+_HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
+
+
+def as_text(figures: Mapping[str, Value]) -> dict[str, str]:
+    """As the metadata of a file, which knows nothing but text."""
+    return {
+        key: value if isinstance(value, str) else repr(value) for key, value in figures.items() if value is not None
+    }
+
+
+def of_text(text: Mapping[str, str]) -> Figures:
+    """Back from the metadata of a file; what an older one says in a sentence stays text."""
+    return {key: _number(said) if _is_numeric(key) else said for key, said in text.items()}
+
+
+def finite(value: float) -> float | None:
+    """None for what is not known: JSON has no NaN."""
+    return value if math.isfinite(value) else None
+
+
+def rows_for_people(figures: Mapping[str, Value]) -> list[tuple[str, str]]:
+    """Names and values in words; the outcome together with its note."""
+    rows = [(name_of(key), shown(key, value)) for key, value in figures.items() if key not in _HIDDEN]
+    note = figures.get("note")
+    return [(name, f"{said} ({note})" if name == "outcome" and note else said) for name, said in rows]
+
+
+def comparison_for_people(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
+    """The same of recorded and replayed figures beside each other."""
+    return [(name_of(key), shown(key, was), shown(key, now)) for key, was, now in rows]
+
+
+def name_of(key: str) -> str:
+    """A key without its unit, in words."""
+    unit = next((unit for unit in _UNITS if key.endswith(unit) and unit != "_error"), "")
+    return key.removesuffix(unit).replace("_", " ")
+
+
+def shown(key: str, value: Value) -> str:
+    """A value with its unit; `-` where there is none."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    suffix = next((suffix for suffix in _UNITS if key.endswith(suffix)), None)
+    if isinstance(value, str) or suffix is None:
+        return f"{value:g}" if isinstance(value, float) else str(value)
+    if suffix == "_error":
+        return f"{100 * value:.1f} %"
+    if suffix == "_bytes":
+        return f"{value / 1e6:.1f} MB"
+    if suffix == "_um" and abs(value) >= 1000:
+        return f"{value / 1000:.2f} mm"
+    return f"{value:.1f} {_UNITS[suffix]}"
+
+
+def _is_numeric(key: str) -> bool:
+    return key in _COUNTS or key.endswith(tuple(_UNITS))
+
+
+def _number(text: str) -> Value:
+    share = _OLD_SHARE.fullmatch(text)
+    if share is not None:
+        return float(share[1]) / 100
+    if len(text) > _LONGEST:
+        return text
+    for kind in (int, float):
+        try:
+            number = kind(text)
+        except ValueError:
+            continue
+        return number if math.isfinite(number) else text
+    return text

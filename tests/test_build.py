@@ -1,0 +1,73 @@
+"""What is built of a checkout says which commit it was made of."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+GIT = ("git", "-c", "user.name=test", "-c", "user.email=test@localhost", "-c", "commit.gpgsign=false")
+
+
+def git(folder: Path, *words: str) -> str:
+    return subprocess.run([*GIT, *words], cwd=folder, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("checkout")
+    for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py", ".gitignore"):
+        if (ROOT / name).exists():
+            shutil.copy(ROOT / name, folder)
+    (folder / "flowrec").mkdir()
+    for name in ("__init__.py", "provenance.py"):
+        shutil.copy(ROOT / "flowrec" / name, folder / "flowrec")
+    git(folder, "init", "--quiet")
+    git(folder, "add", ".")
+    git(folder, "commit", "--quiet", "--message", "a commit")
+    return folder
+
+
+def built(checkout: Path, kind: str, out: Path) -> dict[str, object]:
+    pytest.importorskip("hatchling")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", out], cwd=checkout, check=True)
+    (file,) = out.iterdir()
+    if kind == "sdist":
+        shutil.unpack_archive(file, out, filter="data")
+        found = next(out.glob("*/flowrec/_build.json"), None)
+        return json.loads(found.read_text()) if found is not None else {}
+    with zipfile.ZipFile(file) as wheel:
+        inside = "flowrec/_build.json"
+        return json.loads(wheel.read(inside)) if inside in wheel.namelist() else {}
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_a_build_holds_its_commit(kind: str, checkout: Path, tmp_path: Path) -> None:
+    assert built(checkout, kind, tmp_path) == {"git_commit": git(checkout, "rev-parse", "HEAD"), "git_changed": False}
+
+
+def test_a_build_of_changed_sources_says_so(checkout: Path, tmp_path: Path) -> None:
+    (checkout / "flowrec" / "new.py").write_text("")
+    try:
+        assert built(checkout, "wheel", tmp_path).get("git_changed") is True
+    finally:
+        (checkout / "flowrec" / "new.py").unlink()
+
+
+def test_a_package_without_git_tells_the_commit_that_it_was_built_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import flowrec
+    from flowrec.provenance import provenance
+
+    monkeypatch.setattr(flowrec, "__file__", str(tmp_path / "__init__.py"))
+    assert "git_commit" not in provenance()
+    (tmp_path / "_build.json").write_text('{"git_commit": "0123abcd", "git_changed": true}')
+    said = provenance()
+    assert (said.get("git_commit"), said.get("git_changed")) == ("0123abcd", "True")
