@@ -39,7 +39,15 @@ class GatedDisk:
                 self.taken += sum(map(len, parts))
             put(file, parts)
 
+        drop = Backlog.drop_images
+
+        def given_up(backlog):
+            count = drop(backlog)
+            self.allow(math.inf)  # who waits for the images all the same waits for ever
+            return count
+
         monkeypatch.setattr(McapFile, "_put", gated)
+        monkeypatch.setattr(Backlog, "drop_images", given_up)
 
     def allow(self, nbytes):
         """So many more; from the first call on only what was allowed."""
@@ -95,17 +103,10 @@ def test_a_slow_disk_costs_evenly_spaced_images_and_nothing_else(tmp_path, monke
 
 @pytest.mark.parametrize("block", [True, False])
 def test_a_run_that_must_end_soon_drops_the_images_that_wait_and_counts_them(tmp_path, monkeypatch, block):
-    disk, drop = GatedDisk(monkeypatch), Backlog.drop_images
-
-    def dropped(backlog):
-        count = drop(backlog)
-        disk.allow(math.inf)
-        return count
-
-    monkeypatch.setattr(Backlog, "drop_images", dropped)
+    disk = GatedDisk(monkeypatch)
     ticks = list(ticks_of(120, shape=(256, 256)))  # 8 MB
     writer = SessionWriter(tmp_path / "s.mcap", HEADER, frames="raw", block=block)
-    disk.allow(2_000_000)  # and no more until the images are given up: who waits for them waits for ever
+    disk.allow(2_000_000)
     for tick in ticks:
         writer.write(tick)
     writer.close({"outcome": "stopped"}, patience_s=0.3)

@@ -27,7 +27,7 @@ from flowrec.store.scan import scan
 from flowrec.store.source import Source
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
-from tests.store.test_disk import slow_disk
+from tests.store.test_disk import GatedDisk, slow_disk
 from tests.store.test_trouble import names_in
 
 TICKS = list(ticks_of(120, shape=(96, 96)))
@@ -35,12 +35,11 @@ APPLIED = SLOTS["/coils/applied"].channel
 SPAN_S = seconds(TICKS[-1].stamp_ns - TICKS[0].stamp_ns)
 
 
-def record(path, split, *, ticks=TICKS, close=True, **options):
+def record(path, split, *, ticks=TICKS, **options):
     writer = SessionWriter(path, HEADER, pieces=split, **options)
     for tick in ticks:
         writer.write(tick)
-    if close:
-        writer.close({"outcome": "reached"})
+    writer.close({"outcome": "reached"})
     return writer
 
 
@@ -135,8 +134,12 @@ def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(t
 
 
 def test_an_end_in_a_hurry_counts_what_it_drops_in_the_part_that_lacks_it(tmp_path, monkeypatch):
-    slow_disk(monkeypatch, 1.5e6)
-    writer = record(tmp_path / "x.mcap", Split(seconds=0.4), frames="raw", close=False)
+    disk = GatedDisk(monkeypatch)
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, pieces=Split(seconds=0.4), frames="raw")
+    disk.allow(600_000)  # of 1.1 MB
+    for tick in TICKS:
+        writer.write(tick)
+        disk.until_idle(writer)
     writer.close({"outcome": "stopped"}, patience_s=0.4)
     kept = 0
     for piece in writer.files:
