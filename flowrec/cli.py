@@ -89,6 +89,7 @@ def record(
     given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
     settings = [*(sets or []), *(f"{key}={value}" for key, (_, value) in given.items())]
     chosen = load_config(config, settings, {key: flag for key, (flag, _) in given.items()})
+    from flowrec.attend import AtTerminal
     from flowrec.record import prepare, print_summary
     from flowrec.record import record as run_record
     from flowrec.terminal import said_within
@@ -96,7 +97,7 @@ def record(
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return
-    recorded = run_record(chosen, out, view, realtime, overwrite)
+    recorded = run_record(chosen, out, view, realtime, overwrite, AtTerminal())
 
     def summarize() -> None:
         if as_json:
@@ -138,6 +139,7 @@ def replay(
 ) -> None:
     """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
     from flowrec import replay as verb
+    from flowrec.attend import AtTerminal
     from flowrec.figures import comparison_for_people
     from flowrec.status import say, table
     from flowrec.whatif import before_and_after
@@ -146,7 +148,7 @@ def replay(
     if verify and refly:
         raise typer.BadParameter("--verify only compares; it goes without --refly")
     target = out if out is not None or verify else verb.default_out(session)
-    done = verb.replay(session, change, from_s, verify, target, overwrite, frames)
+    done = verb.replay(session, change, from_s, verify, target, overwrite, frames, AtTerminal())
     if verify:
         same, lines = verb.verdict(done)
         if as_json:

@@ -34,7 +34,7 @@ from flowrec.planning.space import Swift
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
 from flowrec.robot import USUAL_DELAY_S, Robot
-from flowrec.settings import CameraSettings, Simulated
+from flowrec.settings import CameraSettings, Safety, Simulated
 from flowrec.toml_file import read_toml
 from flowrec.vision import Tracker
 
@@ -111,6 +111,7 @@ class Config:
     mission: Commander = field(default_factory=Commander)
     control: Controller = field(default_factory=Controller)
     coils: Coils = field(default_factory=Coils)
+    safety: Safety = field(default_factory=Safety)
     worker: Worker = field(default_factory=Worker)
     recording: Recording = field(default_factory=Recording)
 

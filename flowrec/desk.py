@@ -2,17 +2,16 @@
 
 Anybody may ask, from any thread; the loop takes one event a tick, so that every one of them is recorded. A run that is
 to end does so by ticks: coils down their ramp, all of it on file. Where no tick comes any more, or a slow stage is at
-work in the loop's own thread, the desk interrupts the loop by a signal: the end must not wait for either.
+work in the loop's own thread, the loop is left by an exception: the end must not wait for either. That exception is
+raised in the blocks that the loop has marked as `interruptible` or `unless_stopped` only, where it holds no lock.
 """
 
 from __future__ import annotations
 
-import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import TypeVar
 
 from flowrec.messages import OperatorEvent
@@ -21,12 +20,7 @@ Result = TypeVar("Result")
 
 RAMP_PATIENCE_S = 0.8  # for the coils to come down their ramp by ticks; the next tick then takes all of the field away
 _TICK_PATIENCE_S = 0.3  # for that tick to come; then the loop is left, and the rig switches the coils off
-_PROD_S = 0.1
-_REASONS = {
-    signal.SIGINT: "stopped by SIGINT: Ctrl-C",
-    signal.SIGTERM: "stopped by SIGTERM",
-    signal.SIGHUP: "stopped by SIGHUP: the terminal was closed",
-}
+_STUCK_S = 5.0  # for the loop to be left; then its thread is stuck
 
 
 class Interrupted(BaseException):
@@ -36,20 +30,25 @@ class Interrupted(BaseException):
 class Desk:
     """Events that wait for their tick, and the wish that the run end.
 
+    Parameters
+    ----------
+    clock : monotonic time in s.
+
     Attributes
     ----------
     reason : why the run is to end; empty as long as it is not.
     ticking : whether the loop has begun; before, nothing is driven, and the end need not wait for anything.
+    interruptible : a context, for the loop: in this block it may be left when the end is overdue.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.reason = ""
         self.ticking = False
+        self.interruptible = _Region()
+        self._clock = clock
         self._since_s = 0.0
-        self._by: int | None = None  # the signal that asked for the end
         self._waiting: deque[tuple[str, str]] = deque()
-        self._armed = self._cut = False
-        self._leave_when_late = self._at_work = False
+        self._cut = self._at_work = self._looping = False
 
     # ---- for those who ask, from any thread
 
@@ -64,10 +63,12 @@ class Desk:
         elif not self.reason:
             self._waiting.append(("stop", reason))
         if not self.reason:
-            self._since_s = time.monotonic()
+            self._since_s = self._clock()
             self.reason = reason
-            if self._armed:
-                signal.setitimer(signal.ITIMER_REAL, 1e-3, _PROD_S)
+
+    def hurry(self) -> None:
+        """There is no time for a ramp any more."""
+        self._since_s = min(self._since_s, self._clock() - RAMP_PATIENCE_S)
 
     # ---- for the loop
 
@@ -75,7 +76,7 @@ class Desk:
         """The event of the tick of this stamp."""
         if self._late() > RAMP_PATIENCE_S and not self._cut:
             self._cut = True
-            return OperatorEvent(stamp_ns, "zero", self.reason)
+            return OperatorEvent(stamp_ns, "zero", self.zero_waiting or self.reason)
         if not self._waiting:
             return None
         action, text = self._waiting.popleft()
@@ -89,20 +90,31 @@ class Desk:
         return bool(self._waiting)
 
     @property
+    def zero_waiting(self) -> str:
+        """The reason of a zero that no tick has taken; empty where there is none."""
+        return next((text for action, text in list(self._waiting) if action == "zero"), "")
+
+    @property
     def overdue(self) -> bool:
         """The run should have ended by now, and its field is gone."""
         return self._cut
 
     @contextmanager
     def left_when_late(self) -> Iterator[None]:
-        """The loop, or what leads to it: it is left when the end is overdue, whatever it waits for."""
-        self._leave_when_late = True
+        """The loop: it is left from an `interruptible` block in it when the end is overdue."""
+        self._looping = True
         try:
             yield
         except Interrupted:
             pass
         finally:
-            self._leave_when_late = False
+            self._looping = self.interruptible.entered = False
+
+    def interrupt(self) -> None:
+        """In the loop's thread, for example in a signal handler: leave the loop if it is to be left and can be."""
+        if self.leave_now:
+            self._at_work = self.interruptible.entered = False  # so that nothing raises again on the way out
+            raise Interrupted
 
     def unless_stopped(self, work: Callable[[], Result], otherwise: Result) -> Result:
         """What slow work gives, or the other thing as soon as the run is to end."""
@@ -116,40 +128,34 @@ class Desk:
             self._at_work = False
             return otherwise
 
+    # ---- for who interrupts it, from any thread
+
+    @property
+    def leave_now(self) -> bool:
+        """Whether the loop is to be left and can be: `Interrupted` may be raised in its thread."""
+        if not self.reason:
+            return False
+        late = self._late() > RAMP_PATIENCE_S + _TICK_PATIENCE_S or not self.ticking
+        return self._at_work or (self.interruptible.entered and late)
+
+    @property
+    def stuck(self) -> bool:
+        """The loop should have been left long ago and was not: its thread is in a call that does not return."""
+        return self._looping and self._late() > _STUCK_S
+
     def _late(self) -> float:
         """For how long the run has been asked to end, in s; 0: it has not."""
-        return time.monotonic() - self._since_s if self.reason else 0.0
+        return self._clock() - self._since_s if self.reason else 0.0
 
-    # ---- signals
 
-    @contextmanager
-    def armed(self) -> Iterator[Desk]:
-        """Take Ctrl-C, SIGTERM and the closing of the terminal as the wish to end; a second Ctrl-C gets through."""
-        wanted = dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), self._signalled)
-        if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:  # nohup
-            del wanted[signal.SIGHUP]
-        before = {number: signal.signal(number, handler) for number, handler in wanted.items()}
-        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._prodded)
-        self._armed = True
-        if self.reason:
-            signal.setitimer(signal.ITIMER_REAL, 1e-3, _PROD_S)
-        try:
-            yield self
-        finally:
-            self._armed = False
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            for number, handler in before.items():
-                signal.signal(number, handler)
+class _Region:
+    """Whether a thread is in a block; entered and left a few times a tick."""
 
-    def _signalled(self, number: int, _frame: FrameType | None) -> None:
-        # A closed terminal comes twice, from the kernel and from the shell, and a shutdown sends whatever it knows.
-        insists = number == signal.SIGINT or (number == signal.SIGTERM and self._by == signal.SIGTERM)
-        if self._by is not None and insists:
-            raise KeyboardInterrupt
-        self._by = number if self._by is None else self._by
-        self.stop(_REASONS[signal.Signals(number)])
+    def __init__(self) -> None:
+        self.entered = False
 
-    def _prodded(self, _number: int, _frame: FrameType | None) -> None:
-        late = self._late() > RAMP_PATIENCE_S + _TICK_PATIENCE_S or not self.ticking
-        if self.reason and (self._at_work or (self._leave_when_late and late)):
-            raise Interrupted
+    def __enter__(self) -> None:
+        self.entered = True
+
+    def __exit__(self, *error: object) -> None:
+        self.entered = False

@@ -18,7 +18,6 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import Any
 
 from flowrec.desk import Desk
@@ -80,8 +79,11 @@ class KeyBoard:
 
 
 @contextmanager
-def listening(desk: Desk) -> Iterator[KeyBoard | None]:
-    """Read keys for the length of the context; None where stdin is no terminal. It is left as it was found."""
+def listening(desk: Desk) -> Iterator[tuple[KeyBoard, Callable[[], None]] | None]:
+    """Read keys for the length of the context; None where stdin is no terminal. It is left as it was found.
+
+    The function that comes with the keys leaves it at once, in any thread.
+    """
     descriptor = _terminal()
     if descriptor is None:
         yield None
@@ -92,7 +94,7 @@ def listening(desk: Desk) -> Iterator[KeyBoard | None]:
         reader = threading.Thread(target=_read, args=(terminal, board.take, over), name="keys", daemon=True)
         reader.start()
         try:
-            yield board
+            yield board, terminal.leave
         finally:
             over.set()
             reader.join(2 * _LOOK_S)
@@ -114,18 +116,16 @@ class _Terminal:
         self._found: list[Any] | None = None
         self._lock = threading.RLock()
         self._left = False
-        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> _Terminal:
         self.take_over()
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in ((signal.SIGTSTP, self._suspended), (signal.SIGQUIT, self._killed)):
-                self._handlers[number] = signal.signal(number, handler)
         return self
 
     def __exit__(self, *error: object) -> None:
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
+        self.leave()
+
+    def leave(self) -> None:
+        """As it was found, for good: the end of the run, or Ctrl-Z, which ends it."""
         with self._lock:
             self._left = True
             self._give_back()
@@ -154,20 +154,6 @@ class _Terminal:
             return os.tcgetpgrp(self.descriptor) == os.getpgrp()
         except OSError:
             return False
-
-    def _suspended(self, _number: int, _frame: FrameType | None) -> None:
-        """Ctrl-Z: the shell gets its terminal as it was; `fg` goes on here."""
-        with self._lock:
-            self._give_back()
-        os.kill(os.getpid(), signal.SIGSTOP)
-        self.take_over()
-
-    def _killed(self, number: int, _frame: FrameType | None) -> None:
-        """SIGQUIT kills at once, but does not take the echo of the shell with it."""
-        with self._lock:
-            self._give_back()
-        signal.signal(number, signal.SIG_DFL)
-        os.kill(os.getpid(), number)
 
 
 def _read(terminal: _Terminal, take: Callable[[str], None], over: threading.Event) -> None:

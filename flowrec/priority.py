@@ -11,7 +11,7 @@ _PRIORITY = 1
 
 
 @contextmanager
-def first_of_all() -> Iterator[bool]:
+def first_of_all(priority: int = _PRIORITY) -> Iterator[bool]:
     """Run this thread in real time, where that is allowed: yields whether it is.
 
     For loops that wait for a camera; one that never waits would keep a core for itself. Threads and processes that
@@ -23,7 +23,7 @@ def first_of_all() -> Iterator[bool]:
         return
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except OSError:
         yield False
         return

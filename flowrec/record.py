@@ -3,28 +3,29 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from flowrec.attend import Unattended
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.chip.places import distance_um
 from flowrec.clocks import ClockWatch
 from flowrec.config import Config, derived, resolve
-from flowrec.desk import Desk
 from flowrec.disk import DiskWatch, refuse_below
 from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.figures import Figures, as_text, finite, rows_for_people
 from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
-from flowrec.keys import HELP as KEYS
-from flowrec.keys import listening
+from flowrec.guard import Guard
 from flowrec.leftovers import look_after
 from flowrec.messages import Demand, FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
@@ -33,7 +34,7 @@ from flowrec.priority import first_of_all
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
 from flowrec.session import length_um, session_writer
-from flowrec.status import StatusLine, say, table, warn
+from flowrec.status import say, table, warn
 from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
 from flowrec.store.names import pieces, run_path
 from flowrec.units import seconds
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 # Of the 2 s that a run may take to end: the rest is for the coils (desk.py) and for Python itself.
 CLOSE_PATIENCE_S = 0.5  # for images that still wait to be written
 VIEW_PATIENCE_S = 0.2  # for a viewer to show the last of it
+_GIVE_UP_S = 1.0  # for a file to be closed beside a thread that is stuck
+_LEAST_FRAMES = 3.0  # of the camera in the guard's time
 
 View = Literal["spawn", "serve", "rrd", "none"]
 
@@ -197,20 +200,42 @@ def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
 
 
 def record(
-    config: Config, out: Path | None = None, view: View = "none", realtime: bool = False, overwrite: bool = False
+    config: Config,
+    out: Path | None = None,
+    view: View = "none",
+    realtime: bool = False,
+    overwrite: bool = False,
+    control: Unattended | None = None,
 ) -> Recorded:
-    """Run the mission of `config` and write it to `out`; `view` is spawn, serve, rrd or none."""
+    """Run the mission of `config` and write it to `out`, in any thread.
+
+    Whatever ends it, KeyboardInterrupt included, the field is off before this function returns or raises.
+
+    Parameters
+    ----------
+    view : spawn, serve, rrd or none.
+    realtime : keep the rig to the wall clock, with a guard of its ticks (guard.py).
+    control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
+
+    Raises
+    ------
+    FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
+    """
     asked = config
     config, chip, pipeline = prepare(config)
     made = derived(asked, config)
+    timeout_s = _guard_timeout_s(config) if realtime else None
     path = _place(config, out, overwrite)
     fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
     rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
     folder, floor_gb = path.resolve().parent, config.recording.disk_floor_gb
-    desk = Desk()
+    control = control if control is not None else Unattended()
+    desk = control.desk
+    guard = Guard(rig, timeout_s, partial(desk.stop, zero=True), warn)
     witness = Witness()
     clocks = ClockWatch()
     low: list[str] = []
+    opened: list[SessionWriter] = []
 
     def disk_low(reason: str) -> None:
         low.append(reason)
@@ -218,59 +243,52 @@ def record(
 
     with ExitStack() as stack:
         # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
-        stack.enter_context(desk.armed())
+        stack.enter_context(control.armed(guard, lambda: _closed_beside(opened, desk.reason)))
         writer = stack.enter_context(
             session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made)
         )
+        opened.append(writer)
         sinks: list[Sink] = [writer, witness]
         live: LiveView | None = None
-        worker: Worker | None = None
-        with desk.left_when_late():
-            if view in ("spawn", "serve"):
-                # Late: importing Rerun takes a second, and most runs do without.
-                from flowrec.export import scene_of
-                from flowrec.view import LiveView
+        worker: Worker
+        if view in ("spawn", "serve"):
+            # Late: importing Rerun takes a second, and most runs do without.
+            from flowrec.export import scene_of
+            from flowrec.view import LiveView
 
-                live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
-                say(live.message)
-                sinks.append(live)
-            worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
-            stack.callback(worker.close)
-            if fields:
-                worker = Preloaded(worker, fields)
+            live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
+            say(live.message)
+            sinks.append(live)
+        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
+        stack.callback(worker.close)
+        if fields:
+            worker = Preloaded(worker, fields)
         disk = stack.enter_context(DiskWatch(folder, lambda: writer.bytes_written, floor_gb, disk_low).watching())
-        board = stack.enter_context(listening(desk))
-        status = StatusLine(
-            lambda: writer.bytes_written, lambda: disk.text, lambda: board.note if board is not None else None
-        )
-        report = RunReport("stopped", desk.reason)
-
-        def on_tick(tick: Tick) -> None:
-            status(tick)
-            _say_remarks(writer)
-
         # A run that does not keep real time never waits: it would keep a core for itself.
         priority = first_of_all() if realtime else nullcontext(enter_result=False)
-        with status.shown(), priority as first:
-            if board is not None:
-                say(KEYS)
-            if worker is not None:
-                report = run(
-                    pipeline,
-                    rig,
-                    worker,
-                    sinks,
-                    desk=desk,
-                    on_tick=on_tick,
-                    queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
-                    clocks=clocks,
-                )
+        with control.shown(writer, disk) as show, priority as first:
+
+            def on_tick(tick: Tick) -> None:
+                show(tick)
+                _say_remarks(writer)
+
+            report = run(
+                pipeline,
+                rig,
+                worker,
+                sinks,
+                desk=desk,
+                on_tick=on_tick,
+                queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
+                clocks=clocks,
+                guard=guard,
+            )
         facts = facts_of(chip, report, witness.true_field)
         if config.control.method != "policy":  # which has no reference to be off
             facts["tracking_error_um"] = finite(witness.rms_um)
         facts["frames_dropped"] = writer.dropped_frames
-        if board is not None and board.note:
-            facts["note_not_finished"] = board.note
+        if control.note:
+            facts["note_not_finished"] = control.note
         outcome = as_text(facts) | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
@@ -290,6 +308,38 @@ def record(
         for name in recorded.sessions:
             facts["rrd"] = str(write_rrd_of(name))
     return recorded
+
+
+def _guard_timeout_s(config: Config) -> float:
+    """The guard's time, which must suffice for the camera's frames."""
+    timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
+    if rate_hz is not None and timeout_s * rate_hz < _LEAST_FRAMES:
+        raise UsageError(
+            f"safety.guard_timeout_s = {timeout_s:g}: shorter than {_LEAST_FRAMES:g} frames at camera.rate_hz = "
+            f"{rate_hz:g}; the nearest that works is {_LEAST_FRAMES / rate_hz:.3g}"
+        )
+    return timeout_s
+
+
+def _closed_beside(opened: list[SessionWriter], reason: str) -> str:
+    """Close the file beside a main thread that is stuck; returns what a person is to know of it.
+
+    In the thread of the signals. The writer is not in use: where the main thread is stuck in it, this does not wait.
+    """
+    if not opened:
+        return ""
+    writer = opened[0]
+
+    def close() -> None:
+        with suppress(SessionError):  # what is there stays in the partial file
+            writer.close({"outcome": "failed", "note": f"{reason}; the main thread did not answer"}, CLOSE_PATIENCE_S)
+
+    thread = threading.Thread(target=close, name="give up", daemon=True)
+    thread.start()
+    thread.join(_GIVE_UP_S)
+    if writer.partial_path.exists():
+        return f"flowrec recover {writer.partial_path} makes a session of what was recorded"
+    return f"the file is whole: {files_told(writer.path, tuple(writer.files))}"
 
 
 def _say_remarks(writer: SessionWriter) -> None:

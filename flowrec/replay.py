@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.attend import Unattended
 from flowrec.chip.chip import Chip
 from flowrec.compare import Comparison, Side
 from flowrec.config import Config, with_sets
-from flowrec.desk import Desk
 from flowrec.errors import SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
 from flowrec.figures import as_text
@@ -24,7 +24,7 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, run
 from flowrec.session import open_session, session_writer
-from flowrec.status import progress, warn
+from flowrec.status import warn
 from flowrec.store import SessionReader, SessionWriter, digest_faults
 from flowrec.topics import BY_FIELD
 from flowrec.units import nanoseconds, seconds
@@ -154,8 +154,17 @@ def replay(
     out: Path | None = None,
     overwrite: bool = False,
     frames: bool = False,
+    control: Unattended | None = None,
 ) -> Replayed:
-    """Replay `path` with `change`; write the result to `out` when given (without camera frames unless `frames`)."""
+    """Replay `path` with `change`, in any thread; write the result to `out` when given.
+
+    Parameters
+    ----------
+    from_s : resume at this second.
+    verify : do the worker's orders again as well, and compare.
+    frames : copy the camera's images to `out`.
+    control : who attends it; None: nobody, it takes no signals and shows no progress.
+    """
     reader, recorded_config, chip = open_session(path)
     config = change.apply(recorded_config)
     stale = stale_results(recorded_config, config)
@@ -195,7 +204,8 @@ def replay(
             checker.see(tick)
         done(seconds(tick.stamp_ns - first_ns))
 
-    desk = Desk()
+    control = control if control is not None else Unattended()
+    desk = control.desk
     first_ns = start_ns if start_ns is not None else reader.first_ns
     with ExitStack() as stack:
         sinks: list[Sink] = []
@@ -203,8 +213,9 @@ def replay(
         if out is not None:
             writer = stack.enter_context(session_writer(out, config, chip, parent=path, overwrite=overwrite))
             sinks.append(writer if frames else WithoutFrames(writer))
-        done = stack.enter_context(progress(f"replaying {path.name}", max(seconds(reader.last_ns - first_ns), 1e-3)))
-        with desk.armed():
+        length_s = max(seconds(reader.last_ns - first_ns), 1e-3)
+        done = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
+        with control.armed():
             report = run(pipeline, rig, worker, sinks, start=start, desk=desk, on_tick=on_tick, end_when_finished=False)
         if report.ticks == 0:
             raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")

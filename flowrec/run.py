@@ -13,7 +13,8 @@ from typing import Any, Protocol
 from flowrec.clocks import ClockWatch
 from flowrec.desk import Desk
 from flowrec.errors import RigError
-from flowrec.messages import Currents, FlowField, Route, Tick, Timing
+from flowrec.guard import Guard
+from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step
 from flowrec.rigs.arrival import Arrivals
 from flowrec.units import nanoseconds, seconds
@@ -25,7 +26,11 @@ _PASSED_OVER = 50  # frames in a row, then the robot is out of control
 
 
 class Rig(Protocol):
-    """Camera and coils. Leaving the context zeroes the coils."""
+    """Camera and coils. Leaving the context zeroes the coils.
+
+    `zero` is for emergencies: it is called by another thread than the other methods (guard.py), at any time from before
+    the context is entered until the process ends, also while `inputs` or `apply` is at work or stuck in a driver.
+    """
 
     def __enter__(self) -> Rig: ...
 
@@ -36,6 +41,14 @@ class Rig(Protocol):
 
     def apply(self, currents: Currents) -> None:
         """Send a command to the coils."""
+
+    def zero(self) -> None:
+        """Take the field away now; until the rig is entered again `apply` lets none back. A second call is harmless.
+
+        Raises
+        ------
+        RigError : the hardware has refused; it is called again.
+        """
 
 
 class Sink(Protocol):
@@ -182,17 +195,24 @@ def run(
     queue_state: Callable[[], tuple[float, int]] = lambda: (0.0, 0),
     end_when_finished: bool = True,
     clocks: ClockWatch | None = None,
+    guard: Guard | None = None,
 ) -> RunReport:
     """Run until the rig ends, the mission is finished and the coils are at zero, or somebody stops it at the `desk`.
 
-    `start` is the tick to resume from; `queue_state` tells MB waiting for the disk and frames dropped.
+    However it ends, the guard takes the field away before anything else is done. `guard` is that of this rig; None: one
+    without a timer. `start` is the tick to resume from; `queue_state` tells MB waiting for the disk and frames dropped.
     A stage that fails leaves its inputs, and only those, as the last tick in the sinks. A frame whose stamp does not
     grow enters no stage and is counted; `clocks` has it told, with what else clocks do, in the record. Frames are
     checked on arrival where `end_when_finished`, so not in a replay: its inputs hold what was found.
+
+    Raises
+    ------
+    RigError : the rig can not go on, or its zero() has failed. Besides, what stages, rig, worker and sinks raise.
     """
     report = RunReport()
     desk = desk if desk is not None else Desk()
-    tick = start if start is not None else Tick()
+    guard = guard if guard is not None else Guard(rig, tripped=partial(desk.stop, zero=True))
+    tick = ended = start if start is not None else Tick()
     first_ns: int | None = None
     clock = time.perf_counter
     began = clock()
@@ -212,11 +232,16 @@ def run(
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(SWITCH_S)
         stack.callback(worker.close)
+        stack.enter_context(guard.running())
         stack.enter_context(rig)
+        stack.callback(guard.field_off)
         stack.enter_context(desk.left_when_late())
         growing = _growing(rig.inputs(), tick.stamp_ns, report, clocks)
-        for arrived in map(Arrivals(pipeline.image_shape).check, growing) if end_when_finished else growing:
-            if desk.overdue or (desk.reason and not end_when_finished):
+        arrivals = map(Arrivals(pipeline.image_shape).check, growing) if end_when_finished else growing
+        while True:
+            with desk.interruptible:
+                arrived = next(arrivals, None)
+            if arrived is None or desk.overdue or (desk.reason and not end_when_finished):
                 break
             desk.ticking = True
             begin = mark = clock()
@@ -229,13 +254,16 @@ def run(
             last = tick
             mark = clock()
             try:
-                tick = step(pipeline, last, inputs, lap)
+                with desk.interruptible:
+                    tick = step(pipeline, last, inputs, lap)
             except Exception:
+                guard.take_away()
                 _write(sinks, _only_inputs(last, inputs))
                 raise
             assert tick.currents is not None
             assert tick.mission is not None
-            rig.apply(tick.currents)
+            with desk.interruptible:
+                guard.apply(tick.currents)
             if tick.mission.wanted and (last.mission is None or tick.mission.request != last.mission.request):
                 worker.submit(tick)
             lap("apply")
@@ -262,17 +290,30 @@ def run(
             report.contacts = inputs.truth.contacts if inputs.truth is not None else report.contacts
             if on_tick is not None:
                 on_tick(recorded)
+            ended = tick
+            guard.tick_ended()
             at_rest = tick.mission.finished and tick.currents.amplitude_mt == 0.0
             if end_when_finished and at_rest and not desk.pending:
                 break
     report.wall_s = clock() - began
-    report.last = tick
+    report.last = tick = ended
+    still_on = desk.reason and tick.currents is not None and tick.currents.amplitude_mt > 0.0
+    cut_by = ("" if desk.overdue else desk.zero_waiting) or (desk.reason if still_on else "")
+    if cut_by and end_when_finished and report.ticks:
+        # No tick has come to say so: the file tells without one.
+        since_ns = max(nanoseconds(guard.clock() - guard.ticked_s), 1)
+        told = OperatorEvent(tick.stamp_ns + since_ns, "zero", cut_by)
+        _write(sinks, replace(tick, stamp_ns=told.stamp_ns, operator=told))
     if tick.mission is not None and tick.mission.finished:
         report.outcome, report.note = tick.mission.outcome, tick.mission.note
     elif desk.reason:  # no tick came to say so
         report.outcome, report.note = "stopped", desk.reason
-    if desk.reason and tick.currents is not None and tick.currents.amplitude_mt > 0.0:
+    if still_on:
         report.note += "; the coils were switched off before they were down their ramp"
+    if guard.hung:
+        report.outcome, report.note = "failed", guard.reason
+    if guard.failures:
+        report.note += f"; the coils' zero() worked after {guard.failures} failures"
     return report
 
 

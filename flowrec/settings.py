@@ -53,3 +53,11 @@ class Simulated:
     # by which the camera's clock runs fast; None: drawn, up to 50 either way
     clock_skew_ppm: Annotated[float, Range(-1e5, 1e5)] | None = None
     arrival_jitter_s: Annotated[float, Range(0.0, 1.0)] = 3e-4  # by which frames reach the host late, on average
+
+
+@dataclass(frozen=True, slots=True)
+class Safety:
+    """When a run that is not steered loses its field. With --realtime, and on hardware."""
+
+    # no tick has ended for so long while the field is on
+    guard_timeout_s: Annotated[float, Range(0.01, 60.0)] = 0.5

@@ -14,6 +14,7 @@ import pytest
 
 from flowrec import record as verb
 from flowrec import replay as again
+from flowrec.attend import Unattended
 from flowrec.config import load_config
 from flowrec.desk import Desk
 from flowrec.disk import DiskWatch, refuse_below
@@ -29,11 +30,9 @@ from tests.conftest import SMALL
 class Scripted(Desk):
     """An operator who does things at certain times of the session."""
 
-    script: tuple[tuple[float, str, str], ...] = ()
-
-    def __init__(self) -> None:
+    def __init__(self, script: tuple[tuple[float, str, str], ...]) -> None:
         super().__init__()
-        self.left = list(self.script)
+        self.left = list(script)
 
     def next(self, stamp_ns: int, held: bool) -> OperatorEvent | None:
         while self.left and seconds(stamp_ns) >= self.left[0][0]:
@@ -45,9 +44,8 @@ class Scripted(Desk):
         return super().next(stamp_ns, held)
 
 
-def flown(path: Path, monkeypatch: pytest.MonkeyPatch, *script: tuple[float, str, str], sets: tuple[str, ...] = ()):  # type: ignore[no-untyped-def]
-    monkeypatch.setattr(verb, "Desk", type("Desk", (Scripted,), {"script": script}))
-    recorded = verb.record(load_config(None, [*SMALL, *sets]), path)
+def flown(path: Path, *script: tuple[float, str, str], sets: tuple[str, ...] = ()):  # type: ignore[no-untyped-def]
+    recorded = verb.record(load_config(None, [*SMALL, *sets]), path, control=Unattended(Scripted(script)))
     return recorded, list(SessionReader(path).ticks(with_frames=False))
 
 
@@ -61,7 +59,7 @@ def test_a_held_robot_stays_goes_on_and_arrives_and_a_replay_is_identical(
 ) -> None:
     script = ((0.2, "hold", ""), (0.4, "hold", ""), (1.7, "hold", ""), (1.7, "mark", "1"), (1.7, "note", "look"))
     script += ((3.2, "hold", ""), (7.0, "hold", ""), (9.0, "hold", ""))
-    recorded, ticks = flown(tmp_path / "held.mcap", monkeypatch, *script)
+    recorded, ticks = flown(tmp_path / "held.mcap", *script)
     assert recorded.report.outcome == "reached"
     assert recorded.report.contacts == 0
     # What was asked in one frame comes one by one, in order, each on a tick of its own.
@@ -108,7 +106,7 @@ def test_a_held_robot_stays_goes_on_and_arrives_and_a_replay_is_identical(
 def test_zero_takes_the_field_away_on_that_very_tick_and_a_replay_agrees(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorded, ticks = flown(tmp_path / "zero.mcap", monkeypatch, (2.0, "mark", "1"), (2.0, "zero", "enough"))
+    recorded, ticks = flown(tmp_path / "zero.mcap", (2.0, "mark", "1"), (2.0, "zero", "enough"))
     assert (recorded.report.outcome, recorded.report.note) == ("stopped", "enough")
     assert said(ticks) == [("zero", "enough"), ("mark", "1")]  # the field first, and nothing is forgotten
     before, at = next((a, b) for a, b in pairwise(ticks) if b.operator is not None)
@@ -128,7 +126,7 @@ def test_a_robot_that_the_flow_carries_off_its_place_is_told_of_and_does_its_bes
 ) -> None:
     # Down the fast branch of a flow that is half as fast again as the robot.
     sets = ("simulated.inlet_speed_error=0", "robot.max_speed_um_s=160", "mission.phases=navigate", "duration_s=14")
-    _, ticks = flown(tmp_path / "swept.mcap", monkeypatch, (6.0, "hold", ""), sets=sets)
+    _, ticks = flown(tmp_path / "swept.mcap", (6.0, "hold", ""), sets=sets)
     swept = [tick for tick in ticks if tick.mission is not None and tick.mission.swept]
     assert swept
     assert any(tick.event is not None and "carried off the place" in tick.event.text for tick in swept)

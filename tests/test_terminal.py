@@ -19,7 +19,7 @@ import pytest
 from flowrec.store import SessionReader
 from tests.conftest import SMALL, until
 
-WORDS = [word for setting in SMALL for word in ("--set", setting)]
+WORDS = [word for setting in (*SMALL, "safety.guard_timeout_s=20") for word in ("--set", setting)]
 
 
 class Command:
@@ -102,18 +102,11 @@ def command(tmp_path: Path) -> Iterator[Command]:
                 os.close(descriptor)
 
 
-def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_for_a_while_and_at_the_end(
-    command: Command,
-) -> None:
+def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_at_the_end(command: Command) -> None:
     assert b"keys: q stop" in command.said
     command.until(lambda: command.raw)
     command.press("mnlooks g\x7fgood")
     command.until(lambda: b"looks good_" in command.said)
-    command.press("\x1a")  # Ctrl-Z
-    command.until(command.stopped)
-    assert not command.raw
-    os.kill(command.pid, signal.SIGCONT)  # fg
-    command.until(lambda: command.raw)
     command.press("\r ")
     command.until(lambda: b"HELD" in command.said)
     command.press(" q")
@@ -124,6 +117,18 @@ def test_keys_are_recorded_and_the_terminal_is_given_back_to_the_shell_for_a_whi
     events = list(SessionReader(command.out).messages("operator"))
     assert [event.action for event in events] == ["mark", "note", "pause", "resume", "stop"]
     assert events[1].text == "looks good"
+
+
+def test_ctrl_z_gives_the_terminal_back_to_the_shell_and_ends_the_run(command: Command) -> None:
+    command.until(lambda: command.raw)
+    command.press("\x1a")
+    command.until(command.stopped)
+    assert not command.raw
+    os.kill(command.pid, signal.SIGCONT)  # fg
+    command.until(command.ended)
+    assert command.status == 0
+    assert command.outcome() == ("stopped", "operator: zero field (SIGTSTP: Ctrl-Z)")
+    assert termios.tcgetattr(command.keys) == command.before
 
 
 def test_a_frozen_terminal_neither_stops_the_run_nor_its_end(command: Command) -> None:

@@ -61,6 +61,9 @@ class PacedRig:
     def apply(self, currents: Currents) -> None:
         """Nothing is driven."""
 
+    def zero(self) -> None:
+        """Nothing is driven."""
+
 
 class Keep:
     """A sink that keeps what it is given."""

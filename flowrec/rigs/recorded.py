@@ -62,5 +62,8 @@ class RecordedRig:
     def apply(self, currents: Currents) -> None:
         """Recorded coils hear nothing."""
 
+    def zero(self) -> None:
+        """Recorded coils hear nothing."""
+
     def _adopted(self, field: str, tick: Tick, before: Tick) -> bool:
         return field not in self._recompute and getattr(tick, field) is not getattr(before, field)

@@ -137,8 +137,12 @@ class SimulatedRig:
         self._rotation = Rotation()
         self._coming: list[tuple[int, Currents]] = []
         self._latest: Currents | None = None
+        # Set by zero(), in any thread: one attribute, which the loop's thread looks at whenever the world goes on. A
+        # lock would be held by a loop that is interrupted.
+        self._cut = False
 
     def __enter__(self) -> SimulatedRig:
+        self._cut = False
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -146,15 +150,14 @@ class SimulatedRig:
 
     def apply(self, currents: Currents) -> None:
         """Send a command; the field changes when the delay is over. The same message again is no new command."""
-        if currents is self._latest:
+        if currents is self._latest or (self._cut and currents.amplitude_mt > 0.0):
             return
         self._latest = currents
         self._coming.append((self._now_ns + self._delay_ns, currents))
 
     def zero(self) -> None:
-        """Send no field and no currents."""
-        stopped = Currents(self._now_ns, 0.0, 0.0, 0.0, 0.0, np.zeros(_COILS), False)
-        self.apply(stopped)
+        """Take the field away at once, and let none come back until the rig is entered again."""
+        self._cut = True
 
     def inputs(self) -> Iterator[Inputs]:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
@@ -223,6 +226,9 @@ class SimulatedRig:
         turns = np.zeros(2)
         now = self._now_ns
         while True:
+            if self._cut:
+                self._coming.clear()
+                self._acting = Currents(now, 0.0, 0.0, 0.0, 0.0, np.zeros(_COILS), False)
             switch = self._coming[0][0] if self._coming else until_ns
             end = min(max(switch, now), until_ns)
             if end > now and self._acting is None:
