@@ -77,7 +77,7 @@ def ticks_of(images: Sequence[Image], count: int, rate_hz: float) -> Iterator[Ti
         )
 
 
-def _poses() -> list[Given]:
+def poses_given() -> list[Given]:
     """Estimates of 1 kB on the wire, by way of a covariance of ten states."""
     rng = np.random.default_rng(0)
     given = []
@@ -87,7 +87,8 @@ def _poses() -> list[Given]:
     return given
 
 
-def _frames(width: int, height: int) -> list[Given]:
+def frames_given(width: int, height: int) -> list[Given]:
+    """Camera images as foxglove.RawImage."""
     frames = [Frame(10**9 + number * _STEP_NS, number, image) for number, image in enumerate(pictures(width, height))]
     return [Given("frame", frame, encode(frame)) for frame in frames]
 
@@ -174,14 +175,14 @@ LOADS = (
     Load(
         "1 kB poses",
         60_000,
-        _poses,
+        poses_given,
         ("flowrec, zstd", "flowrec, bytes", "mcap, zstd", "foxglove-sdk, zstd", "foxglove-sdk, none"),
         "foxglove-sdk, zstd",
     ),
     Load(
         "640x512",
         400,
-        lambda: _frames(640, 512),
+        lambda: frames_given(640, 512),
         (
             *("flowrec, delta", "flowrec, zstd", "flowrec, png", "flowrec, jpeg"),
             *("mcap, zstd", "foxglove-sdk, png", "foxglove-sdk, zstd", "foxglove-sdk, zstd 1", "foxglove-sdk, none"),
@@ -191,7 +192,7 @@ LOADS = (
     Load(
         "2448x2048",
         80,
-        lambda: _frames(2448, 2048),
+        lambda: frames_given(2448, 2048),
         (
             *("flowrec, zstd", "flowrec, delta", "flowrec, raw"),
             *("mcap, zstd", "mcap, none", "foxglove-sdk, zstd", "foxglove-sdk, zstd 1", "foxglove-sdk, none"),

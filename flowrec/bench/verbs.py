@@ -131,11 +131,21 @@ def bench_store(
     split: Annotated[
         float, typer.Option(min=0.0, metavar="S", help="Only split runs after so long: what it does to the loop.")
     ] = 0.0,
+    equal: Annotated[
+        bool, typer.Option("--equal", help="Only our writer and encoder beside the libraries' own, at equal terms.")
+    ] = False,
     folder: Annotated[
         Path | None, typer.Option("--at", metavar="DIR", help="On which disk; by default that of temporary files.")
     ] = None,
 ) -> None:
     """Recording beside a bare mcap and a bare foxglove-sdk writer: speed, stall of the control loop, reading."""
+    if equal:
+        from flowrec.bench import store_equal
+
+        rows = store_equal.measure(1 if quick else 3, 0.1 if quick else 1.0, 0.5 if quick else 3.0)
+        store_equal.show(rows)
+        _keep({"equal": rows}, json_file)
+        return
     from flowrec.bench.store import measure, show
 
     figures = measure(folder, quick, minutes, kills, split)

@@ -1,0 +1,326 @@
+"""`flowrec bench store --equal`: our MCAP writer and protobuf encoder beside the libraries', at equal terms.
+
+The writers are given the same bytes and pack them into chunks of 1 MiB with zstd at level 1, in one thread. The
+encoders are given the same messages and must give the same bytes. Speed is measured alone. The stall is measured at a
+camera's rate: how late a thread wakes that sleeps 1 ms at a time, while another thread of the process writes.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import foxglove
+import mcap.writer
+import numpy as np
+import zstandard
+from foxglove.mcap import MCAPCompression, MCAPWriteOptions
+
+from flowrec.bench.store_writers import frames_given, poses_given
+from flowrec.messages import FlowField, Message, Track
+from flowrec.priority import first_of_all
+from flowrec.run import SWITCH_S
+from flowrec.status import progress, table
+from flowrec.store import chunk, encoder, mcap_file
+from flowrec.store.chunk import ChunkBuilder
+from flowrec.store.codec import codec_of, encode
+from flowrec.store.frames import ENCODINGS
+from flowrec.store.layout import SLOTS, declarations
+from flowrec.store.mcap_file import McapFile
+from flowrec.store.schemas import Schema, forms_of
+from flowrec.topics import BY_FIELD
+
+_CHUNK_BYTES = 1 << 20
+_STEP_NS = 1_000_000
+_PERIOD_S = 1e-3
+
+
+class Open(NamedTuple):
+    """A file that is being written: `put` takes a payload and its stamp in ns."""
+
+    put: Callable[[bytes, int], None]
+    close: Callable[[], None]
+
+
+class Load(NamedTuple):
+    """Payloads of one topic: how many at full speed, and how many a second while the stall is measured."""
+
+    name: str
+    field: str
+    schema: Schema
+    payloads: list[bytes]
+    messages: int
+    rate_hz: float
+
+
+def _ours(path: Path, load: Load) -> Open:
+    file, builder = McapFile(path), ChunkBuilder()
+    file.start("flowrec", "bench")
+    for record in declarations(ENCODINGS["zstd"]):
+        file.add(record)
+    number, channel = 0, SLOTS[BY_FIELD[load.field].path].channel
+
+    def put(payload: bytes, now_ns: int) -> None:
+        nonlocal number
+        builder.add(channel, number, now_ns, now_ns, (payload,))
+        number += 1
+        if builder.size >= _CHUNK_BYTES:
+            file.add_chunks([builder.seal()])
+
+    def close() -> None:
+        if builder.size:
+            file.add_chunks([builder.seal()])
+        file.finish()
+        file.close()
+
+    return Open(put, close)
+
+
+def _foxglove(path: Path, load: Load, packed_before: bool = False) -> Open:
+    options = MCAPWriteOptions(
+        compression=None if packed_before else MCAPCompression.Zstd,
+        compression_level=1,
+        compression_threads=0,
+        chunk_size=_CHUNK_BYTES,
+    )
+    context = foxglove.Context()
+    writer = foxglove.open_mcap(path, context=context, writer_options=options)
+    schema = foxglove.Schema(name=load.schema.name, encoding="protobuf", data=load.schema.data)
+    channel = foxglove.Channel("/x", message_encoding="protobuf", schema=schema, context=context)
+    compressor = zstandard.ZstdCompressor(level=1)
+
+    def put(payload: bytes, now_ns: int) -> None:
+        channel.log(compressor.compress(payload) if packed_before else payload, log_time=now_ns)
+
+    def close() -> None:
+        writer.close()
+        _ = context  # the channel lives as long as this
+
+    return Open(put, close)
+
+
+def _mcap(path: Path, load: Load) -> Open:
+    # mcap packs at level 3 and has no setting for it.
+    vars(mcap.writer)["zstandard"] = SimpleNamespace(compress=partial(zstandard.compress, level=1))
+    stream = path.open("wb")
+    writer = mcap.writer.Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+    writer.start()
+    number = writer.register_schema(load.schema.name, "protobuf", load.schema.data)
+    channel = writer.register_channel("/x", "protobuf", number)
+
+    def put(payload: bytes, now_ns: int) -> None:
+        writer.add_message(channel, now_ns, payload, now_ns)
+
+    def close() -> None:
+        writer.finish()  # type: ignore[no-untyped-call]
+        stream.close()
+        vars(mcap.writer)["zstandard"] = zstandard
+
+    return Open(put, close)
+
+
+# The last one writes files that only flowrec could read: it shows what foxglove-sdk costs without its compression.
+WRITERS: dict[str, Callable[[Path, Load], Open]] = {
+    "flowrec": _ours,
+    "foxglove-sdk": _foxglove,
+    "mcap": _mcap,
+    "foxglove-sdk, payloads packed by zstandard": partial(_foxglove, packed_before=True),
+}
+
+
+def lines_of(name: str) -> int:
+    """Lines of our own code behind a writer or encoder, those of the bench that stand for it included."""
+    own = {"flowrec": (chunk, mcap_file, _ours), "mcap": (_mcap,), "protobuf, ours": (encoder,)}
+    fallback = protobuf_encoder if name.startswith("protobuf") else _foxglove
+    return sum(len(inspect.getsource(part).splitlines()) for part in own.get(name, (fallback,)))
+
+
+def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
+    """What makes the payload of a message by protobuf's own runtime."""
+    wire, forms = codec_of(message_type).schema.wire, forms_of(message_type)
+
+    def by_protobuf(message: Any) -> bytes:
+        made = wire()
+        for form in forms:
+            value = getattr(message, form.name)
+            if value is None:
+                continue
+            if form.kind == "vector":
+                getattr(made, form.name).extend(value.tolist())
+            elif form.kind == "array":
+                part = getattr(made, form.name)
+                part.shape.extend(value.shape)
+                part.dtype, part.data = value.dtype.str, value.tobytes()
+            else:
+                setattr(made, form.name, value)
+        done: bytes = made.SerializeToString()
+        return done
+
+    return by_protobuf
+
+
+def our_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
+    """The same by ours, in one piece."""
+    parts_of = codec_of(message_type).encode
+    return lambda message: b"".join(parts_of(message))
+
+
+ENCODERS: dict[str, Callable[[type[Any]], Callable[[Any], bytes]]] = {
+    "protobuf, ours": our_encoder,
+    "protobuf, its own": protobuf_encoder,
+}
+
+
+def loads(share: float = 1.0) -> list[Load]:
+    """Poses of 1 kB and images of two cameras as foxglove.RawImage; `share` of the usual number."""
+    rows = [
+        ("poses of 1 kB", poses_given(), 60_000, 1000.0),
+        ("images 640x512", frames_given(640, 512), 600, 200.0),
+        ("images 2448x2048", frames_given(2448, 2048), 100, 60.0),
+    ]
+    return [
+        Load(name, given[0].field, codec_of(type(given[0].message)).schema, [one.payload for one in given], n, hz)
+        for name, given, count, hz in rows
+        if (n := max(round(count * share), 20))
+    ]
+
+
+def messages() -> dict[str, tuple[list[Message], int, float]]:
+    """By name: messages to be encoded in turn, how many at full speed, how many a second for the stall."""
+    rng = np.random.default_rng(0)
+    stamps = [10**9 + number * _STEP_NS for number in range(256)]
+    tracks = [Track(now, True, rng.normal(size=2), 0.9, 0, 4.5, rng.normal(size=4), now) for now in stamps]
+    poses = [given.message for given in poses_given()[:256]]
+    size = (512, 512)
+    speed, pressure = rng.normal(size=(*size, 2)).astype(np.float32), rng.normal(size=size).astype(np.float32)
+    field = FlowField(10**9, 1, "fvm", 5.0, speed, pressure, speed, rng.normal(size=4), 1.0, 1000.0, "")
+    return {
+        "tracks of 0.1 kB": (list(tracks), 60_000, 2000.0),
+        "poses of 1 kB": (poses, 60_000, 2000.0),
+        "flow fields 512x512": ([field], 100, 20.0),
+    }
+
+
+def measure(rounds: int = 3, share: float = 1.0, stall_s: float = 3.0) -> list[dict[str, Any]]:
+    """One row for each load and each writer or encoder, which take turns; least and median of the rounds."""
+    jobs: list[tuple[str, str, int, float, Callable[[Path], tuple[Callable[[int], Any], Callable[[], Any]]]]] = []
+    sizes: dict[str, int] = {}
+    for load in loads(share):
+        sizes[load.name] = len(load.payloads[0])
+        jobs += [(load.name, name, load.messages, load.rate_hz, partial(_writing, load, name)) for name in WRITERS]
+    for what, (given, count, rate_hz) in messages().items():
+        sizes[what] = len(encode(given[0]))
+        for name in ENCODERS:
+            jobs.append((what, name, max(round(count * share), 20), rate_hz, partial(_encoding, given, name)))
+    rows: dict[tuple[str, str], list[dict[str, float]]] = {}
+    memory = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is made in it
+    with (
+        tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder,
+        progress("at equal terms", rounds * (len(jobs) + 1)) as done,
+    ):
+        path = Path(folder, "bench.mcap")
+        for turn in range(rounds):
+            rows.setdefault(("nothing", ""), []).append(_stall_ms(lambda _number: None, 1.0, stall_s))
+            done(turn * (len(jobs) + 1) + 1)
+            for number, (what, name, count, rate_hz, start) in enumerate(jobs):
+                found = _speed(start, path, count)
+                put, close = start(path)
+                found |= _stall_ms(put, rate_hz, stall_s)
+                close()
+                path.unlink(missing_ok=True)
+                rows.setdefault((what, name), []).append(found)
+                done(turn * (len(jobs) + 1) + number + 2)
+    return [
+        {"load": what, "name": name, "nbytes": sizes.get(what, 0), "lines": lines_of(name) if name else 0}
+        | {key: [float(np.min(column)), float(np.median(column))] for key in found[0] for column in [_of(found, key)]}
+        for (what, name), found in rows.items()
+    ]
+
+
+def _of(rounds: list[dict[str, float]], key: str) -> list[float]:
+    return [found[key] for found in rounds]
+
+
+def _writing(load: Load, name: str, path: Path) -> tuple[Callable[[int], Any], Callable[[], Any]]:
+    file = WRITERS[name](path, load)
+    payloads = load.payloads
+    return lambda number: file.put(payloads[number % len(payloads)], 10**9 + number * _STEP_NS), file.close
+
+
+def _encoding(given: list[Message], name: str, _path: Path) -> tuple[Callable[[int], Any], Callable[[], Any]]:
+    make = ENCODERS[name](type(given[0]))
+    return lambda number: make(given[number % len(given)]), lambda: None
+
+
+def _speed(
+    start: Callable[[Path], tuple[Callable[[int], Any], Callable[[], Any]]], path: Path, count: int
+) -> dict[str, float]:
+    put, close = start(path)
+    began, began_cpu = time.perf_counter(), time.process_time()
+    for number in range(count):
+        put(number)
+    close()
+    wall_s, cpu_s = time.perf_counter() - began, time.process_time() - began_cpu
+    size = path.stat().st_size if path.exists() else 0
+    path.unlink(missing_ok=True)
+    return {"us": 1e6 * wall_s / count, "cpu_us": 1e6 * cpu_s / count, "file_bytes": size / count}
+
+
+def _stall_ms(put: Callable[[int], Any], rate_hz: float, duration_s: float) -> dict[str, float]:
+    """How late this thread wakes while another one puts messages at a rate; with the loop's priority and switching."""
+    over = threading.Event()
+
+    def work() -> None:
+        due, number = time.perf_counter(), 0
+        while not over.wait(max(due - time.perf_counter(), 0.0)):
+            put(number)
+            number += 1
+            due = max(due + 1.0 / rate_hz, time.perf_counter() - 1.0)
+
+    thread = threading.Thread(target=work)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    thread.start()
+    late_s = []
+    try:
+        with first_of_all():
+            end = time.perf_counter() + duration_s
+            due = time.perf_counter() + _PERIOD_S
+            while due < end:
+                time.sleep(max(due - time.perf_counter(), 0.0))
+                now = time.perf_counter()
+                late_s.append(now - due)
+                due = max(due, now) + _PERIOD_S
+    finally:
+        over.set()
+        thread.join()
+        sys.setswitchinterval(before)
+    p50, p99 = np.percentile(late_s, (50, 99))
+    return {"p50_ms": 1e3 * float(p50), "p99_ms": 1e3 * float(p99), "max_ms": 1e3 * max(late_s)}
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print the figures: the median of the rounds."""
+    table(
+        "At equal terms: same bytes or messages in, chunks of 1 MiB, zstd level 1; median of the rounds",
+        ("load", "by", "us each", "MB/s", "CPU us each", "late p50 ms", "p99", "max", "lines"),
+        [
+            (
+                row["load"],
+                row["name"],
+                *((f"{row['us'][1]:.1f}", f"{row['nbytes'] / row['us'][1]:.0f}") if "us" in row else ("", "")),
+                f"{row['cpu_us'][1]:.1f}" if "us" in row else "",
+                *(f"{row[key][1]:.2f}" for key in ("p50_ms", "p99_ms", "max_ms")),
+                str(row["lines"] or ""),
+            )
+            for row in rows
+        ],
+    )
