@@ -91,8 +91,8 @@ def working(
     with ExitStack() as stack:
 
         def start(*ways: str) -> WorkProcess:
-            import hurdles  # type: ignore[import-not-found]
-
+            if ways:
+                import hurdles  # type: ignore[import-not-found]
             process = WorkProcess(replace(pipeline, solver=hurdles.Stage(*ways)) if ways else pipeline)
             stack.callback(process.close)
             return process
@@ -167,9 +167,10 @@ def test_a_file_in_the_working_directory_does_not_shadow_a_library(
 ) -> None:
     desk = tmp_path / "desk"
     desk.mkdir()
-    for name in ("filterpy", "scipy", "hurdles"):
+    for name in ("filterpy", "scipy"):
         (desk / f"{name}.py").write_text("raise SystemExit('the file of the user was run')")
     monkeypatch.chdir(desk)
+    monkeypatch.syspath_prepend(str(desk))  # as python -m does
     process = working()
     process.submit(order)
     result = answer(process)
