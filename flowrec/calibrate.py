@@ -13,7 +13,7 @@ import flowrec
 from flowrec.control.coil_fit import CoilFit, advice, fit_coils
 from flowrec.control.coils import Coils
 from flowrec.control.excitations import read_excitations
-from flowrec.errors import UsageError
+from flowrec.output import TOML, check_output, new_file
 from flowrec.status import say, table
 
 _AXES = ("x", "y", "z")
@@ -25,14 +25,16 @@ def calibrate(path: Path, out: Path | None = None, overwrite: bool = False) -> C
 
     Raises
     ------
-    UsageError : a table that can not be read or does not suffice, an output that is there, coils no run could use.
+    UsageError : a table that can not be read or does not suffice, coils no run could use.
+    OutputError : `out` may not be written, see `check_output`.
     """
-    if out is not None and out.exists() and not overwrite:
-        raise UsageError(f"{out}: is there already; --overwrite replaces it")
+    if out is not None:
+        check_output(out, TOML, inputs=(path,), overwrite=overwrite)
     fit = fit_coils(read_excitations(path))
     Coils(mt_per_a=_matrix(fit), bias_mt=_bias(fit)).check(path.name)
     if out is not None:
-        out.write_text(fragment(fit, path), encoding="utf-8")
+        with new_file(out, TOML, inputs=(path,), overwrite=overwrite) as part:
+            part.write_text(fragment(fit, path), encoding="utf-8")
     return fit
 
 

@@ -16,8 +16,9 @@ from flowrec.clocks.watch import CRYSTAL_PPM, camera_told, faults_of, skew_ppm
 from flowrec.config import Config, config_from_toml
 from flowrec.errors import FlowrecError, printable
 from flowrec.figures import Figures, finite
+from flowrec.locks import is_growing
 from flowrec.messages import Clocks, Frame, Message, Timing
-from flowrec.store import is_growing, not_finite
+from flowrec.store import not_finite
 from flowrec.store.audit import Audit, audit
 from flowrec.store.choice import is_left_out
 from flowrec.store.joints import fault_of, goes_on, without_part

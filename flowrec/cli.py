@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 import typer
 
 import flowrec
-from flowrec.bench.verbs import Sets, bench
+from flowrec.bench.verbs import Overwrite, Sets, bench
 from flowrec.errors import FlowrecError
 
 app = typer.Typer(
@@ -32,7 +32,10 @@ DEFAULT_REFINE = "pi_unet"
 
 View = Literal["spawn", "serve", "rrd", "none"]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
+RrdOut = Annotated[
+    Path | None,
+    typer.Option(help="Where to write the .rrd; by default beside the session, over an .rrd of that session only."),
+]
 
 
 def _version(asked: bool) -> None:
@@ -97,7 +100,8 @@ def record(
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return
-    recorded = run_record(chosen, out, view, realtime, overwrite, AtTerminal())
+    read = [config] if config is not None else []
+    recorded = run_record(chosen, out, view, realtime, overwrite, AtTerminal(), read)
 
     def summarize() -> None:
         if as_json:
@@ -148,6 +152,8 @@ def replay(
     if verify and refly:
         raise typer.BadParameter("--verify only compares; it goes without --refly")
     target = out if out is not None or verify else verb.default_out(session)
+    if target is not None:
+        verb.check_outputs(session, target, refly=refly, rrd=view == "rrd", overwrite=overwrite)
     done = verb.replay(session, change, from_s, verify, target, overwrite, frames, AtTerminal())
     if verify:
         same, lines = verb.verdict(done)
@@ -161,7 +167,7 @@ def replay(
     if refly:
         from flowrec.refly import refly as fly_both
 
-        rows += fly_both(done, target.with_name(f"{target.stem}_refly.mcap") if target is not None else None, overwrite)
+        rows += fly_both(done, verb.refly_path(target) if target is not None else None, overwrite)
     if as_json:
         typer.echo(
             json.dumps(
@@ -184,33 +190,38 @@ def replay(
     if view == "rrd" and target is not None:
         from flowrec.export import write_rrd_of
 
-        write_rrd_of(target)
+        write_rrd_of(target, overwrite=overwrite)
 
 
 @app.command()
 def view(
     session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
-    out: Annotated[Path | None, typer.Option(help="Where to write the .rrd; beside the session by default.")] = None,
+    out: RrdOut = None,
     screenshot: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
     ] = None,
     time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session and open it in Rerun."""
     from flowrec.export import write_rrd_of
+    from flowrec.output import PICTURE, check_output
+    from flowrec.session import files_behind
     from flowrec.status import say
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
     if session.suffix == ".rrd" and not session.exists():
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
-    rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out)
+    if screenshot is not None:
+        check_output(screenshot, PICTURE, inputs=files_behind(session), overwrite=overwrite)
+    rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out, overwrite)
     if as_json:
         typer.echo(_rrd_told(session, rrd))
     if screenshot is not None:
-        for problem in take(rrd, screenshot, time_s=time):
+        for problem in take(rrd, screenshot, time_s=time, overwrite=overwrite):
             say(problem)
         say(f"{screenshot} written")
     elif not no_open:
@@ -222,13 +233,14 @@ def view(
 @app.command()
 def export(
     session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
-    out: Annotated[Path | None, typer.Option(help="Where to write the .rrd; beside the session by default.")] = None,
+    out: RrdOut = None,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session without opening it."""
     from flowrec.export import write_rrd_of
 
-    rrd = write_rrd_of(session, out)
+    rrd = write_rrd_of(session, out, overwrite)
     if as_json:
         typer.echo(_rrd_told(session, rrd))
 

@@ -16,8 +16,9 @@ from pathlib import Path
 
 from flowrec import child
 from flowrec.errors import FlowrecError
+from flowrec.locks import is_growing
 from flowrec.status import say, warn
-from flowrec.store import is_growing, recover
+from flowrec.store import recover
 from flowrec.store.names import PARTIAL_SUFFIX, SUFFIX
 
 _REMAINS = SUFFIX + PARTIAL_SUFFIX

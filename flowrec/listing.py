@@ -16,10 +16,10 @@ from typing import Any
 
 from flowrec.errors import SessionError
 from flowrec.figures import name_of, of_text, shown
+from flowrec.locks import is_growing
 from flowrec.store.head import Head
 from flowrec.store.header import Part, SessionHeader
 from flowrec.store.joints import Run
-from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
 from flowrec.units import seconds
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -28,12 +28,13 @@ from flowrec.flow.metrics import relative_rmse
 from flowrec.guard import Guard
 from flowrec.leftovers import look_after
 from flowrec.messages import Demand, FlowField, Tick
+from flowrec.output import MCAP, RRD, check_output
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.space import no_room, too_swift
 from flowrec.priority import first_of_all
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
-from flowrec.session import length_um, session_writer
+from flowrec.session import files_behind, length_um, session_writer
 from flowrec.status import say, table, warn
 from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
 from flowrec.store.names import pieces, run_path
@@ -206,6 +207,7 @@ def record(
     realtime: bool = False,
     overwrite: bool = False,
     control: Unattended | None = None,
+    inputs: Sequence[Path] = (),
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -216,16 +218,22 @@ def record(
     view : spawn, serve, rrd or none.
     realtime : keep the rig to the wall clock, with a guard of its ticks (guard.py).
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
+    inputs : files that were read for it besides those that `config` names; no output may be one of either.
 
     Raises
     ------
     FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
     """
     asked = config
+    inputs = (*inputs, *_named_by(config))
+    if out is not None:  # before anything else: to solve the flow takes a while
+        check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
     config, chip, pipeline = prepare(config)
     made = derived(asked, config)
     timeout_s = _guard_timeout_s(config) if realtime else None
     path = _place(config, out, overwrite)
+    if view == "rrd":
+        check_output(path.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
     fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
     rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
     folder, floor_gb = path.resolve().parent, config.recording.disk_floor_gb
@@ -245,7 +253,9 @@ def record(
         # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
         stack.enter_context(control.armed(guard, lambda: _closed_beside(opened, desk.reason)))
         writer = stack.enter_context(
-            session_writer(path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made)
+            session_writer(
+                path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
+            )
         )
         opened.append(writer)
         sinks: list[Sink] = [writer, witness]
@@ -306,7 +316,7 @@ def record(
         from flowrec.export import write_rrd_of
 
         for name in recorded.sessions:
-            facts["rrd"] = str(write_rrd_of(name))
+            facts["rrd"] = str(write_rrd_of(name, overwrite=overwrite))
     return recorded
 
 
@@ -340,6 +350,17 @@ def _closed_beside(opened: list[SessionWriter], reason: str) -> str:
     if writer.partial_path.exists():
         return f"flowrec recover {writer.partial_path} makes a session of what was recorded"
     return f"the file is whole: {files_told(writer.path, tuple(writer.files))}"
+
+
+def _named_by(config: Config) -> list[Path]:
+    """The files that a configuration names, and what belongs to them."""
+    files: list[Path] = []
+    chip = Path(config.chip.path)
+    if chip.name:
+        files += [chip, chip.with_suffix(".png"), chip.with_suffix(".toml")]
+    if config.start.field:
+        files += files_behind(Path(config.start.field))
+    return files
 
 
 def _say_remarks(writer: SessionWriter) -> None:

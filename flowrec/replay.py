@@ -20,10 +20,11 @@ from flowrec.errors import SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
 from flowrec.figures import as_text
 from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
+from flowrec.output import MCAP, RRD, check_output
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, run
-from flowrec.session import open_session, session_writer
+from flowrec.session import files_behind, open_session, session_writer
 from flowrec.status import warn
 from flowrec.store import SessionReader, SessionWriter, digest_faults
 from flowrec.topics import BY_FIELD
@@ -144,6 +145,21 @@ def stale_results(recorded: Config, changed: Config) -> frozenset[str]:
             )
         stale |= STALE.get(section.name, frozenset())
     return stale
+
+
+def check_outputs(path: Path, out: Path, *, refly: bool, rrd: bool, overwrite: bool) -> None:
+    """Refuse what a replay of `path` may not write, before it begins: `out` and what is made beside it."""
+    inputs = files_behind(path)
+    check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
+    if refly:
+        check_output(refly_path(out), MCAP, inputs=inputs, overwrite=overwrite)
+    if rrd:
+        check_output(out.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
+
+
+def refly_path(out: Path) -> Path:
+    """Where the flight of the replayed plan goes, beside the replay."""
+    return out.with_name(f"{out.stem}_refly{MCAP[0]}")
 
 
 def replay(

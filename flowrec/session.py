@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import numpy as np
 from flowrec.chip import chip_files, chip_from_files
 from flowrec.chip.chip import Chip
 from flowrec.config import Config, calibration_of, config_from_toml, to_toml
+from flowrec.errors import SessionError
 from flowrec.messages import Route
 from flowrec.provenance import provenance
 from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
 from flowrec.store.head import Head
+from flowrec.store.names import pieces
 
 _QUEUE_S = 2.0
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
@@ -32,11 +35,13 @@ def session_writer(
     overwrite: bool = False,
     in_pieces: bool = False,
     derived: Mapping[str, float] | None = None,
+    inputs: Iterable[Path] = (),
 ) -> SessionWriter:
     """A new session file with its head written. `parent` is the session that it replays, named by content.
 
     A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
     `derived`: settings that nobody gave, by key; they are named in the head.
+    `inputs` are other files that the command reads; none of them, and none of the parent's, is replaced.
     """
     header = session_header(config, chip)
     if derived:
@@ -57,6 +62,7 @@ def session_writer(
         pieces=_pieces_of(config) if in_pieces else None,
         region=region_of(config, chip, again=parent is not None),
         leave_out=config.recording.leave_out,
+        inputs=(*inputs, *(files_behind(parent) if parent is not None else ())),
     )
 
 
@@ -116,6 +122,26 @@ def session_header(config: Config, chip: Chip) -> SessionHeader:
     if config.refine.weights_sha256:
         facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
     return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]))
+
+
+def files_behind(path: Path) -> list[Path]:
+    """All files of a session and, where they are beside it, of those that it replays, one through the other.
+
+    None of them may be replaced by what is made of the session.
+    """
+    files: list[Path] = []
+    while path not in files:
+        files += [path, *pieces(path)]
+        with contextlib.suppress(SessionError), Head(files_of(path)[0]) as head:  # who reads it says what is wrong
+            path = path.with_name(Path(head.header.parent.get("file", "")).name or path.name)
+    return files
+
+
+def session_key(reader: SessionReader) -> str:
+    """What tells a session from every other, by its head and its times: 32 hexadecimal digits."""
+    header = reader.header
+    told = (header.config_toml, sorted(header.provenance.items()), sorted(header.parent.items()))
+    return hashlib.sha256(repr((told, reader.first_ns, reader.last_ns)).encode()).hexdigest()[:32]
 
 
 def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:

@@ -86,8 +86,8 @@ def test_files_that_are_no_session_are_told_apart(session: Path, tmp_path: Path)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
     one_line_error(flowrec("info", cut), 1, "cut.mcap")
-    one_line_error(flowrec("record", "--out", session), 1, "exists")
-    one_line_error(flowrec("record", "--out", tmp_path / "no" / "such" / "a.mcap"), 1, "no such directory")
+    one_line_error(flowrec("record", "--out", session), 2, "exists")
+    one_line_error(flowrec("record", "--out", tmp_path / "no" / "such" / "a.mcap"), 2, "no such directory")
 
 
 def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:

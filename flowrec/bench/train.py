@@ -18,6 +18,7 @@ import numpy as np
 
 from flowrec.bench.lessons import Lesson, prepare, read_lessons
 from flowrec.errors import UsageError
+from flowrec.output import WEIGHTS, check_output
 from flowrec.refine.case import Case
 from flowrec.refine.sight import sight
 from flowrec.refine.torch_run import Device, torch_run
@@ -54,6 +55,8 @@ def train(
     out: Path,
     training: Training = Training(),
     say: Callable[[int, float, float], None] | None = None,
+    *,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Train on the lessons in `folder`, made where they are missing, and write the best weights to `out`.
 
@@ -63,7 +66,10 @@ def train(
     ------
     UsageError
         If there are too few lessons to keep some apart.
+    OutputError
+        If `out` may not be written; what is there is replaced with `overwrite` only.
     """
+    check_output(out, WEIGHTS, overwrite=overwrite)
     if training.lessons < 4:
         raise UsageError(f"bench train: {training.lessons} lessons are too few; give at least 4")
     paths = []

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+
+from flowrec.output import FIGURE, JSON, new_file
 
 bench = typer.Typer(help="Measure flowrec itself.", no_args_is_help=True)
 
@@ -14,20 +19,23 @@ Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb."),
 ]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
 JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")]
 
 
 @bench.command("loop")
 def bench_loop(
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     ticks: Annotated[int, typer.Option(help="Frames per measurement.")] = 900,
 ) -> None:
     """Time of one tick with recording and viewing on and off, and the speed of a replay."""
     from flowrec.bench.loop import measure, show
 
-    figures = measure(ticks)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite) as to:
+        figures = measure(ticks)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("observer")
@@ -36,15 +44,17 @@ def bench_observer(
         Path | None, typer.Option(metavar="FILE.mcap", help="Also say which settings suit this recording.")
     ] = None,
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the flow as told, and the errors.")] = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
 ) -> None:
     """Error of each observer on the paper's lemniscate, and the tuning of the Kalman filter from a recording."""
     from flowrec.bench.observer import measure, show
 
-    figures = measure(session, figure, seed)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite, figure, [session] if session is not None else []) as to:
+        figures = measure(session, to.figure, seed)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("flow")
@@ -64,6 +74,7 @@ def bench_flow(
         Literal["raw", "trimmed"], typer.Option(help="trimmed: treated as in the paper before they are used.")
     ] = "raw",
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep every field in this folder.")] = None,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw one case, and the errors of all.")] = None,
     case: Annotated[
@@ -75,9 +86,10 @@ def bench_flow(
 
     chosen = methods.split(",") if methods is not None else None
     trouble = Trouble(outliers, mask, observations)
-    figures = measure(cases, chosen, noise, share, k, trouble, fields, figure, case)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite, figure) as to:
+        figures = measure(cases, chosen, noise, share, k, trouble, fields, to.figure, case)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("missions")
@@ -97,34 +109,39 @@ def bench_missions(
     sets: Sets = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw arrival over optimum.")] = None,
 ) -> None:
     """Whole missions in the simulated rig: arrivals, wall contacts, time over the optimum, policies in pairs."""
     from flowrec.bench.missions import World, measure, show
 
     world = World(flow_error, outlet_error, latency, tuple(sets or ()))
-    figures = measure(seeds, cases, policies.split(","), world, figure=figure, jobs=jobs)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite, figure) as to:
+        figures = measure(seeds, cases, policies.split(","), world, figure=to.figure, jobs=jobs)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("track")
 def bench_track(
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the ways and the errors.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5,
 ) -> None:
     """The paper's lemniscate in a vortex: how well each control law tracks it."""
     from flowrec.bench.track import measure, show
 
-    figures = measure(seeds, figure)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite, figure) as to:
+        figures = measure(seeds, to.figure)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("store")
 def bench_store(
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
     minutes: Annotated[float, typer.Option(min=0.0, help="Only watch memory while recording for so long.")] = 0.0,
     kills: Annotated[int, typer.Option(min=0, help="Only kill so many recordings and recover them.")] = 0,
@@ -142,15 +159,17 @@ def bench_store(
     if equal:
         from flowrec.bench import store_equal
 
-        rows = store_equal.measure(1 if quick else 3, 0.1 if quick else 1.0, 0.5 if quick else 3.0)
-        store_equal.show(rows)
-        _keep({"equal": rows}, json_file)
+        with _outputs(json_file, overwrite) as to:
+            rows = store_equal.measure(1 if quick else 3, 0.1 if quick else 1.0, 0.5 if quick else 3.0)
+            store_equal.show(rows)
+            to.keep({"equal": rows})
         return
     from flowrec.bench.store import measure, show
 
-    figures = measure(folder, quick, minutes, kills, split)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite) as to:
+        figures = measure(folder, quick, minutes, kills, split)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("clocks")
@@ -158,26 +177,30 @@ def bench_clocks(
     seconds: Annotated[float, typer.Option(min=60.0, help="Length of each series.")] = 300.0,
     seed: Annotated[int, typer.Option(min=0, help="Of delays.")] = 0,
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """A camera's clock fitted to the host's in five ways: errors of the dates, whatever goes wrong."""
     from flowrec.bench.clocks import measure, show
 
-    figures = measure(seconds, seed)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite) as to:
+        figures = measure(seconds, seed)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("solver")
 def bench_solver(
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     quick: Annotated[bool, typer.Option("--quick", help="Small cases only, a few seconds.")] = False,
 ) -> None:
     """The flow solver beside exact and published solutions, its speed and its memory."""
     from flowrec.bench.solver import measure, show
 
-    figures = measure(quick)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite) as to:
+        figures = measure(quick)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("fuzz")
@@ -185,13 +208,15 @@ def bench_fuzz(
     files: Annotated[int, typer.Option(min=1, help="How many spoiled sessions.")] = 2000,
     seed: Annotated[int, typer.Option(min=0, help="Of the first; the others follow it.")] = 0,
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Spoil sessions in every way and read them with every verb; exit status 1 when anything but our errors came."""
     from flowrec.bench.fuzz import measure, show
 
-    figures = measure(files, seed)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite) as to:
+        figures = measure(files, seed)
+        show(figures)
+        to.keep(figures)
     raise typer.Exit(1 if figures["fault_count"] else 0)
 
 
@@ -200,13 +225,15 @@ def bench_large(
     gigabytes: Annotated[float, typer.Option("--gb", min=0.01, help="Size of the sessions (sparse files).")] = 10.0,
     folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Where to make them; they are removed.")] = None,
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Opening a session of many gigabytes, and what is read of it to get at its poses."""
     from flowrec.bench.large import measure, show
 
-    figures = measure(gigabytes, folder)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite) as to:
+        figures = measure(gigabytes, folder)
+        show(figures)
+        to.keep(figures)
 
 
 @bench.command("grid")
@@ -229,11 +256,12 @@ def bench_train(
     steps: Annotated[int, typer.Option(min=1, help="Steps of four lessons each.")] = 4500,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to train.")] = "cpu",
     seed: Annotated[int, typer.Option(min=0, help="Of lessons and weights.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Train a network's shipped weights on vessels drawn at random, with our own solver as the teacher."""
     from flowrec.bench.train import Training, show, train
 
-    show(train(lessons, out, Training(network, count, steps, device=device, seed=seed)))
+    show(train(lessons, out, Training(network, count, steps, device=device, seed=seed), overwrite=overwrite))
 
 
 @bench.command("plan")
@@ -247,18 +275,42 @@ def bench_plan(
     iterations: Annotated[int, typer.Option(min=1, help="Of rrt and rrt_star.")] = 4000,
     seed: Annotated[int, typer.Option(min=0, help="Of channels and trips.")] = 0,
     json_file: JsonFile = None,
+    overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw two channels, and all trips.")] = None,
 ) -> None:
     """Path length and travel time of every planner, up and down, beside the least time that is possible."""
     from flowrec.bench.plan import measure, show
 
     chosen = methods.split(",") if methods is not None else None
-    figures = measure(cases, trips, trees, iterations, figure, methods=chosen, seed=seed)
-    show(figures)
-    _keep(figures, json_file)
+    with _outputs(json_file, overwrite, figure) as to:
+        figures = measure(cases, trips, trees, iterations, to.figure, methods=chosen, seed=seed)
+        show(figures)
+        to.keep(figures)
 
 
-def _keep(figures: dict[str, Any], json_file: Path | None) -> None:
-    """Write the figures of a bench where they are wanted."""
-    if json_file is not None:
-        json_file.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+@dataclass
+class _Outputs:
+    """Where a bench writes to; None: nowhere."""
+
+    json: Path | None = None
+    figure: Path | None = None
+
+    def keep(self, figures: dict[str, Any]) -> None:
+        """Write the figures where they are wanted."""
+        if self.json is not None:
+            self.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _outputs(
+    json_file: Path | None, overwrite: bool, figure: Path | None = None, inputs: Iterable[Path] = ()
+) -> Iterator[_Outputs]:
+    """The output files of a bench: refused at its beginning, under their names when it has ended well."""
+    with contextlib.ExitStack() as stack:
+        outputs = _Outputs()
+        read = list(inputs)
+        if json_file is not None:
+            outputs.json = stack.enter_context(new_file(json_file, JSON, inputs=read, overwrite=overwrite))
+        if figure is not None:
+            outputs.figure = stack.enter_context(new_file(figure, FIGURE, inputs=read, overwrite=overwrite))
+        yield outputs

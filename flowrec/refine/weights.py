@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flowrec.errors import FlowError
+from flowrec.output import WEIGHTS, new_file
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -19,14 +20,15 @@ SHIPPED = {"vessels": FOLDER / "pi_unet.safetensors", "unet": FOLDER / "unet.saf
 
 
 def write_weights(path: Path, network: nn.Module, facts: Mapping[str, str]) -> None:
-    """Store the network's parameters in half precision, with facts about how they were made."""
+    """Store the network's parameters in half precision, with facts about how they were made. Replaces an older file."""
     import torch
     from safetensors.torch import save
 
     halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     # One entry: the order of several is not the same twice.
-    path.write_bytes(save(halves, {"facts": json.dumps(dict(facts), sort_keys=True)}))
+    with new_file(path, WEIGHTS, overwrite=True) as part:
+        part.write_bytes(save(halves, {"facts": json.dumps(dict(facts), sort_keys=True)}))
 
 
 def read_weights(path: Path, network: nn.Module) -> None:

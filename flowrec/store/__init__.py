@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from flowrec.store.frames import encoding_for
     from flowrec.store.header import SessionHeader
     from flowrec.store.joints import files_of
-    from flowrec.store.mcap_file import is_growing
     from flowrec.store.names import is_snapshot, taken
     from flowrec.store.parts import Split
     from flowrec.store.reader import SessionReader
@@ -32,7 +31,6 @@ _HOME = {
     "digest_faults": "audit",
     "encoding_for": "frames",
     "files_of": "joints",
-    "is_growing": "mcap_file",
     "is_snapshot": "names",
     "lit": "region",
     "not_finite": "shapes",
@@ -52,7 +50,6 @@ __all__ = [
     "digest_faults",
     "encoding_for",
     "files_of",
-    "is_growing",
     "is_snapshot",
     "lit",
     "not_finite",

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Self
 
 from flowrec.errors import SessionError
+from flowrec.locks import is_growing
 from flowrec.store.head import Head
 from flowrec.store.header import Part, SessionHeader
-from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import PARTIAL_SUFFIX, part_number, part_path, partial_path, parts, pieces
 from flowrec.store.source import UnfinishedError
 from flowrec.units import seconds

@@ -10,9 +10,7 @@ Layout: https://mcap.dev/spec.
 
 from __future__ import annotations
 
-import contextlib
 import errno
-import fcntl
 import os
 import struct
 import zlib
@@ -38,6 +36,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from flowrec.locks import open_new
 from flowrec.store.digest import added, of_record, record_of
 
 if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
@@ -52,12 +51,14 @@ _PARTS_PER_WRITE = 1024
 class McapFile:
     """An MCAP file open for appending. Every call ends with the bytes handed to the operating system.
 
+    It is locked until it is closed, so that no other process writes it or takes it for the remains of a run.
+
     Raises
     ------
     OSError : from any method, when the disk refuses.
     """
 
-    def __init__(self, path: Path, *, truncate: bool = False) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self.size = 0
         self._crc = 0
         self._schemas: list[McapRecord] = []
@@ -70,10 +71,7 @@ class McapFile:
         self._digests: dict[int, int] = {}
         self._head_digest = 0
         self._span: tuple[int, int] | None = None
-        self._file = path.open("wb" if truncate else "xb", buffering=0)
-        # While we live, nobody may take the growing file for the remains of a run; a few file systems know no locks.
-        with contextlib.suppress(OSError):
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._file = open_new(path, overwrite=overwrite)
 
     def start(self, profile: str, library: str) -> None:
         """Magic and header."""
@@ -208,18 +206,6 @@ class McapFile:
             metadata_count=len(self._metadata),
             schema_count=len(self._schemas),
         )
-
-
-def is_growing(path: Path) -> bool:
-    """Whether a living process is writing this file."""
-    try:
-        with path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    return False
 
 
 def _bytes_of(record: McapRecord) -> bytes:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from mcap.records import Metadata
 
 import flowrec
 from flowrec.errors import SessionError
+from flowrec.output import MCAP, check_output, put_in_place, taken
 from flowrec.store.chunk import Sealed
 from flowrec.store.frames import FrameEncoding
 from flowrec.store.header import OUTCOME, PROFILE, VIEW, SessionHeader, records_of
@@ -93,7 +93,7 @@ class Piece:
         self.broken = False
         self._overwrite = making.overwrite
         try:
-            self._file = McapFile(self.partial_path, truncate=making.overwrite)
+            self._file = McapFile(self.partial_path, overwrite=making.overwrite)
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         try:
@@ -131,10 +131,10 @@ class Piece:
             self._file.add_digest()
             self._file.finish()
             self._file.sync()
-            if self.path.exists() and (not self._overwrite or self.path.is_dir()):
-                raise _taken(self.path, f" (the finished session stays in {self.partial_path})")
-            self.partial_path.replace(self.path)
-            sync_directory(self.path.parent)
+            try:
+                put_in_place(self.partial_path, self.path, overwrite=self._overwrite)
+            except (FileExistsError, IsADirectoryError) as error:
+                raise taken(self.path, f" (the finished session stays in {self.partial_path})") from error
 
     def close(self) -> None:
         """Close the file as it is."""
@@ -157,37 +157,32 @@ class Piece:
             raise
 
 
-def refuse_if_taken(path: Path, *, overwrite: bool) -> None:
-    """Raise SessionError where there is anything of the run X.mcap already, finished or not."""
-    if overwrite and not path.is_dir():
+def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
+    """Refuse the output X.mcap as `check_output` does, and any piece of that run, finished or not, in the same way.
+
+    Raises
+    ------
+    OutputError : as `check_output`.
+    PieceError : remains of a run are there, which `overwrite` would remove.
+    """
+    there = pieces(path)
+    check_output(path, MCAP, inputs=inputs, overwrite=overwrite, also=(*there, partial_path(path)))
+    if overwrite:
         return
-    if path.exists():
-        raise _taken(path)
-    for piece in pieces(path):
+    for piece in there:
         if not piece.name.endswith(PARTIAL_SUFFIX):
-            raise _taken(piece)
+            raise taken(piece)
         raise PieceError(
             f"{piece}: is left from a run that did not finish; `flowrec recover {piece}`"
             " saves it, another --out or --overwrite goes on without it"
         )
 
 
-def sync_directory(directory: Path) -> None:
-    """Have the disk keep the new name as well."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _taken(path: Path, kept: str = "") -> PieceError:
-    return PieceError(f"{path}: exists already{kept}; choose another name with --out, or --overwrite it")
-
-
 def _not_writable(path: Path, error: OSError) -> PieceError:
     if isinstance(error, FileNotFoundError):
         return PieceError(f"{path.parent}: no such directory; make it, or choose another place with --out")
+    if isinstance(error, BlockingIOError):
+        return PieceError(f"{path}: is being written by another process just now; choose another name with --out")
     return PieceError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
 
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from flowrec.errors import SessionError
+from flowrec.locks import held
 from flowrec.messages import Tick
+from flowrec.output import MCAP, OutputError, check_output, put_in_place
 from flowrec.store.contents import Contents
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
-from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import PARTIAL_SUFFIX, partial_path
-from flowrec.store.piece import sync_directory
 from flowrec.store.reader import SessionReader
 from flowrec.store.scan import Scan, scan
 from flowrec.store.source import DamageError, Source
@@ -91,11 +92,23 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     ------
     SessionError : nothing can be saved, the run is still going on, or `out` is taken or can not be written.
     """
+    try:
+        with held(path):
+            return _recover(path, out)
+    except BlockingIOError as error:
+        raise SessionError(
+            f"{path}: is being recorded just now, or recovered; stop that with Ctrl-C, and the file is whole"
+        ) from error
+
+
+def _recover(path: Path, out: Path | None) -> Recovered:
     partial = path.name.endswith(PARTIAL_SUFFIX)
     final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
     target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
-    if is_growing(path):
-        raise SessionError(f"{path}: is being recorded just now; stop that run with Ctrl-C, and its file is whole")
+    growing = partial_path(target)  # a run that will want the name at its end
+    check_output(target, MCAP, inputs=(path,), overwrite=True, also=(growing,) if growing != path else ())
+    if out is not None:
+        _refuse_if_taken(target)
     if partial and path.is_file() and not path.stat().st_size:
         raise NothingSavedError(f"{path}: is empty; nothing was recorded into it; remove the file")
     with _without_circular_advice(path):
@@ -250,14 +263,13 @@ def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Map
 
 
 def _refuse_if_taken(target: Path) -> None:
-    if target.exists():
-        raise SessionError(f"{target}: exists already; choose another name with --out")
+    if os.path.lexists(target):
+        raise OutputError(f"{target}: exists already; choose another name with --out")
 
 
 def _rename(source: Path, target: Path) -> None:
     try:
-        source.rename(target)
-        sync_directory(target.parent)
+        put_in_place(source, target, overwrite=False)
     except OSError as error:
         raise SessionError(f"{target}: can not be made ({error.strerror}); choose another --out") from error
 

@@ -374,8 +374,8 @@ class Snapshots:
         making = self._making
         path = snapshot_path(making.path, 1)
         piece = Piece(path, making.header, making)
-        piece.close()
         piece.partial_path.unlink(missing_ok=True)
+        piece.close()  # after that, for another process may make a file of this name as soon as it is not locked
 
 
 def _nowhere(_sealed: list[Sealed]) -> None:

@@ -16,13 +16,13 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from flowrec.errors import SessionError
+from flowrec.locks import remove_idle
 from flowrec.messages import Drops, Frame, Message, Tick, Track, array_fields
 from flowrec.store.backlog import Backlog, Entry, News
 from flowrec.store.choice import left_out
 from flowrec.store.frames import ENCODINGS
 from flowrec.store.header import SessionHeader
 from flowrec.store.layout import FRAME_PATH
-from flowrec.store.mcap_file import is_growing
 from flowrec.store.names import pieces as pieces_of
 from flowrec.store.parts import Parts, Split
 from flowrec.store.piece import Making, refuse_if_taken
@@ -92,6 +92,7 @@ class SessionWriter:
     pieces : a Split, after which the run X.mcap is in the files X.part001.mcap, X.part002.mcap, ..., each of which can
         be read alone; or a Snapshot: nothing is written but X.snap001.mcap, ... around events.
     leave_out : topics that are not recorded (choice.py), in patterns such as `/view/*`.
+    inputs : files that the run reads; it is refused where it would replace one of them.
     region : keep of most images only the window around the robot (region.py); None: all of all images.
 
     Attributes
@@ -117,6 +118,7 @@ class SessionWriter:
         pieces: Split | Snapshot | None = None,
         region: Region | None = None,
         leave_out: Iterable[str] = (),
+        inputs: Iterable[Path] = (),
     ) -> None:
         self.path = Path(path)
         self.ticks = 0  # written so far
@@ -128,14 +130,15 @@ class SessionWriter:
         self._said: Drops | None = None
         self._carried_ns = header.part.carried_ns if header.part is not None else None
         self._block = block
-        self._overwrite = overwrite
         self._last: tuple[Any, ...] = (None,) * len(_FIELDS)
         self._last_ns = -1
         self._failure: BaseException | None = None
         self._closed = False
         unwanted = left_out(leave_out)
         self._unwanted = [topic.field for topic in TOPICS if topic.path in unwanted]
-        refuse_if_taken(self.path, overwrite=overwrite)
+        refuse_if_taken(self.path, overwrite=overwrite, inputs=inputs)
+        # Only what was there before this run may be removed after it.
+        self._replaced = {file: file.stat().st_ino for file in pieces_of(self.path)} if overwrite else {}
         making = Making(self.path, header, ENCODINGS[frames], flush_s, sync_s, overwrite, region, unwanted)
         run = os.urandom(8).hex()  # the same in all pieces, and in no other run
         self.remarks: deque[str] = deque()
@@ -331,10 +334,17 @@ class SessionWriter:
             drops = Drops(self._last_ns, FRAME_PATH, self.dropped_frames, self.missing_frames, self._thinning.every)
             self._output.add(Entry(self._last_ns, {"drops": drops}, 0))  # at the last tick, for no other comes
         self._output.finish(outcome, why)
-        if self._overwrite and self.files:  # else nothing has come of the run, and what was there may stay
-            for stale in set(pieces_of(self.path)) - set(self.files):
-                if not is_growing(stale):
-                    stale.unlink(missing_ok=True)
+        if self.files:  # else nothing has come of the run, and what was there may stay
+            for stale in set(pieces_of(self.path)) & set(self._replaced) - set(self.files):
+                if stale.stat().st_ino == self._replaced[stale]:
+                    self._remove(stale)
+
+    def _remove(self, stale: Path) -> None:
+        """A file that the run has replaced, unless another process is writing it by now."""
+        try:
+            remove_idle(stale)
+        except OSError as error:
+            self.remarks.append(f"{stale}: is left from before, it can not be removed ({error.strerror})")
 
     def _raise_failure(self) -> None:
         if isinstance(self._failure, SessionError):

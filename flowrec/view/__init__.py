@@ -6,9 +6,9 @@ where the viewer is and whether there is a screen (viewer), pictures without a s
 """
 
 from flowrec.view.live import LiveView
-from flowrec.view.rrd import write_rrd
+from flowrec.view.rrd import is_made_from, write_rrd
 from flowrec.view.scene import Scene
 from flowrec.view.screenshot import screenshot
 from flowrec.view.viewer import open_viewer
 
-__all__ = ["LiveView", "Scene", "open_viewer", "screenshot", "write_rrd"]
+__all__ = ["LiveView", "Scene", "is_made_from", "open_viewer", "screenshot", "write_rrd"]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import heapq
-import os
+import secrets
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import rerun as rr
 
-from flowrec.errors import SessionError
 from flowrec.messages import Tick
+from flowrec.output import RRD, new_file
 from flowrec.units import seconds
 from flowrec.view.blueprint import blueprint
 from flowrec.view.log import TickLogger
@@ -19,6 +19,8 @@ from flowrec.view.scene import Scene
 
 APPLICATION = "flowrec"
 _PROGRESS_EVERY = 20  # ticks
+_MAGIC = b"RRF"
+_HEAD_BYTES = 1024  # with the names of application and recording, as they are
 
 
 def write_rrd(
@@ -27,22 +29,22 @@ def write_rrd(
     ticks: Iterable[Tick],
     replayed_ticks: Iterable[Tick] | None = None,
     progress: Callable[[float], None] | None = None,
+    *,
+    inputs: Iterable[Path] = (),
+    overwrite: bool = False,
 ) -> None:
     """Write ticks, with the replayed ones beside them if given; a file of this name appears when it is whole.
 
     Parameters
     ----------
+    inputs, overwrite : as of `flowrec.output.check_output`.
     progress : called now and then with the session time in s that is done, counted from the first tick.
 
     Raises
     ------
-    SessionError : the file cannot be written.
+    SessionError : the file cannot be written; OutputError where it may not be.
     """
-    path = Path(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        # Opened here first: Rerun reports a directory that is missing or full only in its own log.
-        part.open("wb").close()
+    with new_file(Path(path), RRD, inputs=inputs, overwrite=overwrite) as part:
         stream = open_stream(scene)
         try:
             stream.save(part)
@@ -50,17 +52,22 @@ def write_rrd(
             stream.flush()
         finally:
             stream.disconnect()
-        part.replace(path)
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise SessionError(f"{path}: cannot be written: {reason}; choose another place with --out") from error
-    finally:
-        part.unlink(missing_ok=True)
+
+
+def is_made_from(path: Path, key: str) -> bool:
+    """Whether a file is an .rrd that flowrec made of the session with this key (see Scene)."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+    return bool(key) and head.startswith(_MAGIC) and APPLICATION.encode() in head and key.encode() in head
 
 
 def open_stream(scene: Scene) -> rr.RecordingStream:
     """A stream that carries the title and properties of a scene and flowrec's own timelines only."""
-    stream = rr.RecordingStream(APPLICATION)
+    # A viewer takes recordings of one name for one, so the name is new each time; its first half says of what it is.
+    stream = rr.RecordingStream(APPLICATION, recording_id=f"{scene.key}-{secrets.token_hex(8)}")
     rr.set_log_time_enabled(False, recording=stream)
     rr.set_log_tick_enabled(False, recording=stream)
     return stream

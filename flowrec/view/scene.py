@@ -28,7 +28,7 @@ class Placement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is looked at. The properties are shown to people with the recording."""
+    """What is looked at. The properties are shown to people with the recording, the key names the session."""
 
     chip: Chip
     calibration: Calibration
@@ -37,6 +37,7 @@ class Scene:
     properties: dict[str, str] = field(default_factory=dict)
     image_px: tuple[int, int] | None = None  # width and height of the camera's image; None: as the chip
     windows: bool = False  # whether most images are black but for a window around the robot
+    key: str = ""
 
     def to_plane(self, points_um: ArrayLike) -> NDArray[np.float64]:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""

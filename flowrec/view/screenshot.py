@@ -14,6 +14,7 @@ import numpy as np
 from rerun.experimental import ViewerClient, ViewerState
 
 from flowrec.errors import FlowrecError
+from flowrec.output import PICTURE, new_file
 from flowrec.store.head import Head
 from flowrec.store.source import ForeignError
 from flowrec.units import nanoseconds
@@ -30,7 +31,12 @@ _NOTICES_S = 4.5  # until the viewer's greetings have left the upper right corne
 
 
 def screenshot(
-    path: Path | str, out_png: Path | str, time_s: float | None = None, size: tuple[int, int] = (1920, 1080)
+    path: Path | str,
+    out_png: Path | str,
+    time_s: float | None = None,
+    size: tuple[int, int] = (1920, 1080),
+    *,
+    overwrite: bool = False,
 ) -> list[str]:
     """Save what the viewer shows of a file (.rrd or .mcap) at a session time, at the end without one.
 
@@ -38,12 +44,16 @@ def screenshot(
 
     Raises
     ------
-    FlowrecError : there is no viewer, or it has no graphics to draw with, or does not read the file.
+    FlowrecError : there is no viewer, or it has no graphics to draw with, or does not read the file; OutputError where
+        the picture may not be written.
     """
-    path, out_png = Path(path).resolve(), Path(out_png).resolve()
+    path = Path(path).resolve()
     if not path.exists():
         raise FlowrecError(f"{path}: no such file")
-    with _headless(size) as (client, began):
+    with (
+        new_file(Path(out_png), PICTURE, inputs=(path,), overwrite=overwrite) as part,
+        _headless(size) as (client, began),
+    ):
         client.open(path.as_uri())
         state = _until(lambda: _loaded(client), _LOAD_S)
         if state is None:
@@ -56,8 +66,7 @@ def screenshot(
             at_ns = _start_unix_ns(path) + nanoseconds(time_s)
             client.set_time(_LOG_TIME, timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
         time.sleep(max(_SETTLE_S, began + _NOTICES_S - time.monotonic()))
-        out_png.parent.mkdir(parents=True, exist_ok=True)
-        out_png.write_bytes(client.take_screenshot())
+        part.write_bytes(client.take_screenshot())
         return [
             f"{view.name}: {report.severity}: {report.summary}"
             for view in client.get_state().views

@@ -31,9 +31,9 @@ def test_a_short_training_lowers_the_error_on_lessons_it_has_not_seen(lessons, t
 
 def test_the_same_seed_trains_the_same_bytes(lessons, tmp_path):
     folder, _ = lessons
-    for name in ("a", "b"):
+    for name in ("a.safetensors", "b.safetensors"):
         train(folder, tmp_path / name, Training("unet", lessons=8, steps=2, judged_every=2))
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
 def test_a_vessel_case_is_not_taken_for_a_lesson(lessons, tmp_path):

@@ -13,6 +13,7 @@ from flowrec.config import load_config
 from flowrec.control.coil_fit import advice, fit_coils
 from flowrec.control.excitations import Excitations, read_excitations
 from flowrec.errors import UsageError
+from flowrec.output import OutputError
 
 A = np.array([[2.1, 0.1, -0.05], [0.08, 1.9, 0.1], [0.02, -0.1, 1.5]])
 BIAS = np.array([0.02, -0.01, -0.045])
@@ -160,7 +161,7 @@ def test_a_run_takes_the_written_settings_and_the_printed_ones_alike(tmp_path):
     assert written == load_config(None, as_sets(fit)).coils
     np.testing.assert_allclose(written.mt_per_a, fit.mt_per_a, atol=0.01 * fit.mt_per_a_std.max())
     assert "12 excitations" in out.read_text() and "sha256" in out.read_text()
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(OutputError, match="--overwrite"):
         calibrate(path, out)
 
 

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from flowrec import replay as verb
 from flowrec.compare import compare_sessions
 from flowrec.errors import SessionError
+from flowrec.locks import is_growing
 from flowrec.replay import Change
-from flowrec.store import SessionReader, SessionWriter, is_growing, recover
+from flowrec.store import SessionReader, SessionWriter, recover
 from flowrec.store.layout import SLOTS
 from flowrec.store.recorder import Recorder
 from flowrec.store.scan import scan

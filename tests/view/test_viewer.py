@@ -65,6 +65,7 @@ def test_a_screenshot_shows_all_views_without_complaint_and_rerun_takes_no_notes
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
     write_rrd(tmp_path / "session.rrd", scene, ticks)
+    (tmp_path / "out").mkdir()
     try:
         problems = screenshot(tmp_path / "session.rrd", tmp_path / "out" / "shot.png", time_s=1.5, size=(1280, 800))
     except FlowrecError as error:

@@ -1,0 +1,133 @@
+"""Which process writes a file: an exclusive lock (flock) of the open file, from its first byte to its last.
+
+Who only asks takes a shared lock for some microseconds; a writer waits for that, and refuses a file of another writer.
+On a file system without locks nobody can tell that a file is being written; everything else holds there as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from io import FileIO
+from pathlib import Path
+
+_PATIENCE_S = 2.0  # for those who only ask
+_PAUSE_S = 1e-3
+_WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)  # what such a file system answers
+
+
+def open_new(path: Path, *, overwrite: bool = False) -> FileIO:
+    """Make a file that this process alone writes; nothing is ever truncated.
+
+    Parameters
+    ----------
+    overwrite : remove a file of that name first, which no living process may be writing.
+
+    Raises
+    ------
+    FileExistsError : the file is there, and `overwrite` is not set.
+    BlockingIOError : another process writes the file of that name.
+    OSError : the file can not be made, removed or locked.
+    """
+    while True:
+        try:
+            file = FileIO(path, "x+")
+        except FileExistsError:
+            if not overwrite:
+                raise
+            remove_idle(path)
+            continue
+        try:
+            _take(file.fileno())
+            if _is_at(file, path):
+                return file
+        except BlockingIOError:
+            file.close()  # another process was quicker to lock the new file, and has it now
+            raise
+        except BaseException:
+            file.close()
+            path.unlink(missing_ok=True)
+            raise
+        file.close()  # replaced by another process before it was locked: that one has the name now
+
+
+def remove_idle(path: Path) -> None:
+    """Remove a file, unless a living process writes it.
+
+    Raises
+    ------
+    BlockingIOError : a living process writes it.
+    OSError : it can not be opened, locked or removed.
+    """
+    try:
+        file = FileIO(path, "r+")
+    except FileNotFoundError:
+        path.unlink(missing_ok=True)  # a symbolic link to nothing
+        return
+    with file:
+        _take(file.fileno())
+        if _is_at(file, path):
+            path.unlink()
+
+
+@contextlib.contextmanager
+def held(path: Path) -> Iterator[None]:
+    """Keep every other process from writing, recovering or removing a file; a file that can not be opened is not held.
+
+    Raises
+    ------
+    BlockingIOError : another process writes or holds it.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(FileIO(path, "r"))
+            _take(file.fileno())
+        except BlockingIOError:
+            raise
+        except OSError:  # who reads it next says why; some network file systems lock nothing that is opened to be read
+            pass
+        yield
+
+
+def is_growing(path: Path) -> bool:
+    """Whether a living process is writing this file."""
+    try:
+        with FileIO(path, "r") as file:
+            return not _locked(file.fileno(), fcntl.LOCK_SH)
+    except OSError:
+        return False
+
+
+def _take(descriptor: int) -> None:
+    """Take the exclusive lock, after those who only ask."""
+    end_s = time.monotonic() + _PATIENCE_S
+    while not _locked(descriptor, fcntl.LOCK_EX):
+        # A shared lock is refused by a writer alone.
+        if not _locked(descriptor, fcntl.LOCK_SH) or time.monotonic() > end_s:
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process has locked it")
+        fcntl.flock(descriptor, fcntl.LOCK_UN)
+        time.sleep(_PAUSE_S)
+
+
+def _locked(descriptor: int, kind: int) -> bool:
+    """Try to take a lock; False where another process has one that excludes it."""
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        if error.errno not in _WITHOUT_LOCKS:
+            raise
+    return True
+
+
+def _is_at(file: FileIO, path: Path) -> bool:
+    """Whether a path still names an open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
