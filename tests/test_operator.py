@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from flowrec.leftovers import look_after
 from flowrec.messages import OperatorEvent, Tick
 from flowrec.store import SessionReader
 from flowrec.units import seconds
-from tests.conftest import SMALL
+from tests.conftest import HANG_S, SMALL
 
 
 class Scripted(Desk):
@@ -199,6 +200,13 @@ def test_a_disk_that_runs_low_ends_a_run_in_good_order_with_status_3(
     assert last.currents is None or last.currents.amplitude_mt == 0.0
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recovery has as long as a busy machine needs."""
+    monkeypatch.setattr("flowrec.leftovers._PATIENCE_S", HANG_S)
+
+
+@pytest.mark.usefixtures("patient")
 def test_what_a_killed_run_left_is_recovered_at_the_next_start_and_its_name_is_taken(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -219,6 +227,7 @@ def test_what_a_killed_run_left_is_recovered_at_the_next_start_and_its_name_is_t
     assert junk.exists()
 
 
+@pytest.mark.usefixtures("patient")
 def test_remains_are_looked_after_in_any_thread(session: Path, tmp_path: Path) -> None:
     (tmp_path / "left.mcap.partial").write_bytes(session.read_bytes()[: session.stat().st_size // 2])
     with ThreadPoolExecutor() as pool:
@@ -237,6 +246,23 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
     assert set(threading.enumerate()) == threads
     assert len(list(Path("/dev/fd").iterdir())) == files
     assert [path.name for path in tmp_path.iterdir()] == [left.name]
+
+
+def test_a_recovery_that_hears_no_signal_is_killed(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, ended = tmp_path / "left.mcap.partial", tmp_path / "ended"
+    left.write_bytes(session.read_bytes())
+    deaf = (
+        "import pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
+        f"time.sleep(20); pathlib.Path({str(ended)!r}).touch()"
+    )
+    monkeypatch.setattr("flowrec.child.command", lambda *_: [sys.executable, "-c", deaf])
+    monkeypatch.setattr("flowrec.leftovers._PATIENCE_S", 2.0)
+    monkeypatch.setattr("flowrec.leftovers._TIDY_S", 0.1)
+    assert look_after(tmp_path) == {}
+    assert not ended.exists()
+    assert left.exists()
 
 
 def test_remains_that_are_too_large_are_offered_and_left_alone(
