@@ -182,6 +182,25 @@ def test_the_loop_is_left_in_the_blocks_it_has_marked_and_nowhere_else() -> None
     desk.interrupt()  # on the way out nothing raises again
 
 
+def test_a_stop_that_is_late_takes_the_field_away_after_0_8_s_and_leaves_the_loop_after_1_1_s() -> None:
+    driver = Driver()
+    desk = Desk(driver.clock)
+    desk.ticking = True
+    desk.stop("enough")
+    told = desk.next(1, held=False)
+    assert told is not None and told.action == "stop"
+    driver.now_s += 0.79
+    assert desk.next(2, held=False) is None
+    driver.now_s += 0.02
+    told = desk.next(3, held=False)
+    assert told is not None and told.action == "zero"
+    with desk.interruptible:
+        driver.now_s += 0.28
+        assert not desk.leave_now
+        driver.now_s += 0.02
+        assert desk.leave_now
+
+
 def test_a_late_zero_keeps_the_reason_of_the_guard() -> None:
     driver = Driver()
     desk = Desk(driver.clock)
