@@ -218,6 +218,20 @@ def test_the_replay_itself_finds_an_edit_of_what_the_worker_gave(
     assert found["topics"][topic]["different"] > 0
 
 
+def test_what_verify_prints_of_a_file_has_its_control_characters_escaped(tmp_path: Path) -> None:
+    def edit(channel: Any, _: Any, wire: Any) -> bool:
+        if channel.topic in ("/flow/refined", "/run/events"):
+            setattr(wire, "method" if channel.topic == "/flow/refined" else "message", "\x1b]0;gone\x07")
+            return True
+        return False
+
+    assert rewrite(GOLDEN, tmp_path / "edited.mcap", edit) > 1
+    status, said = run("replay", tmp_path / "edited.mcap", "--verify")
+    assert status == 3
+    assert "\x1b" not in said
+    assert "\\x1b]0;gone\\x07" in said
+
+
 def test_each_part_of_a_run_has_a_digest_of_its_own(tmp_path: Path) -> None:
     config = load_config(None, SMALL)
     header = session_header(config, load_chip(config.chip))
