@@ -90,6 +90,25 @@ def test_every_value_of_a_message_is_under_the_digest(topic: str, small: Path, t
         edited.unlink()
 
 
+def test_one_pixel_of_a_large_image_is_under_the_digest(tmp_path: Path) -> None:
+    config = load_config(None, SMALL)
+    header = session_header(config, load_chip(config.chip))
+    with SessionWriter(tmp_path / "large.mcap", header, block=True, frames="raw") as writer:
+        for tick in ticks_of(2, shape=(300, 400)):
+            writer.write(tick)
+
+    def edit(channel: Any, message: Any, wire: Any) -> bool:
+        if channel.topic != "/camera/frame" or message.sequence:
+            return False
+        assert len(wire.data) == 300 * 400
+        wire.data = wire.data[:-1] + bytes([wire.data[-1] ^ 1])
+        return True
+
+    assert digest_findings(tmp_path / "large.mcap") == []
+    assert rewrite(tmp_path / "large.mcap", tmp_path / "edited.mcap", edit) == 1
+    assert digest_findings(tmp_path / "edited.mcap")
+
+
 @pytest.mark.parametrize("attribute", ["log_time", "sequence"])
 def test_the_time_and_the_number_of_a_message_are_under_the_digest(attribute: str, small: Path, tmp_path: Path) -> None:
     def edit(channel: Any, message: Any, _: Any) -> bool:
