@@ -6,6 +6,7 @@ Exit status: 0 done, 1 failed (also when the goal is unreachable, found before t
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
@@ -15,14 +16,14 @@ from typing import Annotated, Literal
 import typer
 
 import flowrec
-from flowrec.bench.verbs import Overwrite, Sets, bench
+from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
 from flowrec.errors import FlowrecError
 
 app = typer.Typer(
     name="flowrec",
     help="Record, replay and look at missions of magnetic micro-robots that swim in flow.",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
@@ -31,7 +32,6 @@ app.add_typer(bench, name="bench")
 DEFAULT_REFINE = "pi_unet"
 
 View = Literal["spawn", "serve", "rrd", "none"]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 RrdOut = Annotated[
     Path | None,
     typer.Option(help="Where to write the .rrd; by default beside the session, over an .rrd of that session only."),
@@ -146,7 +146,7 @@ def replay(
     from flowrec.attend import AtTerminal
     from flowrec.figures import comparison_for_people
     from flowrec.status import say, table
-    from flowrec.whatif import before_and_after
+    from flowrec.whatif import before_and_after, refinement_told
 
     change = verb.Change(refine, plan, observer, controller, tuple(sets or ()))
     if verify and refly:
@@ -177,6 +177,7 @@ def replay(
                     "wall_s": done.report.wall_s,
                     "duration_s": done.report.duration_s,
                     "ticks": done.report.ticks,
+                    "refinement": refinement_told(done),
                     "rows": [{"quantity": a, "recorded": b, "replayed": c} for a, b, c in rows],
                 }
             )
@@ -185,8 +186,8 @@ def replay(
         table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
         report = done.report
         say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {target}")
-        if done.replayed.field is not None and done.replayed.field.note:
-            say(f"{done.replayed.field.method}: {done.replayed.field.note}")
+        for line in refinement_told(done):
+            say(line)
     if view == "rrd" and target is not None:
         from flowrec.export import write_rrd_of
 
@@ -383,7 +384,9 @@ def compare(
 @app.command()
 def calibrate(
     file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
-    out: Annotated[Path | None, typer.Option(metavar="TOML", help="Write the [coils] of a configuration.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="Write the coils section of a configuration.")
+    ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -454,6 +457,8 @@ def with_default_refine(words: list[str]) -> list[str]:
 
 def main() -> None:
     """Entry point: run the command line, turn our errors into one line and an exit status."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # the locale's encoding may not have every character
     try:
         app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec")
     except FlowrecError as error:

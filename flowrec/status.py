@@ -28,6 +28,7 @@ _PATIENCE_S = 2.0  # without a tick, then a person wants to know why
 _PERIOD_S = 0.12
 _GOODBYE_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000
+_STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
 _NOTE_SHOWN = 60  # characters of a long note, from its end
 
 outlet = Outlet()
@@ -160,14 +161,36 @@ def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
     if not console.is_terminal:
         yield lambda _done: None
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 
-    bar = Progress(
-        TextColumn(what), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), console=console, transient=True
-    )
+    advanced_s = time.monotonic()
+
+    class Left(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(time_left(task.time_remaining, time.monotonic() - advanced_s))
+
+    def advance(done: float) -> None:
+        nonlocal advanced_s
+        advanced_s = time.monotonic()
+        bar.update(task, completed=done)
+
+    bar = Progress(TextColumn(what), BarColumn(), TimeElapsedColumn(), Left(), console=console, transient=True)
     with bar:
         task = bar.add_task(what, total=total)
-        yield lambda done: bar.update(task, completed=done)
+        yield advance
+
+
+def time_left(estimate_s: float | None, stands_s: float) -> str:
+    """The time that work will still take, in words; nothing where it is not known or work has not advanced lately.
+
+    Parameters
+    ----------
+    estimate_s : from how fast it advanced.
+    stands_s : how long ago it last did.
+    """
+    if estimate_s is None or stands_s > _STALE_S:
+        return ""
+    return f"{estimate_s:.0f} s left"
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

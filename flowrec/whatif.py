@@ -16,6 +16,8 @@ from flowrec.session import length_um
 from flowrec.units import seconds
 from flowrec.work import no_observations
 
+_SAME_MAP = 1e-3  # of the largest speed: no table shows less
+
 
 def residual_um_s(flow: FlowField, observations: Observations) -> float:
     """Root mean square of observed minus mapped flow, um/s, both components together."""
@@ -58,6 +60,29 @@ def before_and_after(done: Replayed) -> list[Row]:
         first_ns = commands.first_ns
         rows.append(("first_changed_command_s", None, seconds(first_ns) if first_ns is not None else None))
     return rows
+
+
+def refinement_told(done: Replayed) -> list[str]:
+    """What the refinement of a replay did, in lines; where it left the recorded map as it was, why."""
+    was, now = done.recorded.refined, done.replayed.refined
+    if now is None:
+        return []
+    lines = [f"{now.method}: {now.note}"] if now.note else []
+    if was is None or now is was or _largest_change(was, now) > _SAME_MAP:
+        return lines
+    why = ""
+    if now.method == "pi_unet" and done.config.refine.pi_unet.start == "assimilate":
+        why = (
+            ": pi_unet begins with the assimilated map and keeps it where it explains the observations; with "
+            "--set refine.pi_unet.start=fvm it begins with the assumed flow, as in the paper"
+        )
+    return [*lines, f"the refined map is the recorded one, unchanged{why}"]
+
+
+def _largest_change(was: FlowField, now: FlowField) -> float:
+    """Of the velocity, as a share of its largest component."""
+    largest = float(np.abs(was.velocity_um_s).max())
+    return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
 
 
 def _flow_error(done: Replayed, flow: FlowField | None) -> float | None:

@@ -9,8 +9,9 @@ import itertools
 import os
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,15 @@ class Row:
     reason: str
 
 
+def _installed(methods: Iterable[str]) -> list[str]:
+    """Those that can run here; says which are left out."""
+    trees = [name for name in methods if name.startswith("rrt")]
+    if find_spec("ompl") is not None:
+        return list(methods)
+    say(f"left out: {', '.join(trees)}, which need OMPL 2: pip install 'flowrec[ompl]'")
+    return [name for name in methods if name not in trees]
+
+
 def measure(
     cases: Path | None = None,
     trips: int = 40,
@@ -88,7 +98,7 @@ def measure(
     """
     if figure is not None:
         need_matplotlib()
-    chosen = tuple(METHODS if methods is None else dict.fromkeys(methods))
+    chosen = tuple(_installed(METHODS) if methods is None else dict.fromkeys(methods))
     if unknown := [name for name in chosen if name not in METHODS]:
         raise UsageError(f"bench plan: no method {', '.join(map(repr, unknown))}; there are {', '.join(METHODS)}")
     source = worlds(side_px, seed) if cases is None else worlds_of(cases)

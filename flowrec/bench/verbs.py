@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,22 +20,23 @@ Sets = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb."),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+FiguresFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the figures to a file.")]
 
 
 @bench.command("loop")
 def bench_loop(
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     ticks: Annotated[int, typer.Option(help="Frames per measurement.")] = 900,
 ) -> None:
     """Time of one tick with recording and viewing on and off, and the speed of a replay."""
     from flowrec.bench.loop import measure, show
 
-    with _outputs(json_file, overwrite) as to:
+    with _outputs(out, overwrite) as to:
         figures = measure(ticks)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("observer")
@@ -43,7 +44,8 @@ def bench_observer(
     session: Annotated[
         Path | None, typer.Option(metavar="FILE.mcap", help="Also say which settings suit this recording.")
     ] = None,
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the flow as told, and the errors.")] = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
@@ -51,10 +53,9 @@ def bench_observer(
     """Error of each observer on the paper's lemniscate, and the tuning of the Kalman filter from a recording."""
     from flowrec.bench.observer import measure, show
 
-    with _outputs(json_file, overwrite, figure, [session] if session is not None else []) as to:
+    with _outputs(out, overwrite, figure, [session] if session is not None else []) as to:
         figures = measure(session, to.figure, seed)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("flow")
@@ -73,7 +74,8 @@ def bench_flow(
     observations: Annotated[
         Literal["raw", "trimmed"], typer.Option(help="trimmed: treated as in the paper before they are used.")
     ] = "raw",
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     fields: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep every field in this folder.")] = None,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw one case, and the errors of all.")] = None,
@@ -86,10 +88,9 @@ def bench_flow(
 
     chosen = methods.split(",") if methods is not None else None
     trouble = Trouble(outliers, mask, observations)
-    with _outputs(json_file, overwrite, figure) as to:
+    with _outputs(out, overwrite, figure) as to:
         figures = measure(cases, chosen, noise, share, k, trouble, fields, to.figure, case)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("missions")
@@ -108,7 +109,8 @@ def bench_missions(
     ] = None,
     sets: Sets = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw arrival over optimum.")] = None,
 ) -> None:
@@ -116,15 +118,15 @@ def bench_missions(
     from flowrec.bench.missions import World, measure, show
 
     world = World(flow_error, outlet_error, latency, tuple(sets or ()))
-    with _outputs(json_file, overwrite, figure) as to:
+    with _outputs(out, overwrite, figure) as to:
         figures = measure(seeds, cases, policies.split(","), world, figure=to.figure, jobs=jobs)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("track")
 def bench_track(
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the ways and the errors.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5,
@@ -132,15 +134,15 @@ def bench_track(
     """The paper's lemniscate in a vortex: how well each control law tracks it."""
     from flowrec.bench.track import measure, show
 
-    with _outputs(json_file, overwrite, figure) as to:
+    with _outputs(out, overwrite, figure) as to:
         figures = measure(seeds, to.figure)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("store")
 def bench_store(
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
     minutes: Annotated[float, typer.Option(min=0.0, help="Only watch memory while recording for so long.")] = 0.0,
@@ -159,64 +161,62 @@ def bench_store(
     if equal:
         from flowrec.bench import store_equal
 
-        with _outputs(json_file, overwrite) as to:
+        with _outputs(out, overwrite) as to:
             rows = store_equal.measure(1 if quick else 3, 0.1 if quick else 1.0, 0.5 if quick else 3.0)
-            store_equal.show(rows)
-            to.keep({"equal": rows})
+            to.tell({"equal": rows}, lambda figures: store_equal.show(figures["equal"]), as_json)
         return
     from flowrec.bench.store import measure, show
 
-    with _outputs(json_file, overwrite) as to:
+    with _outputs(out, overwrite) as to:
         figures = measure(folder, quick, minutes, kills, split)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("clocks")
 def bench_clocks(
     seconds: Annotated[float, typer.Option(min=60.0, help="Length of each series.")] = 300.0,
     seed: Annotated[int, typer.Option(min=0, help="Of delays.")] = 0,
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """A camera's clock fitted to the host's in five ways: errors of the dates, whatever goes wrong."""
     from flowrec.bench.clocks import measure, show
 
-    with _outputs(json_file, overwrite) as to:
+    with _outputs(out, overwrite) as to:
         figures = measure(seconds, seed)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("solver")
 def bench_solver(
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     quick: Annotated[bool, typer.Option("--quick", help="Small cases only, a few seconds.")] = False,
 ) -> None:
     """The flow solver beside exact and published solutions, its speed and its memory."""
     from flowrec.bench.solver import measure, show
 
-    with _outputs(json_file, overwrite) as to:
+    with _outputs(out, overwrite) as to:
         figures = measure(quick)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("fuzz")
 def bench_fuzz(
     files: Annotated[int, typer.Option(min=1, help="How many spoiled sessions.")] = 2000,
     seed: Annotated[int, typer.Option(min=0, help="Of the first; the others follow it.")] = 0,
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Spoil sessions in every way and read them with every verb; exit status 1 when anything but our errors came."""
     from flowrec.bench.fuzz import measure, show
 
-    with _outputs(json_file, overwrite) as to:
+    with _outputs(out, overwrite) as to:
         figures = measure(files, seed)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
     raise typer.Exit(1 if figures["fault_count"] else 0)
 
 
@@ -224,16 +224,16 @@ def bench_fuzz(
 def bench_large(
     gigabytes: Annotated[float, typer.Option("--gb", min=0.01, help="Size of the sessions (sparse files).")] = 10.0,
     folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Where to make them; they are removed.")] = None,
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Opening a session of many gigabytes, and what is read of it to get at its poses."""
     from flowrec.bench.large import measure, show
 
-    with _outputs(json_file, overwrite) as to:
+    with _outputs(out, overwrite) as to:
         figures = measure(gigabytes, folder)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @bench.command("grid")
@@ -274,7 +274,8 @@ def bench_plan(
     trees: Annotated[int, typer.Option(help="Channels in which rrt and rrt_star plan.")] = 10,
     iterations: Annotated[int, typer.Option(min=1, help="Of rrt and rrt_star.")] = 4000,
     seed: Annotated[int, typer.Option(min=0, help="Of channels and trips.")] = 0,
-    json_file: JsonFile = None,
+    as_json: AsJson = False,
+    out: FiguresFile = None,
     overwrite: Overwrite = False,
     figure: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw two channels, and all trips.")] = None,
 ) -> None:
@@ -282,10 +283,9 @@ def bench_plan(
     from flowrec.bench.plan import measure, show
 
     chosen = methods.split(",") if methods is not None else None
-    with _outputs(json_file, overwrite, figure) as to:
+    with _outputs(out, overwrite, figure) as to:
         figures = measure(cases, trips, trees, iterations, to.figure, methods=chosen, seed=seed)
-        show(figures)
-        to.keep(figures)
+        to.tell(figures, show, as_json)
 
 
 @dataclass
@@ -295,8 +295,12 @@ class _Outputs:
     json: Path | None = None
     figure: Path | None = None
 
-    def keep(self, figures: dict[str, Any]) -> None:
-        """Write the figures where they are wanted."""
+    def tell(self, figures: dict[str, Any], show: Callable[[Any], None], as_json: bool) -> None:
+        """Print the figures for people or as JSON, and write them where they are wanted."""
+        if as_json:
+            typer.echo(json.dumps(figures))
+        else:
+            show(figures)
         if self.json is not None:
             self.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 

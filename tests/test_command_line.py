@@ -1,0 +1,118 @@
+"""The same words mean the same in every verb, and what is printed can be read wherever it is printed."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from flowrec import status
+from flowrec.bench import plan
+from flowrec.cli import app, main
+
+SESSIONS = Path(__file__).parents[1] / "sessions"
+
+
+def run(words: list[object], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_bench_prints_its_figures_as_json_like_every_other_verb(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    kept = tmp_path / "figures.json"
+    monkeypatch.setattr("flowrec.bench.clocks.measure", lambda *_: {"rows": [1]})
+    assert run(["bench", "clocks", "--json", "--out", kept], monkeypatch) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == {"rows": [1]}
+    assert json.loads(kept.read_text()) == printed
+
+
+@pytest.mark.parametrize("words", [["-h"], ["record", "-h"], ["bench", "plan", "-h"]])
+def test_help_is_asked_for_in_short(words: list[str]) -> None:
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0
+    assert "Show this message" in done.output
+
+
+def test_a_shell_can_complete_the_verbs() -> None:
+    assert "--install-completion" in CliRunner().invoke(app, ["--help"], env={"COLUMNS": "120"}).output
+
+
+def test_the_help_of_calibrate_names_the_section_that_it_writes() -> None:
+    shown = CliRunner().invoke(app, ["calibrate", "--help"], env={"COLUMNS": "160"}).output
+    assert "coils section of a configuration" in " ".join(shown.split())
+
+
+def test_calibrate_prints_where_the_encoding_has_no_plus_minus_sign(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
+    monkeypatch.setattr(sys, "stdout", printed)
+    assert run(["calibrate", SESSIONS / "coils.csv"], monkeypatch) == 0
+    assert b"b_x" in printed.buffer.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_chip_given_as_a_configuration_is_told_apart(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["record", "--dry-run", SESSIONS / "chips" / "y_junction.toml"], monkeypatch) == 2
+    said = capsys.readouterr().err
+    assert "describes a chip" in said
+    assert "--set chip.path=" in said
+
+
+@pytest.mark.parametrize(("name", "said"), [("own.yaml", "is YAML by its name"), ("run.mcap", "is a session")])
+def test_a_configuration_that_is_no_toml_is_told_apart(
+    name: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("chip:\n  name: straight\n")
+    assert run(["record", "--dry-run", tmp_path / name], monkeypatch) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_byte_order_mark_is_no_part_of_a_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.toml").write_bytes(b"\xef\xbb\xbf[chip]\nname = 'straight'\n")
+    monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--dry-run", str(tmp_path / "own.toml")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    assert 'name = "straight"' in capsys.readouterr().out
+
+
+def test_planners_that_are_not_installed_are_left_out_and_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "find_spec" in vars(plan):  # as on an installation without the extra
+        monkeypatch.setattr(plan, "find_spec", lambda _name: None)
+    try:
+        figures = plan.measure(None, trips=1, tree_channels=1, side_px=128, quick=True)
+    except Exception as error:  # noqa: BLE001 - what a user would see
+        pytest.fail(str(error))
+    assert "rrt" not in figures["summary"]
+    assert "time_field" in figures["summary"]
+    assert "rrt, rrt_star, which need OMPL 2" in capsys.readouterr().err
+
+
+def test_a_refinement_that_changes_nothing_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "again.mcap"
+    assert run(["replay", SESSIONS / "golden.mcap", "--refine", "--out", out], monkeypatch) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the refined map is the recorded one, unchanged" in said
+    assert "--set refine.pi_unet.start=fvm" in said
+
+
+def test_a_bar_that_stands_names_no_time_left() -> None:
+    assert hasattr(status, "time_left")
+    assert status.time_left(12.4, stands_s=0.2) == "12 s left"
+    assert status.time_left(1.0, stands_s=5.0) == ""
+    assert status.time_left(None, stands_s=0.0) == ""
