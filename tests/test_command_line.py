@@ -54,7 +54,10 @@ def test_the_help_of_calibrate_names_the_section_that_it_writes() -> None:
 def test_calibrate_prints_where_the_encoding_has_no_plus_minus_sign(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
     monkeypatch.setattr(sys, "stdout", printed)
-    assert run(["calibrate", SESSIONS / "coils.csv"], monkeypatch) == 0
+    try:
+        assert run(["calibrate", SESSIONS / "coils.csv"], monkeypatch) == 0
+    except UnicodeEncodeError as error:
+        pytest.fail(str(error))
     assert b"b_x" in printed.buffer.getvalue()  # type: ignore[attr-defined]
 
 
