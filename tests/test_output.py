@@ -36,7 +36,7 @@ VERBS: dict[str, tuple[Callable[[Path], list[object]], str, str]] = {
     "view, screenshot": (lambda read: ["view", read, "--screenshot"], "a.mcap", ".png"),
     "calibrate": (lambda read: ["calibrate", read, "--out"], "coils.csv", ".toml"),
     "recover": (lambda read: ["recover", read, "--out"], "cut.mcap", ".mcap"),
-    "bench, figures": (lambda read: ["bench", "observer", "--session", read, "--json"], "a.mcap", ".json"),
+    "bench, figures": (lambda read: ["bench", "observer", "--session", read, "--out"], "a.mcap", ".json"),
     "bench, drawing": (lambda read: ["bench", "observer", "--session", read, "--figure"], "a.mcap", ".png"),
 }
 NEVER_OVERWRITES = ("recover",)
