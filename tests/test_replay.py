@@ -192,5 +192,5 @@ def test_a_time_outside_the_session_is_refused(session: Path) -> None:
 
 
 def test_an_existing_output_is_not_overwritten(session: Path) -> None:
-    with pytest.raises(SessionError, match="exists"):
+    with pytest.raises(SessionError, match="is read by this command"):
         verb.replay(session, Change(), out=session)
