@@ -23,7 +23,7 @@ from flowrec.pipeline import Pipeline
 from flowrec.record import prepare
 from flowrec.work import work
 from flowrec.work_process import WorkProcess
-from tests.conftest import SMALL
+from tests.conftest import HANG_S, SMALL, until
 
 # Found by this process and by its child: stages that fail in every way in which an answer can fail.
 HURDLES = """
@@ -101,8 +101,8 @@ def working(
 
 
 def answer(process: WorkProcess) -> Any:
-    """The next result, or what was raised instead of one; None after a minute in vain."""
-    end = time.monotonic() + 60
+    """The next result, or what was raised instead of one; None where it hangs."""
+    end = time.monotonic() + HANG_S
     try:
         while (result := process.result()) is None and time.monotonic() < end:
             time.sleep(0.02)
@@ -149,8 +149,7 @@ def test_what_the_process_printed_is_in_the_log_that_the_error_names_and_a_clean
 ) -> None:
     process = working("sleeps")
     process.submit(order)
-    while b"solving sleeps" not in process._printed:
-        time.sleep(0.02)
+    until(lambda: b"solving sleeps" in process._printed)
     os.kill(process._process.pid, signal.SIGKILL)
     log = Path(str(answer(process)).split("see ")[1].split(" for")[0])
     assert "solving sleeps" in log.read_text()
@@ -182,5 +181,5 @@ def test_a_process_that_is_closed_leaves_no_thread_and_no_open_pipe(order, worki
     process = working()
     process.submit(order)
     process.close()
-    assert set(threading.enumerate()) <= before
+    until(lambda: set(threading.enumerate()) <= before)
     assert all(pipe.closed for pipe in (process._process.stdin, process._process.stdout, process._process.stderr))
