@@ -53,6 +53,21 @@ def fly(rig, commands=()):
     return seen
 
 
+def test_zero_acts_at_once_and_no_field_comes_back_until_the_rig_is_entered_again():
+    rig = rig_with(simulated=replace(EXACT, delay_s=0.1))
+    amplitudes = []
+    with rig:
+        for k, inputs in enumerate(rig.inputs()):
+            amplitudes.append(inputs.applied.amplitude_mt)
+            rig.apply(command(10.0 + k))  # three of them are always on their way
+            if k == 10:
+                rig.zero()
+    assert amplitudes[10] > 0.0
+    assert not any(amplitudes[11:])
+    again = fly(rig, {0: command(10.0)})
+    assert again[-1].applied.amplitude_mt > 0.0
+
+
 def test_the_same_seed_and_commands_give_the_same_bytes_at_any_pace():
     commands = {2: command(10.0, 0.3), 9: command(15.0, -0.5)}
     camera = replace(CAMERA, debris=12)
