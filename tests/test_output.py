@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ import pytest
 from flowrec.cli import main
 from flowrec.config import load_config
 from flowrec.errors import FlowrecError, SessionError
+from flowrec.locks import is_growing, open_new, remove_idle
 from flowrec.record import record
 from flowrec.store import SessionReader, SessionWriter
 from tests.conftest import SMALL
@@ -217,6 +219,18 @@ def test_a_second_writer_is_refused_and_the_first_loses_nothing(tmp_path):
         for tick in ticks[10:]:
             first.write(tick)
     assert len(list(SessionReader(tmp_path / "x.mcap").ticks())) == 20
+
+
+def test_a_file_that_is_written_is_neither_opened_nor_removed_whatever_was_found_before(tmp_path):
+    path = tmp_path / "x"
+    with open_new(path) as first:
+        first.write(b"precious")
+        for again in (partial(open_new, path, overwrite=True), partial(remove_idle, path)):
+            with pytest.raises(BlockingIOError):
+                again()
+        assert path.read_bytes() == b"precious" and is_growing(path)
+    remove_idle(path)
+    assert not path.exists()
 
 
 def test_a_writer_waits_for_one_who_only_asks_and_then_holds_its_lock(tmp_path):
