@@ -220,6 +220,14 @@ class Health(Message):
     bank_power: Vector  # (24,) mean square of what they listen to
     mean_um_s: Vector  # (2,) flow
     offset_share: float  # mean of what the resonators listen to, taken out of it
+    # Motion per revolution, see estimation/step_out.py.
+    # (4,) leaky sums: um rolled along the heading, um that the turns should have given, um that the map's flow carried
+    # the robot, s. (0,): none yet, or not said.
+    rolled_sums: Vector = field(default_factory=lambda: np.zeros(0))
+    limit_hz: float | None = None  # of the field's frequency because of step-out; None: the robot's own
+    limited_ns: int | None = None  # when the limit was last changed
+    # (2,) um/s rolled, and that the turns should have given, just before the limit was lowered; (0,): judged, or none
+    rolled_before_um_s: Vector = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -93,6 +93,15 @@ def assemble(config: Config, chip: Chip) -> Pipeline:
     )
 
 
+def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
+    """From a point (2,) to the nearest wall, by the nearest pixel of the chip; 0 where the point is nowhere."""
+    if not np.isfinite(point_um).all():
+        return 0.0
+    height, width = p.clearance_um.shape
+    column, row = (round(value) for value in (point_um / p.chip.um_per_px).tolist())
+    return float(p.clearance_um[min(max(row, 0), height - 1), min(max(column, 0), width - 1)])
+
+
 def _strength(coils: Coils, last: Tick) -> float:
     """Share of its full amplitude that the field had in the tick before; all of it before there is any."""
     full_mt = coils.amplitude_mt
@@ -128,7 +137,11 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, refined or assumed)
     # The robot as it is felt, where the observer estimates how far it rolls per revolution.
     robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
-    health = p.health.watch(last.health, last.estimate, estimate, refined or assumed, p.robot)
+    # Runs recorded before step-out was looked for replay without it.
+    looked = inputs.applied if inputs.applied.image_since_ns is not None else None
+    wall_um = _wall_um(p, estimate.position_um)
+    health = p.health.watch(last.health, last.estimate, estimate, refined or assumed, p.robot, looked, wall_um)
+    robot = robot.limited_to(health.limit_hz)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
     mission = p.commander.decide(

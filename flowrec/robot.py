@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from flowrec.ranges import PositiveShare, Range
@@ -42,6 +42,10 @@ class Robot:
         """The fastest speed through the fluid that may be commanded, um/s."""
         assert self.max_speed_um_s is not None and self.step_out_hz is not None, "robot is resolved with the chip"
         return min(self.max_speed_um_s, self.step_out_margin * self.step_out_hz * self.um_per_rev)
+
+    def limited_to(self, frequency_hz: float | None) -> Robot:
+        """The same robot, never driven at more than a frequency; None: without that limit."""
+        return self if frequency_hz is None else replace(self, step_out_hz=frequency_hz / self.step_out_margin)
 
     def speed_limit_at(self, strength: float) -> float:
         """The same with a field of this share of its full amplitude, um/s: step-out falls with the torque."""

@@ -133,6 +133,7 @@ class ProcessWorker:
             stamp_ns=order.stamp_ns,
             assumed=order.assumed,
             refined=order.refined,
+            health=order.health,
             observations=order.observations,
             mission=order.mission,
         )

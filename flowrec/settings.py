@@ -46,6 +46,8 @@ class Simulated:
     speed_noise: Share = 0.02  # the same for its speed, as a share
     # from command to motion; None: what the robot is assumed to have
     delay_s: Annotated[float, Range(0.0, 10.0)] | None = None
+    # the robot's true step-out frequency is the stated one times this
+    step_out_share: Annotated[float, Range(0.01, 10.0)] = 1.0
     # the true flow is the steady one times 1 + this sin(2 pi pulsation_hz t)
     pulsation_share: Annotated[float, Range(0.0, 0.99)] = 0.0
     pulsation_hz: Annotated[float, Range(0.0, 1e3)] = 1.0

@@ -43,7 +43,8 @@ def work(pipeline: Pipeline, order: Tick) -> FlowField | Route:
     else:
         assert mission.wanted == "route"
         assert order.field is not None
-        result = pipeline.planner.plan(order.field, mission.start_um, mission.goal_um, pipeline.chip, pipeline.robot)
+        robot = pipeline.robot.limited_to(order.health.limit_hz if order.health is not None else None)
+        result = pipeline.planner.plan(order.field, mission.start_um, mission.goal_um, pipeline.chip, robot)
     return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,10 @@ class FaultyCamera(SimulatedRig):
     def apply(self, currents: Currents) -> None:
         super().apply(currents)
         self.log.append((currents.stamp_ns / 1e9, currents.amplitude_mt))
+
+    def zero(self) -> None:
+        super().zero()
+        self.log.append((math.inf, 0.0))
 
 
 def frozen(now: Inputs, before: Inputs) -> Inputs:

@@ -40,6 +40,10 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
         lines += _alarms(last.health, tick.health)
         if tick.health.alarm and (last.health is None or tick.health.alarm != last.health.alarm):
             level = "warning"
+        limited = _limited(last.health, tick.health)
+        lines += limited
+        if limited:
+            level = "warning"
     if tick.operator is not None and tick.operator is not last.operator:
         lines += _said(tick.operator)
     if mission is not None:
@@ -99,6 +103,17 @@ def _held(before: Mission | None, mission: Mission, tick: Tick) -> list[str]:
             f"carried off the place where it is held{off}{why}" if mission.swept else "held in its place again"
         )
     return lines
+
+
+def _limited(before: Health | None, health: Health) -> list[str]:
+    """A frequency limit that was lowered because of step-out, or lifted."""
+    was_hz = before.limit_hz if before is not None else None
+    if health.limit_hz == was_hz:
+        return []
+    if health.limit_hz is None:
+        return [f"no step-out: at {was_hz:.1f} Hz the robot rolls no better; the flow is not that of the map"]
+    rolled, asked = health.rolled_before_um_s
+    return [f"step-out: the robot rolls {rolled / asked:.0%} of what it should; limited to {health.limit_hz:.1f} Hz"]
 
 
 def _alarms(before: Health | None, health: Health) -> list[str]:

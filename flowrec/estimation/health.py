@@ -8,20 +8,23 @@ Three signs, all leaky means that the message itself remembers:
   listens to r, the share by which the flow is stronger than the map (or than its own mean) says, less the mean of r. A
   line alarms when it is strong and when it is most of what r does: a turn into another branch is strong, but no line.
 - `tracking`: the share of frames without the robot.
+
+Step-out is found beside these, see step_out.py.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.estimation.step_out import StepOut
 from flowrec.flow import sample
-from flowrec.messages import Estimate, FlowField, Health
+from flowrec.messages import Applied, Estimate, FlowField, Health
 from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
@@ -47,6 +50,7 @@ class HealthMonitor:
     # nothing is listened to while the flow's sigma is above this share of v_max
     settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1
     ends_at: Share = 0.8  # an alarm ends below this share of its thresholds
+    step_out: StepOut = field(default_factory=StepOut)
 
     def watch(
         self,
@@ -55,8 +59,13 @@ class HealthMonitor:
         estimate: Estimate,
         field: FlowField | None,
         robot: Robot,
+        applied: Applied | None = None,
+        wall_um: float = math.inf,
     ) -> Health:
-        """The state of health after this frame. `before` is the estimate that `previous` was made with."""
+        """The state of health after this frame. `before` is the estimate that `previous` was made with.
+
+        Without `applied` step-out is not looked for. `wall_um` is from the robot's centre to the nearest wall.
+        """
         assert robot.max_speed_um_s is not None
         if previous is None or before is None:
             bank = np.zeros(len(_BANK_HZ))
@@ -92,7 +101,7 @@ class HealthMonitor:
         }
         was = previous.alarm.split("; ")
         alarms = [name for name, level in worst.items() if level > (self.ends_at if name in was else 1.0)]
-        return Health(
+        now = Health(
             stamp_ns=estimate.stamp_ns,
             alarm="; ".join(alarms),
             nis=nis,
@@ -107,6 +116,9 @@ class HealthMonitor:
             mean_um_s=mean,
             offset_share=offset,
         )
+        if applied is None:
+            return now
+        return self.step_out.watch(previous, now, before, estimate, applied, field, robot, wall_um)
 
 
 @lru_cache(maxsize=16)

@@ -34,6 +34,9 @@ _GAIN_SHARE = 0.15  # one sigma of the robot's um per revolution before it is es
 _GAIN_WANDERS = 0.005  # of it, within a second
 _STILL_SHARE = 0.05  # of v_max: even a robot at rest has this way behind it, as no flow is quite steady
 _SLOWEST_SHARE = 1.0 / 6.0  # of v_max: changes of a slow flow are a share of this
+# Of v_max: an estimate of a faster flow is wrong, and as its noise grows with it, gets worse without limit. A robot
+# that is pressed against a wall brings the filter there.
+_FASTEST_SHARE = 4.0
 _CALM, _HURRY = 0.2, 100.0  # the noise is scaled within these
 _SURPRISE_LIMIT = 4.0  # sigma: one wild measurement is no trend
 
@@ -74,6 +77,9 @@ class Kalman:
         `estimate_gain` the filter needs headings that vary within the memory of the flow; on a straight way its
         variance stays what it was and the belief with it.
         """
+        assert robot.max_speed_um_s is not None
+        if previous is not None and math.hypot(*previous.flow_um_s) > _FASTEST_SHARE * robot.max_speed_um_s:
+            previous = None  # begin anew
         state, covariance, layout, _ = self.predict(previous, track, applied, robot, field)
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
         # State and covariance are set anew for every step: all that the filter knows is in the messages.

@@ -8,6 +8,7 @@ wander (Ornstein-Uhlenbeck, forgotten within a second) and a random walk of the 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,7 +94,8 @@ class Swimmer:
         self.gone = False
         self._touching = False
         self._time_s = 0.0
-        self._robot = robot
+        assert robot.step_out_hz is not None
+        self._robot = replace(robot, step_out_hz=simulated.step_out_share * robot.step_out_hz)
         self._simulated = simulated
         self._vx = np.ascontiguousarray(velocity_um_s[..., 0])
         self._vy = np.ascontiguousarray(velocity_um_s[..., 1])

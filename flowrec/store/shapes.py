@@ -15,7 +15,7 @@ from flowrec.messages import Message, array_fields
 
 Shape = tuple[int | str, ...]
 
-# A letter is any length, the same one throughout a message; `n` and `m` may be zero, `h` and `w` may not.
+# A letter is any length, the same one throughout a message; `n`, `m` and `o` may be zero, `h` and `w` may not.
 _SHAPES: Mapping[type[Message], Mapping[str, Shape]] = {
     m.Frame: {"image": ("h", "w")},
     m.Applied: {"currents_a": (3,), "turns": (2,)},
@@ -36,7 +36,14 @@ _SHAPES: Mapping[type[Message], Mapping[str, Shape]] = {
         "slopes_per_s": ("n",),
         "surprise": ("m",),
     },
-    m.Health: {"bank_re": ("n",), "bank_im": ("n",), "bank_power": ("n",), "mean_um_s": (2,)},
+    m.Health: {
+        "bank_re": ("n",),
+        "bank_im": ("n",),
+        "bank_power": ("n",),
+        "mean_um_s": (2,),
+        "rolled_sums": ("m",),
+        "rolled_before_um_s": ("o",),
+    },
     m.Observations: {"position_um": ("n", 2), "flow_um_s": ("n", 2), "std_um_s": ("n",)},
     m.Mission: {"start_um": (2,), "goal_um": (2,)},
     m.Demand: {"velocity_um_s": (2,), "reference_um": (2,), "sent_um_s": ("m", 2)},
@@ -70,7 +77,7 @@ def misfit(message: Message) -> str:
             if isinstance(length, int):
                 fits = fits and found == length
             else:
-                fits = fits and lengths.setdefault(length, found) == found and (found > 0 or length in "nm")
+                fits = fits and lengths.setdefault(length, found) == found and (found > 0 or length in "nmo")
         if not fits:
             return f"{name} has the shape {array.shape} where ({', '.join(map(str, wanted))}) belongs"
     return ""

@@ -248,3 +248,14 @@ def test_an_observation_of_a_lagging_filter_is_placed_where_the_robot_was() -> N
     lag_um_s = growth * pace * float(before.covariance[0, 0] / before.covariance[0, 2])
     assert lag_um_s > 10.0, "without a correction much would be missed"
     assert np.abs(missed).max() < 0.1 * lag_um_s
+
+
+def test_a_flow_that_no_robot_could_be_held_in_is_not_believed_for_longer_than_a_frame():
+    track = Track(0, True, np.array([500.0, 400.0]), 0.9, 0, 5.0, np.zeros(4))
+    applied = Applied(0, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+    first = Kalman().estimate(None, track, applied, ROBOT)
+    run_away = replace(first, flow_um_s=np.array([1e40, -1e40]), covariance=1e80 * np.eye(len(first.covariance)))
+    later = replace(track, stamp_ns=33_000_000)
+    after = Kalman().estimate(run_away, later, replace(applied, stamp_ns=33_000_000), ROBOT)
+    assert np.hypot(*after.flow_um_s) < ROBOT.max_speed_um_s
+    assert np.linalg.norm(after.position_um - track.position_um) < 5.0

@@ -270,3 +270,10 @@ def test_a_world_that_can_not_be_is_refused_in_one_line():
     other = FlowSolver(1).solve(load_chip(ChipSettings("bifurcation")))
     with pytest.raises(RigError, match="solve it on this chip"):
         next(iter(rig_with(flow=other).inputs()))
+
+
+def test_the_true_step_out_may_lie_below_the_stated_one():
+    weak = replace(EXACT, step_out_share=0.5)  # at 12 of 24 Hz
+    far = {f: fly(rig_with(simulated=weak), {0: command(f)})[-1].truth.position_um[0] - 1000.0 for f in (12.0, 20.0)}
+    assert far[12.0] == pytest.approx(25.0 * 12.0 * 0.96, rel=1e-3)
+    assert far[20.0] == pytest.approx(25.0 * (20.0 - 16.0) * 0.96, rel=1e-3)
