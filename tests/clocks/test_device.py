@@ -10,7 +10,7 @@ from flowrec.clocks import DeviceClock
 from flowrec.clocks.device import envelope
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.tuples(

@@ -38,7 +38,7 @@ def situations(draw, least=0.0):
     return state, Order(limit * draw(share), draw(angles), to_mt, limit, COILS.ramp_mt_s)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(situations())
 def test_the_circle_is_round_and_no_sample_is_further_from_the_last_than_the_field_can_be_followed(situation):
     state, order = situation
@@ -54,7 +54,7 @@ def test_the_circle_is_round_and_no_sample_is_further_from_the_last_than_the_fie
         assert abs(reached @ across) < 1e-6, "half a revolution has passed: the plane is there"
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(situations(), st.integers(1, 400), st.integers(1, 400))
 @example((Rotation(0.0, 2.0, 0.125), Order(0.9375, 0.0, 0.0, 0.9375, 20.0)), 125, 3)  # ends on a sample
 def test_two_blocks_on_end_are_one_of_both_lengths(situation, first, second):
@@ -72,7 +72,7 @@ def test_two_blocks_on_end_are_one_of_both_lengths(situation, first, second):
         assert math.cos(two.after.phase_rad - whole.after.phase_rad) == pytest.approx(1.0)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(situations())
 def test_neither_currents_nor_voltages_ever_leave_their_limits(situation):
     state, order = situation
@@ -81,7 +81,7 @@ def test_neither_currents_nor_voltages_ever_leave_their_limits(situation):
         assert np.abs(played.voltages_v).max() <= INDUCTIVE.max_voltage_v + 1e-9
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(situations())
 def test_a_robot_is_carried_exactly_where_the_field_travels(situation):
     state, order = situation
@@ -137,7 +137,7 @@ def test_inductive_coils_driven_with_these_voltages_make_this_field():
     assert without.min() > 3.9
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(situations(least=0.02))
 def test_after_a_stop_or_when_no_one_orders_the_next_block_the_field_turns_down_to_nothing(situation):
     state, order = situation
@@ -172,7 +172,7 @@ def test_a_turn_waits_for_half_a_revolution_at_most_and_a_turn_back_for_nothing(
     assert off.slew_s == 0.0 and off.spin == 1 and float(off.plane(0.0)) == 1.5
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(angles, angles, angles, share, st.sampled_from([0.5, 20.0, 30.0]))
 @example(3.0, -3.0, 0.3, 1.0, 0.5)  # across the cut of the angle, forward
 @example(-3.0, 3.0, 0.3, 1.0, 0.5)

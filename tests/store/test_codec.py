@@ -63,7 +63,7 @@ def messages(draw, kind):
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)
 def test_every_message_comes_back_bit_for_bit(kind):
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     @given(messages(kind))
     def round_trip(message):
         sequence, parts = codec.encode_record(message)
@@ -84,7 +84,7 @@ def test_every_message_comes_back_bit_for_bit(kind):
     "kind", [Maybe, *(kind for kind in TYPES if kind is not Frame)], ids=lambda kind: kind.__name__
 )
 def test_bytes_are_those_that_protobuf_itself_would_write(kind):
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     @given(messages(kind))
     def same(message):
         payload = codec.encode(message)
@@ -143,7 +143,7 @@ def test_vectors_are_packed_doubles_that_viewers_can_plot():
     assert (position.type, position.label) == (position.TYPE_DOUBLE, position.LABEL_REPEATED)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.sampled_from(TYPES), st.binary(max_size=60))
 def test_rubbish_is_a_session_error_or_a_message(kind, rubbish):
     with contextlib.suppress(SessionError):

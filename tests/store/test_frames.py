@@ -45,7 +45,7 @@ def record(path, frames, **options):
 
 @pytest.mark.parametrize("name", LOSSLESS)
 def test_images_of_any_shape_and_content_come_back_bit_for_bit(name):
-    @settings(max_examples=40, deadline=None)
+    @settings(max_examples=40)
     @given(hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=40)))
     def round_trip(image):
         frame = Frame(5, 7, image)
@@ -132,7 +132,7 @@ def test_an_image_file_that_claims_more_pixels_than_it_can_hold_is_refused_unrea
             picture(bytes(data))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.data())
 def test_a_damaged_image_file_is_a_session_error_or_an_image(data):
     name = data.draw(st.sampled_from(["delta", "png", "jpeg"]))

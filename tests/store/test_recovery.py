@@ -226,7 +226,7 @@ def test_a_running_recording_is_not_taken_for_remains_and_a_killed_one_is_saved(
     assert same_ticks(ticks, flown)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_anywhere_leaves_a_readable_session_or_one_line(small, tmp_path, data):
     content = bytearray(small.read_bytes())

@@ -238,7 +238,7 @@ def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 << 10
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damage_anywhere_is_told_in_one_line_or_does_no_harm(session, tmp_path, data):
     content = bytearray(session.read_bytes())
