@@ -2,6 +2,7 @@
 
 import itertools
 import shutil
+import struct
 import subprocess
 import sys
 from collections import Counter
@@ -11,6 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import zstandard
+from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 
 from flowrec.errors import SessionError
@@ -178,6 +181,30 @@ def test_other_programs_read_unix_times_and_flowrec_reads_session_stamps(path):
     assert found["/run/events"] == found["/view/flow_assumed"] == [(times[0], times[0], times[0])]
     events = list(SessionReader(path).messages("event"))
     assert [event.stamp_ns for event in events] == [TICKS[0].stamp_ns]
+
+
+def test_every_message_index_of_the_file_points_at_its_messages(path):
+    # By the specification alone: https://mcap.dev/spec.
+    content = path.read_bytes()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary.chunk_indexes
+    indexed = Counter()
+    for chunk in summary.chunk_indexes:
+        opcode, length = struct.unpack_from("<BQ", content, chunk.chunk_start_offset)
+        assert (opcode, 9 + length) == (Opcode.CHUNK, chunk.chunk_length)
+        packed = content[chunk.chunk_start_offset : chunk.chunk_start_offset + chunk.chunk_length]
+        data = packed[-chunk.compressed_size :]
+        if chunk.compression == "zstd":
+            data = zstandard.decompress(data, chunk.uncompressed_size)
+        for channel, offset in chunk.message_index_offsets.items():
+            opcode, _, told, nbytes = struct.unpack_from("<BQHI", content, offset)
+            assert (opcode, told) == (Opcode.MESSAGE_INDEX, channel)
+            for entry in range(nbytes // 16):
+                log_ns, at = struct.unpack_from("<QQ", content, offset + 15 + 16 * entry)
+                assert struct.unpack_from("<BxxxxxxxxHxxxxQ", data, at) == (Opcode.MESSAGE, channel, log_ns)
+                indexed[channel] += 1
+    assert indexed == summary.statistics.channel_message_counts
 
 
 def test_a_session_is_dated_by_the_day_on_which_it_was_recorded(session):
