@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ from flowrec.attend import Unattended
 from flowrec.chip.chip import Chip
 from flowrec.compare import Comparison, Side
 from flowrec.config import Config, with_sets
-from flowrec.errors import SessionError, UsageError, printable
+from flowrec.errors import FlowrecError, SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
 from flowrec.figures import as_text
 from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
 from flowrec.output import MCAP, RRD, check_output
 from flowrec.pipeline import Pipeline, assemble
+from flowrec.ranges import faults as range_faults
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, run
 from flowrec.session import files_behind, open_session, session_writer
@@ -224,6 +225,7 @@ def replay(
     desk = control.desk
     first_ns = start_ns if start_ns is not None else reader.first_ns
     with ExitStack() as stack:
+        stack.enter_context(_settings_blamed(path, config))
         sinks: list[Sink] = []
         writer = None
         if out is not None:
@@ -260,6 +262,23 @@ def replay(
         worker_check=checker,
         digest=intact(reader) if verify else None,
     )
+
+
+@contextmanager
+def _settings_blamed(path: Path, config: Config) -> Iterator[None]:
+    """A replay runs with recorded settings that are outside of their ranges; where it fails, the first one is named."""
+    fault = next(range_faults(config), None)
+    try:
+        yield
+    except FlowrecError:
+        raise
+    except Exception as error:
+        if fault is None:
+            raise
+        raise SessionError(
+            f"{path}: the replay failed ({type(error).__name__}) with what was recorded: {fault}; replay it with "
+            f"--set {fault.key}=..."
+        ) from error
 
 
 def _warned_of_windows(reader: SessionReader, recorded: Config, config: Config) -> Config:

@@ -11,6 +11,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
 
+from flowrec import replay
 from flowrec.chip import load_chip
 from flowrec.cli import main
 from flowrec.config import Config, load_config, resolve, with_sets
@@ -167,3 +168,14 @@ def test_a_file_is_named_for_what_it_sets(tmp_path: Path) -> None:
     path.write_text("[control]\nkp_per_s = -3.0\n")
     with pytest.raises(UsageError, match=r"own\.toml: control\.kp_per_s = -3: must be from 0 to 1000"):
         load_config(path, ["simulated.seed=2"])
+
+
+def test_a_replay_that_fails_over_a_recorded_setting_outside_of_its_range_names_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    reader, config, chip = replay.open_session(GOLDEN)
+    absurd = replace(config, health=replace(config.health, window_s=0.0))
+    monkeypatch.setattr(replay, "open_session", lambda _path: (reader, absurd, chip))
+    with pytest.raises(Exception) as caught:  # noqa: PT011 - any: a traceback is what it must not be
+        replay.replay(GOLDEN, replay.Change())
+    assert "health.window_s = 0: must be from 0.05" in str(caught.value)
