@@ -183,5 +183,5 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         truth=None,
         true_field=None,
     )
-    event = narrate(last, tick)
+    event = narrate(last, tick, p.controller.method)
     return replace(tick, event=event) if event is not None else tick

@@ -8,8 +8,8 @@ from flowrec.messages import Event, Health, Mission, OperatorEvent, Tick
 from flowrec.units import seconds
 
 
-def narrate(last: Tick, tick: Tick) -> Event | None:
-    """An event when something worth telling has happened between two ticks, else None."""
+def narrate(last: Tick, tick: Tick, control: str = "") -> Event | None:
+    """An event when something worth telling has happened between two ticks, else None. `control` is control.method."""
     lines: list[str] = []
     level = "info"
     mission, before = tick.mission, last.mission
@@ -25,6 +25,9 @@ def narrate(last: Tick, tick: Tick) -> Event | None:
             lines.append(
                 f"route adopted ({tick.route.method}): {length / 1000:.2f} mm in {tick.route.arrival_s[-1]:.1f} s"
             )
+            if control == "policy" and tick.route.method != "survey" and tick.route.time_to_go_s is None:
+                level = "warning"
+                lines.append("no time to go is known from here: the route is followed as by control.method = vector")
         else:
             level = "warning"
             lines.append(f"no route ({tick.route.method}): {tick.route.reason}")

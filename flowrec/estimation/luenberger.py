@@ -35,9 +35,11 @@ class Luenberger:
                 flow = flow + (1.0 - math.exp(-self.gain_per_s * dt)) * (drift - flow)
             elif not track.seen:
                 position = previous.position_um + moved + flow * dt
-        share = 1.0 - math.exp(-self.gain_per_s * dt) if dt > 0 else 1.0
-        # Differences of neighbouring positions are anticorrelated: the low pass leaves gain * sigma * sqrt(2 share).
-        flow_variance = max(2.0 * (self.gain_per_s * sigma_um) ** 2, 2.0 * share * (self.gain_per_s * sigma_um) ** 2)
+        # White noise of the positions through differences over dt and the low pass with a share s of the newest: the
+        # stationary variance is 2 / (2 - s) (s sigma / dt)^2, which goes to (gain sigma)^2 for short dt.
+        share = 1.0 - math.exp(-self.gain_per_s * dt) if dt > 0 else 0.0
+        per_s = share / dt if dt > 0 else self.gain_per_s
+        flow_variance = 2.0 / (2.0 - share) * (per_s * sigma_um) ** 2
         return Estimate(
             stamp_ns=track.stamp_ns,
             position_um=position,

@@ -12,7 +12,10 @@ from flowrec.errors import UsageError
 from flowrec.flow import sample
 from flowrec.messages import Estimate, Route
 from flowrec.planning import Planner
+from flowrec.record import record
 from flowrec.robot import Robot
+from flowrec.store import SessionReader
+from tests.conftest import SMALL
 from tests.control.plant import field_of, fly, mission, straight
 from tests.planning import worlds
 
@@ -159,3 +162,12 @@ def test_a_robot_out_of_sight_is_soon_asked_for_nothing_under_the_policy_too():
     options = {"robot": SWIMMER, "clearance": (None, PX_UM), "blind": (0.5, 9.0)}
     run = fly(POLICY, route, lambda x, y: (0.0, 0.0), 4.0, (600.0, 600.0), None, **options)
     assert not run.demands[-1].velocity_um_s.any()
+
+
+def test_a_route_without_a_time_to_go_is_told_to_who_asked_for_the_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr(Planner, "_with_policy", lambda self, route, *others: route)
+    for method, told in (("policy", 1), ("vector", 0)):
+        sets = [*SMALL, f"control.method={method}", "mission.phases=plan"]
+        done = record(load_config(None, sets), tmp_path / f"{method}.mcap")
+        events = [event for event in SessionReader(done.path).messages("event") if "no time to go" in event.text]
+        assert [event.level for event in events] == told * ["warning"]

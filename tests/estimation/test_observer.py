@@ -259,3 +259,19 @@ def test_a_flow_that_no_robot_could_be_held_in_is_not_believed_for_longer_than_a
     after = Kalman().estimate(run_away, later, replace(applied, stamp_ns=33_000_000), ROBOT)
     assert np.hypot(*after.flow_um_s) < ROBOT.max_speed_um_s
     assert np.linalg.norm(after.position_um - track.position_um) < 5.0
+
+
+@pytest.mark.parametrize("gain_per_s", [1.0, 20.0])
+def test_the_luenberger_observer_states_the_variance_that_the_noise_of_the_positions_gives_its_flow(
+    gain_per_s: float,
+) -> None:
+    observer, rng = Luenberger(gain_per_s, position_noise_um=3.0), np.random.default_rng(0)
+    previous, flows = None, []
+    for index in range(20_000):
+        stamp = round(index * 1e9 / RATE_HZ)
+        track = Track(stamp, True, rng.normal(0.0, 3.0, 2), 0.9, 0, 5.0, np.zeros(4))
+        still = Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+        previous = observer.estimate(previous, track, still, ROBOT)
+        flows.append(previous.flow_um_s)
+    assert previous is not None
+    assert previous.covariance[2, 2] == pytest.approx(np.var(flows[1000:]), rel=0.1)
