@@ -127,8 +127,9 @@ def test_a_stage_that_raises_ends_the_run_after_the_field(tmp_path: Path) -> Non
     assert SessionReader(done.path).outcome["reason"] == "ValueError: a stage that fails"
 
 
-def test_a_worker_that_is_killed_ends_the_run_after_the_field(tmp_path: Path) -> None:
-    done = ended("worker killed", tmp_path, PATIENT)
+@pytest.mark.parametrize("name", ["worker killed", "worker stopped"])
+def test_a_worker_that_is_killed_or_stopped_ends_the_run_after_the_field(name: str, tmp_path: Path) -> None:
+    done = ended(name, tmp_path, PATIENT)
     assert done.status == 1
     assert SessionReader(done.path).outcome["outcome"] == "failed"
 

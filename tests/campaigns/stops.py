@@ -54,7 +54,7 @@ KINDS = {
     "stage never returns": Kind("stage-for-ever", timer_s=_HANG_S),
     "stage never returns, in C": Kind("stage-in-c", timer_s=_HANG_S),
     "worker killed": Kind(worker=signal.SIGKILL),
-    "worker stopped": Kind(worker=signal.SIGSTOP, sent=(signal.SIGINT,), timer_s=_RAMP_S),
+    "worker stopped": Kind(worker=signal.SIGSTOP),
     "zero() raises 5 times, SIGINT twice": Kind("zero-raises", (signal.SIGINT, signal.SIGINT), 5 * 0.02),
     "zero() takes 30 ms, SIGINT twice": Kind("zero-slow", (signal.SIGINT, signal.SIGINT), 0.03),
 }
@@ -114,7 +114,6 @@ def stop(kind: Kind, folder: Path, *sets: str) -> Ended:
             cause_s = time.monotonic()
             if kind.worker is not None:
                 os.kill(_worker_of(process.pid), kind.worker)
-                time.sleep(1.0 if kind.sent else 0.0)
             for one in kind.sent:
                 cause_s = time.monotonic() if one is kind.sent[0] else cause_s
                 process.send_signal(one)
@@ -172,6 +171,7 @@ def _read(path: Path) -> str:
 
 
 def main() -> None:
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=20)
     parser.add_argument("--only", action="append", help="a kind; may be given several times")
