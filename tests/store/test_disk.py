@@ -144,6 +144,12 @@ def test_thinning_uses_the_disk_and_keeps_the_queue_from_ever_being_full(disk_sh
     assert sum(a != b for a, b in itertools.pairwise(gaps)) < 60  # it changes its mind seldom
 
 
+def test_a_try_that_failed_is_repeated_ever_more_seldom():
+    # Six in ten: every second image always finds room, all of them never do for long.
+    gaps = [b - a for a, b in itertools.pairwise(kept_by(0.6, seconds=240.0))]
+    assert sum(a != b for a, b in itertools.pairwise(gaps)) < 40  # 100 where it is tried again at once
+
+
 def test_a_disk_that_takes_all_is_given_all_also_after_a_hiccup():
     assert len(kept_by(1.0)) == 3600
     thinning, fill = Thinning(), 0.0
