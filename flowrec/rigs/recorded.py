@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from flowrec.messages import Currents, Tick
 from flowrec.pipeline import Inputs
@@ -35,7 +36,9 @@ class RecordedRig:
         before = self._reader.tick_before(self._start_ns - 1) if self._start_ns is not None else Tick()
         for tick in self._reader.ticks(self._start_ns):
             if tick.applied is None or tick.applied is before.applied:
-                continue  # not a whole tick: the one a crash cut off, or messages of an operator alone
+                # Not a whole tick: the one a crash cut off, or messages of an operator alone, which the next one takes.
+                before = replace(before, frame=tick.frame)
+                continue
             self.recorded = tick
             frame = tick.frame if tick.frame is not before.frame else None
             track = None

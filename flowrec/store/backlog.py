@@ -49,6 +49,8 @@ class Backlog:
         self._images: deque[Entry] = deque()
         self._changed = threading.Condition()
         self._closed = self._abandoned = False
+        self._flushed_ns = -1
+        self._flush_wanted = False
 
     @property
     def fill(self) -> float:
@@ -64,6 +66,26 @@ class Backlog:
         with self._changed:
             self._changed.wait_for(lambda: self._abandoned or self.has_room(nbytes))
 
+    def wait_for_flush(self, stamp_ns: int) -> None:
+        """Block until the ticks up to a stamp are with the operating system, or until the queue is abandoned."""
+        with self._changed:
+            if self._flushed_ns < stamp_ns:
+                self._flush_wanted = True
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._abandoned or self._flushed_ns >= stamp_ns)
+
+    @property
+    def flush_wanted(self) -> bool:
+        """Whether somebody waits for that."""
+        return self._flush_wanted
+
+    def flushed(self, stamp_ns: int) -> None:
+        """The ticks up to a stamp are with the operating system."""
+        if stamp_ns > self._flushed_ns:  # set by this thread alone
+            with self._changed:
+                self._flushed_ns, self._flush_wanted = stamp_ns, False
+                self._changed.notify_all()
+
     def put(self, entry: Entry, image: Entry | None = None) -> None:
         """Append an entry, `image` to the lane that waits; never blocks."""
         with self._changed:
@@ -74,9 +96,9 @@ class Backlog:
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None) -> Entry | None:
-        """The next entry, None after the time is over or when the closed queue has run dry."""
+        """The next entry; None after the time is over, when all is taken and a flush is wanted, or the end has come."""
         with self._changed:
-            self._changed.wait_for(lambda: self._state or self._images or self._closed, timeout_s)
+            self._changed.wait_for(lambda: self._state or self._images or self._closed or self._flush_wanted, timeout_s)
             lane = self._state or self._images
             return lane.popleft() if lane else None
 

@@ -124,6 +124,14 @@ class Parts:
         """For how long one may wait for the next entry; None: for ever."""
         return min((s for recorder in self._recorders() if (s := recorder.patience_s) is not None), default=None)
 
+    @property
+    def flushed_ns(self) -> int | None:
+        """Stamp up to which all state is with the operating system; None before the first flush."""
+        stretches = self._stretches
+        flushed_ns = stretches.current.stretch.recorder.flushed_ns
+        # A part begins when the one before has been flushed.
+        return stretches.current.carried_ns if flushed_ns is None else flushed_ns
+
     def add(self, entry: Entry) -> None:
         """Write one entry, to the part that it belongs to."""
         self._hear_of_ended(wait=False)
@@ -135,6 +143,10 @@ class Parts:
         """Have the disk keep what has waited for long enough."""
         for recorder in self._recorders():
             recorder.flush_if_due()
+
+    def flush(self) -> None:
+        """Write what waits."""
+        self._stretches.current.stretch.recorder.flush()
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
         """End the last part; everything is on the disk then. `why` a run ended badly is for snapshots alone."""

@@ -12,7 +12,7 @@ from mcap.records import Metadata
 
 import flowrec
 from flowrec.errors import SessionError
-from flowrec.output import MCAP, check_output, put_in_place, taken
+from flowrec.output import MCAP, check_output, put_in_place, sync_directory, taken
 from flowrec.store.chunk import Sealed
 from flowrec.store.frames import FrameEncoding
 from flowrec.store.header import OUTCOME, PROFILE, VIEW, SessionHeader, records_of
@@ -91,6 +91,7 @@ class Piece:
         self.path = path
         self.partial_path = partial_path(path)
         self.broken = False
+        self._listed = False
         self._overwrite = making.overwrite
         try:
             self._file = McapFile(self.partial_path, overwrite=making.overwrite)
@@ -121,6 +122,9 @@ class Piece:
         """Have the disk keep what was appended."""
         with self._told():
             self._file.sync()
+            if not self._listed:
+                sync_directory(self.partial_path.parent)  # or a power cut leaves content without a name
+                self._listed = True
 
     def finish(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
         """The outcome, the scale of the views' colours and the summary, down to the disk; then the name."""

@@ -37,6 +37,7 @@ class Recorder:
     Attributes
     ----------
     first_bytes : what the file begins with, its head and the tick that it was told to begin with.
+    flushed_ns : stamp up to which all that was added is with the operating system; None before the first flush.
 
     Raises
     ------
@@ -59,11 +60,12 @@ class Recorder:
         self._start_unix_ns = header.start_unix_ns
         self._packer = Packer(making.frames, mirrors, self._piece.add_chunks, header.start_unix_ns)
         self.first_bytes = self._piece.size
+        self.flushed_ns: int | None = None
         self._beginning: Future[None] | None = None
         self._held: list[Sealed] = []
         self._flushed_s = self._synced_s = time.monotonic()
         self._synced_size = 0
-        self._flushed_ns: int | None = None
+        self._since_ns: int | None = None  # stamp of the last flush, or of the first entry
         self._last_ns = 0
         self._syncing: Future[None] | None = None
         self._beside = ThreadPoolExecutor(1, "session-sync")
@@ -126,8 +128,8 @@ class Recorder:
     def add(self, entry: Entry) -> None:
         """Encode the messages of one tick; write the chunks that are full."""
         self._hear_of_beginning(wait=False)
-        if self._flushed_ns is None:
-            self._flushed_ns = entry.stamp_ns
+        if self._since_ns is None:
+            self._since_ns = entry.stamp_ns
         self._last_ns = max(self._last_ns, entry.stamp_ns)
         try:
             self._packer.add(entry)
@@ -139,10 +141,10 @@ class Recorder:
     def flush_if_due(self) -> None:
         """Write what has waited for long enough, and have the disk keep it."""
         self._hear_of_beginning(wait=False)
-        now, stamps_s = time.monotonic(), seconds(self._last_ns - (self._flushed_ns or 0))
+        now, stamps_s = time.monotonic(), seconds(self._last_ns - (self._since_ns or 0))
         if now >= self._flushed_s + self._flush_s or stamps_s >= self._flush_s:
             self._flush()
-            self._flushed_s, self._flushed_ns = now, self._last_ns
+            self._flushed_s, self._since_ns = now, self._last_ns
         if now >= self._synced_s + self._sync_every_s and self._synced_size < self._piece.size:
             self._sync_beside(now)
 
@@ -150,7 +152,7 @@ class Recorder:
         """Write what waits."""
         self._hear_of_beginning(wait=True)
         self._flush()
-        self._flushed_s, self._flushed_ns = time.monotonic(), self._last_ns
+        self._flushed_s, self._since_ns = time.monotonic(), self._last_ns
 
     def finish(self, outcome: Mapping[str, str]) -> None:
         """The rest of the messages, the outcome and the summary, down to the disk; then the file has its name."""
@@ -166,6 +168,8 @@ class Recorder:
 
     def _flush(self) -> None:
         self._packer.seal()
+        if self._beginning is None and self._since_ns is not None:
+            self.flushed_ns = self._last_ns
 
     def _hold(self, sealed: list[Sealed]) -> None:
         self._held += kept(sealed)

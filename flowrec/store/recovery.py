@@ -76,12 +76,13 @@ class _Nonsense:
 
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
-    """Write everything intact of a session to a new file, from the first tick to the last whole one.
+    """Write everything intact of a session to a new file.
 
-    A tick is whole when its inputs and what the stages made of them are there: the images of a killed run are often
-    ahead of the rest. Derived views are made anew. What is missing is told in the new session's outcome. The remains
-    `X.mcap.partial` are removed once `X.mcap` is complete; any other file stays as it is, and so does a whole one,
-    which at most gets the name that its run could not give it.
+    A tick is whole when its inputs and what the stages made of them are there. The images of a killed run are often
+    ahead of the rest: they are kept as ticks with nothing but an image, which a replay passes over. Derived views are
+    made anew. What is missing is told in the new session's outcome. The remains `X.mcap.partial` are removed once
+    `X.mcap` is complete, but not where they hold topics that this flowrec does not know; any other file stays as it
+    is, and so does a whole one, which at most gets the name that its run could not give it.
 
     Parameters
     ----------
@@ -148,7 +149,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
         for remains in (draft, partial_path(draft)):
             with contextlib.suppress(OSError):  # a read-only disk has had its say above
                 remains.unlink(missing_ok=True)
-    if partial and target == final:
+    if partial and target == final and not _unknown_topics(found):
         path.unlink()
     return Recovered(target, ticks, done.duration_s, sum(lost.nbytes for lost in found.lost), lost)
 
@@ -194,10 +195,16 @@ def _channel(found: Scan, topic: str) -> int:
     return next((number for number, channel in found.summary.channels.items() if channel.topic == topic), -1)
 
 
+def _unknown_topics(found: Scan) -> list[str]:
+    """Topics of another flowrec or program, which can not be written anew."""
+    channels = found.summary.channels.values()
+    return sorted({c.topic for c in channels if c.topic not in BY_PATH and c.metadata.get("role") != "view"})
+
+
 def _rewrite(
     reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str, nonsense: _Nonsense
 ) -> tuple[int, str]:
-    """Write the ticks up to a stamp; their number and what was lost."""
+    """Write all ticks, of which those after `end_ns` are not whole; the number of whole ones and what was lost."""
     before = Tick()
     whole = images_missing = images_ahead = dropped = 0
     # Only replays are written without images.
@@ -213,9 +220,8 @@ def _rewrite(
     ) as writer:
         for tick in reader.ticks():
             if tick.stamp_ns > end_ns:
-                images_ahead += 1
-                continue
-            if tick.stamp_ns == reader.carried_ns:
+                images_ahead += tick.frame is not before.frame
+            elif tick.stamp_ns == reader.carried_ns:
                 pass  # counted where it was recorded
             elif tick.applied is not before.applied and tick.track is not before.track:
                 whole += 1
@@ -226,7 +232,7 @@ def _rewrite(
             while writer.queue_bytes > _QUEUE_BYTES:  # a large one is not to wait while the next is read
                 time.sleep(_POLL_S)
         lost = "; ".join([*_losses(reader, found, images_missing - dropped, images_ahead), *nonsense.told()])
-        writer.close(_outcome(reader, lost, before.stamp_ns, dropped))
+        writer.close(_outcome(reader, lost, end_ns, dropped))
     return whole, lost
 
 
@@ -242,13 +248,17 @@ def _losses(reader: SessionReader, found: Scan, images_missing: int, images_ahea
     if gaps:
         from_s = seconds(gaps[0].before_ns - reader.first_ns)
         yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"
-    absent = sorted(set(BY_PATH) - {channel.topic for channel in found.summary.channels.values()})
-    if absent:
-        yield f"all of {', '.join(absent)}"
+    # A topic that the file does not declare was not recorded, unless there are messages that belong to none.
+    undeclared = found.undeclared
+    if undeclared:
+        absent = sorted(set(BY_PATH) - {channel.topic for channel in found.summary.channels.values()})
+        yield f"{undeclared} messages of topics whose declaration is damaged ({', '.join(absent) or 'unknown'})"
+    if unknown := _unknown_topics(found):
+        yield f"{', '.join(unknown)}, which this flowrec does not know (the old file is kept)"
     if images_missing > 0:
         yield f"{images_missing} images"
     if images_ahead:
-        yield f"{images_ahead} ticks of which there was only the image"
+        yield f"all but the image of the last {images_ahead} ticks, which a replay passes over"
 
 
 def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Mapping[str, str]:

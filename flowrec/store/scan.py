@@ -101,6 +101,11 @@ class Scan:
             return False
         return True
 
+    @property
+    def undeclared(self) -> int:
+        """Messages of channels whose declaration was not found, or is damaged."""
+        return sum(count for channel, count in self._counts.items() if channel not in self.summary.channels)
+
     def lose(self, offset: int, nbytes: int) -> None:
         """Pass over some bytes."""
         if not self.ended:

@@ -193,6 +193,11 @@ class Snapshots:
             return None
         return max(_POLL_S, self._flushed_s + self._flush_s - time.monotonic())
 
+    @property
+    def flushed_ns(self) -> int | None:
+        """All that was added: who keeps a run in memory is not to wait for a disk."""
+        return self._stretches.last_ns
+
     def add(self, entry: Entry) -> None:
         """Keep one entry, or write it."""
         self._hear_of_ended()
@@ -219,6 +224,9 @@ class Snapshots:
                     place.stretch.packer.seal()
             taken.file.sync_if_due()
             self._flushed_s, self._flushed_ns = now, last_ns
+
+    def flush(self) -> None:
+        """Nothing: nobody waits, see `flushed_ns`."""
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
         """End what is being taken; with `why` take what the ring holds, for a run has ended badly."""

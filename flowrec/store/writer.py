@@ -30,7 +30,7 @@ from flowrec.store.region import Region, Window, Windows
 from flowrec.store.snapshots import Snapshot, Snapshots
 from flowrec.store.thinning import Thinning
 from flowrec.topics import TOPICS
-from flowrec.units import NS_PER_S
+from flowrec.units import NS_PER_S, nanoseconds
 
 _NICE = 5  # where there are too few cores for all, the control loop goes first
 _TELL_DROPS_NS = NS_PER_S // 2
@@ -61,9 +61,14 @@ class _Output(Protocol):
     @property
     def patience_s(self) -> float | None: ...
 
+    @property
+    def flushed_ns(self) -> int | None: ...
+
     def add(self, entry: Entry) -> None: ...
 
     def flush_if_due(self) -> None: ...
+
+    def flush(self) -> None: ...
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None: ...
 
@@ -82,11 +87,12 @@ class SessionWriter:
     path : file to make.
     header : what goes first into the file and is on the disk when the constructor returns.
     frames : how images travel, a name of frames.py: raw, zstd, png, delta, or jpeg, which alone loses something.
-    flush_s : at most this much of a run is lost when the process is killed, in s, of wall time and of stamps;
-        besides, of its images and where `block` is set, what `queue_bytes` says is waiting.
+    flush_s : at most this much of a run is lost when the process is killed, in s, of stamps; without `block` also of
+        wall time, and besides the images that wait for a slow disk, at most `queue_limit_bytes` of them.
     sync_s : the same when the power fails, as long as an fsync takes less than half of it.
     overwrite : replace whatever there is of the run, once the new one is whole.
-    block : what to do when the disk is slower than the run. True: `write` waits (simulation).
+    block : what to do when the disk is slower than the run. True: `write` waits (simulation), also while more than
+        `flush_s` of stamps is not yet with the operating system.
         False: images are thinned out (thinning.py) and counted, nothing else ever is dropped (live run).
     queue_limit_bytes : how much may wait for the disk.
     pieces : a Split, after which the run X.mcap is in the files X.part001.mcap, X.part002.mcap, ..., each of which can
@@ -130,7 +136,9 @@ class SessionWriter:
         self._said: Drops | None = None
         self._carried_ns = header.part.carried_ns if header.part is not None else None
         self._block = block
+        self._flush_ns = nanoseconds(flush_s)
         self._last: tuple[Any, ...] = (None,) * len(_FIELDS)
+        self._first_ns: int | None = None
         self._last_ns = -1
         self._failure: BaseException | None = None
         self._closed = False
@@ -187,10 +195,16 @@ class SessionWriter:
                 f"{self.path}: the tick at {tick.stamp_ns} ns does not come after the one at {self._last_ns} ns;"
                 " stamps of a session must grow, check the clock of the rig"
             )
+        if self._first_ns is None:
+            self._first_ns = tick.stamp_ns
+        elif self._block and tick.stamp_ns - self._flush_ns >= self._first_ns:
+            self._backlog.wait_for_flush(min(self._last_ns, tick.stamp_ns - self._flush_ns))
+            self._raise_failure()
         self._last_ns = tick.stamp_ns
-        counted = int(tick.stamp_ns != self._carried_ns)  # one that another part has recorded counts there
-        self.ticks += counted
         news = self._news_of(tick)
+        # A tick that another part has recorded counts there; one of which recovery has found the image alone is none.
+        counted = int(tick.stamp_ns != self._carried_ns and news.keys() != {"frame"})
+        self.ticks += counted
         for field in self._unwanted:
             news.pop(field, None)
         if self._block:
@@ -318,9 +332,13 @@ class SessionWriter:
                 entry = self._backlog.take(self._output.patience_s)
                 if entry is not None:
                     self._output.add(entry)
+                if entry is None and self._backlog.flush_wanted:
+                    self._output.flush()
                 # The image of a tick comes after its other messages: where it can be, what is flushed are whole ticks.
-                if entry is None or "frame" in entry.news or not self._backlog.images_wait:
+                elif entry is None or "frame" in entry.news or not self._backlog.images_wait:
                     self._output.flush_if_due()
+                if (flushed_ns := self._output.flushed_ns) is not None:
+                    self._backlog.flushed(flushed_ns)
                 if entry is not None:
                     self._backlog.done(entry)
         except Exception as error:  # noqa: BLE001  whatever it is, the control loop has to hear of it

@@ -1,29 +1,30 @@
 """Disks that are slow, full, refusing, gone, or lose their power; files are written for real and read back."""
 
+import contextlib
 import itertools
 import math
 import os
 import shutil
-import stat
 import subprocess
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
-from flowrec.store import SessionReader, SessionWriter, recorder, recover
+from flowrec.store import SessionReader, SessionWriter, recover
 from flowrec.store.backlog import Backlog, Entry
+from flowrec.store.layout import SLOTS
 from flowrec.store.mcap_file import McapFile
+from flowrec.store.scan import scan
+from flowrec.store.source import Source
 from flowrec.store.thinning import Thinning
-from tests.conftest import HANG_S, until
+from flowrec.units import seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
 
@@ -109,7 +110,8 @@ def test_a_slow_disk_costs_evenly_spaced_images_and_nothing_else(tmp_path, monke
 def test_a_run_that_must_end_soon_drops_the_images_that_wait_and_counts_them(tmp_path, monkeypatch, block):
     disk = GatedDisk(monkeypatch)
     ticks = list(ticks_of(120, shape=(256, 256)))  # 8 MB
-    writer = SessionWriter(tmp_path / "s.mcap", HEADER, frames="raw", block=block)
+    # With less of flush_s a run that may block would wait for the disk, which here takes no more.
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER, frames="raw", block=block, flush_s=10.0)
     disk.allow(2_000_000)
     for tick in ticks:
         writer.write(tick)
@@ -173,6 +175,29 @@ def test_frames_that_the_camera_never_delivered_are_counted_apart(tmp_path):
     assert reader.outcome["frames_missing_from_camera"] == "2" and reader.outcome["dropped_frames"] == "0"
 
 
+def test_a_run_that_waits_for_its_disk_is_never_more_than_flush_s_ahead_of_it(tmp_path, monkeypatch):
+    disk = GatedDisk(monkeypatch)
+    disk.allow(math.inf)
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER, block=True, flush_s=0.5)
+    handed, ahead_s = [], []
+
+    def look(backlog, stamp_ns):
+        wait(backlog, stamp_ns)
+        # As a kill would find it: what the file holds, and what was handed over before.
+        with contextlib.closing(Source(writer.partial_path)) as source:
+            found = scan(source)
+        held_ns = found.last_ns.get(SLOTS["/robot/track"].channel, handed[0])
+        ahead_s.append(seconds(handed[-1] - held_ns))
+
+    wait = Backlog.wait_for_flush
+    monkeypatch.setattr(Backlog, "wait_for_flush", look)
+    with writer:
+        for tick in ticks_of(150, shape=(8, 8)):
+            handed.append(tick.stamp_ns)
+            writer.write(tick)
+    assert len(ahead_s) > 100 and max(ahead_s) <= 0.5
+
+
 def test_poses_do_not_queue_behind_images():
     backlog = Backlog(1000)
     for stamp in range(3):
@@ -184,76 +209,88 @@ def test_poses_do_not_queue_behind_images():
     ]
 
 
-class DatedDisk:
-    """A disk whose fsync takes `fsync_s` by a clock that the test sets, and that the writer's thread is given too."""
-
-    def __init__(self, monkeypatch):
-        self.now_s, self.fsync_s = 1000.0, 0.0
-        self.kept = []  # bytes that are on the disk after each fsync
-        self._ordered, self._over_s = 0, None  # fsyncs that have not begun, and when the present one is over
-        self._changed = threading.Condition()
-        sync = McapFile.sync
-
-        def order(executor, call, *words):
-            with self._changed:
-                self._ordered += 1
-            return ThreadPoolExecutor.submit(executor, call, *words)
-
-        def noted(file):
-            with self._changed:
-                self._ordered, self._over_s = max(self._ordered - 1, 0), self.now_s + self.fsync_s
-                self._changed.notify_all()
-            sync(file)
-            with self._changed:
-                self._over_s = None
-                self._changed.notify_all()
-
-        def fsync(descriptor):
-            state = os.fstat(descriptor)  # what is in the file by now
-            with self._changed:
-                self._changed.wait_for(lambda: self._over_s is None or self.now_s >= self._over_s)
-                if stat.S_ISREG(state.st_mode):
-                    self.kept.append(state.st_size)
-
-        monkeypatch.setattr(McapFile, "sync", noted)
-        monkeypatch.setattr(os, "fsync", fsync)
-        monkeypatch.setattr(recorder, "time", SimpleNamespace(monotonic=lambda: self.now_s))
-        monkeypatch.setattr(recorder, "ThreadPoolExecutor", type("Executor", (ThreadPoolExecutor,), {"submit": order}))
-
-    def go_on(self, seconds, writer):
-        """Let so much time pass, once the writer has nothing to do but to wait for an fsync."""
-        until(lambda: not writer.queue_bytes and not self._ordered)
-        with self._changed:
-            self.now_s += seconds
-            self._changed.notify_all()
-            assert self._changed.wait_for(lambda: self._over_s is None or self.now_s < self._over_s, HANG_S)
-
-
 def test_a_power_cut_costs_no_more_than_what_was_not_yet_kept_by_the_disk(tmp_path, monkeypatch):
-    disk = DatedDisk(monkeypatch)
-    handed, cuts = [], []
-    with SessionWriter(tmp_path / "s.mcap", HEADER, flush_s=0.2, sync_s=0.5) as writer:
-        assert disk.kept
-        disk.fsync_s = 0.1  # it holds up nobody
-        for number, tick in enumerate(ticks_of(150, shape=(8, 8))):
-            handed.append((disk.now_s, tick.stamp_ns))
+    kept, sync = [], McapFile.sync
+
+    def noted(self):
+        size = os.fstat(self._file.fileno()).st_size  # what the disk is sure to have afterwards
+        sync(self)
+        kept.append((time.monotonic(), size))
+
+    monkeypatch.setattr(McapFile, "sync", noted)
+    # An fsync of 0.1 s holds up nobody.
+    monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.1))
+    path = tmp_path / "s.mcap"
+    said = []
+    with SessionWriter(path, HEADER, flush_s=0.2, sync_s=0.5) as writer:
+        for tick in ticks_of(150, shape=(8, 8)):
+            began = time.monotonic()
             writer.write(tick)
-            disk.go_on(0.01, writer)
-            if number % 16 == 15:
-                cuts.append((disk.now_s, disk.kept[-1]))
-        content = writer.partial_path.read_bytes()
-        disk.fsync_s = 0.0
-        disk.go_on(1.0, writer)
-    assert len(disk.kept) >= 5
-    for number, (now_s, size) in enumerate(cuts):
-        cut = tmp_path / f"{number}.mcap.partial"
-        cut.write_bytes(content[:size])
-        try:
-            last_ns = SessionReader(recover(cut).path).last_ns
-        except SessionError:  # nothing but its head
-            last_ns = 0
-        assert all(at_s > now_s - 0.5 for at_s, stamp_ns in handed if at_s < now_s and stamp_ns > last_ns)
-    assert last_ns > handed[100][1]
+            said.append((began, tick.stamp_ns))
+            time.sleep(0.01)
+        cut = time.monotonic()
+        shutil.copyfile(writer.partial_path, tmp_path / "cut.mcap.partial")
+    done, size = max(entry for entry in kept if entry[0] <= cut)
+    os.truncate(tmp_path / "cut.mcap.partial", size)
+    saved = recover(tmp_path / "cut.mcap.partial")
+    with SessionReader(saved.path) as reader:
+        last_ns = reader.last_ns
+    # Not one tick is missing of what had been handed over when the last fsync began, give or take a busy machine.
+    missing = [began for began, stamp_ns in said if stamp_ns > last_ns]
+    assert saved.ticks > 30 and min(missing) > done - 0.1 - 0.5
+    assert len(kept) >= 4
+
+
+@pytest.fixture
+def disk_calls(monkeypatch):
+    """What is asked of the disk, in order: ("fsync", name of file or folder), ("rename", new name)."""
+    calls, fsync, replace = [], os.fsync, Path.replace
+
+    def noted_fsync(descriptor):
+        calls.append(("fsync", Path(f"/proc/self/fd/{descriptor}").readlink().name))
+        fsync(descriptor)
+
+    def noted_replace(path, target):
+        calls.append(("rename", Path(target).name))
+        return replace(path, target)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(Path, "replace", noted_replace)
+    monkeypatch.setattr(Path, "rename", noted_replace)
+    return calls
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="file names of descriptors are those of Linux")
+def test_the_disk_keeps_head_content_and_name_in_this_order(tmp_path, disk_calls):
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    writer = SessionWriter(folder / "s.mcap", HEADER)
+    # The head and the name that it can be found by are on the disk before the first tick.
+    assert disk_calls == [("fsync", "s.mcap.partial"), ("fsync", "runs")]
+    writer.write(next(ticks_of(1)))
+    before = len(disk_calls)
+    writer.close()
+    ending = disk_calls[before:]
+    assert ending[-3:] == [("fsync", "s.mcap.partial"), ("rename", "s.mcap"), ("fsync", "runs")]
+    disk_calls.clear()
+    shutil.copyfile(folder / "s.mcap", folder / "t.mcap.partial")
+    os.truncate(folder / "t.mcap.partial", (folder / "s.mcap").stat().st_size - 100)
+    recover(folder / "t.mcap.partial")
+    assert disk_calls[-2:] == [("rename", "t.mcap"), ("fsync", "runs")]
+    assert ("fsync", "t.recovering.mcap.partial") in disk_calls[:-2]
+
+
+def test_a_disk_that_can_not_keep_what_was_written_is_told_and_the_file_gets_no_name(tmp_path, monkeypatch):
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER)
+    writer.write(next(ticks_of(1)))
+
+    def refuse(_descriptor):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(SessionError, match=r"writing failed \(Input/output error\); .*flowrec recover"):
+        writer.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["s.mcap.partial"]
 
 
 def test_a_directory_that_disappears_ends_the_run(tmp_path):
@@ -295,7 +332,6 @@ FULL = """
 import resource, sys, time
 from flowrec.errors import SessionError
 from flowrec.store import SessionWriter
-from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, ticks_of
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 writer = SessionWriter(sys.argv[1], HEADER, flush_s=0.05)

@@ -199,8 +199,14 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
         plain(self, sealed)
 
     monkeypatch.setattr(McapFile, "add_chunks", refuse)
+
+    def fly():
+        with SessionWriter(tmp_path / "x.mcap", HEADER, pieces=Split(seconds=1.0), block=True) as writer:
+            for tick in TICKS:
+                writer.write(tick)
+
     with pytest.raises(SessionError, match=r"part002\.mcap\.partial: the disk is full"):
-        record(tmp_path / "x.mcap", Split(seconds=1.0), block=True)
+        fly()
     assert sorted(names_in(tmp_path)) == ["x.part001.mcap", "x.part002.mcap.partial"]
     assert messages_in(part_path(tmp_path / "x.mcap", 1))[1]["flowrec.outcome"]["outcome"] == "continued"
     monkeypatch.undo()  # or what is recovered would fail as well
