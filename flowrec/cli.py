@@ -17,7 +17,7 @@ import typer
 
 import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
-from flowrec.errors import FlowrecError
+from flowrec.errors import FlowrecError, printable
 
 app = typer.Typer(
     name="flowrec",
@@ -161,7 +161,7 @@ def replay(
             typer.echo(json.dumps({"session": str(session), **verb.verdict_json(done)}))
         else:
             for line in lines:
-                typer.echo(line)
+                typer.echo(printable(line))
         raise typer.Exit(0 if same else 3)
     rows = before_and_after(done)
     if refly:
@@ -370,9 +370,9 @@ def compare(
         typer.echo(json.dumps({"first_session": str(first), "second_session": str(second)} | comparison.as_json()))
     else:
         for line in comparison.lines():
-            typer.echo(line)
+            typer.echo(printable(line))
         if comparison.first is not None:
-            typer.echo(f"first difference: {comparison.first}")
+            typer.echo(printable(f"first difference: {comparison.first}"))
         same = "identical" if comparison.identical else "the same within tolerance"
         typer.echo(
             f"{comparison.ticks} ticks: "

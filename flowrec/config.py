@@ -35,7 +35,7 @@ from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.settings import CameraSettings, Safety, Simulated
-from flowrec.toml_file import read_toml
+from flowrec.toml_file import parse_toml, read_toml
 from flowrec.vision import Tracker
 
 
@@ -160,7 +160,7 @@ def config_from_toml(text: str, where: str) -> Config:
     """
     origin = Origin(where)
     try:
-        config = _config_from(tomllib.loads(text), origin)
+        config = _config_from(parse_toml(text), origin)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
     for fault in faults(config):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import struct
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from flowrec.store.head import Head
 from flowrec.store.header import Part, SessionHeader
 from flowrec.store.joints import Run
 from flowrec.store.names import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
+from flowrec.toml_file import parse_toml
 from flowrec.units import seconds
 
 _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
@@ -171,7 +171,7 @@ def _piece(part: Part, path: Path) -> str:
 
 def _table(text: str, where: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        return parse_toml(text)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise SessionError(f"{where}: is not valid TOML ({error}); the file is damaged or was edited") from error
 

@@ -18,6 +18,26 @@ _NOT_TOML = {
 }
 
 
+# Ours have 10 kB. Each dot may open a table of a kilobyte, and a key with many costs the square of them in time.
+_LIMIT_CHARACTERS, _LIMIT_DOTS, _LIMIT_DOTS_IN_A_ROW = 1 << 19, 20_000, 2_000
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML text, whoever wrote it, within bounded memory and time.
+
+    Raises
+    ------
+    ValueError, RecursionError : it is no TOML, or none that flowrec has a use for.
+    """
+    if len(text) > _LIMIT_CHARACTERS:
+        raise ValueError(f"{len(text)} characters, more than {_LIMIT_CHARACTERS}")
+    if text.count(".") > _LIMIT_DOTS:
+        raise ValueError(f"{text.count('.')} dots, more than {_LIMIT_DOTS}")
+    if any(line.count(".") > _LIMIT_DOTS_IN_A_ROW for line in text.splitlines()):
+        raise ValueError(f"a line with more than {_LIMIT_DOTS_IN_A_ROW} dots")
+    return tomllib.loads(text)
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a configuration.
 
@@ -30,7 +50,9 @@ def read_toml(path: Path) -> dict[str, Any]:
     if kind is not None:
         raise UsageError(f"{path}: is {kind} by its name, and a configuration is a TOML file; {begin}")
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
+        if path.stat().st_size > 4 * _LIMIT_CHARACTERS:
+            raise ValueError(f"{path.stat().st_size} bytes, more than {4 * _LIMIT_CHARACTERS}")
+        tree = parse_toml(path.read_text(encoding="utf-8-sig"))  # with or without a byte-order mark
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such configuration; {begin}") from error
     except (OSError, UnicodeDecodeError) as error:

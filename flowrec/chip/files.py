@@ -25,7 +25,6 @@ import difflib
 import json
 import math
 import struct
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +38,7 @@ from scipy.ndimage import label
 from flowrec.chip.chip import Chip, Kind, Opening, Side, Walls
 from flowrec.chip.openings import DEFAULT_INLET_UM_S, check_openings, find_openings, guess_inlets
 from flowrec.errors import ChipError
+from flowrec.toml_file import parse_toml
 
 MIN_SIDE_PX = 8
 MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
@@ -76,7 +76,7 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
     Raises ChipError, in one line, for whatever no flow can be computed on.
     """
     try:
-        table = tomllib.loads(toml_text)
+        table = parse_toml(toml_text)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
     _refuse_unknown(table, CHIP_KEYS, where)

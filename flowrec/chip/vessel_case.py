@@ -6,11 +6,14 @@ mask, px, op_side, op_a, op_b, op_type and the keys that end in _assumed.
 
 from __future__ import annotations
 
+import math
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip, Opening, Side
@@ -22,6 +25,7 @@ from flowrec.messages import Observations
 NOISES = {"00": 0.0, "02": 0.02, "05": 0.05, "10": 0.1}
 SHARES = {"05": 0.05, "10": 0.1, "20": 0.2}
 KEYS = ("mask", "px", "rho_assumed", "mu_assumed", "op_side", "op_a", "op_b", "op_type", "op_u_assumed", "op_p_assumed")
+_LIMIT_BYTES = 256 << 20  # of the arrays that are read at a time; those of a case have some 10 MB
 # Row 0 is their south (y grows with the row), and our top (y points down): the same array, no flip.
 _SIDES: dict[str, Side] = {"W": "left", "E": "right", "S": "top", "N": "bottom"}
 
@@ -87,6 +91,24 @@ def read_true_velocity(path: Path) -> NDArray[np.float64]:
     return np.stack([known["vx"], known["vy"]], axis=-1) * 1e6
 
 
+def _refuse_large(case: zipfile.ZipFile, keys: tuple[str, ...]) -> None:
+    """Raise ValueError where arrays would take much more memory than a case needs: before any is unpacked."""
+    members = [case.getinfo(f"{key}.npy") for key in keys]
+    nbytes = sum(member.file_size for member in members)
+    if nbytes > _LIMIT_BYTES:
+        raise ValueError(f"arrays of {nbytes} bytes, more than {_LIMIT_BYTES}")
+    for member in members:
+        with case.open(member) as file:
+            read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(
+                npy.read_magic(file)
+            )
+            if read_header is None:
+                raise ValueError(f"{member.filename} is of a version that is not known")
+            shape, _, dtype = read_header(file)
+            if math.prod(shape) * dtype.itemsize > member.file_size:
+                raise ValueError(f"{member.filename} announces an array of shape {shape} in {member.file_size} bytes")
+
+
 def _read(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Some arrays of a case, and no others."""
     try:
@@ -94,8 +116,9 @@ def _read(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
             missing = [key for key in keys if key not in case.files]
             if missing:
                 raise ChipError(f"{path}: no {', '.join(missing)}; a vessel case has {', '.join(keys)}")
+            _refuse_large(case.zip, keys)
             return {key: case[key] for key in keys}
     except FileNotFoundError as error:
         raise ChipError(f"{path}: no such vessel case; give the path of an .npz file") from error
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, AttributeError, KeyError, zlib.error, zipfile.BadZipFile) as error:
         raise ChipError(f"{path}: not a readable .npz vessel case ({error})") from error

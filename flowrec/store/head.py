@@ -32,6 +32,7 @@ from flowrec.store.source import ForeignError, Source
 
 _METADATA_LIMIT_BYTES = 16 << 20
 _ATTACHMENTS_LIMIT_BYTES = 256 << 20
+_SHOWN = 40  # characters of a version; int() refuses thousands of digits
 
 
 class Head:
@@ -80,7 +81,7 @@ class Head:
                 f"{path}: is an MCAP file without the record {SESSION!r}, so not a session;"
                 " flowrec reads what `flowrec record` has written"
             )
-        self.flowrec_version = metadata[SESSION].get("flowrec_version", "?")
+        self.flowrec_version = metadata[SESSION].get("flowrec_version", "?")[:_SHOWN]
         self._check_version(metadata[SESSION].get("format_version", ""))
         self.outcome = metadata.get(OUTCOME, {})
         self.digest = metadata.get(DIGEST)
@@ -142,6 +143,7 @@ class Head:
     def _check_version(self, version: str) -> None:
         if version == str(FORMAT_VERSION):
             return
+        version = version[:_SHOWN]
         what = f"{self.source.path}: is a session of format {version!r}, written by flowrec {self.flowrec_version}"
         newer = version.isdecimal() and int(version) > FORMAT_VERSION
         need = f"install flowrec {self.flowrec_version} or later" if newer else "it is damaged or was edited"

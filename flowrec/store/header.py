@@ -129,8 +129,10 @@ def part_from(metadata: Mapping[str, Mapping[str, str]]) -> Part | None:
     if said is None:
         return None
     number, kind, carried = said.get("number", ""), said.get("kind", ""), said.get("carried_ns", "")
-    if kind not in ("part", "snapshot") or not number.isdecimal() or not (carried.isdecimal() or not carried):
-        raise ValueError(f"a piece of a run that is called {kind!r} {number!r}, carried from {carried!r}")
+    numbers = number.isdecimal() and (carried.isdecimal() or not carried) and max(len(number), len(carried)) < 20
+    if kind not in ("part", "snapshot") or not numbers:
+        called = f"{kind[:40]!r} {number[:40]!r}, carried from {carried[:40]!r}"
+        raise ValueError(f"a piece of a run that is called {called}")
     return Part(
         said.get("run", ""),
         int(number),

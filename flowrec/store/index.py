@@ -21,6 +21,9 @@ _CHANNEL_BYTES = 10  # channel number and the offset of its own index, which nob
 _LENGTH_AND_NAME = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
 
+# Of schemas, channels, metadata and attachments together, each of which takes some 20 us. Ours have 60.
+DECLARED_LIMIT = 10_000
+
 _Declared = TypeVar("_Declared", Schema, Channel)
 
 
@@ -75,7 +78,7 @@ def summary_from(data: bytes, data_start: int, data_end: int) -> Summary:
     """
     summary = Summary()
     interned: dict[tuple[bytes, bytes], dict[int, int]] = {}
-    listed_bytes = 0
+    listed_bytes = declared = 0
     for opcode, at, length in records_of(data):
         if opcode == Opcode.CHUNK_INDEX:
             chunk = _chunk_index(data, at, at + length, interned)
@@ -85,6 +88,9 @@ def summary_from(data: bytes, data_start: int, data_end: int) -> Summary:
                 raise ValueError("the chunks that are listed do not fit into the file")
             summary.chunks.append(chunk)
         else:
+            declared += 1
+            if declared > DECLARED_LIMIT:
+                raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
             _take_in(summary, opcode, data[at : at + length])
     _check_places(summary, data_start, data_end)
     _check_counts(summary)

@@ -47,7 +47,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
                 done.append(_end_of_run(path, last, last.part))
     if not done:
         with SessionReader(path) as whole:
-            done = [Recovered(path, int(whole.outcome.get("ticks", "0")), whole.duration_s, changed=False)]
+            done = [Recovered(path, whole.counts.get("track", 0), whole.duration_s, changed=False)]
     return done
 
 

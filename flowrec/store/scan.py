@@ -25,7 +25,7 @@ from mcap.records import (
 
 from flowrec.errors import SessionError
 from flowrec.store.header import CONFIG_FILE, OUTCOME
-from flowrec.store.index import Summary, declare
+from flowrec.store.index import DECLARED_LIMIT, Summary, declare
 from flowrec.store.mcap_file import MAGIC
 from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Record, Source
 
@@ -36,6 +36,8 @@ _CHUNK_SHAPE = re.compile(rb"(?s)(?=\x06.{24}(.{8}).{4}(?:\x04\x00\x00\x00zstd|\
 _WINDOW_BYTES = 1 << 20
 _TRIES = 8  # how often, on average, a damaged byte may be looked at
 _SEQUENCES = 2**32
+_DECLARING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT)
+_TIMES_DECLARED = 2  # in the file and in its index
 
 
 Visit = Callable[[int, list[Record]], None]
@@ -195,10 +197,14 @@ def scan(source: Source, visit: Visit | None = None, progress: Callable[[int], N
     at = len(MAGIC)
     # What has the shape of a chunk after damage may be none, and lie over the next one: the price of trying is bounded.
     patience_bytes = _TRIES * source.size + _WINDOW_BYTES
+    declared = 0
     while at < source.size:
         if progress is not None:
             progress(at)
         opcode, end = _extent(source, at)
+        declared += opcode in _DECLARING
+        if declared > _TIMES_DECLARED * DECLARED_LIMIT:
+            raise source.damaged(at, f"more than {_TIMES_DECLARED * DECLARED_LIMIT} records besides chunks")
         if end and found.take(source, opcode, at, end - at):
             if opcode == Opcode.FOOTER:
                 break

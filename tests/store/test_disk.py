@@ -244,7 +244,7 @@ def test_a_power_cut_costs_no_more_than_what_was_not_yet_kept_by_the_disk(tmp_pa
 @pytest.fixture
 def disk_calls(monkeypatch):
     """What is asked of the disk, in order: ("fsync", name of file or folder), ("rename", new name)."""
-    calls, fsync, replace = [], os.fsync, Path.replace
+    calls, fsync, replace, link = [], os.fsync, Path.replace, os.link
 
     def noted_fsync(descriptor):
         calls.append(("fsync", Path(f"/proc/self/fd/{descriptor}").readlink().name))
@@ -254,7 +254,12 @@ def disk_calls(monkeypatch):
         calls.append(("rename", Path(target).name))
         return replace(path, target)
 
+    def noted_link(path, target):
+        calls.append(("rename", Path(target).name))
+        link(path, target)
+
     monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "link", noted_link)
     monkeypatch.setattr(Path, "replace", noted_replace)
     monkeypatch.setattr(Path, "rename", noted_replace)
     return calls

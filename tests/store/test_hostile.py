@@ -4,6 +4,8 @@ import pickle
 import re
 import resource
 import struct
+import tracemalloc
+import zipfile
 import zlib
 from dataclasses import fields, replace
 from pathlib import Path
@@ -11,10 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from mcap.records import Schema
 from typer.testing import CliRunner
 
 from flowrec.check import check
 from flowrec.chip.files import chip_from_files
+from flowrec.chip.vessel_case import KEYS as CASE_KEYS
+from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.cli import app
 from flowrec.config import config_from_toml
 from flowrec.errors import ChipError, FlowError, SessionError, UsageError, printable
@@ -348,6 +353,90 @@ def test_a_configuration_names_no_code_and_breaks_no_parser(toml):
     with pytest.raises(UsageError) as error:
         config_from_toml(toml, "config.toml inside")
     assert len(str(error.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("toml", "said"),
+    [
+        ("a" + ".a" * 3000 + " = 1", "a line with more than 2000 dots"),
+        ("".join(f"a{number}.b.c = 1\n" for number in range(12_000)), "24000 dots, more than"),
+        ("".join(f"a{number} = 1\n" for number in range(60_000)), "characters, more than"),
+    ],
+)
+def test_a_text_that_would_become_gigabytes_of_tables_is_not_parsed(tmp_path, toml, said):
+    for parse in (lambda: config_from_toml(toml, "config.toml inside"), lambda: chip_from_files(b"", toml)):
+        with pytest.raises(UsageError, match=f"not valid TOML .*{said}") as error:
+            parse()
+        assert len(str(error.value)) < 200
+    (tmp_path / "a.toml").write_text(toml)
+    done = CliRunner().invoke(app, ["record", "--dry-run", str(tmp_path / "a.toml")])
+    assert isinstance(done.exception, UsageError) and said in str(done.exception)
+
+
+def vessel_case(path, mask_header, zeros):
+    """A case whose mask announces itself like this and has so many MB of zeros."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as case:
+        for key in CASE_KEYS:
+            with case.open(f"{key}.npy", "w") as file:
+                if key == "mask":
+                    np.lib.format.write_array_header_1_0(file, mask_header)
+                    for _ in range(zeros):
+                        file.write(bytes(1 << 20))
+                else:
+                    np.lib.format.write_array(file, np.zeros(3))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("shape", "zeros", "said"),
+    [((270, 1 << 20), 270, "arrays of 2831.* bytes, more than"), ((10**6, 10**6), 0, "announces an array of shape")],
+)
+def test_a_vessel_case_that_would_fill_the_memory_is_refused_before_it_is_unpacked(tmp_path, shape, zeros, said):
+    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+    path = vessel_case(tmp_path / "case.npz", header, zeros)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ChipError, match=said):
+            read_vessel_case(path)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def with_session(**said):
+    """The draft with another account of its format."""
+    head = [
+        (opcode, text("flowrec.session") + _map(said))
+        if opcode == METADATA and body[4:].startswith(b"flowrec.session")
+        else (opcode, body)
+        for opcode, body in DRAFT.head
+    ]
+    return replace(DRAFT, head=tuple(head))
+
+
+def test_a_version_of_thousands_of_digits_is_cut_and_does_not_hide_the_other_sessions(tmp_path):
+    path = file_of(tmp_path, with_session(format_version="9" * 5000, flowrec_version="8" * 5000))
+    refused(path, "is a session of format '9999.*install flowrec 8888")
+    done = CliRunner().invoke(app, ["ls", str(tmp_path), "--json"])
+    assert done.exit_code == 0 and len(done.stdout) < 1000 and "of format" in done.stdout
+
+
+@pytest.mark.parametrize("where", ["file", "index"])
+def test_schemas_without_end_are_refused_before_all_are_read(tmp_path, where, monkeypatch):
+    schema = struct.pack("<H", 900) + text("a") + text("") + bytes(4)
+    many = 30_000
+    if where == "index":
+        draft = with_index(lambda parts: [(SCHEMA, schema)] * many + parts)
+    else:
+        draft = replace(DRAFT, head=((SCHEMA, schema),) * many + DRAFT.head)
+    path, parsed, read = file_of(tmp_path, draft), [], Schema.read
+    monkeypatch.setattr(Schema, "read", lambda stream: (parsed.append(1), read(stream))[1])
+    refused(path, "more than 10000 records besides chunks")
+    assert len(parsed) <= 10_000
+    parsed.clear()
+    with pytest.raises(SessionError, match="more than 20000 records besides chunks"):
+        check(path)
+    assert len(parsed) <= 10_000 + 20_000
 
 
 def test_weights_that_are_a_pickle_are_refused_unopened(tmp_path):
