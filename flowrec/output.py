@@ -152,6 +152,8 @@ def sync_directory(directory: Path) -> None:
 
 def _same(output: Path, other: Path) -> bool:
     """Whether two paths are one file, by whatever names."""
+    if "\0" in str(other):  # only a file can have given such a name, and none can have it
+        return False
     try:
         return output.samefile(other)
     except OSError:  # one of them is not there

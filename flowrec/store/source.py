@@ -117,6 +117,8 @@ class Source:
             self._descriptor = os.open(path, os.O_RDONLY)
         except FileNotFoundError as error:
             raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
+        except ValueError as error:  # a name with a NUL, which only another file can have given
+            raise SessionError(f"{path}: is not the name of a file") from error
         except OSError as error:
             raise SessionError(f"{path}: can not be opened ({error.strerror}); check its permissions") from error
         self.close = weakref.finalize(self, os.close, self._descriptor)
