@@ -11,7 +11,7 @@ from flowrec.config import Config
 from flowrec.errors import SessionError
 from flowrec.output import RRD, check_output
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.session import files_behind, open_session, session_key
+from flowrec.session import content_blamed, files_behind, open_session, session_key
 from flowrec.status import progress, say
 from flowrec.store import SessionReader, files_of
 from flowrec.view import Scene, is_made_from, write_rrd
@@ -58,7 +58,8 @@ def write_rrd_of(path: Path, out: Path | None = None, overwrite: bool = False) -
             ticks, replayed = SessionReader(parent).ticks(), reader.ticks(with_frames=False)
         else:
             ticks, replayed = reader.ticks(), None
-        write_rrd(target, scene, ticks, replayed, done, inputs=inputs, overwrite=overwrite)
+        with content_blamed(reader, "drawn"):
+            write_rrd(target, scene, ticks, replayed, done, inputs=inputs, overwrite=overwrite)
     say(f"{target} written in {time.perf_counter() - began:.1f} s; open it with: rerun {target}")
     return target
 

@@ -25,7 +25,7 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.ranges import faults as range_faults
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run import LockstepWorker, RunReport, Sink, run
-from flowrec.session import files_behind, open_session, session_writer
+from flowrec.session import content_blamed, files_behind, open_session, session_writer
 from flowrec.status import warn
 from flowrec.store import SessionReader, SessionWriter, digest_faults
 from flowrec.topics import BY_FIELD
@@ -226,6 +226,7 @@ def replay(
     first_ns = start_ns if start_ns is not None else reader.first_ns
     with ExitStack() as stack:
         stack.enter_context(_settings_blamed(path, config))
+        stack.enter_context(content_blamed(reader, "replayed"))
         sinks: list[Sink] = []
         writer = None
         if out is not None:

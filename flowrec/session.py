@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +14,15 @@ import numpy as np
 from flowrec.chip import chip_files, chip_from_files
 from flowrec.chip.chip import Chip
 from flowrec.config import Config, calibration_of, config_from_toml, to_toml
-from flowrec.errors import SessionError
-from flowrec.messages import Route
+from flowrec.errors import FlowrecError, SessionError
+from flowrec.messages import Route, Tick
 from flowrec.provenance import provenance
 from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
 from flowrec.store.head import Head
 from flowrec.store.names import pieces
+from flowrec.store.shapes import beyond_measure
+from flowrec.topics import TOPICS
+from flowrec.units import seconds
 
 _QUEUE_S = 2.0
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
@@ -149,6 +152,38 @@ def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:
     reader = SessionReader(path)
     config = config_from_toml(reader.header.config_toml, f"{path}: config.toml inside")
     return reader, config, chip_from_files(reader.header.chip_png, reader.header.chip_toml)
+
+
+@contextlib.contextmanager
+def content_blamed(reader: SessionReader, done: str) -> Iterator[None]:
+    """What fails over numbers in a session that can not be is told as such; any other failure stays what it is.
+
+    `done` says what can not be done with the session, such as "replayed".
+    """
+    try:
+        yield
+    except FlowrecError:
+        raise
+    except Exception as error:
+        said = next(_beyond_measure(reader), None)
+        if said is None:
+            raise
+        raise SessionError(
+            f"{reader.path}: {said}, so it can not be {done} ({type(error).__name__}: {error}); "
+            f"`flowrec check {reader.path}` says more"
+        ) from error
+
+
+def _beyond_measure(reader: SessionReader) -> Iterator[str]:
+    before = Tick()
+    for tick in reader.ticks(with_frames=False):
+        for topic in TOPICS:
+            message = getattr(tick, topic.field)
+            if message is not None and message is not getattr(before, topic.field):
+                for name in beyond_measure(message):
+                    at_s = seconds(tick.stamp_ns - reader.first_ns)
+                    yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or a number beyond all measure"
+        before = tick
 
 
 def session_sha256(files: Sequence[Path]) -> str:

@@ -170,7 +170,7 @@ _UNTROUBLED = {"rate": 1.0, "unit": 0.0} | dict.fromkeys(
 
 def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Generator) -> Message:
     """A message of some type with shapes that fit and numbers that mean nothing."""
-    lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4}
+    lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4, "o": 2}
     shapes = shapes_of(kind)
     arrays = dict(array_fields(kind))  # type: ignore[arg-type]
     values: dict[str, Any] = {}

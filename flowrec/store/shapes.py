@@ -95,6 +95,18 @@ def not_finite(message: Message) -> tuple[str, ...]:
     return tuple(found)
 
 
+def beyond_measure(message: Message) -> tuple[str, ...]:
+    """Names of the fields that hold what no run can have: `not_finite`, or a number of `_NEVER` or more."""
+    found = list(not_finite(message))
+    for name in _float_fields(type(message)):
+        value = getattr(message, name)
+        with np.errstate(invalid="ignore"):
+            if value is not None and name not in found and (np.abs(value)[np.isfinite(value)] >= _NEVER).any():
+                found.append(name)
+    return tuple(found)
+
+
+_NEVER = 1e15  # a million kilometres in um
 _FLOATS: dict[type[Any], tuple[str, ...]] = {}
 
 

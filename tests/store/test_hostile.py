@@ -1,5 +1,6 @@
 """Files made to do harm, with every checksum right: one line, bounded memory and time, nothing written, nothing run."""
 
+import itertools
 import pickle
 import re
 import resource
@@ -26,11 +27,11 @@ from flowrec.errors import ChipError, FlowError, SessionError, UsageError, print
 from flowrec.export import write_rrd_of
 from flowrec.messages import Estimate, Frame, Message
 from flowrec.refine.weights import read_weights
-from flowrec.store import SessionReader, recover
+from flowrec.store import SessionReader, SessionWriter, recover
 from flowrec.store.codec import encode_record
 from flowrec.store.layout import SLOTS
 from flowrec.store.shapes import misfit, not_finite, shapes_of
-from flowrec.topics import TOPICS
+from flowrec.topics import BY_FIELD, TOPICS
 from tests.store.drafts import (
     ATTACHMENT,
     CHANNEL,
@@ -319,6 +320,40 @@ def test_a_source_that_stamps_back_in_time_is_flagged(tmp_path):
     payload = b"".join(encode_record(late)[1])
     path = file_of(tmp_path, with_message(FRAMES, lambda sent: replace(sent, payload=payload)))
     assert any("the source of /camera/frame stamped 1 messages back" in f.text for f in check(path).findings)
+
+
+def spoiled(session, tmp_path, field, **changes):
+    """The first 40 ticks of a mission with other numbers in a message of a topic."""
+    with SessionReader(session) as reader:
+        header, ticks = reader.header, list(itertools.islice(reader.ticks(), 40))
+    said = getattr(ticks[-5], field)
+    other = replace(said, **{name: np.full_like(getattr(said, name), value) for name, value in changes.items()})
+    path = tmp_path / "spoiled.mcap"
+    with SessionWriter(path, header, block=True) as writer:
+        for tick in ticks:
+            writer.write(replace(tick, **{field: other}) if getattr(tick, field) is said else tick)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("verb", "field", "changes", "done"),
+    [
+        ("replay", "applied", {"turns": float("nan")}, "replayed"),
+        ("replay", "assumed", {"velocity_um_s": float("nan")}, "replayed"),
+        ("replay", "assumed", {"velocity_um_s": 1e300}, "replayed"),
+        ("replay", "demand", {"velocity_um_s": 1e300}, "replayed"),
+        ("export", "assumed", {"velocity_um_s": 1e300}, "drawn"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_numbers_that_can_not_be_are_named_where_a_verb_fails_over_them(session, tmp_path, verb, field, changes, done):
+    path = spoiled(session, tmp_path, field, **changes)
+    words = ["replay", str(path), "--verify"] if verb == "replay" else ["export", str(path)]
+    error = CliRunner().invoke(app, words).exception
+    assert isinstance(error, SessionError), error
+    (name,) = changes
+    told = rf"{BY_FIELD[field].path} {name} at \d\.\d+ s holds NaN, infinity or a number beyond all measure, .* {done}"
+    assert re.search(told, str(error)) and len(str(error).splitlines()) == 1
 
 
 HARMFUL = "\x1b[2J\x1b]0;owned\x07<script>alert(1)</script>\r\n\u202egnp.exe\x9b31m"
