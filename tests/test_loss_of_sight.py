@@ -14,9 +14,10 @@ import flowrec.record as verb
 from flowrec import replay
 from flowrec.config import load_config
 from flowrec.errors import RigError
-from flowrec.messages import Currents, Event, Frame
+from flowrec.messages import Applied, Currents, Event, Frame
 from flowrec.pipeline import Inputs
 from flowrec.record import Recorded, record
+from flowrec.rigs.arrival import Arrivals
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.store import SessionReader
 from tests.conftest import SMALL
@@ -60,6 +61,18 @@ def empty(now: Inputs, _before: Inputs) -> Inputs:
     assert now.frame is not None
     noise = np.random.default_rng(now.frame.index).integers(0, 4, now.frame.image.shape, dtype=np.uint8)
     return replace(now, frame=replace(now.frame, image=noise))
+
+
+def test_an_image_with_one_pixel_changed_is_a_new_one() -> None:
+    arrivals = Arrivals((64, 48))
+    image = np.full((64, 48), 9, np.uint8)
+    changed = image.copy()
+    changed[13, 5] += 1
+    since = []
+    for stamp, each in enumerate((image, image.copy(), changed, changed.copy())):
+        applied = Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+        since.append(arrivals.check(Inputs(stamp, Frame(stamp, stamp, each), applied)).applied.image_since_ns)
+    assert since == [0, 0, 2, 2]
 
 
 def wrong_image(image: np.ndarray) -> Fault:
@@ -110,6 +123,14 @@ def test_out_of_sight_the_robot_is_held_then_the_field_goes_off_and_an_alarm_nam
     assert max(amplitude for stamp, amplitude in log if stamp > AT_S + 1.4) == 0.0
     told = [(event.stamp_ns / 1e9 - AT_S, event.level, event.text) for event in alarms(tmp_path / "s.mcap")]
     held, off, lost = [each for each in told if cause in each[2]]
+    demands = [
+        tick.demand
+        for tick in SessionReader(tmp_path / "s.mcap").ticks(with_frames=False)
+        if tick.demand is not None and held[0] <= tick.stamp_ns / 1e9 - AT_S < off[0]
+    ]
+    assert len(demands) > 20
+    assert len({demand.progress_s for demand in demands}) == 1  # the route is not followed any more
+    assert len({tuple(demand.reference_um) for demand in demands}) == 1
     assert 0.45 < held[0] < 0.55 and held[1] == "warning" and "held" in held[2]
     assert 1.35 < off[0] < 1.45 and off[1] == "error" and "field off" in off[2]
     assert done.report.outcome == "lost" and cause in done.report.note and "mission: lost" in lost[2]
