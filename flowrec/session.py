@@ -53,6 +53,7 @@ def session_writer(
         files = files_of(parent)
         named = {"file": parent.name, "sha256": session_sha256(files)}
         header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
+    header = replace(header, provenance={**header.provenance, **_durability(config, live=live)})
     return SessionWriter(
         path,
         header,
@@ -67,6 +68,14 @@ def session_writer(
         leave_out=config.recording.leave_out,
         inputs=(*inputs, *(files_behind(parent) if parent is not None else ())),
     )
+
+
+def _durability(config: Config, *, live: bool) -> dict[str, str]:
+    """How much of a run a kill takes at most, in s of stamps; of a ring, from its event on."""
+    camera, flush_s = config.camera, config.recording.flush_s
+    pixels_s = camera.width_px * camera.height_px * (camera.rate_hz or 0.0)
+    waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only where the disk is too slow
+    return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
 
 
 def _start_unix_ns(file: Path) -> int:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.store_kills import kills
+from flowrec.bench.store_kills import show as show_kills
 from flowrec.bench.store_loop import soak, stall
 from flowrec.bench.store_region import regions
 from flowrec.bench.store_splits import show_splits, splits
@@ -35,8 +36,9 @@ def measure(
     """Throughput of each writer, stall of the control step, read, seek and recovery times.
 
     `folder` is where the disk is measured and the stall is; by default that for temporary files. With `minutes`
-    nothing but memory is measured, for so long; with `killed` nothing but what so many kills cost. With `split_s` the
-    killed runs go on in another file after so many seconds; alone, what that does to the control loop is measured.
+    nothing but memory is measured, for so long; with `killed` nothing but what so many kills of each kind cost. With
+    `split_s` the killed runs in parts go on in another file after so many seconds; alone, what that does to the control
+    loop is measured.
     """
     if minutes:
         return {"soak": soak(minutes, folder, keeping=False), "soak_ring": soak(minutes, folder, keeping=True)}
@@ -155,13 +157,7 @@ def show(figures: dict[str, Any]) -> None:
         show_splits(figures["splits"])
         return
     if "kills" in figures:
-        found = figures["kills"]
-        rows = [
-            (name.replace("_", " "), str(found[name]))
-            for name in ("kills", "files", "before_the_first_flush", "broken")
-        ]
-        rows += [(f"lost, {name}, s", f"{value:.3f}") for name, value in found["lost_s"].items()]
-        table("kill -9 of a recording, 640x512 at 100 Hz", ("", ""), rows)
+        show_kills(figures["kills"])
         return
     for load in figures["throughput"]:
         best = load["rows"][load["rival"]]["messages_s"]

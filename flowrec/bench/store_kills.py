@@ -1,13 +1,16 @@
-"""kill -9 at random moments of a live recording, and what `recover` makes of the rest."""
+"""kill -9 at random moments of a recording, and what `recover` makes of the rest."""
 
 from __future__ import annotations
 
+import mmap
 import os
 import random
 import signal
+import struct
 import tempfile
 import time
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,104 +18,204 @@ import numpy as np
 
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.errors import SessionError
-from flowrec.messages import Image
-from flowrec.status import progress
-from flowrec.store import SessionReader, SessionWriter, Split, recover
+from flowrec.messages import Image, OperatorEvent, Tick
+from flowrec.status import progress, table
+from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
 from flowrec.store.names import PARTIAL_SUFFIX, pieces
+from flowrec.units import seconds
 
-_RATE_HZ = 100.0
 _SHORTEST_S, _LONGEST_S = 0.1, 2.5
+_PART_S = 0.4
+_FLUSH_S = 0.5
+_HANDED = struct.Struct("<QQ")  # stamp of the last tick that was handed over, ns, and how many were
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One way to record, and what README states to be lost at most, in s of stamps: of the state, and of the images."""
+
+    name: str
+    width: int = 640
+    height: int = 512
+    rate_hz: float = 100.0
+    frames: str = "delta"
+    realtime: bool = True
+    pieces: Split | Snapshot | None = None
+    mark_every: int = 0  # ticks
+    state_s: float = _FLUSH_S
+    images_s: float = _FLUSH_S
+
+
+@dataclass(slots=True)
+class _Found:
+    """What the kills of one kind have cost."""
+
+    kills: int = 0
+    files: int = 0
+    before_the_first_flush: int = 0
+    faults: list[str] = field(default_factory=list)
+    state_s: list[float] = field(default_factory=list)
+    images_s: list[float] = field(default_factory=list)
+
+
+def _kinds(split_s: float) -> tuple[Kind, ...]:
+    return (
+        Kind("real time"),
+        Kind("faster than real time", realtime=False, rate_hz=60.0),
+        # Images wait for a slow disk for up to 2 s, as with `recording.queue_mb` left alone.
+        Kind("2448x2048 at 20 Hz", 2448, 2048, 20.0, "zstd", images_s=2.0 + _FLUSH_S),
+        Kind(f"parts of {split_s:g} s", pieces=Split(seconds=split_s)),
+        Kind("ring, from a mark on", pieces=Snapshot(2.0, 60.0), mark_every=10**6),
+    )
 
 
 def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[str, Any]:
-    """Seconds of the recording that are lost per kill, by the monotonic clock that its stamps are of.
+    """What is lost per kill, in s of stamps, between the last tick handed over and the last one recovered.
 
-    Every recovered session is read from end to end and recovered once more, which must change nothing. Runs that
-    were killed before the first flush may have nothing to be saved; their whole length is the loss. With `split_s` they
-    go on in another file after so many seconds: the finished ones must be whole, and no tick may be missing between.
+    `count` kills of each kind. Every recovered session is read from end to end and recovered once more, which must
+    change nothing. Runs that were killed before the first flush may have nothing to be saved; their length is no loss
+    of more than that. In parts, the finished ones must be whole, and no tick may be missing between.
     """
-    images = pictures(640, 512, 4)
+    kinds = _kinds(split_s or _PART_S)
     moments = random.Random(0)  # noqa: S311  moments, not secrets
-    lost_s: list[float] = []
-    faults: list[str] = []
-    too_short = parts = 0
-    with tempfile.TemporaryDirectory(dir=folder) as name, progress("killing", count) as done:
-        for number in range(count):
-            path = Path(name) / f"{number}.mcap"
-            child = os.fork()
-            if child == 0:
-                try:
-                    _record(path, images, split_s)
-                finally:
-                    os._exit(1)
-            while not pieces(path):
-                time.sleep(0.001)
-            time.sleep(moments.uniform(_SHORTEST_S, _LONGEST_S))
-            killed_ns = time.monotonic_ns()
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            left = pieces(path)
-            parts += len(left)
-            stamps_ns: list[int] = []
-            numbers: list[int] = []
-            for piece in left:
-                try:
-                    saved = piece
-                    if piece.name.endswith(PARTIAL_SUFFIX):
-                        saved = recover(piece).path
-                    with SessionReader(saved) as reader:
-                        part = reader.header.part
-                        begin_ns = part.carried_ns if part is not None and part.carried_ns is not None else -1
-                        for tick in reader.ticks():
-                            if tick.stamp_ns > begin_ns and tick.track is not None:
-                                stamps_ns.append(tick.stamp_ns)
-                                numbers.append(round(2 * float(tick.track.position_um[0])))
-                    if recover(saved).changed:
-                        faults.append(f"{saved.name}: recovery changes what was recovered")
-                except SessionError as error:
-                    # A part that has only begun, maybe without its head, is none yet; the run is what came before.
-                    begun = "nothing can be saved" in str(error) or "nothing was recorded" in str(error)
-                    if not begun or piece != left[-1]:
-                        faults.append(str(error))
-            if numbers != list(range(len(numbers))):
-                hole = next(place for place, number in enumerate(numbers) if place != number)
-                faults.append(f"tick {hole} is missing of a run in {len(left)} files")
-            if stamps_ns:
-                lost_s.append((killed_ns - stamps_ns[-1]) / 1e9)
-            too_short += not stamps_ns
-            for piece in pieces(path):
-                piece.unlink()
-            done(number + 1)
+    rows = {}
+    with tempfile.TemporaryDirectory(dir=folder) as name, progress("killing", count * len(kinds)) as done:
+        for place, kind in enumerate(kinds):
+            images = pictures(kind.width, kind.height, 4)
+            found = _Found()
+            for number in range(count):
+                _kill(kind, images, Path(name) / f"{number}.mcap", moments.uniform(_SHORTEST_S, _LONGEST_S), found)
+                done(place * count + number + 1)
+            rows[kind.name] = _row(kind, found)
     return {
-        "kills": count,
-        "before_the_first_flush": too_short,
-        "files": parts,
-        "broken": len(faults),
-        "faults": faults,
-        "lost_s": {
-            "median": float(np.median(lost_s)) if lost_s else float("nan"),
-            "p99": float(np.percentile(lost_s, 99)) if lost_s else float("nan"),
-            "max": max(lost_s, default=float("nan")),
-        },
-        "lost_s_each": lost_s,
+        "kills": count * len(kinds),
+        "broken": sum(len(row["faults"]) for row in rows.values()),
+        "kinds": rows,
     }
 
 
-def _record(path: Path, images: list[Image], split_s: float) -> None:
-    """Record in real time until somebody ends it; stamps are the monotonic clock's."""
-    with SessionWriter(path, made_up_header(), frames="delta", pieces=Split(seconds=split_s or None)) as writer:
-        for tick in ticks_of(images, 10**6, _RATE_HZ):
-            now = time.monotonic_ns()
-            assert tick.frame is not None
-            assert tick.applied is not None
-            assert tick.track is not None
-            writer.write(
-                replace(
-                    tick,
-                    stamp_ns=now,
-                    frame=replace(tick.frame, stamp_ns=now),
-                    applied=replace(tick.applied, stamp_ns=now),
-                    track=replace(tick.track, stamp_ns=now),
-                )
+def show(found: dict[str, Any]) -> None:
+    """The figures for people."""
+
+    def worst(row: dict[str, Any], what: str) -> str:
+        lost = row[f"{what}_lost_s"]
+        return f"{lost['median']:.2f}, {lost['max']:.2f} / {row[f'{what}_stated_s']:g}"
+
+    table(
+        "kill -9, lost in s of stamps: median, worst / stated",
+        ("", "kills", "files", "before the first flush", "broken", "state", "images"),
+        [
+            (
+                name,
+                *(str(row[key]) for key in ("kills", "files", "before_the_first_flush")),
+                str(len(row["faults"])),
+                worst(row, "state"),
+                worst(row, "images"),
             )
-            time.sleep(1.0 / _RATE_HZ)
+            for name, row in found["kinds"].items()
+        ],
+    )
+
+
+def _kill(kind: Kind, images: list[Image], path: Path, after_s: float, found: _Found) -> None:
+    with mmap.mmap(-1, _HANDED.size) as handed:
+        child = os.fork()
+        if child == 0:
+            try:
+                _record(kind, path, images, handed)
+            finally:
+                os._exit(1)
+        while not _HANDED.unpack_from(handed)[1]:
+            time.sleep(0.001)
+        time.sleep(after_s)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        handed_ns, _ = _HANDED.unpack_from(handed)
+    found.kills += 1
+    left = pieces(path)
+    found.files += len(left)
+    state: list[tuple[int, int]] = []  # number of the tick and its stamp
+    frame_ns = 0
+    for piece in left:
+        try:
+            saved = recover(piece).path if piece.name.endswith(PARTIAL_SUFFIX) else piece
+            with SessionReader(saved) as reader:
+                for tick in _own_ticks(reader):
+                    if tick.applied is not None and tick.applied.stamp_ns == tick.stamp_ns and tick.track is not None:
+                        state.append((round(2 * float(tick.track.position_um[0])), tick.stamp_ns))
+                    if tick.frame is not None:
+                        frame_ns = max(frame_ns, tick.frame.stamp_ns)
+            if recover(saved).changed:
+                found.faults.append(f"{saved.name}: recovery changes what was recovered")
+        except SessionError as error:
+            # A part that has only begun, maybe without its head, is none yet; the run is what came before.
+            begun = "nothing can be saved" in str(error) or "nothing was recorded" in str(error)
+            if not begun or piece != left[-1]:
+                found.faults.append(str(error))
+    numbers = [number for number, _ in state]
+    if numbers != list(range(len(numbers))):
+        found.faults.append(f"a tick is missing of a run in {len(left)} files")
+    if state:  # else the whole run, which was short
+        found.state_s.append(seconds(handed_ns - state[-1][1]))
+        found.images_s.append(seconds(handed_ns - frame_ns))
+        if found.state_s[-1] > kind.state_s or found.images_s[-1] > kind.images_s:
+            found.faults.append(f"more than stated is lost: {found.state_s[-1]:.2f} s, {found.images_s[-1]:.2f} s")
+    found.before_the_first_flush += not state
+    for piece in pieces(path):
+        piece.unlink()
+
+
+def _own_ticks(reader: SessionReader) -> Iterator[Tick]:
+    """Without the one that a piece repeats of what was before it."""
+    begin_ns = -1 if reader.carried_ns is None else reader.carried_ns
+    return (tick for tick in reader.ticks() if tick.stamp_ns > begin_ns)
+
+
+def _row(kind: Kind, found: _Found) -> dict[str, Any]:
+    return {
+        "kills": found.kills,
+        "files": found.files,
+        "before_the_first_flush": found.before_the_first_flush,
+        "faults": found.faults,
+        **{f"{what}_stated_s": getattr(kind, f"{what}_s") for what in ("state", "images")},
+        **{f"{what}_lost_s": _spread(getattr(found, f"{what}_s")) for what in ("state", "images")},
+    }
+
+
+def _spread(lost_s: list[float]) -> dict[str, float]:
+    if not lost_s:
+        return dict.fromkeys(("median", "p99", "max"), float("nan"))
+    return {
+        "median": float(np.median(lost_s)),
+        "p99": float(np.percentile(lost_s, 99)),
+        "max": max(lost_s),
+    }
+
+
+def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> None:
+    """Record until somebody ends it. In real time, stamps are those of the monotonic clock."""
+    with SessionWriter(
+        path, made_up_header(), frames=kind.frames, flush_s=_FLUSH_S, block=not kind.realtime, pieces=kind.pieces
+    ) as writer:
+        for number, made in enumerate(ticks_of(images, 10**6, kind.rate_hz)):
+            tick = _at(made, time.monotonic_ns()) if kind.realtime else made
+            if kind.mark_every and number % kind.mark_every == 0:
+                tick = replace(tick, operator=OperatorEvent(tick.stamp_ns, "mark", ""))
+            writer.write(tick)
+            _HANDED.pack_into(handed, 0, tick.stamp_ns, number + 1)
+            if kind.realtime:
+                time.sleep(1.0 / kind.rate_hz)
+
+
+def _at(tick: Tick, now_ns: int) -> Tick:
+    """The tick as if it were now."""
+    assert tick.frame is not None
+    assert tick.applied is not None
+    assert tick.track is not None
+    return replace(
+        tick,
+        stamp_ns=now_ns,
+        frame=replace(tick.frame, stamp_ns=now_ns),
+        applied=replace(tick.applied, stamp_ns=now_ns),
+        track=replace(tick.track, stamp_ns=now_ns),
+    )

@@ -146,7 +146,7 @@ def bench_store(
     overwrite: Overwrite = False,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
     minutes: Annotated[float, typer.Option(min=0.0, help="Only watch memory while recording for so long.")] = 0.0,
-    kills: Annotated[int, typer.Option(min=0, help="Only kill so many recordings and recover them.")] = 0,
+    kills: Annotated[int, typer.Option(min=0, help="Only kill so many recordings of each kind and recover them.")] = 0,
     split: Annotated[
         float, typer.Option(min=0.0, metavar="S", help="Only split runs after so long: what it does to the loop.")
     ] = 0.0,

@@ -210,7 +210,9 @@ def test_every_message_index_of_the_file_points_at_its_messages(path):
 def test_a_session_is_dated_by_the_day_on_which_it_was_recorded(session):
     found, statistics = seen_by_others(session)
     with SessionReader(session) as reader:
-        began_ns, last_ns = int(reader.header.provenance["wall_ns"]), reader.last_ns
+        said, last_ns = reader.header.provenance, reader.last_ns
+    began_ns = int(said["wall_ns"])
+    assert said["durability_state_s"] == said["durability_images_s"] == "0.5"  # it waited for its disk
     assert statistics.message_start_time >= began_ns and statistics.message_end_time == began_ns + last_ns
     assert all(time >= began_ns for messages in found.values() for time, _, _ in messages)
 
