@@ -8,8 +8,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -18,10 +19,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
-from flowrec.messages import Tick
-from flowrec.store import SessionReader, SessionWriter, Split, recover
+from flowrec.messages import OperatorEvent, Tick
+from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
 from flowrec.store.layout import SLOTS
 from flowrec.store.mcap_file import McapFile
+from flowrec.store.mirrors import Mirrors
 from flowrec.store.names import part_path, pieces
 from flowrec.store.scan import scan
 from flowrec.store.source import Source
@@ -247,6 +249,20 @@ def test_a_kill_at_or_about_a_split_leaves_whole_parts_and_a_last_one_to_be_save
     assert stamps == [tick.stamp_ns for tick in ticks_of(len(stamps), shape=(8, 8))]
     # Not in the file are what is younger than 0.05 s and what waits for the beginning of the last part.
     assert len(stamps) > moment - (0.05 + 0.1) * NS_PER_S / PERIOD_NS
+
+
+@pytest.mark.parametrize("split", [Split(seconds=0.3), Snapshot(0.3, 0.3)])
+def test_what_makes_views_is_used_by_one_thread(tmp_path, monkeypatch, split):
+    used, make = {}, Mirrors.of
+
+    def noted(mirrors, news):
+        used.setdefault(id(mirrors), (mirrors, set()))[1].add(threading.get_ident())
+        return make(mirrors, news)
+
+    monkeypatch.setattr(Mirrors, "of", noted)
+    marked = replace(TICKS[60], operator=OperatorEvent(TICKS[60].stamp_ns, "mark", ""))
+    record(tmp_path / "x.mcap", split, ticks=[*TICKS[:60], marked, *TICKS[61:]], block=True)
+    assert len(used) > 1 and all(len(threads) == 1 for _, threads in used.values())
 
 
 def copy_as_it_is(folder, to):
