@@ -70,15 +70,20 @@ class Ended:
     end_s: float
     status: int
     stderr: str
+    ends: tuple[str, ...] = ("apply", "zero")
 
     @property
     def off_s(self) -> float | None:
-        """From when on the driver had no field, None: it had one to the end. Only what follows the cause counts."""
+        """From when on the driver had no field, None: it had one to the end. Only what follows the cause counts.
+
+        `ends` are the events that take the field away. An amplifier whose zero() fails does not obey a command of zero
+        either, so there only a zero() that has returned counts.
+        """
         off_s: float | None = None
         for at_s, _thread, event, amplitude_mt in self.log:
             if event == "apply" and amplitude_mt > 0.0:
                 off_s = None
-            elif at_s >= self.cause_s and event in ("apply", "zero") and off_s is None:
+            elif at_s >= self.cause_s and event in self.ends and off_s is None:
                 off_s = at_s
         return off_s
 
@@ -132,7 +137,9 @@ def stop(kind: Kind, folder: Path, *sets: str) -> Ended:
     lines = _lines(log)
     if waited and (by_itself or kind.timer_s == _HANG_S):
         cause_s = next(at_s for at_s, _, event, _ in lines if event == "cause")
-    return Ended(path, lines, cause_s, end_s, process.returncode, (folder / "stderr").read_text(errors="replace"))
+    stderr = (folder / "stderr").read_text(errors="replace")
+    ends = ("zero",) if kind.fault.startswith("zero-") else ("apply", "zero")
+    return Ended(path, lines, cause_s, end_s, process.returncode, stderr, ends)
 
 
 def _lines(log: Path) -> list[tuple[float, str, str, float]]:
