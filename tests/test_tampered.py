@@ -146,6 +146,13 @@ def test_a_message_that_was_taken_out_is_missed_by_number(small: Path, tmp_path:
     ]
 
 
+def test_a_digest_that_was_taken_out_is_missed(small: Path, tmp_path: Path) -> None:
+    rewrite(small, tmp_path / "edited.mcap", keep_digest=False)
+    assert digest_findings(tmp_path / "edited.mcap") == [
+        "the digest that was recorded is missing: edited or damaged after the recording"
+    ]
+
+
 def test_what_another_program_adds_is_no_edit(small: Path, tmp_path: Path) -> None:
     rewrite(small, tmp_path / "more.mcap", notes={"who": "the lab's own program"})
     assert digest_findings(tmp_path / "more.mcap") == []

@@ -86,13 +86,14 @@ class Digests:
             self.sums[record.channel] = added(self.sums[record.channel], digest)
 
     def faults(self, head: Head) -> list[str] | None:
-        """What differs from the digest in the file, for people, without advice; None where there is none in it.
+        """What differs from the digest in a finished file, for people, without advice; None: written without a digest.
 
         Topics and records that flowrec has not written are passed over.
         """
         said = head.digest
         if said is None:
-            return None
+            # Files of the first release have neither a digest nor a start.
+            return ["the digest that was recorded is missing"] if self.start_unix_ns and head.outcome else None
         found: dict[str, tuple[int, int]] = {}
         for number, channel in head.channels.items():
             count, total = found.get(channel.topic, (0, 0))
