@@ -15,6 +15,7 @@ from flowrec.compare import compare_sessions
 from flowrec.errors import SessionError
 from flowrec.locks import is_growing
 from flowrec.replay import Change
+from flowrec.rigs.recorded import RecordedRig
 from flowrec.store import SessionReader, SessionWriter, recover
 from flowrec.store.layout import SLOTS
 from flowrec.store.recorder import Recorder
@@ -113,6 +114,17 @@ def test_images_ahead_of_the_rest_are_kept_without_it(small, tmp_path):
     assert all(mine.frame.same_as(theirs.frame) for mine, theirs in zip(ticks, TICKS[:18], strict=True))
     assert [tick.applied.stamp_ns for tick in ticks[14:]] == [TICKS[14].stamp_ns] * 4
     assert SessionReader(done.path).outcome["ticks"] == "15" and not recover(done.path).changed
+
+
+def test_a_replay_takes_no_image_of_a_tick_that_it_passes_over_for_one_of_the_next(tmp_path):
+    whole, alone, blind = TICKS[:3]
+    with SessionWriter(tmp_path / "s.mcap", HEADER, block=True) as writer:
+        writer.write(whole)
+        writer.write(replace(whole, stamp_ns=alone.stamp_ns, frame=alone.frame))
+        writer.write(replace(blind, frame=alone.frame))
+    inputs = list(RecordedRig(SessionReader(tmp_path / "s.mcap")).inputs())
+    assert [each.stamp_ns for each in inputs] == [whole.stamp_ns, blind.stamp_ns]
+    assert inputs[1].frame is None and inputs[1].track.same_as(blind.track)
 
 
 def test_topics_that_an_older_file_never_had_are_not_lost(tmp_path):
