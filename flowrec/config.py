@@ -23,14 +23,14 @@ from flowrec.chip import ChipSettings, check_point, median_width_um
 from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
 from flowrec.chip.files import CHIP_KEYS
-from flowrec.chip.places import opening_point_um
+from flowrec.chip.places import named_opening, opening_point_um
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import Commander
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
-from flowrec.planning.space import Swift
+from flowrec.planning.space import Swift, swept_out, too_swift
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
 from flowrec.robot import USUAL_DELAY_S, Robot
@@ -119,6 +119,7 @@ class Config:
 _ADAPTER = TypeAdapter(Config)
 SIMULATED = "simulated"
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
+_OUTLET_START_RADII = (5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +238,7 @@ def resolve(config: Config, chip: Chip) -> Config:
     mission = config.mission
     mission = replace(
         mission,
-        start=_point(chip, mission.start, "start", robot),
+        start=_start(resolved, chip),
         goal=_point(chip, mission.goal, "goal", robot),
     )
     _refuse_apart(chip, mission)
@@ -286,6 +287,27 @@ def calibration_of(config: Config, chip: Chip) -> Calibration:
     x = width_um / 2 - half - camera.um_per_px * (camera.width_px - 1) / 2
     y = height_um / 2 - half - camera.um_per_px * (camera.height_px - 1) / 2
     return Calibration(camera.um_per_px, (x, y))
+
+
+def _start(config: Config, chip: Chip) -> tuple[float, float]:
+    """The start; that called `outlet` is the nearest to the opening at which the robot can be held.
+
+    Five radii inside, as elsewhere, or farther where the assumed flow carries the robot out before the coils are up. No
+    such place: the first one, which is refused with the reason before anything is driven.
+    """
+    place, robot = config.mission.start, config.robot
+    if not isinstance(place, str) or named_opening(chip, place).kind != "outlet":
+        return _point(chip, place, "start", robot)
+    field, drift = config.flow.solve(chip), config.plan.swift.drift(robot, robot.speed_limit_um_s)
+    points = [opening_point_um(chip, place, radii * robot.radius) for radii in _OUTLET_START_RADII]
+    for point in points:
+        start_um = np.array(point)
+        if not (
+            swept_out(chip, field, start_um, drift, config.coils.ramp_s)
+            or too_swift(chip, field, start_um, start_um, robot.radius, drift)
+        ):
+            return point
+    return points[0]
 
 
 def _point(chip: Chip, place: tuple[float, float] | str, what: str, robot: Robot) -> tuple[float, float]:

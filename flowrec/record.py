@@ -17,20 +17,18 @@ import numpy as np
 from flowrec.attend import Unattended
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
-from flowrec.chip.places import distance_um
 from flowrec.clocks import ClockWatch
 from flowrec.config import Config, derived, resolve
 from flowrec.disk import DiskWatch, refuse_below
 from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.figures import Figures, as_text, finite, rows_for_people
-from flowrec.flow import sample
 from flowrec.flow.metrics import relative_rmse
 from flowrec.guard import Guard
 from flowrec.leftovers import look_after
 from flowrec.messages import Demand, FlowField, Tick
 from flowrec.output import MCAP, RRD, check_output
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.planning.space import no_room, too_swift
+from flowrec.planning.space import no_room, swept_out, too_swift
 from flowrec.priority import first_of_all
 from flowrec.rigs.simulated import SimulatedRig
 from flowrec.run import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
@@ -152,8 +150,7 @@ def refuse_adrift(config: Config, chip: Chip) -> None:
     """
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
-    limit_um_s = robot.speed_limit_um_s
-    drift = config.plan.swift.drift(robot, limit_um_s)
+    drift = config.plan.swift.drift(robot, robot.speed_limit_um_s)
     reason = too_swift(chip, field, start, start, robot.radius, drift)
     if reason:
         raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
@@ -162,15 +159,9 @@ def refuse_adrift(config: Config, chip: Chip) -> None:
         reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius, drift)
         if reason:
             raise UnreachableError(f"unreachable: {reason}")
-    flow_um_s = float(np.hypot(*sample(field, start)))
-    swept_um = flow_um_s * (drift.blind_s + 0.5 * config.coils.ramp_s * min(flow_um_s / limit_um_s, 1.0))
-    for opening in chip.openings:
-        if opening.kind == "outlet" and distance_um(chip, opening, start) < swept_um + robot.radius:
-            raise UnreachableError(
-                f"unreachable: the start {start[0]:.0f},{start[1]:.0f} um is too near the outlet {opening.side} "
-                f"{opening.first}-{opening.last}: a flow of {flow_um_s:.0f} um/s carries the robot {swept_um:.0f} um "
-                "before the coils are up; start farther in, or shorten coils.ramp_s"
-            )
+    reason = swept_out(chip, field, start, drift, config.coils.ramp_s)
+    if reason:
+        raise UnreachableError(f"unreachable: {reason}")
 
 
 def default_path(config: Config, folder: Path | None = None) -> Path:

@@ -15,8 +15,8 @@ import flowrec
 from flowrec.chip import load_chip
 from flowrec.cli import main
 from flowrec.config import Config, config_from_toml, load_config, resolve, to_toml, with_sets
-from flowrec.errors import FlowrecError, UsageError
-from flowrec.record import Recorded
+from flowrec.errors import FlowrecError, UnreachableError, UsageError
+from flowrec.record import Recorded, prepare
 from flowrec.store import SessionReader
 
 
@@ -168,3 +168,16 @@ def test_what_was_derived_is_said_and_kept_in_the_file(
     said = next(line for line in capsys.readouterr().err.splitlines() if line.startswith("derived"))
     assert "robot.max_speed_um_s = 600" in said
     assert "robot.radius_um" not in said
+
+
+def test_a_start_called_outlet_is_where_the_robot_can_be_held_while_the_field_comes_up():
+    def start_of(*sets):
+        config, chip, _ = prepare(load_config(None, ["mission.start=outlet", "mission.goal=inlet", *sets]))
+        end_um = (chip.mask.shape[1] - 0.5) * chip.um_per_px
+        return (end_um - config.mission.start[0]) / config.robot.radius
+
+    slow, swift = start_of("chip.name=straight"), start_of("chip.name=straight", "chip.inlet_speed_um_s=3000")
+    assert slow < 6.0 < swift
+    # No place would do: it is refused as before.
+    with pytest.raises(UnreachableError, match="too near the outlet"):
+        start_of("chip.name=straight", "chip.inlet_speed_um_s=3000", "coils.ramp_s=5")

@@ -12,7 +12,9 @@ from scipy.ndimage import distance_transform_edt, label
 
 from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
+from flowrec.chip.places import distance_um
 from flowrec.errors import FlowError, UsageError
+from flowrec.flow import sample
 from flowrec.messages import FlowField
 from flowrec.planning.zermelo import bilinear, line_is_clear
 from flowrec.ranges import Range
@@ -227,6 +229,25 @@ def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, r
         f"before that is put right, and the walls leave {wide.clearance[row, column] * px - radius_um:.0f} um; less "
         "latency (robot.delay_s), more frames (camera.rate_hz) or a slower flow would do"
     )
+
+
+def swept_out(chip: Chip, field: FlowField, start_um: Points, drift: Drift, ramp_s: float) -> str:
+    """Why a robot at the start leaves through an outlet before the coils are up, '' when it does not.
+
+    The speed that the coils can drive grows to `drift.speed_um_s` in `ramp_s`, and until the blind time is over nothing
+    is driven.
+    """
+    x, y = np.asarray(start_um, np.float64)
+    flow_um_s = float(np.hypot(*sample(field, (x, y))))
+    swept_um = flow_um_s * (drift.blind_s + 0.5 * ramp_s * min(flow_um_s / drift.speed_um_s, 1.0))
+    for opening in chip.openings:
+        if opening.kind == "outlet" and distance_um(chip, opening, (x, y)) < swept_um + drift.radius_um:
+            return (
+                f"the start {x:.0f},{y:.0f} um is too near the outlet {opening.side} {opening.first}-{opening.last}: "
+                f"a flow of {flow_um_s:.0f} um/s carries the robot {swept_um:.0f} um before the coils are up; start "
+                "farther in, or shorten coils.ramp_s"
+            )
+    return ""
 
 
 def no_room(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, robot: Robot) -> str:
