@@ -21,10 +21,12 @@ from flowrec.store.layout import SLOTS
 from flowrec.store.recorder import Recorder
 from flowrec.store.scan import scan
 from flowrec.store.source import Source
+from flowrec.topics import TOPICS, Role
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_trouble import KILLED, names_in
 
 TICKS = list(ticks_of(40, shape=(8, 8)))
+OUTPUTS = [topic.field for topic in TOPICS if topic.role is Role.OUTPUT]
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +116,24 @@ def test_images_ahead_of_the_rest_are_kept_without_it(small, tmp_path):
     assert all(mine.frame.same_as(theirs.frame) for mine, theirs in zip(ticks, TICKS[:18], strict=True))
     assert [tick.applied.stamp_ns for tick in ticks[14:]] == [TICKS[14].stamp_ns] * 4
     assert SessionReader(done.path).outcome["ticks"] == "15" and not recover(done.path).changed
+
+
+def test_a_last_tick_of_inputs_alone_is_not_taken_for_a_whole_one(tmp_path):
+    # What a stage that failed leaves; then the file was cut before its end.
+    last = replace(TICKS[5], **{name: getattr(TICKS[4], name) for name in OUTPUTS})
+    path = tmp_path / "s.mcap"
+    with SessionWriter(path, HEADER, frames="raw") as writer:
+        for tick in (*TICKS[:5], last):
+            writer.write(tick)
+        writer.close({"outcome": "failed"})
+    footer_bytes = 9 + 20 + 8  # with the magic after it
+    done = recover(cut(path, path.stat().st_size - footer_bytes, tmp_path / "t.mcap.partial"))
+    ticks = list(SessionReader(done.path).ticks())
+    assert done.ticks == 5
+    # They are kept, and said not to be a whole tick.
+    assert ticks[-1].applied.stamp_ns == ticks[-1].frame.stamp_ns == TICKS[5].stamp_ns
+    until_s = (TICKS[4].stamp_ns - TICKS[0].stamp_ns) / 1e9
+    assert f"recovered up to {until_s:.2f} s" in SessionReader(done.path).outcome["note"]
 
 
 def test_a_replay_takes_no_image_of_a_tick_that_it_passes_over_for_one_of_the_next(tmp_path):
