@@ -18,6 +18,16 @@ _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns
 _LONGEST = 25  # characters of a number in a file: more is none of ours
 _OLD_SHARE = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
+# Where the key alone would be misread.
+_NAMES = {
+    "wall_s": "computed in",
+    "contacts": "wall contacts",
+    "planned_s": "planned time",
+    "navigation_s": "navigation time",
+    "observations": "flow observations",
+    "assumed_method": "assumed flow",
+    "refined_method": "refined flow",
+}
 
 
 def as_text(figures: Mapping[str, Value]) -> dict[str, str]:
@@ -51,6 +61,8 @@ def comparison_for_people(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
 
 def name_of(key: str) -> str:
     """A key without its unit, in words."""
+    if key in _NAMES:
+        return _NAMES[key]
     unit = next((unit for unit in _UNITS if key.endswith(unit) and unit != "_error"), "")
     return key.removesuffix(unit).replace("_", " ")
 
