@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -39,9 +40,10 @@ def built(checkout: Path, kind: str, out: Path) -> dict[str, object]:
     subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", out], cwd=checkout, check=True)
     (file,) = out.iterdir()
     if kind == "sdist":
-        shutil.unpack_archive(file, out, filter="data")
-        found = next(out.glob("*/flowrec/_build.json"), None)
-        return json.loads(found.read_text()) if found is not None else {}
+        with tarfile.open(file) as archive:
+            found = [name for name in archive.getnames() if name.endswith("/flowrec/_build.json")]
+            content = archive.extractfile(found[0]) if found else None
+            return json.load(content) if content is not None else {}
     with zipfile.ZipFile(file) as wheel:
         inside = "flowrec/_build.json"
         return json.loads(wheel.read(inside)) if inside in wheel.namelist() else {}

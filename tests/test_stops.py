@@ -67,8 +67,11 @@ def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run
     name: str, says: str, tmp_path: Path
 ) -> None:
     done = ended(name, tmp_path, PATIENT)
-    zeroed = done.after_cause().index(("zero", 0.0))
-    assert all(amplitude_mt == 0.0 for event, amplitude_mt in done.after_cause()[zeroed:] if event == "apply")
+    told = done.after_cause()
+    late = [one for one in told[told.index(("zero", 0.0)) :] if one[0] == "apply" and one[1] > 0.0]
+    # A command that was under way at that moment is followed by another zero().
+    assert len(late) <= 1
+    assert [event for event, amplitude_mt in told if event == "zero" or amplitude_mt > 0.0][-1] == "zero"
     assert done.status == 0, done.stderr
     assert outcome(done)[0] == "stopped"
     actions = events(done)

@@ -1,6 +1,7 @@
 """Every way in which a frame may travel: the same bytes come back, other programs read it, nothing explodes."""
 
 import contextlib
+import os
 import shutil
 import struct
 import subprocess
@@ -100,7 +101,8 @@ def test_other_programs_see_an_ordinary_image_file(name, kind, tmp_path):
     rerun = Path(sys.executable).with_name("rerun")
     if name == "delta" and (rerun.exists() or shutil.which("rerun")):
         convert = [rerun if rerun.exists() else "rerun", "mcap", "convert", path, "-o", tmp_path / "s.rrd"]
-        done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=60)
+        home = os.environ | {"HOME": str(tmp_path)}  # where Rerun notes that it was started
+        done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=60, env=home)
         assert done.returncode == 0 and "ERROR" not in done.stderr, done.stderr
 
 

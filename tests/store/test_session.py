@@ -1,12 +1,14 @@
 """Writer and reader together, and what other programs make of the file."""
 
 import itertools
+import os
 import shutil
 import struct
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -250,10 +252,11 @@ def test_rerun_accepts_the_bare_file(path, tmp_path):
     rerun = str(beside) if beside.exists() else shutil.which("rerun")
     if rerun is None:
         pytest.skip("the rerun command is not installed")
-    checked = subprocess.run([rerun, "mcap", "check", path], capture_output=True, text=True, check=False, timeout=60)
+    home = os.environ | {"HOME": str(tmp_path)}  # where Rerun notes that it was started
+    run = partial(subprocess.run, capture_output=True, text=True, check=False, timeout=60, env=home)
+    checked = run([rerun, "mcap", "check", path])
     assert checked.returncode == 0, checked.stdout + checked.stderr
-    convert = [rerun, "mcap", "convert", path, "-o", tmp_path / "s.rrd"]
-    done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=60)
+    done = run([rerun, "mcap", "convert", path, "-o", tmp_path / "s.rrd"])
     assert done.returncode == 0 and "ERROR" not in done.stderr, done.stderr
     assert all(topic in done.stderr for topic in ("/camera/frame", "/robot/estimate", "/view/robot_pose", "/view/path"))
 
