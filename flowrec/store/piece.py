@@ -57,7 +57,7 @@ class Making:
 
     @property
     def flush_every_s(self) -> float:
-        """Half of the time is left for a thread that gets the processor late and a disk that is slow to take the data."""
+        """Half of the time is left for a thread that gets the processor late, or a slow disk."""
         return 0.5 * min(self.flush_s, self.sync_every_s)
 
     def said(self, tally: Tally) -> dict[str, str]:
