@@ -212,4 +212,5 @@ def test_a_snapshot_that_is_being_taken_outlives_a_kill(tmp_path):
     with SessionReader(saved.path) as reader:
         assert "on the way" not in reader.outcome["note"]
         stamps = [tick.stamp_ns for tick in reader.ticks()]
-    assert QUIET[80].stamp_ns >= stamps[0] and stamps[-1] > QUIET[320].stamp_ns - 0.1 * NS_PER_S
+    # The flush of a tick may still be under way when it has left the queue: at most the flush before it is there.
+    assert QUIET[80].stamp_ns >= stamps[0] and stamps[-1] > QUIET[320].stamp_ns - 0.2 * NS_PER_S
