@@ -299,15 +299,15 @@ def _start(config: Config, chip: Chip) -> tuple[float, float]:
     if not isinstance(place, str) or named_opening(chip, place).kind != "outlet":
         return _point(chip, place, "start", robot)
     field, drift = config.flow.solve(chip), config.plan.swift.drift(robot, robot.speed_limit_um_s)
-    points = [opening_point_um(chip, place, radii * robot.radius) for radii in _OUTLET_START_RADII]
-    for point in points:
+    for radii in _OUTLET_START_RADII:
+        point = opening_point_um(chip, place, radii * robot.radius)
         start_um = np.array(point)
         if not (
             swept_out(chip, field, start_um, drift, config.coils.ramp_s)
             or too_swift(chip, field, start_um, start_um, robot.radius, drift)
         ):
             return point
-    return points[0]
+    return _point(chip, place, "start", robot)
 
 
 def _point(chip: Chip, place: tuple[float, float] | str, what: str, robot: Robot) -> tuple[float, float]:
