@@ -76,7 +76,7 @@ def record(
     as_json: AsJson = False,
 ) -> None:
     """Run a mission (survey, refine, plan, navigate) and record every stage of it."""
-    from flowrec.toml_file import read_toml
+    from flowrec.system.toml_file import read_toml
 
     if config is not None:
         read_toml(config)  # a file that is none is refused before the imports below, which take a second
@@ -92,10 +92,10 @@ def record(
     given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
     settings = [*(sets or []), *(f"{key}={value}" for key, (_, value) in given.items())]
     chosen = load_config(config, settings, {key: flag for key, (flag, _) in given.items()})
-    from flowrec.attend import AtTerminal
-    from flowrec.record import prepare, print_summary
-    from flowrec.record import record as run_record
-    from flowrec.terminal import said_within
+    from flowrec.commands.interactive import AtTerminal
+    from flowrec.commands.record import prepare, print_summary
+    from flowrec.commands.record import record as run_record
+    from flowrec.system.stderr import said_within
 
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
@@ -142,11 +142,11 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
-    from flowrec import replay as verb
-    from flowrec.attend import AtTerminal
-    from flowrec.figures import comparison_for_people
-    from flowrec.status import say, table
-    from flowrec.whatif import before_and_after, refinement_told
+    from flowrec.commands import replay as verb
+    from flowrec.commands.interactive import AtTerminal
+    from flowrec.commands.replay_report import before_and_after, refinement_told
+    from flowrec.summary import comparison_for_people
+    from flowrec.terminal import say, table
 
     change = verb.Change(refine, plan, observer, controller, tuple(sets or ()))
     if verify and refly:
@@ -165,7 +165,7 @@ def replay(
         raise typer.Exit(0 if same else 3)
     rows = before_and_after(done)
     if refly:
-        from flowrec.refly import refly as fly_both
+        from flowrec.commands.refly import refly as fly_both
 
         rows += fly_both(done, verb.refly_path(target) if target is not None else None, overwrite)
     if as_json:
@@ -189,7 +189,7 @@ def replay(
         for line in refinement_told(done):
             say(line)
     if view == "rrd" and target is not None:
-        from flowrec.export import write_rrd_of
+        from flowrec.commands.export import write_rrd_of
 
         write_rrd_of(target, overwrite=overwrite)
 
@@ -207,10 +207,10 @@ def view(
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session and open it in Rerun."""
-    from flowrec.export import write_rrd_of
-    from flowrec.output import PICTURE, check_output
+    from flowrec.commands.export import write_rrd_of
     from flowrec.session import files_behind
-    from flowrec.status import say
+    from flowrec.system.outputs import PICTURE, check_output
+    from flowrec.terminal import say
     from flowrec.view import open_viewer
     from flowrec.view import screenshot as take
 
@@ -239,7 +239,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session without opening it."""
-    from flowrec.export import write_rrd_of
+    from flowrec.commands.export import write_rrd_of
 
     rrd = write_rrd_of(session, out, overwrite)
     if as_json:
@@ -252,13 +252,13 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
-    from flowrec.listing import describe, facts_for_people
+    from flowrec.commands.info import describe, facts_for_people
 
     facts, topics = describe(session)
     if as_json:
         typer.echo(json.dumps({"session": str(session), "facts": facts, "topics": topics}))
         return
-    from flowrec.status import table
+    from flowrec.terminal import table
 
     table(session.name, ("", "value"), facts_for_people(facts))
     table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
@@ -272,13 +272,13 @@ def list_directory(
     """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
     from dataclasses import asdict
 
-    from flowrec.listing import list_sessions
+    from flowrec.commands.info import list_sessions
 
     rows = list_sessions(directory)
     if as_json:
         typer.echo(json.dumps([asdict(row) for row in rows]))
         return
-    from flowrec.status import say, table
+    from flowrec.terminal import say, table
 
     columns = ("name", "outcome", "duration", "size", "chip", "recorded")
     table(
@@ -307,9 +307,9 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
-    from flowrec.check import check as judge
-    from flowrec.check import files_to_check
-    from flowrec.status import progress
+    from flowrec.commands.check import check as judge
+    from flowrec.commands.check import files_to_check
+    from flowrec.terminal import progress
 
     nbytes = sum(file.stat().st_size for file in files_to_check(session) if file.is_file())
     try:
@@ -342,8 +342,8 @@ def recover(
     """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
     from dataclasses import asdict
 
-    from flowrec.status import say
     from flowrec.store import recover_run
+    from flowrec.terminal import say
 
     saved = recover_run(session, out)
     if as_json:
@@ -362,7 +362,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare two sessions, every message of every tick; exit status 3 where they differ."""
-    from flowrec.compare import compare_sessions
+    from flowrec.commands.compare import compare_sessions
     from flowrec.store import SessionReader
 
     comparison = compare_sessions(SessionReader(first), SessionReader(second))
@@ -391,7 +391,7 @@ def calibrate(
     as_json: AsJson = False,
 ) -> None:
     """Fit the coils' field per ampere and the bias to measured fields, and say how far they are to be trusted."""
-    from flowrec import calibrate as verb
+    from flowrec.commands import calibrate as verb
 
     fit = verb.calibrate(file, out, overwrite)
     if as_json:

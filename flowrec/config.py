@@ -20,22 +20,22 @@ from pydantic import TypeAdapter, ValidationError
 from scipy.ndimage import label
 
 from flowrec.chip import ChipSettings, check_point, median_width_um
-from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
-from flowrec.chip.files import CHIP_KEYS
+from flowrec.chip.io import CHIP_KEYS
 from flowrec.chip.places import named_opening, opening_point_um
+from flowrec.chip.registration import Calibration
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import Commander
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.planning import Planner, SurveyPlanner
-from flowrec.planning.space import Swift, swept_out, too_swift
+from flowrec.planning.free_space import Swift, swept_out, too_swift
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
+from flowrec.rig_settings import CameraSettings, Safety, Simulated
 from flowrec.robot import USUAL_DELAY_S, Robot
-from flowrec.settings import CameraSettings, Safety, Simulated
-from flowrec.toml_file import parse_toml, read_toml
+from flowrec.system.toml_file import parse_toml, read_toml
 from flowrec.vision import Tracker
 
 

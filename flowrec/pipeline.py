@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip import clearance_um
-from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.chip.registration import Calibration
 from flowrec.clocks import Fit
 from flowrec.config import Config, calibration_of
 from flowrec.control import Coils, Controller
+from flowrec.control.events import narrate
 from flowrec.control.mission import Commander
-from flowrec.control.narrator import narrate
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEvent, Route, Tick, Track, Truth

@@ -18,8 +18,8 @@ from flowrec.errors import FlowrecError, SessionError
 from flowrec.messages import Route, Tick
 from flowrec.provenance import provenance
 from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
-from flowrec.store.head import Head
-from flowrec.store.names import pieces
+from flowrec.store.paths import pieces
+from flowrec.store.session_metadata import Head
 from flowrec.store.shapes import beyond_measure
 from flowrec.topics import TOPICS
 from flowrec.units import seconds

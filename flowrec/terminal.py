@@ -1,156 +1,204 @@
-"""Where our lines for people go: to stderr, which during a run must not be able to stop it.
-
-A terminal can freeze (Ctrl-S, a stopped emulator, a dead link) or vanish (EIO). During a run a thread does the
-writing, what it can not write in time is left out, and errors end nothing.
-"""
+"""What a person sees on the terminal while a run goes on, and the small tables at its end."""
 
 from __future__ import annotations
 
-import contextlib
-import io
-import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import TextIO, cast
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, TextIO, cast
 
-_LIMIT_CHARACTERS = 200_000  # that wait for a frozen terminal; what is older makes room
-_GOODBYE_S = 0.3  # for the rest to be written when the run is over
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from flowrec.errors import printable
+from flowrec.system.stderr import Outlet
+from flowrec.units import seconds
+
+if TYPE_CHECKING:  # what only a running session needs is imported then: a table is to be there at once
+    from rich.live import Live
+
+    from flowrec.messages import Event, Tick
+
+_PATIENCE_S = 2.0  # without a tick, then a person wants to know why
+_PERIOD_S = 0.12
+_GOODBYE_S = 0.3  # for the last events to be shown
+_EVENTS_LIMIT = 1000
+_STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
+_NOTE_SHOWN = 60  # characters of a long note, from its end
+
+outlet = Outlet()
+console = Console(file=cast(TextIO, outlet), highlight=False)
 
 
-class Outlet(io.TextIOBase):
-    """The file that the console writes to: stderr as it is at that moment."""
+def say(text: str) -> None:
+    """One line for the person at the terminal (stderr: stdout is for --json)."""
+    console.print(escape(printable(text)), soft_wrap=True)
 
-    def __init__(self) -> None:
-        self._pump: _Pump | None = None
 
-    def write(self, text: str) -> int:
-        """Write, or during a run hand over and return at once."""
-        if self._pump is not None:
-            self._pump.put(text)
-        else:
-            with _vanished_is_no_error():
-                _stderr().write(text)
-        return len(text)
+def warn(text: str) -> None:
+    """One line that something is not as it should be."""
+    console.print(f"[yellow]warning:[/yellow] {escape(printable(text))}", soft_wrap=True)
 
-    def flush(self) -> None:
-        """Nothing waits here outside a run."""
-        if self._pump is None:
-            with _vanished_is_no_error():
-                _stderr().flush()
 
-    def isatty(self) -> bool:
-        """Whether a person sees it."""
-        return _stderr().isatty()
+class StatusLine:
+    """Phase, frame rate, latency, drops, queue, file and disk of a running session; events as they come.
 
-    def fileno(self) -> int:
-        """Of stderr."""
-        return _stderr().fileno()
+    On a terminal one line is kept up to date; elsewhere (a log, CI) only the events are printed. All of it is done by
+    threads: the loop only leaves its tick here, and does not mind a terminal that is frozen or gone.
 
-    @property
-    def encoding(self) -> str:  # type: ignore[override]
-        """Of stderr."""
-        return _stderr().encoding
+    Parameters
+    ----------
+    file_bytes : of the session so far.
+    disk : what is to be said of the disk.
+    note : the note that a person is typing just now; None: none is.
+    """
+
+    def __init__(
+        self,
+        file_bytes: Callable[[], int],
+        disk: Callable[[], str] = lambda: "",
+        note: Callable[[], str | None] = lambda: None,
+    ) -> None:
+        self._file_bytes = file_bytes
+        self._disk = disk
+        self._note = note
+        self._arrivals: deque[float] = deque(maxlen=120)
+        self._latency_ms: deque[float] = deque(maxlen=240)
+        self._events: deque[Event] = deque(maxlen=_EVENTS_LIMIT)
+        self._last: Tick | None = None
 
     @contextmanager
-    def aside(self) -> Iterator[None]:
-        """For the length of the context a thread does the writing."""
-        pump = _Pump()
-        self._pump = pump
-        try:
-            yield
-        finally:
-            self._pump = None
-            pump.close()
-
-
-def _stderr() -> TextIO:
-    """Itself, not what rich puts in its place while a bar or a status line is shown: that prints through us."""
-    return cast(TextIO, getattr(sys.stderr, "rich_proxied_file", sys.stderr))
-
-
-class _Pump:
-    """Text on its way to a descriptor that may block for ever; the oldest is left out when there is too much."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self._waiting: list[str] = []
-        self._size = 0
-        self._closed = False
-        self._descriptor: int | None
-        try:
-            _stderr().flush()
-            # The descriptor itself: a thread that is stuck in sys.stderr would hold its lock at the interpreter's end.
-            # A notebook or a test has put another object there, which knows better where its text goes.
-            own = _stderr() is sys.__stderr__
-            self._descriptor = os.dup(_stderr().fileno()) if own else None
-        except (OSError, ValueError):
-            self._descriptor = None
-        self._thread = threading.Thread(target=self._work, name="terminal", daemon=True)
-        self._thread.start()
-
-    def put(self, text: str) -> None:
-        with self._changed:
-            self._waiting.append(text)
-            self._size += len(text)
-            while self._size > _LIMIT_CHARACTERS:
-                self._size -= len(self._waiting.pop(0))
-            self._changed.notify_all()
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join(_GOODBYE_S)
-
-    def _work(self) -> None:
-        try:
-            while True:
-                with self._changed:
-                    self._changed.wait_for(lambda: self._waiting or self._closed)
-                    text = "".join(self._waiting)
-                    self._waiting.clear()
-                    self._size = 0
-                    if not text:
-                        return
-                self._write(text)
-        finally:
-            if self._descriptor is not None:
-                os.close(self._descriptor)
-
-    def _write(self, text: str) -> None:
-        if self._descriptor is None:
-            with _vanished_is_no_error():
-                _stderr().write(text)
-            return
-        left = text.encode(_stderr().encoding or "utf-8", "backslashreplace")
-        while left:
+    def shown(self) -> Iterator[StatusLine]:
+        """Keep the line on the screen for the length of the context."""
+        over = threading.Event()
+        with outlet.aside():
+            thread = threading.Thread(target=self._show, args=(over,), name="status", daemon=True)
+            thread.start()
             try:
-                left = left[os.write(self._descriptor, left) :]
-            except BlockingIOError:
-                time.sleep(0.05)  # a terminal that some other program has set so
-            except OSError:  # vanished: nobody reads this any more
-                return
+                yield self
+            finally:
+                over.set()
+                thread.join(_GOODBYE_S)
+
+    def __call__(self, tick: Tick) -> None:
+        """Take note of one tick."""
+        self._arrivals.append(time.perf_counter())
+        if tick.timing is not None:
+            self._latency_ms.append(tick.timing.total_ms)
+        if tick.event is not None and (self._last is None or tick.event is not self._last.event):
+            self._events.append(tick.event)
+        self._last = tick
+
+    def _show(self, over: threading.Event) -> None:
+        began, explained = time.perf_counter(), False
+        with ExitStack() as stack:
+            live: Live | None = None
+            if console.is_terminal:
+                from rich.live import Live
+
+                live = stack.enter_context(Live(Text("starting"), console=console, auto_refresh=False, transient=True))
+            while True:
+                last = over.wait(_PERIOD_S)
+                while self._events:
+                    _print(self._events.popleft())
+                if last:
+                    return
+                arrivals = list(self._arrivals)
+                if not explained and time.perf_counter() - max([began, *arrivals[-1:]]) > _PATIENCE_S:
+                    explained = True
+                    say("working ... (the first run after an installation compiles its numerics, some 20 s in all)")
+                if live is not None and self._last is not None:
+                    live.update(self.text(self._last), refresh=True)
+
+    def text(self, tick: Tick) -> Text:
+        """The line itself."""
+        note = self._note()
+        if note is not None:
+            line = Text("note: ", style="bold", no_wrap=True, overflow="ellipsis")
+            line.append(f"{note[-_NOTE_SHOWN:]}_", style="bold yellow")
+            line.append("   Enter keeps it, Esc drops it", style="dim")
+            return line
+        import numpy as np
+
+        mission, timing = tick.mission, tick.timing
+        phase = mission.phase if mission is not None else "start"
+        wait = f" ({mission.wanted.replace('_', ' ')} ...)" if mission is not None and mission.wanted else ""
+        arrivals, latencies = list(self._arrivals), list(self._latency_ms)
+        span = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0.0
+        rate = (len(arrivals) - 1) / span if span > 0 else 0.0
+        latency = np.percentile(latencies, [50, 99]) if latencies else (0.0, 0.0)
+        queue_mb, drops = (timing.queue_mb, timing.dropped_frames) if timing is not None else (0.0, 0)
+        error = tick.demand.error_um if tick.demand is not None else float("nan")
+        parts = [
+            *(["HELD"] if mission is not None and mission.held_since_ns is not None else []),
+            f"{phase}{wait}",
+            f"t {seconds(tick.stamp_ns):.1f} s",
+            f"{rate:.0f} fps",
+            f"tick {latency[0]:.1f}/{latency[1]:.1f} ms (median/p99)",
+            f"error {error:.0f} um" if np.isfinite(error) else "no route",
+            f"drops {drops}",
+            f"queue {queue_mb:.0f} MB",
+            f"file {self._file_bytes() / 1e6:.0f} MB",
+            self._disk(),
+        ]
+        return Text("  ".join(parts), style="bold", no_wrap=True, overflow="ellipsis")
+
+
+def _print(event: Event) -> None:
+    colour = {"warning": "yellow", "error": "red"}.get(event.level, "cyan")
+    text = escape(printable(event.text))
+    console.print(f"[dim]{seconds(event.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
 
 
 @contextmanager
-def _vanished_is_no_error() -> Iterator[None]:
-    with contextlib.suppress(OSError, ValueError):
-        yield
+def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
+    """A bar for long work; the yielded function takes how much is done. Silent where there is no terminal."""
+    if not console.is_terminal:
+        yield lambda _done: None
+        return
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+
+    advanced_s = time.monotonic()
+
+    class Left(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text(time_left(task.time_remaining, time.monotonic() - advanced_s))
+
+    def advance(done: float) -> None:
+        nonlocal advanced_s
+        advanced_s = time.monotonic()
+        bar.update(task, completed=done)
+
+    bar = Progress(TextColumn(what), BarColumn(), TimeElapsedColumn(), Left(), console=console, transient=True)
+    with bar:
+        task = bar.add_task(what, total=total)
+        yield advance
 
 
-def said_within(seconds: float, say: Callable[[], None]) -> bool:
-    """Print something that may block or fail; False where the terminal did not take it in time."""
+def time_left(estimate_s: float | None, stands_s: float) -> str:
+    """The time that work will still take, in words; nothing where it is not known or work has not advanced lately.
 
-    def attempt() -> None:
-        with _vanished_is_no_error():
-            say()
-            sys.stdout.flush()
-            sys.stderr.flush()
+    Parameters
+    ----------
+    estimate_s : from how fast it advanced.
+    stands_s : how long ago it last did.
+    """
+    if estimate_s is None or stands_s > _STALE_S:
+        return ""
+    return f"{estimate_s:.0f} s left"
 
-    thread = threading.Thread(target=attempt, name="last words", daemon=True)
-    thread.start()
-    thread.join(seconds)
-    return not thread.is_alive()
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table for people on stdout."""
+    shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
+    for number, column in enumerate(columns):
+        shown.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
+    for row in rows:
+        shown.add_row(*(escape(printable(cell)) for cell in row))
+    # In a log, where rich would take 80 columns, the widest table still keeps a row on a line.
+    Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 110).print(shown)

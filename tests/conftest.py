@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from flowrec.commands.record import Recorded, record
 from flowrec.config import load_config
-from flowrec.record import Recorded, record
 
 # A shell that starts the tests in the background has SIGINT ignored, and so would all that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

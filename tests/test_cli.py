@@ -132,7 +132,7 @@ STAGES = {"numpy", "scipy", "numba", "cv2"}
     [
         (("--version",), HEAVY | STAGES),
         (("record", "nosuch.toml"), HEAVY | STAGES),
-        (("record", "--set", "robot.nosuch=1"), HEAVY | {"flowrec.record"}),
+        (("record", "--set", "robot.nosuch=1"), HEAVY | {"flowrec.commands.record"}),
         (("ls", "."), HEAVY | STAGES),
         (("info", "nosuch.mcap"), HEAVY | STAGES),
     ],

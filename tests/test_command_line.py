@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from flowrec import status
+from flowrec import terminal
 from flowrec.bench import plan
 from flowrec.cli import app, main
 
@@ -115,7 +115,7 @@ def test_a_refinement_that_changes_nothing_says_why(
 
 
 def test_a_bar_that_stands_names_no_time_left() -> None:
-    assert hasattr(status, "time_left")
-    assert status.time_left(12.4, stands_s=0.2) == "12 s left"
-    assert status.time_left(1.0, stands_s=5.0) == ""
-    assert status.time_left(None, stands_s=0.0) == ""
+    assert hasattr(terminal, "time_left")
+    assert terminal.time_left(12.4, stands_s=0.2) == "12 s left"
+    assert terminal.time_left(1.0, stands_s=5.0) == ""
+    assert terminal.time_left(None, stands_s=0.0) == ""

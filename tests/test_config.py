@@ -14,9 +14,9 @@ import pytest
 import flowrec
 from flowrec.chip import load_chip
 from flowrec.cli import main
+from flowrec.commands.record import Recorded, prepare
 from flowrec.config import Config, config_from_toml, load_config, resolve, to_toml, with_sets
 from flowrec.errors import FlowrecError, UnreachableError, UsageError
-from flowrec.record import Recorded, prepare
 from flowrec.store import SessionReader
 
 

@@ -11,9 +11,9 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
 
-from flowrec import replay
 from flowrec.chip import load_chip
 from flowrec.cli import main
+from flowrec.commands import replay
 from flowrec.config import Config, load_config, resolve, with_sets
 from flowrec.errors import UsageError
 

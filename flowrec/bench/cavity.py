@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from flowrec.chip.chip import Chip
-from flowrec.flow.system import assembled
+from flowrec.flow.newton_solver import assembled
 from flowrec.units import UM_PER_M
 
 # fmt: off

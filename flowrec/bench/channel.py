@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip, Opening, Walls
 from flowrec.flow import FlowSolver
-from flowrec.flow.outline import analytic
-from flowrec.flow.system import assembled
+from flowrec.flow.level_set import analytic
+from flowrec.flow.newton_solver import assembled
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
 _UM_PER_PX, _SPEED_UM_S, _MARGIN_PX = 10.0, 100.0, 2

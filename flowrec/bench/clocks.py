@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.clocks import DeviceClock, Fit
-from flowrec.clocks.device import envelope
-from flowrec.status import table
+from flowrec.clocks.device_clock import envelope
+from flowrec.terminal import table
 from flowrec.units import NS_PER_S
 
 _RATE_HZ = 100.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip, Opening, Walls
-from flowrec.flow.system import system
+from flowrec.flow.newton_solver import system
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
 
 REFERENCE = {"drag": 5.57953523384, "lift": 0.010618948146, "pressure_difference_pa": 0.11752016697}

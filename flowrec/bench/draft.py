@@ -20,10 +20,10 @@ from flowrec.chip import load_chip
 from flowrec.config import Config, load_config, resolve
 from flowrec.messages import Message, array_fields
 from flowrec.session import session_header
+from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations
 from flowrec.store.codec import encode_record
-from flowrec.store.frames import ENCODINGS
-from flowrec.store.header import records_of
-from flowrec.store.layout import FRAMES, SLOTS, STATE, declarations
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.metadata import records_of
 from flowrec.store.shapes import shapes_of
 from flowrec.topics import TOPICS
 

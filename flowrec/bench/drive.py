@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.jit import compiled
 from flowrec.messages import FlowField, Route
 from flowrec.planning.zermelo import bilinear
+from flowrec.system.numba_setup import compiled
 
 Raster = NDArray[np.float64]
 _STEP_PX = 0.1

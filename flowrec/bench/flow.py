@@ -29,11 +29,11 @@ from flowrec.chip.openings import border, run_around
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import FlowError, FlowrecError, UsageError
 from flowrec.estimation import Trimmed
-from flowrec.flow import FlowSolver, kept
+from flowrec.flow import FlowSolver, cache
 from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import FlowField, Observations
 from flowrec.refine import PiUnet, Refiner
-from flowrec.status import progress, say, table
+from flowrec.terminal import progress, say, table
 
 MADE_UP = 10  # cases, where none are given
 
@@ -188,7 +188,7 @@ def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Troub
     observations = _observations(case, noise, share, trouble)
     believed = with_wrong_mask(chip, trouble.mask)
     solver, refiner = FlowSolver(k), METHODS[method]
-    kept.forget()
+    cache.forget()
     began, began_cpu = time.perf_counter(), time.process_time()
     assumed = solver.solve(believed)
     field = refiner.refine(assumed, observations, believed, solver)

@@ -23,12 +23,12 @@ from typing import Any
 from flowrec.bench.draft import Draft, small_draft
 from flowrec.bench.memory import peak_mb
 from flowrec.bench.mutate import blind, spoil
-from flowrec.check import check
+from flowrec.commands.check import check
+from flowrec.commands.info import describe, list_sessions
 from flowrec.errors import FlowrecError, printable
-from flowrec.listing import describe, list_sessions
 from flowrec.session import open_session
-from flowrec.status import progress, table
 from flowrec.store import SessionReader, recover
+from flowrec.terminal import progress, table
 
 TIME_LIMIT_S = 20.0
 MEMORY_LIMIT_MB = 270.0  # besides the 240 MB of the program itself: together less than 512

@@ -15,8 +15,8 @@ import numpy as np
 from flowrec.chip.vessel_case import read_true_chip, read_true_velocity, read_vessel_case
 from flowrec.errors import UsageError
 from flowrec.flow import FlowSolver
-from flowrec.refine.model_error import around
-from flowrec.status import table
+from flowrec.refine.discretisation_error import around
+from flowrec.terminal import table
 
 WITHIN_TWO = 0.9545  # of a Gaussian
 

@@ -37,9 +37,9 @@ from flowrec.bench.draft import (
     small_draft,
     text,
 )
-from flowrec.status import progress, table
+from flowrec.store.channels import FRAMES, SLOTS, STATE
 from flowrec.store.codec import encode_record
-from flowrec.store.layout import FRAMES, SLOTS, STATE
+from flowrec.terminal import progress, table
 from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S
 

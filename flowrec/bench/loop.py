@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 
 from flowrec.chip.chip import Chip
+from flowrec.commands.export import scene_of
+from flowrec.commands.record import prepare
+from flowrec.commands.replay import Change, replay
 from flowrec.config import Config, load_config
-from flowrec.export import scene_of
 from flowrec.messages import Currents, Tick
 from flowrec.pipeline import Inputs, Pipeline
-from flowrec.record import prepare
-from flowrec.replay import Change, replay
-from flowrec.rigs.simulated import SimulatedRig
-from flowrec.run import LockstepWorker, Sink, run
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run.loop import LockstepWorker, Sink, run
 from flowrec.session import session_header
-from flowrec.status import progress, table
 from flowrec.store import SessionWriter
+from flowrec.terminal import progress, table
 from flowrec.view import LiveView
 
 RATE_HZ = 60.0

@@ -23,17 +23,17 @@ from numpy.typing import NDArray
 from flowrec.bench.shares import paired, wilson
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
+from flowrec.commands.record import refuse_adrift
 from flowrec.config import Config, load_config, resolve
 from flowrec.errors import FlowrecError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import assemble
 from flowrec.planning import Planner
-from flowrec.record import refuse_adrift
-from flowrec.rigs.simulated import SimulatedRig, true_chip
+from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
 from flowrec.robot import USUAL_DELAY_S, Robot
-from flowrec.run import LockstepWorker, run
-from flowrec.status import progress, say, table
+from flowrec.run.loop import LockstepWorker, run
+from flowrec.terminal import progress, say, table
 from flowrec.units import seconds
 
 # Name: what is set, beside what all have.

@@ -23,7 +23,7 @@ from flowrec.flow import sample
 from flowrec.messages import Applied, Estimate, FlowField, Health, Track
 from flowrec.robot import Robot
 from flowrec.session import open_session
-from flowrec.status import progress, say, table
+from flowrec.terminal import progress, say, table
 from flowrec.units import seconds
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)

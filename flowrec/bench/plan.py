@@ -27,10 +27,10 @@ from flowrec.chip import clearance_um
 from flowrec.errors import UsageError
 from flowrec.messages import FlowField, Route
 from flowrec.planning import Planner, travel_time
+from flowrec.planning.free_space import Space, open_space
 from flowrec.planning.rrt import Rrt
-from flowrec.planning.space import Space, open_space
 from flowrec.planning.zermelo import bilinear
-from flowrec.status import progress, say, table
+from flowrec.terminal import progress, say, table
 
 RATIOS = (0.5, 0.9, 1.3)  # fastest flow over the robot's speed
 DIRECTIONS = ("down", "up")

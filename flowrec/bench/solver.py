@@ -14,7 +14,7 @@ from flowrec.bench.cavity import cavity_case
 from flowrec.bench.channel import bend_case, oblique_case, straight_case
 from flowrec.bench.cylinder import cylinder_case
 from flowrec.bench.speed import speed_case
-from flowrec.status import table
+from flowrec.terminal import table
 
 # Title, and what is printed of a row under which head; the JSON has all of it.
 _TABLES: dict[str, tuple[str, dict[str, str]]] = {

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from flowrec.bench.memory import peak_mb
 from flowrec.chip.builtin import straight
 from flowrec.chip.chip import Chip
-from flowrec.chip.files import without_pockets
+from flowrec.chip.io import without_pockets
 from flowrec.chip.openings import find_openings, guess_inlets
 from flowrec.chip.vessels import vessels
 from flowrec.flow import FlowSolver
-from flowrec.flow.system import system
+from flowrec.flow.newton_solver import system
 
 Pattern = Literal["vessels", "posts"]
 _PITCH_PX, _RADIUS_PX = 32, 13

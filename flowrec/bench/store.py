@@ -23,8 +23,8 @@ from flowrec.bench.store_loop import soak, stall
 from flowrec.bench.store_region import regions
 from flowrec.bench.store_splits import show_splits, splits
 from flowrec.bench.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
-from flowrec.status import progress, table
 from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.terminal import progress, table
 
 _MEMORY = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is made in it
 _AIM = {"p99_ratio": 1.2, "disk_mb_s": 350.0, "throughput": 0.9}

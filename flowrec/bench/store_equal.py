@@ -26,16 +26,16 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
 from flowrec.bench.store_writers import frames_given, poses_given
 from flowrec.messages import FlowField, Message, Track
-from flowrec.priority import first_of_all
-from flowrec.run import SWITCH_S
-from flowrec.status import progress, table
-from flowrec.store import chunk, encoder, mcap_file
+from flowrec.run.loop import SWITCH_S
+from flowrec.store import chunk, encoder, mcap_writer
+from flowrec.store.channels import SLOTS, declarations
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.codec import codec_of, encode
-from flowrec.store.frames import ENCODINGS
-from flowrec.store.layout import SLOTS, declarations
-from flowrec.store.mcap_file import McapFile
-from flowrec.store.schemas import Schema, forms_of
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.mcap_writer import McapFile
+from flowrec.store.schema import Schema, forms_of
+from flowrec.system.realtime_priority import first_of_all
+from flowrec.terminal import progress, table
 from flowrec.topics import BY_FIELD
 
 _CHUNK_BYTES = 1 << 20
@@ -138,7 +138,7 @@ WRITERS: dict[str, Callable[[Path, Load], Open]] = {
 
 def lines_of(name: str) -> int:
     """Lines of our own code behind a writer or encoder, those of the bench that stand for it included."""
-    own = {"flowrec": (chunk, mcap_file, _ours), "mcap": (_mcap,), "protobuf, ours": (encoder,)}
+    own = {"flowrec": (chunk, mcap_writer, _ours), "mcap": (_mcap,), "protobuf, ours": (encoder,)}
     fallback = protobuf_encoder if name.startswith("protobuf") else _foxglove
     return sum(len(inspect.getsource(part).splitlines()) for part in own.get(name, (fallback,)))
 

@@ -19,9 +19,9 @@ import numpy as np
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.errors import SessionError
 from flowrec.messages import Image, OperatorEvent, Tick
-from flowrec.status import progress, table
 from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
-from flowrec.store.names import PARTIAL_SUFFIX, pieces
+from flowrec.store.paths import PARTIAL_SUFFIX, pieces
+from flowrec.terminal import progress, table
 from flowrec.units import seconds
 
 _SHORTEST_S, _LONGEST_S = 0.1, 2.5

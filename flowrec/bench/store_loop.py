@@ -15,13 +15,13 @@ import numpy as np
 from flowrec.bench.loop import PacedRig, TimingsOnly, prepare_inputs
 from flowrec.bench.store_rivals import BareProcess, BareThread
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
+from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.messages import Frame, Image, OperatorEvent, Tick
-from flowrec.priority import first_of_all
-from flowrec.record import prepare
-from flowrec.run import LockstepWorker, Sink, run
-from flowrec.status import progress
+from flowrec.run.loop import LockstepWorker, Sink, run
 from flowrec.store import SessionWriter, Snapshot
+from flowrec.system.realtime_priority import first_of_all
+from flowrec.terminal import progress
 
 RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 2448, 2048

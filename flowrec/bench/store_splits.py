@@ -14,9 +14,9 @@ import numpy as np
 
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.messages import FlowField, Image, OperatorEvent, Tick
-from flowrec.run import SWITCH_S
-from flowrec.status import progress, table
+from flowrec.run.loop import SWITCH_S
 from flowrec.store import SessionWriter, Snapshot, Split
+from flowrec.terminal import progress, table
 
 _RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 1224, 1024  # what two cores that do other things as well keep up with

@@ -15,11 +15,11 @@ from mcap.writer import CompressionType, Writer
 
 from flowrec.messages import Applied, Estimate, Frame, Image, Message, Tick, Track
 from flowrec.store import SessionHeader, SessionWriter
+from flowrec.store.channels import SLOTS, declarations
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.codec import codec_of, encode
-from flowrec.store.frames import ENCODINGS
-from flowrec.store.layout import SLOTS, declarations
-from flowrec.store.mcap_file import McapFile
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.mcap_writer import McapFile
 from flowrec.topics import BY_FIELD
 from flowrec.units import nanoseconds
 

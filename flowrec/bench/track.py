@@ -22,7 +22,7 @@ from flowrec.control import Controller
 from flowrec.control.controller import Method
 from flowrec.estimation import Observer
 from flowrec.estimation.kalman import Kalman
-from flowrec.status import progress, table
+from flowrec.terminal import progress, table
 
 V_MAX_UM_S = 1000.0
 NO_LIMIT_UM_S = 1e6

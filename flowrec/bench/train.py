@@ -18,17 +18,17 @@ import numpy as np
 
 from flowrec.bench.lessons import Lesson, prepare, read_lessons
 from flowrec.errors import UsageError
-from flowrec.output import WEIGHTS, check_output
 from flowrec.refine.case import Case
-from flowrec.refine.sight import sight
+from flowrec.refine.observation_operator import sight
 from flowrec.refine.torch_run import Device, torch_run
-from flowrec.status import progress, table
+from flowrec.system.outputs import WEIGHTS, check_output
+from flowrec.terminal import progress, table
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from flowrec.refine.network import UNet
-    from flowrec.refine.scene import Scene
+    from flowrec.refine.network_inputs import Scene
 
 SIDES = (4, 16)  # of the blocks whose balance of mass counts, px
 JUDGES = 64  # lessons kept apart, at most a fourth
@@ -151,7 +151,7 @@ def _batches(
     """Scenes with true velocity and pressure in their units; `examined`, each lesson once, else forever, turned."""
     import torch
 
-    from flowrec.refine.scene import Scene, turn
+    from flowrec.refine.network_inputs import Scene, turn
 
     rng = np.random.default_rng([training.seed, 0xBA7C])
     order = np.arange(len(lessons))
@@ -187,7 +187,7 @@ def _predict(net: UNet, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
 
 def _loss(net: UNet, scene: Scene, velocity: Tensor, pressure: Tensor, training: Training) -> Tensor:
     """Relative errors of velocity and pressure; for `pi_unet` also the unlikelihood of its error bars, and physics."""
-    from flowrec.refine.physics import Physics, balances
+    from flowrec.refine.residuals import Physics, balances
 
     v, p, output = _predict(net, scene)
     error = _error(v, velocity)

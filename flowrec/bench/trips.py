@@ -17,10 +17,10 @@ from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField
-from flowrec.planning.relax import SPACING_PX, relax
-from flowrec.planning.space import open_space
-from flowrec.planning.terrain import Terrain
-from flowrec.planning.time_field import descend, time_field
+from flowrec.planning.cost_rasters import Terrain
+from flowrec.planning.eikonal import descend, time_field
+from flowrec.planning.free_space import open_space
+from flowrec.planning.path_refinement import SPACING_PX, relax
 from flowrec.planning.timing import travel_time
 from flowrec.robot import Robot
 

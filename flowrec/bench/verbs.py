@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from flowrec.output import FIGURE, JSON, new_file
+from flowrec.system.outputs import FIGURE, JSON, new_file
 
 bench = typer.Typer(help="Measure flowrec itself.", no_args_is_help=True)
 

@@ -2,7 +2,7 @@
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.clearance import check_point, clearance_um, median_width_um, nearest_fluid
-from flowrec.chip.files import chip_files, chip_from_files
+from flowrec.chip.io import chip_files, chip_from_files
 from flowrec.chip.load import load_chip
 from flowrec.chip.settings import ChipSettings
 

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.draw import draw_channel, smooth_curve
-from flowrec.chip.files import WATER_KG_M3, WATER_MPA_S
+from flowrec.chip.io import WATER_KG_M3, WATER_MPA_S
 from flowrec.chip.openings import find_openings, guess_inlets, set_inlet_speed
 
 _UM_PER_PX = 20.0

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flowrec.chip.builtin import bifurcation, straight
 from flowrec.chip.chip import Chip
-from flowrec.chip.files import check_chip, read_png_chip, without_pockets
+from flowrec.chip.io import check_chip, read_png_chip, without_pockets
 from flowrec.chip.openings import name_inlets, set_inlet_speed
 from flowrec.chip.settings import ChipSettings
 from flowrec.chip.vessel_case import read_vessel_case

@@ -15,7 +15,7 @@ from scipy.ndimage import label
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.draw import curve_length, draw_channel, smooth_curve
-from flowrec.chip.files import WATER_KG_M3, WATER_MPA_S
+from flowrec.chip.io import WATER_KG_M3, WATER_MPA_S
 from flowrec.chip.openings import find_openings, guess_inlets, set_inlet_speed
 from flowrec.errors import ChipError
 

@@ -1,6 +1,6 @@
 """One session clock, and what other clocks say beside it."""
 
-from flowrec.clocks.device import DeviceClock, Fit
-from flowrec.clocks.watch import ClockWatch, read_clocks
+from flowrec.clocks.clock_monitor import ClockWatch, read_clocks
+from flowrec.clocks.device_clock import DeviceClock, Fit
 
 __all__ = ["ClockWatch", "DeviceClock", "Fit", "read_clocks"]

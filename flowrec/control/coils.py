@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.control.amplifier import Amplifier, Coilwise
-from flowrec.control.reach import WORST_CONDITION, Reach, named
-from flowrec.control.rotation import Order, Rotation, course
+from flowrec.control.coil_limits import WORST_CONDITION, Reach, named
+from flowrec.control.field_rotation import Order, Rotation, course
 from flowrec.errors import UsageError
 from flowrec.messages import Currents, Demand
 from flowrec.ranges import Range

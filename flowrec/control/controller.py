@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.laws import ff_fb_law, ff_fb_literal_law, saturated, shortened, vector_law
+from flowrec.control.delay_compensation import FlowBelief, blend, remembered, roll_forward
 from flowrec.control.policy import astray_um, downhill
-from flowrec.control.prediction import FlowBelief, blend, remembered, roll_forward
-from flowrec.control.reference import bearable_pace, governed_pace, nearest_on, place_on, velocity_on
-from flowrec.control.walls import guarded, least_room
+from flowrec.control.tracking_laws import ff_fb_law, ff_fb_literal_law, saturated, shortened, vector_law
+from flowrec.control.trajectory import bearable_pace, governed_pace, nearest_on, place_on, velocity_on
+from flowrec.control.wall_barrier import guarded, least_room
 from flowrec.flow import sample
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
 from flowrec.ranges import PositiveShare, Range

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.control.coils import Coils
-from flowrec.control.rotation import Order, Rotation, course
+from flowrec.control.field_rotation import Order, Rotation, course
 from flowrec.messages import Currents
 
 BLOCK_S = 0.01  # of a buffered output: two of them queued make 20 ms of the delay from command to motion

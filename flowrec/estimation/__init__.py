@@ -1,6 +1,6 @@
 """Track and applied field to Estimate; estimates to observations of the flow."""
 
-from flowrec.estimation.health import HealthMonitor
+from flowrec.estimation.consistency_monitor import HealthMonitor
 from flowrec.estimation.kalman import Kalman
 from flowrec.estimation.luenberger import Luenberger
 from flowrec.estimation.observer import Observer

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from flowrec.estimation.motion import ISOTROPIC, Floats, Layout, noise, onward, slope_of
+from flowrec.estimation.process_model import ISOTROPIC, Floats, Layout, noise, onward, slope_of
 from flowrec.flow import sample
 from flowrec.messages import Applied, Estimate, FlowField, Matrix, Track
 from flowrec.ranges import Range, Share

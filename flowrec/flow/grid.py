@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from flowrec.chip.chip import Chip, Kind, Side
 from flowrec.errors import FlowError
-from flowrec.flow.outline import Outline, outline
+from flowrec.flow.level_set import Outline, outline
 
 WALL, OPEN, OUTLET, INLET = range(4)  # kinds of a face
 

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from flowrec.flow.grid import INLET, OPEN, OUTLET, WALL, Floats, Grid, Ints
-from flowrec.flow.lines import lines
+from flowrec.flow.wall_stencils import lines
 
 # A wall that is nearer, in cells, would make a face infinitely stiff.
 NEAREST = 0.02

@@ -9,11 +9,11 @@ import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
+from flowrec.flow.cache import cells_of, chip_key, kept
 from flowrec.flow.grid import Floats
-from flowrec.flow.kept import cells_of, chip_key, kept
 from flowrec.flow.modes import FlowModes
-from flowrec.flow.response import FlowResponse, respond
-from flowrec.flow.system import NotConvergedError, System, depth_friction, system
+from flowrec.flow.newton_solver import NotConvergedError, System, depth_friction, system
+from flowrec.flow.sensitivities import FlowResponse, respond
 from flowrec.messages import FlowField
 from flowrec.ranges import OneOf, Range
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M

@@ -14,12 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from flowrec.chip.chip import Chip
 from flowrec.errors import UsageError
 from flowrec.messages import FlowField, Route
-from flowrec.planning.lattice import backtrack, directions, search
-from flowrec.planning.paper import adjacency, search_paper
-from flowrec.planning.relax import SPACING_PX, relax
-from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route, too_fast
-from flowrec.planning.rrt import Rrt
-from flowrec.planning.space import (
+from flowrec.planning.astar_paper import adjacency, search_paper
+from flowrec.planning.cost_rasters import Terrain, interpolated
+from flowrec.planning.eikonal import descend, time_field, with_band
+from flowrec.planning.free_space import (
     End,
     Space,
     Swift,
@@ -34,8 +32,10 @@ from flowrec.planning.space import (
     why_apart,
     with_margin,
 )
-from flowrec.planning.terrain import Terrain, interpolated
-from flowrec.planning.time_field import descend, time_field, with_band
+from flowrec.planning.grid_search import backtrack, directions, search
+from flowrec.planning.path_refinement import SPACING_PX, relax
+from flowrec.planning.route import no_route, planning_speed_um_s, timed_route, too_fast
+from flowrec.planning.rrt import Rrt
 from flowrec.ranges import OneOf, PositiveShare, Range, Share, check_ranges
 from flowrec.robot import Robot
 

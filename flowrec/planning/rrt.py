@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.errors import UsageError
-from flowrec.planning.space import Space
+from flowrec.planning.free_space import Space
 from flowrec.planning.zermelo import line_is_clear, segment_cost
 from flowrec.ranges import Range, Seed, Share
 

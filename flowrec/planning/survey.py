@@ -11,10 +11,10 @@ from scipy.ndimage import maximum_filter
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.messages import FlowField, Route
-from flowrec.planning.lattice import backtrack, directions, search
-from flowrec.planning.relax import relax
-from flowrec.planning.routes import no_route, planning_speed_um_s, timed_route
-from flowrec.planning.space import Space, Swift, attach_start, joined_ends, margin_remark, margins_um, open_space
+from flowrec.planning.free_space import Space, Swift, attach_start, joined_ends, margin_remark, margins_um, open_space
+from flowrec.planning.grid_search import backtrack, directions, search
+from flowrec.planning.path_refinement import relax
+from flowrec.planning.route import no_route, planning_speed_um_s, timed_route
 from flowrec.ranges import PositiveShare, Range
 from flowrec.robot import Robot
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.jit import compiled
+from flowrec.system.numba_setup import compiled
 
 Raster = NDArray[np.float64]
 

@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
-from flowrec.flow.kept import cells_of, chip_key, kept
-from flowrec.flow.response import FlowResponse, State, fluid_image
+from flowrec.flow.cache import cells_of, chip_key, kept
+from flowrec.flow.sensitivities import FlowResponse, State, fluid_image
 from flowrec.messages import FlowField
 from flowrec.ranges import Range
-from flowrec.refine.mask_doubt import other_walls
-from flowrec.refine.model_error import ModelError
+from flowrec.refine.discretisation_error import ModelError
+from flowrec.refine.mask_variants import other_walls
+from flowrec.refine.mixture_regression import Fit, fit
+from flowrec.refine.observation_operator import Floats, Sight
 from flowrec.refine.prior import Prior, Widths
-from flowrec.refine.robust import Fit, fit
-from flowrec.refine.sight import Floats, Sight
-from flowrec.refine.statement import statement
+from flowrec.refine.report import statement
 
 SURPRISED = 1.5  # standard deviations of chi squared above which the walls are doubted
 GAIN = 4.0  # in ln probability before other walls than the chip's are believed

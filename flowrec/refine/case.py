@@ -15,8 +15,8 @@ from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import border
 from flowrec.messages import FlowField
 from flowrec.refine.crop import Crop
-from flowrec.refine.judge import noise_of
-from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.data_misfit import noise_of
+from flowrec.refine.observation_operator import Floats, Sight
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)

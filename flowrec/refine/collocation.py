@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowrec.chip.chip import Chip
-from flowrec.refine.sight import Floats
+from flowrec.refine.observation_operator import Floats
 
 _SUBPIXELS = np.array([[x, y] for x in (-0.25, 0.25) for y in (-0.25, 0.25)])
 _INWARD = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "top": (0.0, 1.0), "bottom": (0.0, -1.0)}

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.refine.sight import Floats
+from flowrec.refine.observation_operator import Floats
 
 
 @dataclass(frozen=True, slots=True)

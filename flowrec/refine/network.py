@@ -88,6 +88,6 @@ def positions(h: int, w: int, channels: int) -> Tensor:
 
 def trained_network() -> UNet:
     """The network that shipped weights fit: it sees and gives what a `Scene` says."""
-    from flowrec.refine.scene import OUTPUTS, TOLD
+    from flowrec.refine.network_inputs import OUTPUTS, TOLD
 
     return UNet(16, TOLD, OUTPUTS, folded=True, depth=3)

@@ -20,8 +20,8 @@ from flowrec.messages import FlowField
 from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.case import MULTIPLE
 from flowrec.refine.crop import Crop
-from flowrec.refine.judge import RELATIVE_NOISE, TAIL
-from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.data_misfit import RELATIVE_NOISE, TAIL
+from flowrec.refine.observation_operator import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
@@ -74,8 +74,8 @@ class Ni:
         """Iterations done, velocity (h, w, 2) in um/s, pressure (h, w) in Pa, misfit before and after."""
         import torch
 
-        from flowrec.refine.descend import lowest_of
         from flowrec.refine.network import UNet
+        from flowrec.refine.network_fit import lowest_of
 
         crop = Crop.around(chip.mask, MULTIPLE)
         loss_of = _Loss(scale, crop, sight, chip, self)
@@ -126,7 +126,7 @@ class _Loss:
     def __init__(self, scale: _Scale, crop: Crop, sight: Sight, chip: Chip, settings: Ni) -> None:
         import torch
 
-        from flowrec.refine.physics import Physics
+        from flowrec.refine.residuals import Physics
 
         def tensor(array: NDArray[Any]) -> Tensor:
             return torch.from_numpy(np.array(array, np.float32)).to(settings.device)

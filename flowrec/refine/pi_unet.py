@@ -22,8 +22,8 @@ from flowrec.chip.chip import Chip
 from flowrec.messages import FlowField
 from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.case import Case
-from flowrec.refine.judge import doubt, misfit
-from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.data_misfit import doubt, misfit
+from flowrec.refine.observation_operator import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
 from flowrec.refine.weights import SHIPPED, sha256
 
@@ -129,8 +129,8 @@ class PiUnet:
 
     def _corrections(self, case: Case, used: NDArray[np.bool_]) -> list[tuple[str, Floats, Floats]]:
         """What was done, velocity (h, w, 2) in um/s and pressure (h, w) in Pa: the network's field, and its finish."""
-        from flowrec.refine.balance import LARGEST_PX, balance
-        from flowrec.refine.descend import descend
+        from flowrec.refine.gauss_newton import LARGEST_PX, balance
+        from flowrec.refine.network_fit import descend
 
         weights = f"weights {self.weights_sha256[:8]}" if self.weights_sha256 else "random weights"
         with torch_run(self.device, self.threads, self.seed, "refine.pi_unet.device"):

@@ -24,7 +24,7 @@ from flowrec.errors import FlowError
 from flowrec.messages import FlowField
 from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.collocation import Collocation
-from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.observation_operator import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
-from flowrec.refine.sight import Floats
+from flowrec.refine.observation_operator import Floats
 
 
 @dataclass(frozen=True, slots=True)

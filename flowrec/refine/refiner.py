@@ -11,9 +11,9 @@ from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Observations
 from flowrec.refine.assimilate import Assimilate
 from flowrec.refine.ni import Ni
+from flowrec.refine.observation_operator import sight
 from flowrec.refine.pi_unet import PiUnet
 from flowrec.refine.pinn import Pinn
-from flowrec.refine.sight import sight
 from flowrec.refine.unet import Unet
 
 

@@ -17,7 +17,7 @@ from flowrec.chip.chip import Chip
 from flowrec.messages import FlowField
 from flowrec.ranges import Threads
 from flowrec.refine.case import Case
-from flowrec.refine.sight import Floats, Sight
+from flowrec.refine.observation_operator import Floats, Sight
 from flowrec.refine.torch_run import Device, torch_run
 from flowrec.refine.weights import SHIPPED, read_weights, sha256
 
@@ -66,7 +66,7 @@ class Unet:
             import torch
 
             from flowrec.refine.network import trained_network
-            from flowrec.refine.scene import Scene
+            from flowrec.refine.network_inputs import Scene
 
             network = trained_network()
             read_weights(self.path, network)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flowrec.errors import FlowError
-from flowrec.output import WEIGHTS, new_file
+from flowrec.system.outputs import WEIGHTS, new_file
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

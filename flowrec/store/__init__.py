@@ -7,36 +7,36 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from flowrec.store.audit import digest_faults
-    from flowrec.store.frames import encoding_for
-    from flowrec.store.header import SessionHeader
-    from flowrec.store.joints import files_of
-    from flowrec.store.names import is_snapshot, taken
-    from flowrec.store.parts import Split
+    from flowrec.store.frame_encodings import encoding_for
+    from flowrec.store.metadata import SessionHeader
+    from flowrec.store.part_continuity import files_of
+    from flowrec.store.paths import is_snapshot, taken
     from flowrec.store.reader import SessionReader
     from flowrec.store.recovery import Recovered, recover
-    from flowrec.store.region import Region, lit
+    from flowrec.store.ring_buffer import Snapshot
+    from flowrec.store.roi import Region, lit
     from flowrec.store.run_recovery import recover_run
     from flowrec.store.shapes import not_finite
-    from flowrec.store.snapshots import Snapshot
+    from flowrec.store.split import Split
     from flowrec.store.writer import SessionWriter
 
 _HOME = {
     "Recovered": "recovery",
-    "Region": "region",
-    "SessionHeader": "header",
+    "Region": "roi",
+    "SessionHeader": "metadata",
     "SessionReader": "reader",
     "SessionWriter": "writer",
-    "Snapshot": "snapshots",
-    "Split": "parts",
+    "Snapshot": "ring_buffer",
+    "Split": "split",
     "digest_faults": "audit",
-    "encoding_for": "frames",
-    "files_of": "joints",
-    "is_snapshot": "names",
-    "lit": "region",
+    "encoding_for": "frame_encodings",
+    "files_of": "part_continuity",
+    "is_snapshot": "paths",
+    "lit": "roi",
     "not_finite": "shapes",
     "recover": "recovery",
     "recover_run": "run_recovery",
-    "taken": "names",
+    "taken": "paths",
 }
 
 __all__ = [

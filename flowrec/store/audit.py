@@ -12,15 +12,15 @@ from mcap.records import ChunkIndex
 from flowrec.errors import SessionError
 from flowrec.messages import Message
 from flowrec.store.codec import decode, message_stamp
-from flowrec.store.contents import Contents
 from flowrec.store.digest import Digests
-from flowrec.store.head import Head
-from flowrec.store.header import SessionHeader
-from flowrec.store.joints import Piece, files_of
-from flowrec.store.region import Region
+from flowrec.store.mcap_reader import DamageError, Record, Source, UnfinishedError
+from flowrec.store.metadata import SessionHeader
+from flowrec.store.part_continuity import Piece, files_of
+from flowrec.store.roi import Region
 from flowrec.store.scan import Scan, scan
+from flowrec.store.schema_check import Contents
+from flowrec.store.session_metadata import Head
 from flowrec.store.shapes import misfit
-from flowrec.store.source import DamageError, Record, Source, UnfinishedError
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 

@@ -20,8 +20,8 @@ from flowrec.messages import Event, Frame, Message, OperatorEvent
 from flowrec.store import standard
 from flowrec.store.encoder import encoder_of
 from flowrec.store.form import Codec, Payload
-from flowrec.store.frames import FRAME_CODECS, RAW_IMAGE
-from flowrec.store.schemas import ARRAY_DATA, FieldForm, array_schema, forms_of, schema_of
+from flowrec.store.frame_encodings import FRAME_CODECS, RAW_IMAGE
+from flowrec.store.schema import ARRAY_DATA, FieldForm, array_schema, forms_of, schema_of
 from flowrec.store.wire import LARGE_BYTES, cut_out, own
 
 _M = TypeVar("_M", bound=Message)

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING
 from mcap.records import Attachment, Metadata
 
 from flowrec.errors import SessionError, printable
-from flowrec.store.header import DIGEST, belongs
+from flowrec.store.metadata import DIGEST, belongs
 
 if TYPE_CHECKING:  # both write or read what is hashed here
-    from flowrec.store.head import Head
-    from flowrec.store.source import Record
+    from flowrec.store.mcap_reader import Record
+    from flowrec.store.session_metadata import Head
 
 _MODULUS = 1 << 256
 _MESSAGE = struct.Struct("<IQ")  # sequence, log time

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from flowrec.store.form import Payload
-from flowrec.store.schemas import ARRAY_DATA, FieldForm, forms_of
+from flowrec.store.schema import ARRAY_DATA, FieldForm, forms_of
 from flowrec.store.wire import BYTES, FIXED64, VARINT, head_of, tag, varint
 
 _DOUBLE = struct.Struct("<d")

@@ -12,13 +12,13 @@ from mcap.records import ChunkIndex
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Message
+from flowrec.store.chunk_stream import by_time, lane, threads
 from flowrec.store.codec import decode
-from flowrec.store.contents import Contents
-from flowrec.store.frames import ENCODINGS
-from flowrec.store.lane import by_time, lane, threads
-from flowrec.store.pictures import PIXELS_LIMIT
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.image_codec import PIXELS_LIMIT
+from flowrec.store.mcap_reader import DamageError, Record
+from flowrec.store.schema_check import Contents
 from flowrec.store.shapes import misfit
-from flowrec.store.source import DamageError, Record
 from flowrec.topics import BY_FIELD
 
 Kept = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first

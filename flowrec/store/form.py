@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from flowrec.store.schemas import Schema
+from flowrec.store.schema import Schema
 
 Payload = tuple[bytes | memoryview, ...]
 

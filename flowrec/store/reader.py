@@ -11,11 +11,11 @@ from typing import Any, Self
 
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
-from flowrec.store.contents import Contents
 from flowrec.store.file_reader import FileReader, Kept
-from flowrec.store.header import SessionHeader
-from flowrec.store.joints import Piece, Run, without_part
-from flowrec.store.region import Region
+from flowrec.store.metadata import SessionHeader
+from flowrec.store.part_continuity import Piece, Run, without_part
+from flowrec.store.roi import Region
+from flowrec.store.schema_check import Contents
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
 from flowrec.units import seconds
 

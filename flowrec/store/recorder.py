@@ -8,12 +8,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from flowrec.errors import SessionError
-from flowrec.store.backlog import Entry
 from flowrec.store.chunk import Sealed, kept
-from flowrec.store.header import SessionHeader
-from flowrec.store.mirrors import Mirrors
-from flowrec.store.packer import Packer
-from flowrec.store.piece import Making, Piece, PieceError
+from flowrec.store.chunk_encoder import Packer
+from flowrec.store.metadata import SessionHeader
+from flowrec.store.session_file import Making, Piece, PieceError
+from flowrec.store.viewer_topics import Mirrors
+from flowrec.store.write_queue import Entry
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 

@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flowrec.errors import SessionError
-from flowrec.locks import held
 from flowrec.messages import Tick
-from flowrec.output import MCAP, OutputError, check_output, put_in_place
-from flowrec.store.contents import Contents
-from flowrec.store.frames import ENCODINGS
-from flowrec.store.header import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
-from flowrec.store.names import PARTIAL_SUFFIX, partial_path
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.mcap_reader import DamageError, Source
+from flowrec.store.metadata import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
+from flowrec.store.paths import PARTIAL_SUFFIX, partial_path
 from flowrec.store.reader import SessionReader
 from flowrec.store.scan import Scan, scan
-from flowrec.store.source import DamageError, Source
+from flowrec.store.schema_check import Contents
 from flowrec.store.writer import SessionWriter
+from flowrec.system.locks import held
+from flowrec.system.outputs import MCAP, OutputError, check_output, put_in_place
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from flowrec.errors import SessionError
-from flowrec.store.header import Part
-from flowrec.store.joints import goes_on, unfinished_of
-from flowrec.store.names import PARTIAL_SUFFIX, part_number, part_path, parts
+from flowrec.store.metadata import Part
+from flowrec.store.part_continuity import goes_on, unfinished_of
+from flowrec.store.paths import PARTIAL_SUFFIX, part_number, part_path, parts
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import NothingSavedError, Recovered, recover
 from flowrec.store.writer import SessionWriter

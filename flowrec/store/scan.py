@@ -24,10 +24,10 @@ from mcap.records import (
 )
 
 from flowrec.errors import SessionError
-from flowrec.store.header import CONFIG_FILE, OUTCOME
-from flowrec.store.index import DECLARED_LIMIT, Summary, declare
-from flowrec.store.mcap_file import MAGIC
-from flowrec.store.source import CHUNK_LIMIT_BYTES, RECORD_HEAD, Record, Source
+from flowrec.store.mcap_index import DECLARED_LIMIT, Summary, declare
+from flowrec.store.mcap_reader import CHUNK_LIMIT_BYTES, RECORD_HEAD, Record, Source
+from flowrec.store.mcap_writer import MAGIC
+from flowrec.store.metadata import CONFIG_FILE, OUTCOME
 
 _CHUNK_HEAD = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the content
 _HEAD_BYTES = _CHUNK_HEAD.size + 16

@@ -6,7 +6,7 @@ from typing import Any
 
 from flowrec.messages import Event, OperatorEvent
 from flowrec.store.form import Codec, Payload
-from flowrec.store.schemas import foxglove_schema
+from flowrec.store.schema import foxglove_schema
 from flowrec.units import NS_PER_S
 
 # Levels of foxglove.Log by Event.level; one that is not listed travels in the name.

@@ -16,19 +16,19 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from flowrec.errors import SessionError
-from flowrec.locks import remove_idle
 from flowrec.messages import Drops, Frame, Message, Tick, Track, array_fields
-from flowrec.store.backlog import Backlog, Entry, News
-from flowrec.store.choice import left_out
-from flowrec.store.frames import ENCODINGS
-from flowrec.store.header import SessionHeader
-from flowrec.store.layout import FRAME_PATH
-from flowrec.store.names import pieces as pieces_of
-from flowrec.store.parts import Parts, Split
-from flowrec.store.piece import Making, refuse_if_taken
-from flowrec.store.region import Region, Window, Windows
-from flowrec.store.snapshots import Snapshot, Snapshots
-from flowrec.store.thinning import Thinning
+from flowrec.store.channels import FRAME_PATH
+from flowrec.store.frame_decimation import Thinning
+from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.metadata import SessionHeader
+from flowrec.store.paths import pieces as pieces_of
+from flowrec.store.ring_buffer import Snapshot, Snapshots
+from flowrec.store.roi import Region, Window, Windows
+from flowrec.store.session_file import Making, refuse_if_taken
+from flowrec.store.split import Parts, Split
+from flowrec.store.topic_filter import left_out
+from flowrec.store.write_queue import Backlog, Entry, News
+from flowrec.system.locks import remove_idle
 from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S, nanoseconds
 

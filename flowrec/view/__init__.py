@@ -6,7 +6,7 @@ where the viewer is and whether there is a screen (viewer), pictures without a s
 """
 
 from flowrec.view.live import LiveView
-from flowrec.view.rrd import is_made_from, write_rrd
+from flowrec.view.rrd_file import is_made_from, write_rrd
 from flowrec.view.scene import Scene
 from flowrec.view.screenshot import screenshot
 from flowrec.view.viewer import open_viewer

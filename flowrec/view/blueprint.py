@@ -7,8 +7,8 @@ from collections.abc import Set as AbstractSet
 import rerun as rr
 import rerun.blueprint as rrb
 
+from flowrec.view import colours
 from flowrec.view import entities as e
-from flowrec.view import palette
 from flowrec.view.maps import ColourBar
 from flowrec.view.scene import Scene
 
@@ -176,7 +176,7 @@ def _camera(scene: Scene, name: str, contents: list[str], origin: str) -> rrb.Vi
         name=name,
         origin=origin,
         contents=contents,
-        background=palette.SOLID,
+        background=colours.SOLID,
         visual_bounds=_bounds(scene.image_bounds()),
     )
 
@@ -194,7 +194,7 @@ def _map(scene: Scene, name: str, entity: str, scale: str, prefix: str = "") -> 
         ],
         # Thin here: the fastest flow is just where the path runs.
         overrides={e.under(prefix, e.PATH): rr.LineStrips2D.from_fields(radii=rr.Radius.ui_points(0.6))},
-        background=palette.SOLID,
+        background=colours.SOLID,
         visual_bounds=_bounds(ColourBar.beside(scene).bounds_with(scene)),
     )
 

@@ -18,8 +18,8 @@ import rerun as rr
 from flowrec.messages import Tick
 from flowrec.view import viewer
 from flowrec.view.blueprint import blueprint
-from flowrec.view.log import TickLogger
-from flowrec.view.rrd import describe, open_stream
+from flowrec.view.logger import TickLogger
+from flowrec.view.rrd_file import describe, open_stream
 from flowrec.view.scene import Scene
 
 _MEMORY = "256MB"  # kept for viewers that come later

@@ -6,10 +6,10 @@ import numpy as np
 import rerun as rr
 
 from flowrec.messages import FlowField, Route, Tick
+from flowrec.view import colours, maps
 from flowrec.view import entities as e
-from flowrec.view import maps, palette
 from flowrec.view.arrows import arrow_grid, flow_arrows
-from flowrec.view.pen import Pen, label
+from flowrec.view.entity_logger import Pen, label
 from flowrec.view.scene import Scene
 
 
@@ -34,7 +34,7 @@ class FlowLogger:
             left, top, right, bottom = self._scene.chip_bounds()
             centre = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
             for entity in (e.REFINED, e.CHANGE):
-                self._pen.log(_beside(entity), label(centre, "not refined yet", palette.PALE))
+                self._pen.log(_beside(entity), label(centre, "not refined yet", colours.PALE))
         elif refined is not None and last.refined is None:
             for entity in (e.REFINED, e.CHANGE):
                 self._pen.log(_beside(entity), rr.Clear(recursive=False))
@@ -92,7 +92,7 @@ class FlowLogger:
         self._pen.log(e.UNCERTAINTY, maps.picture(values, scale))
         self._log_scale(e.UNCERTAINTY_SCALE, scale)
 
-    def _log_scale(self, entity: str, scale: palette.Scale) -> None:
+    def _log_scale(self, entity: str, scale: colours.Scale) -> None:
         self._pen.log(f"{entity}/bar", *self._bar.strip(scale))
         self._pen.log(f"{entity}/ticks", *self._bar.ticks(scale))
 

@@ -21,8 +21,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from flowrec import child
 from flowrec.messages import Frame, Tick
+from flowrec.system import child_process
 from flowrec.view import viewer
 from flowrec.view.scene import Scene
 
@@ -63,7 +63,7 @@ class LiveView:
         if viewer.executable() is None:
             self._gone = True
             return "no live view: Rerun's viewer is not installed (pip install rerun-sdk); the run goes on without"
-        command = child.command("flowrec.view.feed", str(self._port), "window" if window else "serve")
+        command = child_process.command("flowrec.view.feed", str(self._port), "window" if window else "serve")
         try:
             with self._log.open("wb") as log:
                 self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -72,7 +72,7 @@ class LiveView:
                     stdout=log,
                     stderr=log,
                     start_new_session=True,  # Ctrl-C ends the run, and then the run ends this
-                    env=child.environment(),
+                    env=child_process.environment(),
                 )
         except OSError as error:
             self._gone = True

@@ -10,8 +10,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from flowrec.messages import FlowField
-from flowrec.view import palette
-from flowrec.view.palette import Scale
+from flowrec.view import colours
+from flowrec.view.colours import Scale
 from flowrec.view.scene import Placement, Scene
 
 _HEADROOM = 1.3  # of the scale above the first field: a refined one is often faster
@@ -52,7 +52,7 @@ def change(refined: FlowField, assumed: FlowField, mask: NDArray[np.bool_]) -> N
     return speed(refined, mask) - speed(assumed, mask)
 
 
-def scale_of(values: NDArray[np.float64], colours: palette.Colours) -> Scale:
+def scale_of(values: NDArray[np.float64], colours: colours.Colours) -> Scale:
     """A scale that holds nearly all of a map; the last half percent is corners and may saturate."""
     known = np.abs(values[np.isfinite(values)])
     return Scale.up_to(float(np.quantile(known, 0.995)) if known.size else 1.0, colours)
@@ -61,14 +61,14 @@ def scale_of(values: NDArray[np.float64], colours: palette.Colours) -> Scale:
 def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: Scale) -> rr.EncodedImage:
     """A time to go (h, w), darker where a front passes it, twice between two ticks; red where there is no way."""
     known = mask & np.isfinite(time_s)
-    colours = scale.paint(np.where(known, time_s, np.nan))
+    pixels = scale.paint(np.where(known, time_s, np.nan))
     front = np.floor(np.where(known, time_s, 0.0) / (0.5 * scale.step))
     crossed = np.zeros(mask.shape, np.bool_)
     crossed[:, :-1] |= (front[:, :-1] != front[:, 1:]) & known[:, 1:]
     crossed[:-1] |= (front[:-1] != front[1:]) & known[1:]
-    colours[crossed & known] = (0.6 * colours[crossed & known]).astype(np.uint8)
-    colours[mask & ~known] = palette.NO_WAY
-    return _encoded(colours)
+    pixels[crossed & known] = (0.6 * pixels[crossed & known]).astype(np.uint8)
+    pixels[mask & ~known] = colours.NO_WAY
+    return _encoded(pixels)
 
 
 def picture(values: NDArray[np.float64], scale: Scale) -> rr.EncodedImage:
@@ -123,7 +123,7 @@ class ColourBar:
         right = self.left + self.width
         dash = 0.25 * self.width
         marks = rr.LineStrips2D(
-            [[[right, at], [right + dash, at]] for at in y], colors=palette.WHITE, radii=rr.Radius.ui_points(0.8)
+            [[[right, at], [right + dash, at]] for at in y], colors=colours.WHITE, radii=rr.Radius.ui_points(0.8)
         )
         sign = "+" if scale.colours == "change" else ""
         labels = [f"{value:{sign}g}" if abs(value) > 1e-9 * scale.high else "0" for value in scale.ticks]
@@ -131,5 +131,5 @@ class ColourBar:
         # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
         at = [(right + 2.0 * self.width, row - 0.045 * self.height) for row in y]
         at.append((self.left + 0.5 * self.width, self.top - 0.14 * self.height))
-        numbers = rr.Points2D(at, labels=labels, show_labels=True, colors=palette.WHITE, radii=rr.Radius.ui_points(0))
+        numbers = rr.Points2D(at, labels=labels, show_labels=True, colors=colours.WHITE, radii=rr.Radius.ui_points(0))
         return marks, numbers

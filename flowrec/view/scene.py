@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.chip.registration import Calibration
 from flowrec.robot import Robot
 
 _HALF_PX = 0.5

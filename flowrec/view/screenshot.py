@@ -14,9 +14,9 @@ import numpy as np
 from rerun.experimental import ViewerClient, ViewerState
 
 from flowrec.errors import FlowrecError
-from flowrec.output import PICTURE, new_file
-from flowrec.store.head import Head
-from flowrec.store.source import ForeignError
+from flowrec.store.mcap_reader import ForeignError
+from flowrec.store.session_metadata import Head
+from flowrec.system.outputs import PICTURE, new_file
 from flowrec.units import nanoseconds
 from flowrec.view import viewer
 from flowrec.view.entities import SESSION_TIME

@@ -14,16 +14,16 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.chip.registration import Calibration
 from flowrec.messages import Frame, Image, Track
 from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
-from flowrec.vision.appearance import edge_px, template
-from flowrec.vision.disc import disc_reach, fit_disc
-from flowrec.vision.likeness import likeness
-from flowrec.vision.walls import Box, Walls, walls_in_view
+from flowrec.vision.disc_fit import disc_reach, fit_disc
+from flowrec.vision.disc_model import edge_px, template
+from flowrec.vision.masked_ncc import likeness
+from flowrec.vision.wall_distance import Box, Walls, walls_in_view
 
 _COARSE_RADIUS_PX = 2.5  # candidates are looked for at about this radius
 _FINE_RADIUS_PX = 6.0  # and measured at about this one, or as they are when smaller

@@ -8,8 +8,8 @@ from flowrec.errors import UsageError
 from flowrec.refine import weights
 from flowrec.refine.case import Case
 from flowrec.refine.network import trained_network
-from flowrec.refine.scene import Scene, turn
-from flowrec.refine.sight import sight
+from flowrec.refine.network_inputs import Scene, turn
+from flowrec.refine.observation_operator import sight
 
 
 @pytest.fixture(scope="module")

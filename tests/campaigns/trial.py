@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from flowrec import cli
-from flowrec import record as verb
-from flowrec import run as loop
+from flowrec.commands import record as verb
 from flowrec.errors import RigError
 from flowrec.messages import Currents
 from flowrec.pipeline import Inputs
-from flowrec.rigs.simulated import SimulatedRig
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run import loop
 from tests.conftest import SMALL
 
 AT = 40

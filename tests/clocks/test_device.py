@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from flowrec.clocks import DeviceClock
-from flowrec.clocks.device import envelope
+from flowrec.clocks.device_clock import envelope
 
 
 @settings(max_examples=60)

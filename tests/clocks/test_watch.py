@@ -13,15 +13,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.check import check
 from flowrec.clocks import ClockWatch, DeviceClock, read_clocks
+from flowrec.commands.check import check
+from flowrec.commands.info import describe, facts_for_people
+from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.errors import RigError
-from flowrec.listing import describe, facts_for_people
 from flowrec.pipeline import Inputs
-from flowrec.record import prepare
-from flowrec.rigs.simulated import SimulatedRig
-from flowrec.run import LockstepWorker, run
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run.loop import LockstepWorker, run
 from flowrec.session import session_writer
 from flowrec.store import SessionReader, recover
 from tests.conftest import SMALL, until

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from flowrec.control import Coils
 from flowrec.control.amplifier import Amplifier
 from flowrec.control.coils import reach_of
-from flowrec.control.rotation import Order, Rotation, course
+from flowrec.control.field_rotation import Order, Rotation, course
 from flowrec.control.waveform import block, outputs, tail
 from flowrec.messages import Demand
 from flowrec.robot import Robot

@@ -5,7 +5,7 @@ import pytest
 
 from flowrec.chip import clearance_um
 from flowrec.control import Controller
-from flowrec.control.prediction import blend
+from flowrec.control.delay_compensation import blend
 from flowrec.messages import Demand, Estimate, Route
 from tests.control.plant import CENTRE_UM, ROBOT, field_of, fly, lemniscate, mission, straight, vortex
 

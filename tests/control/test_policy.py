@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from flowrec.chip import clearance_um
+from flowrec.commands.record import record
 from flowrec.config import load_config
 from flowrec.control import Controller
 from flowrec.control.policy import astray_um, downhill
-from flowrec.control.walls import _clearance_and_slope
+from flowrec.control.wall_barrier import _clearance_and_slope
 from flowrec.errors import UsageError
 from flowrec.flow import sample
 from flowrec.messages import Estimate, Route
 from flowrec.planning import Planner
-from flowrec.record import record
 from flowrec.robot import Robot
 from flowrec.store import SessionReader
 from tests.conftest import SMALL

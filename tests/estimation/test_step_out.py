@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import flowrec.record as verb
-from flowrec import replay
+import flowrec.commands.record as verb
+from flowrec.commands import replay
+from flowrec.commands.record import record
 from flowrec.config import Config, load_config
-from flowrec.control.narrator import narrate
+from flowrec.control.events import narrate
 from flowrec.estimation import HealthMonitor
 from flowrec.messages import Applied, Estimate, FlowField, Health, Tick
 from flowrec.pipeline import Pipeline
-from flowrec.record import record
-from flowrec.rigs.simulated import SimulatedRig
+from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.robot import Robot
 from flowrec.store import SessionReader
 from tests.conftest import SMALL

@@ -9,10 +9,10 @@ from scipy.ndimage import gaussian_filter
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import find_openings, guess_inlets
 from flowrec.flow import FlowSolver
-from flowrec.flow import system as systems
-from flowrec.flow.contour import curves
+from flowrec.flow import newton_solver as systems
+from flowrec.flow.contour_smoothing import curves
 from flowrec.flow.grid import INLET
-from flowrec.flow.outline import analytic, outline
+from flowrec.flow.level_set import analytic, outline
 
 SPEED = 100.0
 UM_PER_PX = 10.0

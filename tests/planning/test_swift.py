@@ -3,7 +3,7 @@
 import pytest
 
 from flowrec.planning import Planner, SurveyPlanner
-from flowrec.planning.space import Swift, open_space
+from flowrec.planning.free_space import Swift, open_space
 from tests.planning.worlds import PX, channel, chip_of, field_of, poiseuille, robot
 
 SWIFT = Swift(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)

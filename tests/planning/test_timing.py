@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flowrec.planning import travel_time
-from flowrec.planning.relax import relax
+from flowrec.planning.path_refinement import relax
 from tests.planning.worlds import channel, field_of, open_water, poiseuille
 
 

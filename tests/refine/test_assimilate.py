@@ -8,10 +8,10 @@ from scipy.ndimage import binary_erosion
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.errors import FlowError
-from flowrec.flow import FlowSolver, kept, sample
+from flowrec.flow import FlowSolver, cache, sample
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
-from flowrec.refine.model_error import ModelError, around
+from flowrec.refine.discretisation_error import ModelError, around
 
 
 def test_assimilation_recovers_the_truth_from_noisy_observations(twin):
@@ -129,7 +129,7 @@ def test_what_is_kept_changes_no_result(twin):
     doubled = replace(case.observations, flow_um_s=2.0 * case.observations.flow_um_s)
     Refiner().refine(case.assumed, doubled, case.chip, case.solver)
     warm = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
-    kept.forget()
+    cache.forget()
     cold = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
     assert warm.same_as(cold)
 

@@ -15,7 +15,7 @@ from flowrec.refine.collocation import Collocation
 from flowrec.refine.coordinate_net import CoordinateNet
 from flowrec.refine.crop import Crop
 from flowrec.refine.network import trained_network
-from flowrec.refine.sight import sight
+from flowrec.refine.observation_operator import sight
 from flowrec.refine.weights import write_weights
 
 QUICK = {

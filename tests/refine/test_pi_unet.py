@@ -6,8 +6,8 @@ import torch
 
 from flowrec.flow import sample
 from flowrec.refine import PiUnet, Refiner
-from flowrec.refine.physics import Physics
-from flowrec.refine.stencil import jacobian
+from flowrec.refine.jacobian import jacobian
+from flowrec.refine.residuals import Physics
 
 
 def poiseuille(width, length):

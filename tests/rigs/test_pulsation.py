@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flowrec.rigs.swimmer import Swimmer
+from flowrec.rig_settings import Simulated
+from flowrec.rigs.simulated.swimmer import Swimmer
 from flowrec.robot import Robot
-from flowrec.settings import Simulated
 
 
 def drifter(share: float) -> Swimmer:

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from flowrec.chip import ChipSettings, load_chip
-from flowrec.chip.calibration import Calibration
+from flowrec.chip.registration import Calibration
 from flowrec.control import Coils
 from flowrec.errors import ChipError, RigError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Currents, FlowField
-from flowrec.rigs.simulated import SimulatedRig, true_chip
+from flowrec.rig_settings import CameraSettings, Simulated
+from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
 from flowrec.robot import Robot
-from flowrec.settings import CameraSettings, Simulated
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
 CAMERA = CameraSettings(width_px=256, height_px=64, rate_hz=30.0, debris=0)

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, Matrix, Message, OperatorEvent, Track, Vector, array_fields, defaulted_fields
 from flowrec.store import codec
-from flowrec.store.schemas import forms_of
+from flowrec.store.schema import forms_of
 from flowrec.topics import TOPICS
 
 TYPES = sorted({topic.type for topic in TOPICS}, key=lambda kind: kind.__name__)

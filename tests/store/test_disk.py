@@ -18,12 +18,12 @@ import pytest
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
 from flowrec.store import SessionReader, SessionWriter, recover
-from flowrec.store.backlog import Backlog, Entry
-from flowrec.store.layout import SLOTS
-from flowrec.store.mcap_file import McapFile
+from flowrec.store.channels import SLOTS
+from flowrec.store.frame_decimation import Thinning
+from flowrec.store.mcap_reader import Source
+from flowrec.store.mcap_writer import McapFile
 from flowrec.store.scan import scan
-from flowrec.store.source import Source
-from flowrec.store.thinning import Thinning
+from flowrec.store.write_queue import Backlog, Entry
 from flowrec.units import seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 

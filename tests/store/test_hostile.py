@@ -17,19 +17,19 @@ import zstandard
 from mcap.records import Schema
 from typer.testing import CliRunner
 
-from flowrec.check import check
-from flowrec.chip.files import chip_from_files
+from flowrec.chip.io import chip_from_files
 from flowrec.chip.vessel_case import KEYS as CASE_KEYS
 from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.cli import app
+from flowrec.commands.check import check
+from flowrec.commands.export import write_rrd_of
 from flowrec.config import config_from_toml
 from flowrec.errors import ChipError, FlowError, SessionError, UsageError, printable
-from flowrec.export import write_rrd_of
 from flowrec.messages import Estimate, Frame, Message
 from flowrec.refine.weights import read_weights
 from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.store.channels import SLOTS
 from flowrec.store.codec import encode_record
-from flowrec.store.layout import SLOTS
 from flowrec.store.shapes import misfit, not_finite, shapes_of
 from flowrec.topics import BY_FIELD, TOPICS
 from tests.store.drafts import (
@@ -240,8 +240,8 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
     inner.mkdir()
     (tmp_path / "secret.mcap").write_bytes(DRAFT.build())
     opened = []
-    monkeypatch.setattr("flowrec.export.SessionReader", opened.append)
-    monkeypatch.setattr("flowrec.export.write_rrd", lambda *_, **__: None)
+    monkeypatch.setattr("flowrec.commands.export.SessionReader", opened.append)
+    monkeypatch.setattr("flowrec.commands.export.write_rrd", lambda *_, **__: None)
     for name in ("../secret.mcap", str(tmp_path / "secret.mcap"), "..", "a\0b", ""):
         parent = text("flowrec.parent") + _map({"file": name, "sha256": "0"})
         head = tuple(part for part in DRAFT.head if not part[1].startswith(text("flowrec.parent")))
@@ -252,7 +252,7 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
 def test_an_image_that_promises_more_than_it_has_is_refused(tmp_path):
     wire = made_up(Frame, 10**9, 0, np.random.default_rng(0))
     sound = b"".join(encode_record(wire)[1])
-    from flowrec.store.schemas import foxglove_schema
+    from flowrec.store.schema import foxglove_schema
 
     parsed = foxglove_schema("RawImage").wire.FromString(sound)
     for width, height, data in ((65535, 65535, bytes(10)), (2**32 - 1, 2**32 - 1, b""), (0, 2**32 - 1, b"")):

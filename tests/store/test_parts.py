@@ -9,20 +9,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from flowrec import replay as verb
-from flowrec.check import check
 from flowrec.chip import load_chip
 from flowrec.cli import app
-from flowrec.compare import compare_sessions
+from flowrec.commands import replay as verb
+from flowrec.commands.check import check
+from flowrec.commands.compare import compare_sessions
+from flowrec.commands.info import describe, list_sessions
+from flowrec.commands.replay import Change
 from flowrec.config import load_config, resolve
 from flowrec.errors import SessionError
-from flowrec.listing import describe, list_sessions
 from flowrec.messages import Tick
-from flowrec.replay import Change
 from flowrec.session import session_header, session_sha256
 from flowrec.store import SessionReader, SessionWriter, recover_run
-from flowrec.store.header import Part
-from flowrec.store.names import part_path, partial_path
+from flowrec.store.metadata import Part
+from flowrec.store.paths import part_path, partial_path
 from flowrec.topics import BY_FIELD
 from tests.store.made_up import ticks_of
 
@@ -234,7 +234,7 @@ def test_recover_makes_a_run_whole_whatever_is_left_of_its_last_part(run, whole,
 @pytest.fixture
 def rrd_only_begun(monkeypatch):
     """What Rerun makes of a session is tested elsewhere, and takes its time."""
-    monkeypatch.setattr("flowrec.export.write_rrd", lambda target, *_, **__: target.touch())
+    monkeypatch.setattr("flowrec.commands.export.write_rrd", lambda target, *_, **__: target.touch())
 
 
 def test_the_verbs_take_the_run(run, whole, tmp_path, rrd_only_begun):

@@ -10,17 +10,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec import replay as verb
-from flowrec.compare import compare_sessions
+from flowrec.commands import replay as verb
+from flowrec.commands.compare import compare_sessions
+from flowrec.commands.replay import Change
 from flowrec.errors import SessionError
-from flowrec.locks import is_growing
-from flowrec.replay import Change
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.store import SessionReader, SessionWriter, recover
-from flowrec.store.layout import SLOTS
+from flowrec.store.channels import SLOTS
+from flowrec.store.mcap_reader import Source
 from flowrec.store.recorder import Recorder
 from flowrec.store.scan import scan
-from flowrec.store.source import Source
+from flowrec.system.locks import is_growing
 from flowrec.topics import TOPICS, Role
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_trouble import KILLED, names_in
@@ -261,7 +261,7 @@ def test_a_full_disk_leaves_the_remains_as_they_were(small, tmp_path, monkeypatc
     def refuse(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("flowrec.store.mcap_file.McapFile.add_chunks", refuse)
+    monkeypatch.setattr("flowrec.store.mcap_writer.McapFile.add_chunks", refuse)
     with pytest.raises(SessionError, match=r"left as it was.*disk is full") as error:
         recover(path)
     assert "flowrec recover" not in str(error.value)

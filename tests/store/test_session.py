@@ -21,7 +21,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
 from flowrec.store import SessionReader, SessionWriter
-from flowrec.store.schemas import foxglove_schema
+from flowrec.store.schema import foxglove_schema
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
 TICKS = list(ticks_of(150))

@@ -21,12 +21,12 @@ from mcap.reader import make_reader
 from flowrec.errors import SessionError
 from flowrec.messages import OperatorEvent, Tick
 from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
-from flowrec.store.layout import SLOTS
-from flowrec.store.mcap_file import McapFile
-from flowrec.store.mirrors import Mirrors
-from flowrec.store.names import part_path, pieces
+from flowrec.store.channels import SLOTS
+from flowrec.store.mcap_reader import Source
+from flowrec.store.mcap_writer import McapFile
+from flowrec.store.paths import part_path, pieces
 from flowrec.store.scan import scan
-from flowrec.store.source import Source
+from flowrec.store.viewer_topics import Mirrors
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_disk import GatedDisk, slow_disk

@@ -23,8 +23,8 @@ from mcap.writer import Writer
 
 from flowrec.errors import SessionError
 from flowrec.messages import Currents
-from flowrec.store import SessionReader, SessionWriter, header, layout
-from flowrec.store.mcap_file import McapFile
+from flowrec.store import SessionReader, SessionWriter, channels, metadata
+from flowrec.store.mcap_writer import McapFile
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(30, shape=(8, 8)))
@@ -173,7 +173,7 @@ def test_what_is_no_session_is_named_as_what_it_is(tmp_path, session):
 
 
 def test_a_session_of_a_later_format_says_which_flowrec_it_needs(tmp_path, monkeypatch):
-    monkeypatch.setattr(header, "FORMAT_VERSION", 2)
+    monkeypatch.setattr(metadata, "FORMAT_VERSION", 2)
     monkeypatch.setattr("flowrec.__version__", "9.9.0")
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
     monkeypatch.undo()
@@ -182,36 +182,36 @@ def test_a_session_of_a_later_format_says_which_flowrec_it_needs(tmp_path, monke
 
 
 def test_a_file_made_before_a_field_with_a_default_existed_is_read(tmp_path, monkeypatch):
-    slot = layout.SLOTS["/robot/estimate"]
+    slot = channels.SLOTS["/robot/estimate"]
     files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
     estimate = files.file[-1].message_type[0]
     assert estimate.name == "Estimate" and estimate.field[-1].name == "um_per_rev"
     del estimate.field[-1]
     other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
-    monkeypatch.setitem(layout.SLOTS, "/robot/estimate", other)
+    monkeypatch.setitem(channels.SLOTS, "/robot/estimate", other)
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
     SessionReader(tmp_path / "s.mcap")
 
 
 def test_a_message_that_is_laid_out_differently_is_named(tmp_path, monkeypatch):
-    slot = layout.SLOTS["/robot/track"]
+    slot = channels.SLOTS["/robot/track"]
     files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
     files.file[0].message_type[0].field[3].name = "likeness"
     other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
-    monkeypatch.setitem(layout.SLOTS, "/robot/track", other)
+    monkeypatch.setitem(channels.SLOTS, "/robot/track", other)
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
     with pytest.raises(SessionError, match=r"/robot/track is laid out differently \(Track\.likeness, Track\.score\)"):
         SessionReader(tmp_path / "s.mcap")
 
 
 def test_a_file_from_before_a_message_gained_a_field_that_may_be_missing_is_read(tmp_path, monkeypatch):
-    slot = layout.SLOTS["/coils/command"]
+    slot = channels.SLOTS["/coils/command"]
     files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
     message = files.file[0].message_type[0]
     while message.field[-1].name != "saturated":
         del message.field[-1]
     older = replace(slot, schema=replace(slot.schema, data=files.SerializeToString(deterministic=True)))
-    monkeypatch.setitem(layout.SLOTS, "/coils/command", older)
+    monkeypatch.setitem(channels.SLOTS, "/coils/command", older)
     currents = Currents(
         0, 7.0, 0.2, 3.0, 1.0, np.ones(3), False, voltages_v=np.zeros(0)
     )  # as these leave nothing behind

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flowrec import messages as m
-from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.chip.registration import Calibration
 from flowrec.robot import Robot
 from flowrec.view import Scene
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from flowrec.chip.calibration import Calibration
+from flowrec.chip.registration import Calibration
 from flowrec.flow import sample
 from flowrec.messages import FlowField, Tick
-from flowrec.view import Scene, maps, palette
+from flowrec.view import Scene, colours, maps
 from flowrec.view.arrows import arrow_grid, flow_arrows
-from flowrec.view.log import TickLogger
-from flowrec.view.palette import Scale
+from flowrec.view.colours import Scale
+from flowrec.view.logger import TickLogger
 
 
 class Record:
@@ -57,7 +57,7 @@ def test_maps_beside_each_other_have_one_scale_also_when_a_faster_flow_comes(sce
     fluid = scene.chip.mask
     assert np.array_equal(after, speeds.scale.paint(maps.speed(assumed, fluid)))
     assert np.array_equal(refined, speeds.scale.paint(maps.speed(times(assumed, 3.0), fluid)))
-    assert (after[~fluid] == palette.SOLID).all()
+    assert (after[~fluid] == colours.SOLID).all()
 
 
 def test_a_recorded_and_a_replayed_session_share_one_scale(scene: Scene, ticks: list[Tick]) -> None:
@@ -87,8 +87,8 @@ def test_a_map_of_the_time_to_go_tells_far_from_unreachable(scene: Scene, ticks:
     logger = TickLogger(record, scene)  # type: ignore[arg-type]
     logger.log(Tick(0, route=replace(route, time_to_go_s=time_s)))
     seen = record.map("/plan/time\\ to\\ go/map")
-    assert (seen[~fluid] == palette.SOLID).all()
-    assert (seen[:, -20:][fluid[:, -20:]] == palette.NO_WAY).all()
+    assert (seen[~fluid] == colours.SOLID).all()
+    assert (seen[:, -20:][fluid[:, -20:]] == colours.NO_WAY).all()
     assert "time to go" in logger.present
     row = int(np.argmax(fluid[:, :-20].sum(1)))
     assert seen[row, -30].astype(int).sum() > seen[row, 10].astype(int).sum()  # lighter is farther
@@ -98,8 +98,8 @@ def test_a_map_of_the_time_to_go_tells_far_from_unreachable(scene: Scene, ticks:
 
 @pytest.mark.parametrize("largest", [3e-7, 0.9, 1.0, 7.3, 42.0, 100.0, 456.0, 1e6])
 def test_a_scale_holds_its_largest_value_on_few_round_ticks(largest: float) -> None:
-    for colours in ("speed", "change"):
-        scale = Scale.up_to(largest, colours)  # type: ignore[arg-type]
+    for shown in ("speed", "change"):
+        scale = Scale.up_to(largest, shown)  # type: ignore[arg-type]
         assert largest <= scale.high * (1 + 1e-9) < 2.6 * largest
         assert 3 <= len(scale.ticks) <= 8
         assert scale.ticks[-1] == pytest.approx(scale.high)
@@ -164,7 +164,7 @@ def test_a_robot_that_is_not_seen_is_grey_and_says_so(scene: Scene, ticks: list[
         (word,) = record.logged["/camera/robot\\ label"].labels.as_arrow_array().to_pylist()
         (colour,) = record.logged["/camera/robot"].colors.as_arrow_array().to_pylist()
         words.append(word)
-        expected = palette.ORANGE if word == "robot" else palette.PALE
+        expected = colours.ORANGE if word == "robot" else colours.PALE
         assert colour >> 8 == (expected[0] << 16) + (expected[1] << 8) + expected[2]
     assert words == ["robot"] * 2 + ["robot (not seen)"] * 4 + ["robot"] * 2
 

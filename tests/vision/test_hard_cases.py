@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from flowrec.chip.calibration import Calibration
 from flowrec.chip.chip import Chip
+from flowrec.chip.registration import Calibration
 from flowrec.messages import Frame
 from flowrec.robot import Robot
 from flowrec.vision import Tracker

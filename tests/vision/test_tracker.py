@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from flowrec.chip import ChipSettings, clearance_um, load_chip
-from flowrec.chip.calibration import Calibration
+from flowrec.chip.registration import Calibration
 from flowrec.messages import Frame, Track
-from flowrec.rigs.microscope import Microscope
+from flowrec.rig_settings import CameraSettings
+from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.robot import Robot
-from flowrec.settings import CameraSettings
 from flowrec.vision import Tracker
 
 CHIP = load_chip(ChipSettings())

@@ -1,0 +1,228 @@
+"""A chip as two files: a PNG mask and, beside it, a TOML of the same stem.
+
+    um_per_px = 20.0          # wanted; everything below may be left out
+    viscosity_mpa_s = 1.0     # 1.0
+    density_kg_m3 = 1000.0    # 1000
+    depth_um = 100.0          # left out: two-dimensional
+    walls = "smooth"          # "smooth": the outline behind the pixels; "pixel": the pixels themselves
+    fluid = "bright"          # "bright": fluid is >= 128; "dark": fluid is < 128
+    name = "y_junction"       # the stem of the file
+    inlet_speed_um_s = 200.0  # of inlets that are found, not listed
+
+    [[opening]]               # left out: found automatically, see openings.py
+    side = "left"             # left, right, top, bottom
+    first = 100               # first and last pixel of fluid on that side, from 0, both inclusive
+    last = 119
+    kind = "inlet"            # inlet (speed_um_s: mean inward) or outlet (pressure_pa, 0)
+    speed_um_s = 200.0
+
+Fluid that no opening reaches does not flow: such pockets are filled on loading.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import label
+
+from flowrec.chip.chip import Chip, Kind, Opening, Side, Walls
+from flowrec.chip.openings import DEFAULT_INLET_UM_S, check_openings, find_openings, guess_inlets
+from flowrec.errors import ChipError
+from flowrec.system.toml_file import parse_toml
+
+MIN_SIDE_PX = 8
+MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
+_PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
+_NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um", "inlet_speed_um_s")
+CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "opening")
+_OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
+
+
+def chip_files(chip: Chip) -> tuple[bytes, str]:
+    """PNG and TOML of a chip, from which `chip_from_files` makes exactly the same one."""
+    written, png = cv2.imencode(".png", np.where(chip.mask, 255, 0).astype(np.uint8))
+    if not written:
+        raise ChipError(f"{chip.name}: the mask can not be written as PNG; is it {chip.mask.shape} pixels?")
+    lines = [
+        f"name = {json.dumps(chip.name, ensure_ascii=False)}",
+        f"um_per_px = {float(chip.um_per_px)!r}",
+        f"viscosity_mpa_s = {float(chip.viscosity_mpa_s)!r}",
+        f"density_kg_m3 = {float(chip.density_kg_m3)!r}",
+    ]
+    if chip.depth_um is not None:
+        lines.append(f"depth_um = {float(chip.depth_um)!r}")
+    lines += [f'walls = "{chip.walls}"', 'fluid = "bright"']
+    for o in chip.openings:
+        value = "speed_um_s" if o.kind == "inlet" else "pressure_pa"
+        lines += ["", "[[opening]]", f'side = "{o.side}"', f"first = {int(o.first)}", f"last = {int(o.last)}"]
+        lines += [f'kind = "{o.kind}"', f"{value} = {float(o.value)!r}"]
+    return png.tobytes(), "\n".join(lines) + "\n"
+
+
+def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_per_px: float | None = None) -> Chip:
+    """The chip in a PNG and a TOML text; `where` names it in errors, `um_per_px` goes before the TOML's.
+
+    Raises ChipError, in one line, for whatever no flow can be computed on.
+    """
+    try:
+        table = parse_toml(toml_text)
+    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
+        raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
+    _refuse_unknown(table, CHIP_KEYS, where)
+    number = {key: _number(table, key, where) for key in _NUMBERS}
+    scale = number["um_per_px"] if um_per_px is None else um_per_px
+    if scale is None:
+        raise ChipError(f"{where}: no um_per_px; set chip.um_per_px or put it into a TOML of the same name")
+    mask = _mask(png_bytes, _choice(table, "fluid", ("bright", "dark"), where) or "bright", where)
+    if "opening" in table:
+        openings = _listed(table["opening"], where)
+    else:
+        openings = find_openings(mask)
+        if openings:
+            speed = number["inlet_speed_um_s"]
+            openings = tuple(
+                replace(o, value=DEFAULT_INLET_UM_S if speed is None else speed) if o.kind == "inlet" else o
+                for o in guess_inlets(openings)
+            )
+    name = table.get("name", Path(where).stem)
+    if not isinstance(name, str):
+        raise ChipError(f"{where}: name = {name!r} is no text; put it in quotes")
+    chip = Chip(
+        name,
+        mask,
+        scale,
+        openings,
+        WATER_MPA_S if number["viscosity_mpa_s"] is None else number["viscosity_mpa_s"],
+        WATER_KG_M3 if number["density_kg_m3"] is None else number["density_kg_m3"],
+        number["depth_um"],
+        cast(Walls, _choice(table, "walls", get_args(Walls), where) or "smooth"),
+    )
+    check_chip(chip, where)
+    return chip
+
+
+def check_chip(chip: Chip, where: str) -> None:
+    """Raise ChipError unless a flow can be computed on the chip."""
+    height, width = chip.mask.shape
+    if height < MIN_SIDE_PX or width < MIN_SIDE_PX:
+        raise ChipError(
+            f"{where}: the mask is {width} x {height} pixels; at least {MIN_SIDE_PX} x {MIN_SIDE_PX} needed"
+        )
+    if not chip.mask.any():
+        raise ChipError(f'{where}: no fluid in the mask; is it the other way round? (fluid = "dark" in its TOML)')
+    if chip.mask.all():
+        raise ChipError(f'{where}: no wall in the mask; is it the other way round? (fluid = "dark" in its TOML)')
+    for key in ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um"):
+        value = getattr(chip, key)
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ChipError(f"{where}: {key} = {value:g}; it must be more than zero")
+    check_openings(chip.mask, chip.openings, where)
+
+
+def without_pockets(chip: Chip) -> Chip:
+    """The chip with all fluid filled that no opening reaches through the sides of pixels; its mask is read-only."""
+    labels, _ = label(chip.mask)
+    height, width = chip.mask.shape
+    reached = set()
+    for o in chip.openings:
+        row, column = {"left": (o.first, 0), "right": (o.first, width - 1)}.get(o.side, (0, o.first))
+        reached.add(int(labels[height - 1 if o.side == "bottom" else row, column]))
+    mask = np.isin(labels, sorted(reached))
+    mask.flags.writeable = False
+    return replace(chip, mask=mask)
+
+
+def read_png_chip(path: Path, um_per_px: float | None = None) -> Chip:
+    """The chip of a PNG and, where there is one, the TOML of the same stem; either path will do."""
+    png, toml = path.with_suffix(".png"), path.with_suffix(".toml")
+    if path.suffix.lower() == ".png":
+        png = path
+    try:
+        data = png.read_bytes()
+        text = toml.read_text(encoding="utf-8") if toml.exists() or path == toml else ""
+    except FileNotFoundError as error:
+        raise ChipError(
+            f"{error.filename}: no such file; a chip is a PNG with a TOML of the same stem beside it"
+        ) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ChipError(f"{path}: can not be read ({error}); is it a chip?") from error
+    return chip_from_files(data, text, str(path), um_per_px)
+
+
+def _mask(png_bytes: bytes, fluid: str, where: str) -> NDArray[np.bool_]:
+    grey = None
+    if png_bytes.startswith(_PNG_HEAD) and len(png_bytes) >= len(_PNG_HEAD) + 8:
+        # The head is believed before a pixel is there: a small file could ask for gigabytes.
+        width, height = struct.unpack_from(">II", png_bytes, len(_PNG_HEAD))
+        if width * height > MAX_PIXELS:
+            raise ChipError(f"{where}: a mask of {width} x {height} pixels; at most {MAX_PIXELS} are possible")
+        try:
+            grey = cv2.imdecode(np.frombuffer(png_bytes, np.uint8), cv2.IMREAD_GRAYSCALE)
+        except cv2.error:  # a header that promises an impossible image
+            grey = None
+    if grey is None:
+        raise ChipError(f"{where}: the mask is no PNG image, or a damaged one; save it again as 8-bit grey")
+    mask = np.asarray(grey) >= 128
+    if fluid == "dark":
+        mask = ~mask
+    mask.flags.writeable = False
+    return mask
+
+
+def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, 1, 0.0)[0]
+            raise ChipError(f"{where}: unknown key {key}; did you mean {near}?")
+
+
+def _number(table: Mapping[str, Any], key: str, where: str) -> float | None:
+    value = table.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ChipError(f"{where}: {key} = {value!r}; it must be a number")
+    return float(value)
+
+
+def _choice(table: Mapping[str, Any], key: str, choices: tuple[str, ...], where: str) -> str | None:
+    value = table.get(key)
+    if value is not None and value not in choices:
+        raise ChipError(f"{where}: {key} = {value!r}; it must be one of {', '.join(choices)}")
+    return value
+
+
+def _listed(tables: Any, where: str) -> tuple[Opening, ...]:
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise ChipError(f"{where}: openings are tables; write [[opening]] above each")
+    openings = []
+    for number, table in enumerate(tables, 1):
+        here = f"{where}: opening {number}"
+        _refuse_unknown(table, _OPENING_KEYS, here)
+        side = _choice(table, "side", get_args(Side), here)
+        kind = _choice(table, "kind", get_args(Kind), here)
+        ends = [table.get("first"), table.get("last")]
+        if side is None or kind is None or any(type(end) is not int for end in ends):
+            raise ChipError(
+                f'{here}: side, first, last (whole pixels) and kind are wanted, as in side = "left", first = 91, '
+                'last = 109, kind = "inlet", speed_um_s = 180.0'
+            )
+        key, other = ("speed_um_s", "pressure_pa") if kind == "inlet" else ("pressure_pa", "speed_um_s")
+        if other in table:
+            raise ChipError(f"{here}: an {kind} has no {other}; give {key}")
+        value = _number(table, key, here)
+        if value is None and kind == "inlet":
+            raise ChipError(f"{here}: an inlet needs speed_um_s, its mean inward speed")
+        openings.append(Opening(cast(Side, side), ends[0], ends[1], cast(Kind, kind), value or 0.0))
+    return tuple(openings)

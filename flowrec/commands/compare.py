@@ -1,0 +1,330 @@
+"""Element by element: is a replay the recording, is a session the other one, and where do they first differ?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.config import config_from_toml
+from flowrec.errors import UsageError, printable
+from flowrec.messages import Message, Tick
+from flowrec.store import SessionReader
+from flowrec.store.topic_filter import is_left_out
+from flowrec.topics import BY_FIELD, TOPICS, Role, Topic
+from flowrec.units import seconds
+
+Fields = Mapping[str, frozenset[str]]  # names of message fields, by field of Tick
+_Apart = tuple[float, tuple[int, ...] | None, object, object]  # excess over the tolerance, index, both values
+_ALL: Fields = {topic.field: frozenset(each.name for each in fields(topic.type)) for topic in TOPICS}  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One of the two that are compared.
+
+    Attributes
+    ----------
+    word : what its values are called.
+    name : what it is called as a whole.
+    recorded : the fields that it records.
+    copy : it is a replay, into which images are copied on request only.
+    """
+
+    word: str
+    name: str
+    recorded: Fields = field(default_factory=lambda: _ALL)
+    copy: bool = False
+
+    @classmethod
+    def of(cls, word: str, reader: SessionReader) -> Side:
+        """A session: without the topics that it leaves out, and the fields that its own schemas do not have."""
+        try:
+            left_out = config_from_toml(reader.header.config_toml, f"{reader.path}").recording.leave_out
+        except UsageError:  # the configuration of another flowrec: then every topic that it declares counts
+            left_out = ()
+        copy = bool(reader.header.parent)
+        recorded = dict(reader.recorded_fields)
+        for name in recorded.keys() - reader.counts.keys():
+            if (copy and name == "frame") or is_left_out(BY_FIELD[name].path, left_out):
+                del recorded[name]
+        return cls(word, reader.path.name, recorded, copy)
+
+    def lacks(self, topic: Topic) -> dict[str, str]:
+        """What it does not record of a topic, `/topic` or `/topic field`, each with the words for it."""
+        if topic.field not in self.recorded:
+            copied = self.copy and topic.field == "frame"
+            return {topic.path: f"not copied into {self.name}" if copied else f"not recorded in {self.name}"}
+        missing = _ALL[topic.field] - self.recorded[topic.field]
+        return {f"{topic.path} {name}": f"not recorded in {self.name}" for name in sorted(missing)}
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where two messages of a topic differ most: one element of one field.
+
+    Attributes
+    ----------
+    stamp_ns : of the tick.
+    index : of the element in an array; None for anything else.
+    values : of the element, or what is said of a whole message or array; in the order of `words`.
+    excess : size of the difference over what the tolerance of the field allows; inf where nothing is allowed, or
+        nothing can be subtracted.
+    words : what the two sides are called.
+    """
+
+    topic: str
+    stamp_ns: int
+    field: str
+    index: tuple[int, ...] | None
+    values: tuple[object, object]
+    excess: float
+    words: tuple[str, str] = ("recorded", "replayed")
+
+    @property
+    def beyond(self) -> bool:
+        """Whether it is larger than the tolerance."""
+        return not self.excess <= 1.0
+
+    def __str__(self) -> str:
+        place = "" if self.index is None else str(list(self.index))
+        told = ", ".join(f"{word} {_said(value)}" for word, value in zip(self.words, self.values, strict=True))
+        return printable(f"{self.topic} at {seconds(self.stamp_ns):.3f} s: {self.field}{place} {told}")
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it; what JSON has no number for as text."""
+        values = [value if _is_json(value) else _said(value) for value in self.values]
+        return {
+            "topic": self.topic,
+            "stamp_s": seconds(self.stamp_ns),
+            "field": self.field,
+            "index": None if self.index is None else list(self.index),
+            **dict(zip(self.words, values, strict=True)),
+        }
+
+
+@dataclass(slots=True)
+class TopicCount:
+    """How the messages of one topic compared; `first` is the first difference, beyond the tolerance if there is one."""
+
+    identical: int = 0
+    within_tolerance: int = 0
+    different: int = 0
+    first: Difference | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "identical": self.identical,
+            "within_tolerance": self.within_tolerance,
+            "different": self.different,
+            "first": self.first.as_json() if self.first is not None else None,
+        }
+
+
+@dataclass(slots=True)
+class Comparison:
+    """Takes pairs of ticks; only what is new in either of a pair, and recorded on both sides, is compared.
+
+    Attributes
+    ----------
+    roles : of the topics that `add` compares.
+    sides : what is compared.
+    not_recorded : topics, and fields of a topic as `/topic field`, that one side lacks, with the words for it.
+    first : the first difference beyond a tolerance.
+    """
+
+    roles: tuple[Role, ...] = (Role.OUTPUT,)
+    sides: tuple[Side, Side] = (Side("recorded", "the recording"), Side("replayed", "the replay"))
+    ticks: int = 0
+    different_ticks: int = 0
+    topics: dict[str, TopicCount] = field(default_factory=dict)
+    not_recorded: dict[str, str] = field(default_factory=dict)
+    first: Difference | None = None
+    _before: tuple[Tick, Tick] = (Tick(), Tick())
+    _names: dict[str, list[str]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for topic in TOPICS:
+            lacking = self.sides[0].lacks(topic) | self.sides[1].lacks(topic)
+            names = [each.name for each in fields(topic.type) if f"{topic.path} {each.name}" not in lacking]  # type: ignore[arg-type]
+            self._names[topic.field] = [] if topic.path in lacking else names
+            if topic.role is not Role.DIAGNOSTIC:
+                self.not_recorded |= lacking
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """What the values of the two sides are called."""
+        return self.sides[0].word, self.sides[1].word
+
+    def add(self, recorded: Tick, replayed: Tick) -> None:
+        """Compare all topics of the chosen roles in one tick."""
+        self.ticks += 1
+        differs = False
+        stamp_ns = max(recorded.stamp_ns, replayed.stamp_ns)
+        for topic in TOPICS:
+            if topic.role not in self.roles:
+                continue
+            was, now = getattr(recorded, topic.field), getattr(replayed, topic.field)
+            new = was is not getattr(self._before[0], topic.field) or now is not getattr(self._before[1], topic.field)
+            if new and (was is not None or now is not None):
+                found = self.add_pair(topic, was, now, stamp_ns)
+                differs |= found is not None and found.beyond
+        self.different_ticks += differs
+        self._before = (recorded, replayed)
+
+    def add_lone(self, stamp_ns: int, side: int) -> None:
+        """Count a tick that only one side has (0 or 1)."""
+        self.ticks += 1
+        self.different_ticks += 1
+        values = ("present", "absent") if side == 0 else ("absent", "present")
+        if self.first is None:
+            self.first = Difference("tick", stamp_ns, "tick", None, values, math.inf, self.words)
+
+    def add_pair(self, topic: Topic, was: Message | None, now: Message | None, stamp_ns: int) -> Difference | None:
+        """Compare two messages of a topic: where they differ most; None where they are bit for bit the same."""
+        names = self._names[topic.field]
+        if not names:
+            return None
+        count = self.topics.setdefault(topic.path, TopicCount())
+        difference = first_difference(topic, was, now, stamp_ns, names, self.words)
+        if difference is None:
+            count.identical += 1
+            return None
+        if difference.beyond:
+            count.different += 1
+            self.first = self.first or difference
+        else:
+            count.within_tolerance += 1
+        if count.first is None or (difference.beyond and not count.first.beyond):
+            count.first = difference
+        return difference
+
+    @property
+    def identical(self) -> bool:
+        """Every message bit for bit."""
+        return self.same and all(count.within_tolerance == 0 for count in self.topics.values())
+
+    @property
+    def same(self) -> bool:
+        """Every message within its topic's tolerance."""
+        return self.different_ticks == 0 and all(count.different == 0 for count in self.topics.values())
+
+    def lines(self) -> list[str]:
+        """For people, a line to a topic."""
+        lines = []
+        for topic, count in self.topics.items():
+            total = count.identical + count.within_tolerance + count.different
+            lines.append(
+                f"{topic:20s} {count.identical} of {total} identical"
+                + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
+                + (f", {count.different} DIFFERENT" if count.different else "")
+            )
+        return lines + [printable(f"{what:20s} {why}") for what, why in self.not_recorded.items()]
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it."""
+        return {
+            "same": self.same,
+            "identical": self.identical,
+            "ticks": self.ticks,
+            "different_ticks": self.different_ticks,
+            "topics": {topic: count.as_json() for topic, count in self.topics.items()},
+            "not_recorded": self.not_recorded,
+            "first": self.first.as_json() if self.first is not None else None,
+        }
+
+
+def first_difference(
+    topic: Topic,
+    was: Message | None,
+    now: Message | None,
+    stamp_ns: int,
+    names: Iterable[str] | None = None,
+    words: tuple[str, str] = ("recorded", "replayed"),
+) -> Difference | None:
+    """The largest difference between two messages of a topic, by what its tolerance allows; None: bit for bit the same.
+
+    Parameters
+    ----------
+    names : of the fields to compare; None: all.
+    """
+    if was is None or now is None:
+        values = tuple("absent" if message is None else "present" for message in (was, now))
+        return Difference(topic.path, stamp_ns, "message", None, (values[0], values[1]), math.inf, words)
+    worst: Difference | None = None
+    for name in names if names is not None else _ALL[topic.field]:
+        apart = _apart(getattr(was, name), getattr(now, name), topic.rtol, topic.atol_of(name))
+        if apart is not None and (worst is None or apart[0] > worst.excess):
+            excess, index, *values_apart = apart
+            worst = Difference(topic.path, stamp_ns, name, index, (values_apart[0], values_apart[1]), excess, words)
+    return worst
+
+
+def _apart(was: object, now: object, rtol: float, atol: float) -> _Apart | None:
+    """How far two values are apart, by |was - now| <= atol + rtol |was|; None where they are bit for bit the same."""
+    if isinstance(was, np.ndarray) and isinstance(now, np.ndarray):
+        if was.shape != now.shape or was.dtype.kind != now.dtype.kind:
+            return math.inf, None, _form(was), _form(now)
+        if was.dtype == now.dtype and was.tobytes() == now.tobytes():
+            return None
+        excess = _excess(was, now, rtol, atol)
+        index = tuple(int(i) for i in np.unravel_index(int(np.argmax(excess)), excess.shape))
+        return float(excess[index]), index, was[index].item(), now[index].item()
+    if isinstance(was, float) and isinstance(now, float | int) and not isinstance(now, bool):
+        if was == now or (was != was and now != now):
+            return None
+        return float(_excess(np.array(was), np.array(now), rtol, atol)), None, was, now
+    if isinstance(was, np.ndarray) or isinstance(now, np.ndarray):
+        return math.inf, None, _form(was), _form(now)
+    return None if was == now else (math.inf, None, was, now)
+
+
+def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> NDArray[np.float64]:
+    """Per element |was - now| over what is allowed. Values that are not finite are the same as their like only."""
+    a, b = np.asarray(was, np.float64), np.asarray(now, np.float64)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        same = (a == b) | (np.isnan(a) & np.isnan(b))
+        ratio = np.abs(a - b) / (atol + rtol * np.abs(a))
+    excess: NDArray[np.float64] = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
+    return excess
+
+
+def _form(value: object) -> object:
+    return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else value
+
+
+def _said(value: object) -> str:
+    return "absent" if value is None else str(value) if value in ("absent", "present") else repr(value)
+
+
+def _is_json(value: object) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def compare_sessions(first: SessionReader, second: SessionReader) -> Comparison:
+    """Every message of every tick of two sessions, inputs and truth included; timings left out.
+
+    Ticks belong together by their stamps.
+    """
+    sides = Side.of("first", first), Side.of("second", second)
+    comparison = Comparison(roles=(Role.INPUT, Role.OUTPUT, Role.TRUTH), sides=sides)
+    with_frames = all("frame" in side.recorded for side in sides)
+    ticks = [iter(reader.ticks(with_frames=with_frames)) for reader in (first, second)]
+    was, now = next(ticks[0], None), next(ticks[1], None)
+    while was is not None or now is not None:
+        if was is not None and now is not None and was.stamp_ns == now.stamp_ns:
+            comparison.add(was, now)
+            was, now = next(ticks[0], None), next(ticks[1], None)
+        elif now is None or (was is not None and was.stamp_ns < now.stamp_ns):
+            assert was is not None
+            comparison.add_lone(was.stamp_ns, 0)
+            was = next(ticks[0], None)
+        else:
+            comparison.add_lone(now.stamp_ns, 1)
+            now = next(ticks[1], None)
+    return comparison

@@ -1,0 +1,75 @@
+"""From a session to other files: the .rrd for Rerun. The MCAP stays the archive, these are caches for looking."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from flowrec.chip.chip import Chip
+from flowrec.config import Config
+from flowrec.errors import SessionError
+from flowrec.pipeline import Pipeline, assemble
+from flowrec.session import content_blamed, files_behind, open_session, session_key
+from flowrec.store import SessionReader, files_of
+from flowrec.system.outputs import RRD, check_output
+from flowrec.terminal import progress, say
+from flowrec.view import Scene, is_made_from, write_rrd
+
+
+def scene_of(config: Config, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:
+    """What the viewer needs to know besides the ticks."""
+    properties = {
+        "chip": chip.name,
+        "session": path.name,
+        "observer": config.observer.method,
+        "refine": config.refine.method,
+        "planner": config.plan.method,
+        "controller": config.control.method,
+    }
+    windows = config.recording.region != "whole"
+    return Scene(chip, pipeline.calibration, pipeline.robot, path.stem, properties, windows=windows)
+
+
+def write_rrd_of(path: Path, out: Path | None = None, overwrite: bool = False) -> Path:
+    """Write the .rrd of a session; a replay is shown beside its parent, where that is still there.
+
+    Parameters
+    ----------
+    out : where to; by default beside the session, with the suffix .rrd. What was made there of the same session before
+        is made anew. Any other existing file is refused.
+    overwrite : replace any existing file but those that are read.
+
+    Raises
+    ------
+    SessionError : the session can not be read, or the file not be written; OutputError where it may not be.
+    """
+    reader, config, chip = open_session(path)
+    key = session_key(reader)
+    target = out if out is not None else path.with_suffix(RRD[0])
+    overwrite = overwrite or (out is None and is_made_from(target, key))
+    inputs = files_behind(path)
+    check_output(target, RRD, inputs=inputs, overwrite=overwrite)
+    scene = replace(scene_of(config, chip, assemble(config, chip), path), key=key)
+    parent = _parent_of(path, reader)
+    began = time.perf_counter()
+    with progress(f"writing {target.name}", max(reader.duration_s, 1e-3)) as done:
+        if parent is not None:
+            ticks, replayed = SessionReader(parent).ticks(), reader.ticks(with_frames=False)
+        else:
+            ticks, replayed = reader.ticks(), None
+        with content_blamed(reader, "drawn"):
+            write_rrd(target, scene, ticks, replayed, done, inputs=inputs, overwrite=overwrite)
+    say(f"{target} written in {time.perf_counter() - began:.1f} s; open it with: rerun {target}")
+    return target
+
+
+def _parent_of(path: Path, reader: SessionReader) -> Path | None:
+    """The session that was replayed, where it is there, all of it."""
+    # A name only: a session from elsewhere does not say which files of this machine are opened.
+    name = Path(reader.header.parent.get("file", "")).name
+    parent = path.parent / name
+    try:
+        return parent if name and all(file.is_file() for file in files_of(parent)) else None
+    except SessionError:
+        return None

@@ -1,0 +1,218 @@
+"""What `flowrec info` and `flowrec ls` tell of sessions: from heads and indexes only, at once however large they are.
+
+The configuration is read as the text that it is, and topics by what the file calls them: the stages and the messages
+behind them take long to import.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flowrec.errors import SessionError
+from flowrec.store.metadata import Part, SessionHeader
+from flowrec.store.part_continuity import Run
+from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
+from flowrec.store.session_metadata import Head
+from flowrec.summary import name_of, of_text, shown
+from flowrec.system.locks import is_growing
+from flowrec.system.toml_file import parse_toml
+from flowrec.units import seconds
+
+_NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
+_PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
+_PNG_SIZE_AT = 16
+_SAID_ELSE = ("reason", "duration")  # the second of older files, a sentence
+_CLOCK_READINGS = ("wall_ns", "monotonic_ns")
+
+
+def describe(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """Facts about a session, numbers with their units in the keys, and its message counts by topic.
+
+    Reads no message, but for those that the parts of a run repeat.
+    """
+    run = Run.at(path)
+    header = _header(run)
+    outcome = run.outcome
+    config = _table(header.config_toml, f"{path}: config.toml inside")
+    said = header.provenance
+    facts: dict[str, Any] = {
+        "outcome": outcome.get("outcome", "unknown"),
+        "note": _why(outcome),
+        "duration_s": _duration_s(run),
+        "size_bytes": _size(run),
+        "parts": len(run.pieces) if run.in_parts else None,
+        **_chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
+        "rig": _at(config, "rig"),
+        "phases": list(map(str, _listed_at(config, "mission", "phases"))),
+        **{stage: _at(config, stage, "method") for stage in ("observer", "refine", "plan", "control")},
+        "recorded": said.get("wall_time", "unknown"),
+        "flowrec": said.get("flowrec", "?"),
+        "commit": said.get("git_commit"),
+        "local_changes": said.get("git_changed", str("git_diff" in said)) == "True" if "git_commit" in said else None,
+        **of_text({key: said[key] for key in ("seed", "operator", "sample", "notes") if key in said}),
+        "derived": _derived(said.get("derived", "{}")),
+        "piece": _piece(run.part, path) if run.part is not None else None,
+        "replay_of": header.parent.get("file", "?") if header.parent else None,
+    }
+    for key, code in said.items():
+        if key.startswith("weights."):
+            facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
+    if _at(config, "recording", "region") == "robot" and "frames_windows" not in outcome:
+        facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
+    told = of_text(outcome)
+    return facts | {key: value for key, value in told.items() if key not in (*facts, *_SAID_ELSE)}, run.counts()
+
+
+def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The facts of `describe` in words, what is not known left out."""
+    stages = ("observer", "refine", "plan", "control")
+    width_um, height_um = facts.get("chip_width_um"), facts.get("chip_height_um")
+    size = f", {width_um / 1000:.2f} x {height_um / 1000:.2f} mm" if width_um and height_um else ""
+    changed = ", with local changes" if facts["local_changes"] else ""
+    words = {
+        "outcome": facts["outcome"] + _bracketed(facts["note"]),
+        "size_bytes": shown("size_bytes", facts["size_bytes"])
+        + (f" in {facts['parts']} parts" if facts["parts"] else ""),
+        "chip": f"{facts['chip']}{size}, {facts['chip_openings']} openings",
+        "phases": " -> ".join(facts["phases"]) or "?",
+        "observer": ", ".join(facts[stage] for stage in stages),
+        "derived": ", ".join(f"{key} = {value}" for key, value in facts["derived"].items()),
+        "flowrec": facts["flowrec"] + _bracketed((facts["commit"] or "")[:10] + changed),
+    }
+    names = {"observer": "stages", "flowrec": "by flowrec"}
+    without = (
+        "note",
+        "parts",
+        "commit",
+        "local_changes",
+        "chip_width_um",
+        "chip_height_um",
+        "chip_openings",
+        "duration",
+        # The outcome holds this count twice: in the summary of the run, and for each file of it.
+        *(("dropped_frames",) if "frames_dropped" in facts else ()),
+    )
+    return [
+        (names.get(key, name_of(key)), words.get(key) or shown(key, value))
+        for key, value in facts.items()
+        if key not in (*without, *stages[1:], *_CLOCK_READINGS) and value not in (None, "", {})
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """One session of a directory, the parts of a run together; what is not known of it is None or empty."""
+
+    name: str
+    outcome: str  # or: recording, unfinished, unreadable
+    note: str  # why
+    size_bytes: int
+    duration_s: float | None = None
+    chip: str = ""
+    recorded: str = ""
+    parts: int = 0  # of a run that was split; finished or not
+
+
+def list_sessions(directory: Path) -> list[Listed]:
+    """The sessions in a directory by name, with those that were not finished or can not be read.
+
+    Reads heads and indexes only. Raises SessionError when there is no such directory.
+    """
+    if not directory.is_dir():
+        raise SessionError(f"{directory}: no such directory; flowrec ls lists the sessions in one")
+    try:
+        paths = [path for path in directory.iterdir() if path.is_file() and path.name.endswith(_NAMES)]
+    except OSError as error:
+        raise SessionError(f"{directory}: can not be listed ({error.strerror}); check its permissions") from error
+    rows: dict[Path, list[Path]] = {}
+    for path in sorted(paths):
+        run = run_path(path)
+        # Beside a file of that name the parts are not what opens under it: each is a session of its own.
+        rows.setdefault(run if part_number(path) and run not in paths else path, []).append(path)
+    return [_listed(path, files) for path, files in sorted(rows.items())]
+
+
+def _listed(path: Path, files: list[Path]) -> Listed:
+    size = sum(file.stat().st_size for file in files)
+    parts = len(files) if files != [path] else 0
+    try:
+        run = Run.at(path)
+        head = _header(run)
+        outcome = run.outcome.get("outcome", "unknown"), _why(run.outcome)
+        chip = str(_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
+        recorded = head.provenance.get("wall_time", "")
+        return Listed(path.name, *outcome, size, _duration_s(run), chip, recorded, parts)
+    except SessionError as error:
+        unfinished = any(file.name.endswith(PARTIAL_SUFFIX) for file in files)
+        what = "recording" if any(map(is_growing, files)) else "unfinished" if unfinished else "unreadable"
+        return Listed(path.name, what, str(error).removeprefix(f"{path}: "), size, parts=parts)
+
+
+def _header(run: Run) -> SessionHeader:
+    with Head(run.pieces[0].path) as head:
+        return head.header
+
+
+def _duration_s(run: Run) -> float:
+    return seconds(run.last_ns - run.first_ns)
+
+
+def _size(run: Run) -> int:
+    return sum(piece.path.stat().st_size for piece in run.pieces)
+
+
+def _piece(part: Part, path: Path) -> str:
+    said = f"{part.kind} {part.number} of the run {run_path(path).stem}" + _bracketed(part.why)
+    return said if part.carried_ns is None else f"{said}, goes on from {seconds(part.carried_ns):.2f} s"
+
+
+def _table(text: str, where: str) -> dict[str, Any]:
+    try:
+        return parse_toml(text)
+    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
+        raise SessionError(f"{where}: is not valid TOML ({error}); the file is damaged or was edited") from error
+
+
+def _chip(said: Mapping[str, Any], png: bytes) -> dict[str, Any]:
+    facts: dict[str, Any] = {"chip": str(said.get("name", "?"))}
+    scale_um = said.get("um_per_px")
+    if isinstance(scale_um, float) and len(png) >= _PNG_SIZE_AT + _PNG_SIZE.size:
+        width_px, height_px = _PNG_SIZE.unpack_from(png, _PNG_SIZE_AT)
+        facts |= {"chip_width_um": width_px * scale_um, "chip_height_um": height_px * scale_um}
+    openings = said.get("opening")
+    return facts | {"chip_openings": len(openings) if isinstance(openings, list) else 0}
+
+
+def _derived(text: str) -> dict[str, Any]:
+    """Settings that nobody gave, by key; none where the file was edited."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _at(tree: object, *keys: str) -> str:
+    for key in keys:
+        tree = tree.get(key) if isinstance(tree, dict) else None
+    return str(tree) if tree is not None else "?"
+
+
+def _listed_at(tree: object, *keys: str) -> list[Any]:
+    for key in keys:
+        tree = tree.get(key) if isinstance(tree, dict) else None
+    return tree if isinstance(tree, list) else []
+
+
+def _bracketed(text: str) -> str:
+    return f" ({text})" if text else ""
+
+
+def _why(outcome: Mapping[str, str]) -> str:
+    """The note of a run that ended by itself, the reason of one that failed."""
+    return outcome.get("note") or outcome.get("reason", "")

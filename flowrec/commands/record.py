@@ -1,0 +1,435 @@
+"""`flowrec record`: drive a mission on a rig and write every stage to one session file."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, nullcontext, suppress
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from flowrec.chip import load_chip, median_width_um
+from flowrec.chip.chip import Chip
+from flowrec.clocks import ClockWatch
+from flowrec.commands.auto_recovery import look_after
+from flowrec.commands.interactive import Unattended
+from flowrec.config import Config, derived, resolve
+from flowrec.errors import SessionError, UnreachableError, UsageError
+from flowrec.flow.metrics import relative_rmse
+from flowrec.messages import Demand, FlowField, Tick
+from flowrec.pipeline import Pipeline, assemble
+from flowrec.planning.free_space import no_room, swept_out, too_swift
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run.disk_monitor import DiskWatch, refuse_below
+from flowrec.run.loop import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
+from flowrec.run.watchdog import Guard
+from flowrec.session import files_behind, length_um, session_writer
+from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
+from flowrec.store.paths import pieces, run_path
+from flowrec.summary import Figures, as_text, finite, rows_for_people
+from flowrec.system.outputs import MCAP, RRD, check_output
+from flowrec.system.realtime_priority import first_of_all
+from flowrec.terminal import say, table, warn
+from flowrec.units import seconds
+
+if TYPE_CHECKING:
+    from flowrec.view import LiveView
+
+# Of the 2 s that a run may take to end: the rest is for the coils (desk.py) and for Python itself.
+CLOSE_PATIENCE_S = 0.5  # for images that still wait to be written
+VIEW_PATIENCE_S = 0.2  # for a viewer to show the last of it
+_GIVE_UP_S = 1.0  # for a file to be closed beside a thread that is stuck
+_LEAST_FRAMES = 3.0  # of the camera in the guard's time
+
+View = Literal["spawn", "serve", "rrd", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What a finished recording is known by."""
+
+    path: Path  # of the run, also where it is in several files
+    report: RunReport
+    facts: Figures  # numbers with their units in the keys
+    files: tuple[Path, ...] = ()  # in order; none where a run was to be kept around events, and none came
+
+    @property
+    def sessions(self) -> tuple[Path, ...]:
+        """What can be given to other verbs: the run, or each of its snapshots."""
+        return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
+
+    derived: Mapping[str, float] = field(default_factory=dict)  # settings that nobody gave, by key
+    lost: str = ""  # why there is less of it than was wanted
+    stopped: bool = False  # by somebody who does not want to wait
+
+    @property
+    def exit_status(self) -> int:
+        """0 reached its end, 1 did not, 3 was cut short for want of room."""
+        if self.lost:
+            return 3
+        return 0 if self.report.outcome in GOOD_ENDS else 1
+
+
+# Ends that are what was asked for.
+GOOD_ENDS = ("reached", "survey complete", "refine complete", "plan complete", "stopped", "time over")
+
+
+class Witness:
+    """A sink that keeps what the summary tells: the true flow, and the distance to the reference while navigating."""
+
+    def __init__(self) -> None:
+        self.true_field: FlowField | None = None
+        self._square_um2 = 0.0
+        self._count = 0
+        self._last: Demand | None = None
+
+    def write(self, tick: Tick) -> None:
+        self.true_field = tick.true_field or self.true_field
+        demand = tick.demand
+        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != "navigate":
+            return
+        self._last = demand
+        if math.isfinite(demand.error_um):
+            self._square_um2 += demand.error_um**2
+            self._count += 1
+
+    @property
+    def rms_um(self) -> float:
+        """Root mean square distance to the reference, NaN when nothing was navigated."""
+        return math.sqrt(self._square_um2 / self._count) if self._count else math.nan
+
+
+def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
+    """The resolved configuration, its chip and its pipeline. Warns where the plan will have to be honest."""
+    if config.sampler.method == "smoothed":
+        raise UsageError(
+            "sampler.method = 'smoothed' looks at what came later: use it in flowrec replay --refine; a run takes "
+            "'filter' or 'trimmed'"
+        )
+    chip = load_chip(config.chip)
+    asked, config = config, resolve(config, chip)
+    made = derived(asked, config)
+    if made:
+        say(f"derived for the simulated rig: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
+    refuse_adrift(config, chip)
+    assert config.robot.max_speed_um_s is not None
+    full_mt = config.coils.full_mt(config.robot)
+    if full_mt < config.coils.amplitude_mt:
+        warn(
+            f"coils and amplifiers make {full_mt:.2g} of {config.coils.amplitude_mt:g} mT: the robot follows it up to "
+            f"{config.robot.max_speed_um_s:.0f} um/s; see coils.max_current_a and coils.amplifier"
+        )
+    for opening in chip.openings:
+        if opening.kind == "inlet" and opening.value > config.robot.max_speed_um_s:
+            warn(
+                f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
+                f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
+            )
+    blind_um = config.robot.delay * config.robot.max_speed_um_s
+    if blind_um > 0.5 * median_width_um(chip):
+        warn(
+            f"in the {1e3 * config.robot.delay:.0f} ms from command to motion a robot at "
+            f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
+            "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
+        )
+    return config, chip, assemble(config, chip)
+
+
+def refuse_adrift(config: Config, chip: Chip) -> None:
+    """Raise UnreachableError where the assumed flow leaves no way to the goal, before anything is driven.
+
+    So it is where it can not be held at the start, or is out of an outlet before the coils are up: their field, and
+    with it the speed that they can drive, grows to all of it in the time of the ramp. And so it is where no way to the
+    goal is wide enough, or all are too swift to be steered on.
+    """
+    robot, field = config.robot, config.flow.solve(chip)
+    start = np.asarray(config.mission.start, np.float64)
+    drift = config.plan.swift.drift(robot, robot.speed_limit_um_s)
+    reason = too_swift(chip, field, start, start, robot.radius, drift)
+    if reason:
+        raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
+    if {"plan", "navigate"} & set(config.mission.phases):
+        goal = np.asarray(config.mission.goal, np.float64)
+        reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius, drift)
+        if reason:
+            raise UnreachableError(f"unreachable: {reason}")
+    reason = swept_out(chip, field, start, drift, config.coils.ramp_s)
+    if reason:
+        raise UnreachableError(f"unreachable: {reason}")
+
+
+def default_path(config: Config, folder: Path | None = None) -> Path:
+    """date_operator_sample_number.mcap, the first number that is free."""
+    sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
+    words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
+    stem = "_".join(word.replace(" ", "-") for word in words if word)
+    folder = folder or Path()
+    names = taken(folder)
+    for number in range(1, 10_000):
+        path = folder / f"{stem}_{number:03d}.mcap"
+        if path not in names:
+            return path
+    raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
+
+
+def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
+    """Assumed and refined flow at the end of an earlier session, on the same chip."""
+    reader = SessionReader(path)
+    last = reader.tick_before(reader.last_ns, with_frames=False)
+    fields = {name: field for name in ("assumed", "refined") if (field := getattr(last, name)) is not None}
+    if "assumed" not in fields:
+        raise UsageError(f"start.field = {path}: that session holds no flow field; survey and refine first")
+    shape = fields["assumed"].velocity_um_s.shape[:2]
+    if shape != chip.mask.shape or not math.isclose(fields["assumed"].um_per_px, chip.um_per_px):
+        raise UsageError(f"start.field = {path}: its field is for another chip ({shape[1]} x {shape[0]} pixels)")
+    return fields
+
+
+def record(
+    config: Config,
+    out: Path | None = None,
+    view: View = "none",
+    realtime: bool = False,
+    overwrite: bool = False,
+    control: Unattended | None = None,
+    inputs: Sequence[Path] = (),
+) -> Recorded:
+    """Run the mission of `config` and write it to `out`, in any thread.
+
+    Whatever ends it, KeyboardInterrupt included, the field is off before this function returns or raises.
+
+    Parameters
+    ----------
+    view : spawn, serve, rrd or none.
+    realtime : keep the rig to the wall clock, with a guard of its ticks (guard.py).
+    control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
+    inputs : files that were read for it besides those that `config` names; no output may be one of either.
+
+    Raises
+    ------
+    FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
+    """
+    asked = config
+    inputs = (*inputs, *_named_by(config))
+    if out is not None:  # before anything else: to solve the flow takes a while
+        check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
+    config, chip, pipeline = prepare(config)
+    made = derived(asked, config)
+    timeout_s = _guard_timeout_s(config) if realtime else None
+    path = _place(config, out, overwrite)
+    if view == "rrd":
+        check_output(path.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
+    fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
+    rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
+    folder, floor_gb = path.resolve().parent, config.recording.disk_floor_gb
+    control = control if control is not None else Unattended()
+    desk = control.desk
+    guard = Guard(rig, timeout_s, partial(desk.stop, zero=True), warn)
+    witness = Witness()
+    clocks = ClockWatch()
+    low: list[str] = []
+    opened: list[SessionWriter] = []
+
+    def disk_low(reason: str) -> None:
+        low.append(reason)
+        desk.stop(reason)
+
+    with ExitStack() as stack:
+        # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
+        stack.enter_context(control.armed(guard, lambda: _closed_beside(opened, desk.reason)))
+        writer = stack.enter_context(
+            session_writer(
+                path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
+            )
+        )
+        opened.append(writer)
+        sinks: list[Sink] = [writer, witness]
+        live: LiveView | None = None
+        worker: Worker
+        if view in ("spawn", "serve"):
+            # Late: importing Rerun takes a second, and most runs do without.
+            from flowrec.commands.export import scene_of
+            from flowrec.view import LiveView
+
+            live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
+            say(live.message)
+            sinks.append(live)
+        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
+        stack.callback(worker.close)
+        if fields:
+            worker = Preloaded(worker, fields)
+        disk = stack.enter_context(DiskWatch(folder, lambda: writer.bytes_written, floor_gb, disk_low).watching())
+        # A run that does not keep real time never waits: it would keep a core for itself.
+        priority = first_of_all() if realtime else nullcontext(enter_result=False)
+        with control.shown(writer, disk) as show, priority as first:
+
+            def on_tick(tick: Tick) -> None:
+                show(tick)
+                _say_remarks(writer)
+
+            report = run(
+                pipeline,
+                rig,
+                worker,
+                sinks,
+                desk=desk,
+                on_tick=on_tick,
+                queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
+                clocks=clocks,
+                guard=guard,
+            )
+        facts = facts_of(chip, report, witness.true_field)
+        if config.control.method != "policy":  # which has no reference to be off
+            facts["tracking_error_um"] = finite(witness.rms_um)
+        facts["frames_dropped"] = writer.dropped_frames
+        if control.note:
+            facts["note_not_finished"] = control.note
+        outcome = as_text(facts) | clocks.outcome()
+        if realtime:
+            outcome["loop_priority"] = "real time" if first else "ordinary"
+        bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
+        writer.close(outcome, CLOSE_PATIENCE_S if desk.reason else None, why=bad)
+        _say_remarks(writer)
+        if live is not None and desk.reason:
+            live.close(VIEW_PATIENCE_S)
+    facts["frames_dropped"] = writer.dropped_frames  # more may have been, for want of time
+    files = tuple(writer.files)
+    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(desk.reason))
+    if view == "rrd" and desk.reason:
+        say(f"the run was stopped: no .rrd was made; flowrec export {path} makes it")
+    elif view == "rrd":
+        from flowrec.commands.export import write_rrd_of
+
+        for name in recorded.sessions:
+            facts["rrd"] = str(write_rrd_of(name, overwrite=overwrite))
+    return recorded
+
+
+def _guard_timeout_s(config: Config) -> float:
+    """The guard's time, which must suffice for the camera's frames."""
+    timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
+    if rate_hz is not None and timeout_s * rate_hz < _LEAST_FRAMES:
+        raise UsageError(
+            f"safety.guard_timeout_s = {timeout_s:g}: shorter than {_LEAST_FRAMES:g} frames at camera.rate_hz = "
+            f"{rate_hz:g}; the nearest that works is {_LEAST_FRAMES / rate_hz:.3g}"
+        )
+    return timeout_s
+
+
+def _closed_beside(opened: list[SessionWriter], reason: str) -> str:
+    """Close the file beside a main thread that is stuck; returns what a person is to know of it.
+
+    In the thread of the signals. The writer is not in use: where the main thread is stuck in it, this does not wait.
+    """
+    if not opened:
+        return ""
+    writer = opened[0]
+
+    def close() -> None:
+        with suppress(SessionError):  # what is there stays in the partial file
+            writer.close({"outcome": "failed", "note": f"{reason}; the main thread did not answer"}, CLOSE_PATIENCE_S)
+
+    thread = threading.Thread(target=close, name="give up", daemon=True)
+    thread.start()
+    thread.join(_GIVE_UP_S)
+    if writer.partial_path.exists():
+        return f"flowrec recover {writer.partial_path} makes a session of what was recorded"
+    return f"the file is whole: {files_told(writer.path, tuple(writer.files))}"
+
+
+def _named_by(config: Config) -> list[Path]:
+    """The files that a configuration names, and what belongs to them."""
+    files: list[Path] = []
+    chip = Path(config.chip.path)
+    if chip.name:
+        files += [chip, chip.with_suffix(".png"), chip.with_suffix(".toml")]
+    if config.start.field:
+        files += files_behind(Path(config.start.field))
+    return files
+
+
+def _say_remarks(writer: SessionWriter) -> None:
+    while writer.remarks:
+        say(writer.remarks.popleft())
+
+
+def files_told(path: Path, files: tuple[Path, ...]) -> str:
+    """Which files a run is in, and how large they are."""
+    if not files:
+        return "none: no mark, note, warning or loss of images, and a good end"
+    size = f"{sum(file.stat().st_size for file in files) / 1e6:.1f} MB"
+    if files == (path,):
+        return f"{path} ({size})"
+    kind = "snapshots" if is_snapshot(files[0]) else "parts"
+    if len(files) == 1:
+        return f"{files[0]} ({size})"
+    return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
+
+
+def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
+    """Where the session goes, with the remains of earlier runs there looked after and room on the disk."""
+    folder = out.parent if out is not None else Path()
+    made: dict[Path, str] = {}
+    if config.recording.recover_leftovers:
+        besides = frozenset(pieces(out.resolve())) if out is not None and overwrite else frozenset()
+        made = look_after(folder, besides)
+    path = out if out is not None else default_path(config)
+    same = next((file for file in made if run_path(file) == path), None)
+    if same is not None and not overwrite:
+        raise SessionError(
+            f"{same}: was left by a run that did not finish and has just been recovered ({made[same]}); "
+            "choose another name for this run with --out"
+        )
+    refuse_below(config.recording.disk_floor_gb, path.resolve().parent)
+    return path
+
+
+def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
+    """What a run came to, in the order in which a person wants it; flow errors are shares of the true flow."""
+    facts: Figures = {
+        "outcome": report.outcome,
+        "note": report.note,
+        "duration_s": report.duration_s,
+        "wall_s": report.wall_s,
+        "ticks": report.ticks,
+    }
+    last = report.last
+    if last.mission is not None and last.route is not None and last.route.reachable and last.mission.phase == "done":
+        facts["planner"] = last.route.method
+        facts["route_length_um"] = length_um(last.route)
+        facts["planned_s"] = float(last.route.arrival_s[-1])
+        if last.mission.outcome == "reached":
+            facts["navigation_s"] = seconds(last.mission.since_ns - last.route.stamp_ns)
+    if true_field is not None:
+        facts["contacts"] = report.contacts
+        for name, field in (("assumed", last.assumed), ("refined", last.refined)):
+            if field is not None:
+                facts[f"{name}_method"] = field.method
+                facts[f"{name}_flow_error"] = finite(float(relative_rmse(field, true_field, chip.mask).v))
+    if last.observations is not None:
+        facts["observations"] = len(last.observations.position_um)
+    return facts
+
+
+def print_summary(recorded: Recorded) -> None:
+    """The table at the end of a run and what to do next."""
+    files = ("file", files_told(recorded.path, recorded.files))
+    table("Session", ("", "value"), [*rows_for_people(recorded.facts), files])
+    sessions = recorded.sessions
+    if recorded.lost:
+        say(
+            f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
+        )
+    elif recorded.exit_status and sessions:
+        say(
+            f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; "
+            f"see flowrec view {sessions[-1]}"
+        )
+    if sessions:
+        say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")

@@ -1,0 +1,225 @@
+"""What a bright-field microscope shows of the chip: walls as dark refracting lines, particles as defocused discs.
+
+Noise: shot noise is Gaussian of variance level / photons_per_level, with read noise added. Its normal numbers are
+not drawn afresh: each row of an image takes a stretch, at a place drawn from the seed, of one pool of a million
+numbers of 1/32 sigma resolution. So single pixels are independent of their neighbours and of the next frame, but the
+whole film holds no more than a million different values. Same seed and frames, same bytes; wall time has no part in it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from flowrec.chip.clearance import clearance_um
+from flowrec.chip.registration import Calibration
+from flowrec.messages import Image
+from flowrec.rig_settings import CameraSettings
+from flowrec.system.numba_setup import compiled
+
+_POOL = 1 << 20
+_NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
+
+
+@compiled
+def _draw(
+    scene: NDArray[np.float32],
+    column: float,
+    row: float,
+    radius: float,
+    edge: float,
+    darkness: float,
+    rim: float,
+    smear_x: float,
+    smear_y: float,
+) -> tuple[int, int, int, int]:
+    """Multiply the light of a defocused disc into the scene; returns the touched window x0, y0, x1, y1.
+
+    All lengths in pixels. `edge` is the softness of its outline; outside it a bright rim and a faint dark ring.
+    `smear` is the way it goes during the exposure.
+    """
+    height, width = scene.shape
+    reach = radius + 9.0 * edge + 0.5 * max(abs(smear_x), abs(smear_y))
+    x0, x1 = max(math.floor(column - reach), 0), min(math.ceil(column + reach) + 1, width)
+    y0, y1 = max(math.floor(row - reach), 0), min(math.ceil(row + reach) + 1, height)
+    length = math.hypot(smear_x, smear_y)
+    copies = 1 + min(8, int(length / 0.35))
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            light = 0.0
+            for n in range(copies):
+                share = (n + 0.5) / copies - 0.5
+                r = math.hypot(x - column - share * smear_x, y - row - share * smear_y)
+                s = (r - radius) / edge
+                inside = 1.0 / (1.0 + math.exp(min(2.2 * s, 40.0)))
+                bright = math.exp(-(((s - 2.0) / 1.1) ** 2))
+                ring = math.exp(-(((s - 4.8) / 1.4) ** 2))
+                core = 0.86 + 0.14 * min(r / radius, 1.0) ** 2
+                light += 1.0 - darkness * core * inside + rim * bright - 0.25 * rim * ring
+            scene[y, x] *= np.float32(light / copies)
+    return x0, y0, x1, y1
+
+
+@compiled
+def _expose(
+    scene: NDArray[np.float32],
+    pool: NDArray[np.int8],
+    offsets: NDArray[np.int64],
+    shot: float,
+    read: float,
+    image: NDArray[np.uint8],
+) -> None:
+    """Add the noise to grey levels (h, w) and digitise."""
+    height, width = scene.shape
+    per_level = np.float32(shot / (_NOISE_STEPS * _NOISE_STEPS))
+    fixed = np.float32(read * read / (_NOISE_STEPS * _NOISE_STEPS))
+    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(255.0)
+    for y in range(height):
+        noise = pool[offsets[y] : offsets[y] + width]
+        line = scene[y]
+        out = image[y]
+        for x in range(width):
+            level = line[x]
+            grey = level + np.float32(math.sqrt(level * per_level + fixed)) * np.float32(noise[x]) + half
+            out[x] = np.uint8(min(max(grey, low), high))
+
+
+class Microscope:
+    """Renders frames. `mask` (h, w) is True in fluid."""
+
+    def __init__(
+        self,
+        mask: NDArray[np.bool_],
+        um_per_px: float,
+        calibration: Calibration,
+        camera: CameraSettings,
+        seed: int,
+    ) -> None:
+        rng = np.random.default_rng([seed, 3])
+        self._camera = camera
+        self._calibration = calibration
+        self._noise = np.random.default_rng([seed, 4])
+        self._pool = np.clip(np.rint(self._noise.standard_normal(_POOL) * _NOISE_STEPS), -127, 127).astype(np.int8)
+        self._empty = _empty_scene(mask, um_per_px, calibration, camera, rng)
+        self._scene = self._empty.copy()
+
+    def add_still(self, point_um: NDArray[np.float64], radius_um: float, darkness: float) -> None:
+        """Put a particle that never moves into the background."""
+        self._particle(self._empty, point_um, radius_um, darkness, np.zeros(2))
+        self._scene[:] = self._empty
+
+    def image(
+        self,
+        robot_um: NDArray[np.float64] | None,
+        robot_radius_um: float,
+        robot_velocity_um_s: NDArray[np.float64],
+        debris_um: NDArray[np.float64],
+        debris_radii_um: NDArray[np.float64],
+        debris_darkness: NDArray[np.float64],
+    ) -> Image:
+        """One frame (h, w): the robot (None: not there) over the debris (n, 2), at the middle of the exposure."""
+        still = np.zeros(2)
+        windows = [
+            self._particle(self._scene, point, radius, darkness, still)
+            for point, radius, darkness in zip(
+                debris_um, debris_radii_um.tolist(), debris_darkness.tolist(), strict=True
+            )
+        ]
+        if robot_um is not None:
+            smear = robot_velocity_um_s * self._camera.exposure_s / self._calibration.um_per_px
+            windows.append(self._particle(self._scene, robot_um, robot_radius_um, 0.8, smear))
+        height, width = self._scene.shape
+        image = np.empty((height, width), np.uint8)
+        offsets = self._noise.integers(0, _POOL - width, height)
+        _expose(self._scene, self._pool, offsets, 1.0 / self._camera.photons_per_level, self._camera.read_noise, image)
+        for x0, y0, x1, y1 in windows:
+            self._scene[y0:y1, x0:x1] = self._empty[y0:y1, x0:x1]
+        return image
+
+    def _particle(
+        self,
+        scene: NDArray[np.float32],
+        point_um: NDArray[np.float64],
+        radius_um: float,
+        darkness: float,
+        smear_px: NDArray[np.float64],
+    ) -> tuple[int, int, int, int]:
+        column, row = self._calibration.to_px(point_um)
+        radius = radius_um / self._calibration.um_per_px
+        edge = math.hypot(max(self._camera.blur_px, 0.3), 0.05 * radius)
+        return _draw(
+            scene, column, row, radius, edge, darkness, 0.35 * darkness, float(smear_px[0]), float(smear_px[1])
+        )
+
+
+def _empty_scene(
+    mask: NDArray[np.bool_],
+    um_per_px: float,
+    calibration: Calibration,
+    camera: CameraSettings,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Grey levels (h, w) of the chip without particles."""
+    height, width = camera.height_px, camera.width_px
+    columns = (np.arange(width) * calibration.um_per_px + calibration.origin_um[0]) / um_per_px
+    rows = (np.arange(height) * calibration.um_per_px + calibration.origin_um[1]) / um_per_px
+    map_x, map_y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    outline = _outline_px(mask) * np.float32(um_per_px)
+    distance = cv2.remap(outline, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    # The milled edge refracts: a dark line with a bright fringe towards the fluid, a fainter pair behind it.
+    # Narrower on fine masks, whose outline is only known within three pixels.
+    line = max(min(9.0, 0.45 * um_per_px), 1.1 * calibration.um_per_px)
+    s = distance / line
+
+    def stripe(at: float, half_width: float) -> NDArray[np.float32]:
+        return np.asarray(np.exp(-(((s - at) / half_width) ** 2)), np.float32)
+
+    solid = 1.0 / (1.0 + np.exp(np.clip(4.0 * (s + 0.5), -40, 40)))
+    light = 1.0 - 0.11 * solid
+    light += -0.52 * stripe(-0.4, 0.75) + 0.15 * stripe(1.3, 0.7) - 0.04 * stripe(2.7, 0.8)
+    light += -0.16 * stripe(-3.2, 0.7) + 0.08 * stripe(-4.6, 0.8)
+    # Machined and glued plastic: blotches of several sizes, much fainter in the channel.
+    texture = np.zeros((height, width), np.float32)
+    for size_um, share in ((12.0, 0.4), (40.0, 0.8), (160.0, 1.0)):
+        texture += share * _blotches(rng, height, width, size_um / calibration.um_per_px)
+    light *= 1.0 + texture * (0.004 + 0.014 * solid)
+
+    x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None]
+    y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+    cx, cy, tilt = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(0, 2 * math.pi)
+    lamp = 1.0 - 0.5 * camera.illumination * ((x - cx) ** 2 + (y - cy) ** 2)
+    lamp += 0.25 * camera.illumination * (x * math.cos(tilt) + y * math.sin(tilt))
+    scene = np.asarray(camera.background * light * lamp, np.float32)
+    if camera.blur_px > 0:
+        scene = np.asarray(cv2.GaussianBlur(scene, (0, 0), camera.blur_px, borderType=cv2.BORDER_REPLICATE), np.float32)
+    return np.ascontiguousarray(np.clip(scene, 0.0, 255.0), np.float32)
+
+
+def _outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Signed distance (h, w) in pixels to a smooth outline behind the pixels of a mask, true within three pixels of it.
+
+    The half level of the blurred mask, as in the solver's smooth walls: a blurred straight edge is a Gaussian
+    integral, whose inverse is the distance. Farther away only the sign matters here.
+    """
+    sigma, pad = 1.0, 8
+    padded = np.pad(mask, pad, mode="edge").astype(np.float64)
+    share = cv2.GaussianBlur(padded, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)[pad:-pad, pad:-pad]
+    near = sigma * ndtri(np.clip(share, 1e-6, 1.0 - 1e-6))
+    far = clearance_um(mask, 1.0)
+    weight = np.clip(np.abs(far) - 2.0, 0.0, 1.0)
+    return np.asarray((1.0 - weight) * near + weight * far, np.float32)
+
+
+def _blotches(rng: np.random.Generator, height: int, width: int, size_px: float) -> NDArray[np.float32]:
+    """Smooth noise (h, w) of unit variance and a given size of its spots."""
+    step = max(size_px / 2.0, 1.0)
+    shape = (math.ceil(height / step) + 4, math.ceil(width / step) + 4)
+    coarse = cv2.GaussianBlur(rng.standard_normal(shape).astype(np.float32), (0, 0), 1.0)
+    fine = cv2.resize(coarse, (math.ceil(shape[1] * step), math.ceil(shape[0] * step)), interpolation=cv2.INTER_CUBIC)
+    cut = fine[:height, :width]
+    return np.asarray(cut / max(float(cut.std()), 1e-6), np.float32)

@@ -1,0 +1,272 @@
+"""The simulated rig: a microscope, coils and a robot in a flow that is not quite the assumed one.
+
+It knows what no stage may know, and says it only in `truth` and `true_field`. Everything is drawn from the seed and
+from what is applied: same seed, same commands, same bytes, however long the loop takes. In real time stamps are made
+as for a real camera, from its own clock and from when its frames arrive.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.chip.chip import Chip
+from flowrec.chip.clearance import check_point, clearance_um
+from flowrec.chip.registration import Calibration
+from flowrec.clocks import DeviceClock
+from flowrec.config import Config
+from flowrec.control.coils import Coils
+from flowrec.control.field_rotation import Order, Rotation, course
+from flowrec.errors import RigError
+from flowrec.flow import FlowSolver
+from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
+from flowrec.pipeline import Inputs, Pipeline
+from flowrec.ranges import check_ranges
+from flowrec.rig_settings import CameraSettings, Simulated
+from flowrec.rigs.simulated.camera_clock import CameraClock
+from flowrec.rigs.simulated.debris import Debris
+from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.swimmer import Swimmer
+from flowrec.robot import Robot
+from flowrec.units import NS_PER_S, nanoseconds, seconds
+
+_COILS = 3
+_DEFAULT_RATE_HZ = 30.0
+
+
+def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
+    """The chip with the boundary values and the viscosity that really hold, drawn from the seed.
+
+    Each inlet speed times 1 +- (a third of inlet_speed_error to all of it), the viscosity times 1 +-
+    viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across the chip;
+    all uniform. One outlet alone keeps its pressure: only differences drive a flow.
+    """
+    rng = np.random.default_rng([simulated.seed, 5])
+    inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
+    draws = rng.uniform(-1.0, 1.0, len(inlet))
+    viscosity = chip.viscosity_mpa_s * (1.0 + simulated.viscosity_error * float(rng.uniform(-1.0, 1.0)))
+    # Never by chance almost right: an assumption that needs no refinement shows nothing.
+    wrong = np.sign(draws) * (1.0 + 2.0 * np.abs(draws)) / 3.0
+    values = chip.boundary_values * np.where(inlet, 1.0 + simulated.inlet_speed_error * wrong, 1.0)
+    changed = chip.with_boundary(values, viscosity)
+    if simulated.outlet_pressure_error == 0.0 or np.count_nonzero(~inlet) < 2:
+        return changed
+    pressure = solver.solve(changed).pressure_pa[chip.mask]
+    drop = float(pressure.max() - pressure.min())
+    values = values + np.where(inlet, 0.0, simulated.outlet_pressure_error * drop * draws)
+    return chip.with_boundary(values, viscosity)
+
+
+class SimulatedRig:
+    """Camera, coils and the world between them. A context manager; `inputs()` yields frames, `apply()` takes currents.
+
+    Parameters
+    ----------
+    chip, calibration : the chip as it is assumed, and where the camera looks at it
+    robot : resolved (no None); its delay is from `apply` to motion
+    start_um : (2,) where the robot's centre is on the first frame
+    duration_s : None goes on for ever
+    realtime : pace the frames to the host's clock and stamp them by the camera's, fitted to it; none is skipped, a late
+        one is just late
+    true_field : a flow to use instead of solving for one, for tests and for known flows
+    coils : how strong the field is beside the full one, and the currents it takes; None: always full, as commanded
+
+    Raises RigError or ChipError for settings that no world can be made of.
+    """
+
+    @classmethod
+    def of(
+        cls,
+        pipeline: Pipeline,
+        config: Config,
+        duration_s: float | None = None,
+        realtime: bool = False,
+        true_field: FlowField | None = None,
+    ) -> SimulatedRig:
+        """The rig of a run: its resolved configuration's camera, world, robot, start and coils, on its chip."""
+        return cls(
+            pipeline.chip,
+            config.robot,
+            pipeline.calibration,
+            config.camera,
+            config.simulated,
+            config.mission.start,
+            duration_s=duration_s,
+            realtime=realtime,
+            true_field=true_field,
+            coils=config.coils,
+        )
+
+    def __init__(
+        self,
+        chip: Chip,
+        robot: Robot,
+        calibration: Calibration,
+        camera: CameraSettings,
+        simulated: Simulated,
+        start_um: ArrayLike,
+        duration_s: float | None = None,
+        realtime: bool = False,
+        true_field: FlowField | None = None,
+        coils: Coils | None = None,
+    ) -> None:
+        check_ranges(camera, "camera")
+        check_ranges(simulated, "simulated")
+        check_point(chip, start_um, "start", robot.radius)
+        self._chip = chip
+        self._robot = robot
+        self._calibration = calibration
+        self._camera = camera
+        self._simulated = simulated
+        x, y = (float(value) for value in np.asarray(start_um, np.float64))
+        self._start_um = (x, y)
+        self._rate_hz = _DEFAULT_RATE_HZ if camera.rate_hz is None else camera.rate_hz
+        self._frames = math.inf if duration_s is None else max(1.0, math.floor(duration_s * self._rate_hz) + 1)
+        self._realtime = realtime
+        self._field = true_field
+        self._delay_ns = nanoseconds(robot.delay if simulated.delay_s is None else simulated.delay_s)
+        self._now_ns = 0
+        self._coils = coils
+        # What the coils were told last and where their field is; what is on its way: (stamp of its effect, command).
+        self._acting: Currents | None = None
+        self._rotation = Rotation()
+        self._coming: list[tuple[int, Currents]] = []
+        self._latest: Currents | None = None
+        # Set by zero(), in any thread: one attribute, which the loop's thread looks at whenever the world goes on. A
+        # lock would be held by a loop that is interrupted.
+        self._cut = False
+
+    def __enter__(self) -> SimulatedRig:
+        self._cut = False
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.zero()
+
+    def apply(self, currents: Currents) -> None:
+        """Send a command; the field changes when the delay is over. The same message again is no new command."""
+        if currents is self._latest or (self._cut and currents.amplitude_mt > 0.0):
+            return
+        self._latest = currents
+        self._coming.append((self._now_ns + self._delay_ns, currents))
+
+    def zero(self) -> None:
+        """Take the field away at once, and let none come back until the rig is entered again."""
+        self._cut = True
+
+    def inputs(self) -> Iterator[Inputs]:
+        """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
+        field = self._true_field()
+        walls = clearance_um(self._chip.mask, self._chip.um_per_px)
+        radius, seed, px = self._robot.radius, self._simulated.seed, self._chip.um_per_px
+        swimmer = Swimmer(self._start_um, self._robot, self._simulated, field.velocity_um_s, walls, px)
+        debris = Debris(self._chip, self._camera.debris, radius, field.velocity_um_s, walls, seed)
+        microscope = Microscope(self._chip.mask, px, self._calibration, self._camera, seed)
+        moving = slice(0, len(debris.points_um) - debris.still)
+        for n in range(moving.stop, len(debris.points_um)):
+            microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))
+        debris.drift(0.0)  # compiles, so that the second frame is not late
+        camera_clock, host_clock, fit = CameraClock(self._simulated), DeviceClock(), None
+        began_ns: int | None = None
+        index = 0
+        while index < self._frames:
+            stamp = round(index * NS_PER_S / self._rate_hz)
+            before = swimmer.position_um
+            turns = self._advance(swimmer, stamp)
+            elapsed = seconds(stamp - self._now_ns)
+            if elapsed > 0:
+                debris.drift(elapsed)
+            self._now_ns = stamp
+            image = microscope.image(
+                None if swimmer.gone else swimmer.position_um,
+                radius,
+                (swimmer.position_um - before) / elapsed if elapsed > 0 else np.zeros(2),
+                debris.points_um[moving],
+                debris.radii_um[moving],
+                debris.darkness[moving],
+            )
+            arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
+            if self._realtime:
+                # An image is there when its exposure is over. The first one, with all that it takes, sets the clock.
+                over_ns = nanoseconds(0.5 * self._camera.exposure_s)
+                began_ns = time.monotonic_ns() - over_ns if began_ns is None else began_ns
+                time.sleep(max(0.0, seconds(began_ns + arrival_ns + over_ns - time.monotonic_ns())))
+                arrival_ns = time.monotonic_ns() - began_ns - over_ns
+            fit = host_clock.take(fit, camera_clock.device(stamp), arrival_ns)
+            stamped = fit.stamp_ns if self._realtime else stamp
+            yield Inputs(
+                stamp_ns=stamped,
+                frame=Frame(stamped, index, image),
+                applied=self._applied(stamped, turns),
+                truth=Truth(stamped, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
+                true_field=field if index == 0 else None,
+                clock=fit,
+            )
+            index += 1
+
+    def _true_field(self) -> FlowField:
+        if self._field is None:
+            solver = FlowSolver(k=self._simulated.k)
+            truth = true_chip(self._chip, self._simulated, solver)
+            self._field = replace(solver.solve(truth), method="truth", note="drawn from the seed of the simulated rig")
+        if self._field.velocity_um_s.shape[:2] != self._chip.mask.shape:
+            raise RigError(
+                f"true flow has {self._field.velocity_um_s.shape[:2]} pixels, the chip {self._chip.mask.shape}; "
+                "solve it on this chip"
+            )
+        return self._field
+
+    def _advance(self, swimmer: Swimmer, until_ns: int) -> NDArray[np.float64]:
+        """Let the world go on to a stamp, switching the field exactly when commands arrive. Returns the turns (2,)."""
+        turns = np.zeros(2)
+        now = self._now_ns
+        while True:
+            if self._cut:
+                self._coming.clear()
+                self._acting = Currents(now, 0.0, 0.0, 0.0, 0.0, np.zeros(_COILS), False)
+            switch = self._coming[0][0] if self._coming else until_ns
+            end = min(max(switch, now), until_ns)
+            if end > now and self._acting is None:
+                swimmer.advance(seconds(end - now), 0.0, 0.0, 0.0)
+            elif end > now and self._acting is not None:
+                turns += self._turn(swimmer, self._acting, seconds(end - now))
+            now = end
+            if not (self._coming and self._coming[0][0] <= now):
+                return turns
+            self._acting = self._coming.pop(0)[1]
+
+    def _turn(self, swimmer: Swimmer, command: Currents, duration_s: float) -> NDArray[np.float64]:
+        """Let the field turn, and the robot with it, as control/rotation.py says. Returns the turns (2,)."""
+        way = course(self._rotation, _order(command))
+        self._rotation = way.after(duration_s)
+        turns = np.zeros(2)
+        full_mt = self._coils.amplitude_mt if self._coils is not None else 0.0
+        strength = min(command.amplitude_mt / full_mt, 1.0) if full_mt > 0.0 else float(command.amplitude_mt > 0.0)
+        for leg in way.legs(duration_s):
+            swimmer.advance(leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
+            if strength > 0.0:
+                heading = np.array([math.cos(leg.heading_rad), math.sin(leg.heading_rad)])
+                turns += leg.frequency_hz * leg.duration_s * heading
+        return turns
+
+    def _applied(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
+        command, now = self._acting, self._rotation
+        if command is None:
+            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(_COILS), turns)
+        currents = command.currents_a
+        if self._coils is not None:
+            field = self._coils.field_mt(now.phase_rad, now.plane_rad, command.amplitude_mt)
+            currents = self._coils.currents_a(field, command.amplitude_mt)
+        heading = course(now, _order(command)).heading_rad(0.0)
+        return Applied(stamp_ns, command.frequency_hz, heading, command.amplitude_mt, currents, turns)
+
+
+def _order(command: Currents) -> Order:
+    """What a command asks of the field; its amplitude, already on a ramp, at once."""
+    c = command
+    return Order(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz)

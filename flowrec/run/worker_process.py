@@ -1,0 +1,209 @@
+"""The slow stages in a process of their own: the parent's end, and the process itself.
+
+It is no pool of multiprocessing: such a pool makes Python wait at exit for unfinished work, delays its parent while it
+starts, and receives the Ctrl-C that is meant for the run.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable
+from typing import Any, BinaryIO
+
+from flowrec.errors import FlowrecError
+from flowrec.messages import FlowField, Route, Tick
+from flowrec.pipeline import Pipeline
+from flowrec.run.jobs import warm_up, work
+from flowrec.system import child_process
+
+Result = FlowField | Route
+
+_NAME = "the process that solves and plans"
+_LOG_BYTES = 65_536  # of what the process printed, the last part is kept
+_JOIN_S = 1.0
+
+
+class WorkProcess:
+    """Takes orders, one after the other; no method but `close` ever blocks the caller.
+
+    What the process prints is kept in memory; it is written to a log file, named in the error, when the process fails.
+    """
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        # The only objects that the threads share: queues, which lock themselves, and `_printed`, which the receiver
+        # reads after the thread that fills it has ended.
+        self._results: queue.SimpleQueue[Result | Exception] = queue.SimpleQueue()
+        self._orders: queue.SimpleQueue[Pipeline | Tick | None] = queue.SimpleQueue()
+        self._printed = b""
+        self._orders.put(pipeline)
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - our own module
+                child_process.command("flowrec.run.worker_process"),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C and a closed terminal end the run, and then the run ends this
+                env=child_process.environment(),
+            )
+        except OSError as error:
+            raise FlowrecError(
+                f"{_NAME} does not start ({error.strerror or error}); free memory, then record again"
+            ) from error
+        self._threads = [
+            threading.Thread(target=target, name="work process", daemon=True)
+            for target in (self._keep_printed, self._send, self._receive)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, order: Tick) -> None:
+        """Start on an order as soon as those before it are done."""
+        self._orders.put(order)
+
+    def result(self) -> Result | None:
+        """That of the oldest order whose result was not taken yet; None while it is worked on.
+
+        Raises what the work has raised; FlowrecError where the process has ended, was stopped by a signal, or its
+        answer can not be read.
+        """
+        try:
+            result = self._results.get_nowait()
+        except queue.Empty:
+            if self._is_stopped():
+                raise FlowrecError(
+                    f"{_NAME} (process {self._process.pid}) was stopped by a signal, and the mission waits for it; "
+                    "find out who sent it, then record again"
+                ) from None
+            return None
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    def close(self) -> None:
+        """End it at once, and with it the threads and pipes."""
+        self._process.kill()
+        self._process.wait()
+        self._orders.put(None)
+        for thread in self._threads:
+            thread.join(_JOIN_S)
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
+            assert pipe is not None
+            with contextlib.suppress(OSError):  # a part of an order that nobody reads any more
+                pipe.close()
+
+    def _is_stopped(self) -> bool:
+        try:
+            state = os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT)
+        except ChildProcessError:  # it has ended; the receiver says so
+            return False
+        return state is not None
+
+    def _keep_printed(self) -> None:
+        pipe = self._process.stderr
+        assert pipe is not None
+        while said := os.read(pipe.fileno(), _LOG_BYTES):
+            self._printed = (self._printed + said)[-_LOG_BYTES:]
+
+    def _send(self) -> None:
+        pipe = self._process.stdin
+        assert pipe is not None
+        try:
+            while (order := self._orders.get()) is not None:
+                pipe.write(pickle.dumps(order, pickle.HIGHEST_PROTOCOL))
+                pipe.flush()
+        except OSError:
+            pass  # it has ended; the receiver says so
+        except Exception as error:  # noqa: BLE001  the mission must not wait for an order that was never sent
+            self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_told(error)})"))
+
+    def _receive(self) -> None:
+        pipe = self._process.stdout
+        assert pipe is not None
+        try:
+            while True:
+                self._results.put(pickle.load(pipe))  # noqa: S301 - from our own process
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._cause()}); {self._log()}"))
+        except BaseException as error:  # noqa: BLE001  whatever it is, the mission must not wait for ever
+            self._results.put(
+                FlowrecError(f"{_NAME} gave an answer that can not be read ({_told(error)}); {self._log()}")
+            )
+
+    def _cause(self) -> str:
+        try:
+            status = self._process.wait(_JOIN_S)
+        except subprocess.TimeoutExpired:
+            return "its pipe is closed"
+        return f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+
+    def _log(self) -> str:
+        """Write the log file; the half of an error that says where it is."""
+        if self._process.poll() is not None:
+            self._threads[0].join(_JOIN_S)
+        if not self._printed:
+            return "it printed nothing; is memory short?"
+        try:
+            number, name = tempfile.mkstemp(prefix="flowrec-worker-", suffix=".log")
+            with os.fdopen(number, "wb") as log:
+                log.write(self._printed)
+        except OSError as error:
+            return f"what it printed can not be kept ({error.strerror or error})"
+        return f"see {name} for what it printed"
+
+
+def _told(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+def _answer(pipeline: Pipeline, order: Tick) -> bytes:
+    """The result of an order, or what it raised, as bytes that the parent can read."""
+    try:
+        return pickle.dumps(work(pipeline, order), pickle.HIGHEST_PROTOCOL)
+    except BaseException as error:  # noqa: BLE001  the parent raises it
+        error.add_note(traceback.format_exc())
+        with contextlib.suppress(Exception):
+            sent = pickle.dumps(error, pickle.HIGHEST_PROTOCOL)
+            pickle.loads(sent)  # noqa: S301 - an exception may be written without complaint and not be readable
+            if isinstance(error, Exception):
+                return sent
+        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_told(error)})"), pickle.HIGHEST_PROTOCOL)
+
+
+def _serve(orders: BinaryIO, results: BinaryIO) -> None:
+    """Work until the parent is gone, however it went."""
+    waiting: queue.SimpleQueue[Tick] = queue.SimpleQueue()
+    pipeline: Pipeline = pickle.load(orders)  # noqa: S301 - from our own parent
+    threading.Thread(target=_listen, args=(orders, waiting.put), daemon=True).start()
+    warm_up()
+    while True:
+        results.write(_answer(pipeline, waiting.get()))
+        results.flush()
+
+
+def _listen(orders: BinaryIO, put: Callable[[Any], None]) -> None:
+    try:
+        while True:
+            put(pickle.load(orders))  # noqa: S301 - from our own parent
+    except (OSError, EOFError):
+        os._exit(0)  # in the midst of its work, for nobody waits for that any more
+    except BaseException:  # noqa: BLE001  an order that can not be read
+        traceback.print_exc()
+        os._exit(1)
+
+
+if __name__ == "__main__":
+    private = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever a library prints must not get in between
+    try:
+        _serve(sys.stdin.buffer, private)
+    except (BrokenPipeError, EOFError):
+        os._exit(0)

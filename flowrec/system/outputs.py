@@ -1,0 +1,160 @@
+"""What may be written where, for every verb: no file that is there is replaced unasked, and none that is read.
+
+A file gets its name when it is whole and on the disk. Sessions are written by store/, with the same rules.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from flowrec.errors import SessionError
+from flowrec.system.locks import is_growing
+
+MCAP = (".mcap",)
+RRD = (".rrd",)
+PICTURE = (".png",)
+FIGURE = (".png", ".pdf", ".svg")
+JSON = (".json",)
+TOML = (".toml",)
+WEIGHTS = (".safetensors",)
+
+_WITHOUT_LINKS = (errno.EPERM, errno.EMLINK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL)
+
+
+class OutputError(SessionError):
+    """A file that may not be written: it is there, is read by the same command, or has a name of another format."""
+
+    exit_status = 2
+
+
+def check_output(
+    path: Path,
+    suffixes: tuple[str, ...],
+    *,
+    inputs: Iterable[Path] = (),
+    overwrite: bool = False,
+    also: Iterable[Path] = (),
+) -> None:
+    """Refuse an output before anything is done for it.
+
+    Parameters
+    ----------
+    suffixes : those of its format, the usual one first.
+    inputs : files that the command reads; the output may be none of them, whatever `overwrite` says.
+    overwrite : an existing file may be replaced.
+    also : other files that this output replaces or adds to: the parts of a session, and what is unfinished of it.
+
+    Raises
+    ------
+    OutputError : one line about what is wrong with it, and what would be right.
+    """
+    if path.is_dir():
+        raise OutputError(f"{path}: is a directory; name a file, as in {path / ('NAME' + suffixes[0])}")
+    read = list(inputs)
+    for file in (path, *also):
+        if any(_same(file, other) for other in read):
+            raise OutputError(f"{file}: is read by this command and stays as it is; choose another name for the output")
+    if path.suffix not in suffixes:
+        formats = " or ".join(suffixes)
+        raise OutputError(
+            f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
+        )
+    if not path.parent.is_dir():
+        raise OutputError(f"{path.parent}: no such directory; make it, or choose another place for {path.name}")
+    for file in (path, *also):
+        if file.is_file() and is_growing(file):
+            raise OutputError(
+                f"{file}: is being written by another process just now; let it end or stop it with Ctrl-C, or choose "
+                "another name"
+            )
+    if not overwrite and os.path.lexists(path):
+        raise taken(path)
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise OutputError(f"{path.parent}: can not be written to; choose another place for {path.name}")
+
+
+def taken(path: Path, kept: str = "") -> OutputError:
+    """The refusal of a name that another file has."""
+    return OutputError(f"{path}: exists already{kept}; choose another name, or replace it with --overwrite")
+
+
+@contextlib.contextmanager
+def new_file(
+    path: Path, suffixes: tuple[str, ...], *, inputs: Iterable[Path] = (), overwrite: bool = False
+) -> Iterator[Path]:
+    """A temporary file in the same folder to be written to; it gets the name `path` when the block has ended well.
+
+    Where the block ends with an exception nothing is left. Parameters as of `check_output`.
+
+    Raises
+    ------
+    OutputError : the output is refused, see `check_output`.
+    SessionError : it can not be written, in one line.
+    """
+    check_output(path, suffixes, inputs=inputs, overwrite=overwrite)
+    part = path.with_name(f".flowrec-{secrets.token_hex(6)}{path.suffix}")
+    try:
+        part.touch(exist_ok=False)  # a folder that can not be written to is told before any work is done
+        yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        put_in_place(part, path, overwrite=overwrite)
+    except FileExistsError as error:
+        raise taken(path) from error
+    except OSError as error:
+        if error.filename not in (None, str(part), str(path)):
+            raise
+        raise SessionError(f"{path}: can not be written ({error.strerror or error}); choose another place") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
+    """Give a finished file its name in one step, and have the disk keep the name.
+
+    Raises
+    ------
+    FileExistsError : another file has the name by now, and `overwrite` is not set.
+    OSError : the name can not be given.
+    """
+    if overwrite:
+        part.replace(path)
+    else:
+        try:
+            os.link(part, path)
+        except OSError as error:
+            if error.errno not in _WITHOUT_LINKS:
+                raise
+            path.touch(exist_ok=False)  # keeps others from the name
+            try:
+                part.replace(path)
+            except BaseException:
+                path.unlink()
+                raise
+        else:
+            part.unlink()
+    sync_directory(path.parent)
+
+
+def sync_directory(directory: Path) -> None:
+    """Have the disk keep names that were given or taken in a directory."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _same(output: Path, other: Path) -> bool:
+    """Whether two paths are one file, by whatever names."""
+    if "\0" in str(other):  # only a file can have given such a name, and none can have it
+        return False
+    try:
+        return output.samefile(other)
+    except OSError:  # one of them is not there
+        return output.resolve() == other.resolve()

@@ -1,0 +1,121 @@
+"""A session as one .rrd file: a cache for looking, the MCAP is the archive."""
+
+from __future__ import annotations
+
+import heapq
+import secrets
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import rerun as rr
+
+from flowrec.messages import Tick
+from flowrec.system.outputs import RRD, new_file
+from flowrec.units import seconds
+from flowrec.view.blueprint import blueprint
+from flowrec.view.logger import TickLogger
+from flowrec.view.maps import SpeedScale
+from flowrec.view.scene import Scene
+
+APPLICATION = "flowrec"
+_PROGRESS_EVERY = 20  # ticks
+_MAGIC = b"RRF"
+_HEAD_BYTES = 1024  # with the names of application and recording, as they are
+
+
+def write_rrd(
+    path: Path | str,
+    scene: Scene,
+    ticks: Iterable[Tick],
+    replayed_ticks: Iterable[Tick] | None = None,
+    progress: Callable[[float], None] | None = None,
+    *,
+    inputs: Iterable[Path] = (),
+    overwrite: bool = False,
+) -> None:
+    """Write ticks, with the replayed ones beside them if given; a file of this name appears when it is whole.
+
+    Parameters
+    ----------
+    inputs, overwrite : as of `flowrec.system.outputs.check_output`.
+    progress : called now and then with the session time in s that is done, counted from the first tick.
+
+    Raises
+    ------
+    SessionError : the file cannot be written; OutputError where it may not be.
+    """
+    with new_file(Path(path), RRD, inputs=inputs, overwrite=overwrite) as part:
+        stream = open_stream(scene)
+        try:
+            stream.save(part)
+            _log_all(stream, scene, ticks, replayed_ticks, progress)
+            stream.flush()
+        finally:
+            stream.disconnect()
+
+
+def is_made_from(path: Path, key: str) -> bool:
+    """Whether a file is an .rrd that flowrec made of the session with this key (see Scene)."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+    return bool(key) and head.startswith(_MAGIC) and APPLICATION.encode() in head and key.encode() in head
+
+
+def open_stream(scene: Scene) -> rr.RecordingStream:
+    """A stream that carries the title and properties of a scene and flowrec's own timelines only."""
+    # A viewer takes recordings of one name for one, so the name is new each time; its first half says of what it is.
+    stream = rr.RecordingStream(APPLICATION, recording_id=f"{scene.key}-{secrets.token_hex(8)}")
+    rr.set_log_time_enabled(False, recording=stream)
+    rr.set_log_tick_enabled(False, recording=stream)
+    return stream
+
+
+def describe(stream: rr.RecordingStream, scene: Scene) -> None:
+    """Send what people read in the properties of a recording."""
+    stream.send_recording_name(scene.title)
+    if scene.properties:
+        stream.send_property("session", rr.AnyValues(drop_untyped_nones=True, **scene.properties))
+
+
+def _log_all(
+    stream: rr.RecordingStream,
+    scene: Scene,
+    ticks: Iterable[Tick],
+    replayed_ticks: Iterable[Tick] | None,
+    progress: Callable[[float], None] | None,
+) -> None:
+    describe(stream, scene)
+    replay = replayed_ticks is not None
+    speeds = SpeedScale()
+    recorded = TickLogger(stream, scene, "recorded" if replay else "", speeds=speeds)
+    replayed = TickLogger(stream, scene, "replayed", images=False, speeds=speeds) if replay else None
+    first_ns: int | None = None
+    index: int | None = None
+    for count, (stamp_ns, again, tick) in enumerate(_merged(ticks, replayed_ticks or ())):
+        first_ns = stamp_ns if first_ns is None else first_ns
+        if again:
+            assert replayed is not None
+            # Replayed ticks may come without frames, but happened on a recorded one.
+            replayed.log(tick, frame_index=index)
+        else:
+            index = tick.frame.index if tick.frame is not None else index
+            recorded.log(tick)
+        if progress is not None and count % _PROGRESS_EVERY == 0:
+            progress(seconds(stamp_ns - first_ns))
+    present = set(recorded.present)
+    if replayed is not None:
+        present |= {f"replayed {what}" for what in replayed.present}
+    # Last, when it is known which views have something to show. Rerun takes it wherever in the file it comes.
+    stream.send_blueprint(blueprint(scene, replay, present))
+
+
+def _merged(ticks: Iterable[Tick], replayed: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
+    """Both in the order of their stamps, the recorded tick before the replayed one."""
+
+    def named(source: Iterable[Tick], again: bool) -> Iterator[tuple[int, bool, Tick]]:
+        return ((tick.stamp_ns, again, tick) for tick in source)
+
+    return heapq.merge(named(ticks, False), named(replayed, True), key=lambda item: item[:2])

@@ -1,0 +1,118 @@
+"""How much each place of an image looks like the robot: normalised correlation that leaves out the walls.
+
+With weights M (1 where a pixel counts) the correlation of image I with template T at each place is that of the
+weighted samples, after taking off their weighted means:
+    cov = T*(MI) - (T*M)(1*MI) / (1*M),  var_I = 1*(MI^2) - (1*MI)^2 / (1*M),  var_T likewise.
+Compiled, because the region is small on most frames and calls of numpy would cost more than the work.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.system.numba_setup import compiled
+
+_LEAST_SHARE = 0.5  # of the template that must lie on pixels that count
+
+
+@compiled
+def likeness(
+    image: NDArray[np.uint8],
+    distance_px: NDArray[np.float32],
+    box: tuple[int, int, int, int],
+    step: int,
+    margin_px: float,
+    clearance_px: float,
+    pattern: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Correlation -1 to 1 (rows, columns) with the robot centred on each square of step x step pixels of a box.
+
+    Pixels nearer to a wall than the margin do not count, nor those outside the image. Squares that are no place for
+    the centre, being nearer to a wall than the clearance, are -1.
+
+    Parameters
+    ----------
+    pattern : (n, n) of mean 0, at the scale of the shrunk image
+    """
+    height, width = image.shape
+    x0, y0 = box[0], box[1]
+    columns, rows = (box[2] - x0 + step - 1) // step, (box[3] - y0 + step - 1) // step
+    size = pattern.shape[0]
+    half = size // 2
+    grey = np.zeros((rows + 2 * half, columns + 2 * half), np.float32)  # M I, grey levels about their middle
+    square = np.zeros(grey.shape, np.float32)  # M I^2
+    weight = np.zeros(grey.shape, np.float32)  # M
+    whole = np.ones(grey.shape[0], np.bool_)  # M is 1 all along the row
+    for j in range(grey.shape[0]):
+        for i in range(grey.shape[1]):
+            left, top = x0 + (i - half) * step, y0 + (j - half) * step
+            total, count = 0.0, 0.0
+            if left >= 0 and top >= 0 and left + step <= width and top + step <= height:
+                for y in range(top, top + step):
+                    for x in range(left, left + step):
+                        total += image[y, x]
+                        count += distance_px[y, x] > margin_px
+            share = count / (step * step)
+            weight[j, i] = share
+            level = total / (step * step) - 128.0
+            grey[j, i], square[j, i] = share * level, share * level * level
+            if share < 1.0:
+                whole[j] = False
+    found = np.full((rows, columns), -1.0, np.float32)
+    middle = (step - 1) // 2
+    area = np.float32(size * size)
+    one = np.float32(1.0)
+    squared = pattern * pattern
+    spread = squared.sum()
+    for row in range(rows):
+        y = min(y0 + row * step + middle, height - 1)
+        first, last = columns, -1
+        for column in range(columns):
+            if distance_px[y, min(x0 + column * step + middle, width - 1)] >= clearance_px:
+                first, last = min(first, column), column
+        if last < 0:
+            continue
+        span, wide = last + 1 - first, last - first + size
+        # Sums over the window: down the columns first, then along the row.
+        line, line2 = np.zeros(wide, np.float32), np.zeros(wide, np.float32)
+        sum_i, sum_i2 = np.zeros(span, np.float32), np.zeros(span, np.float32)
+        cov, sum_m = np.zeros(span, np.float32), np.full(span, area)
+        sum_t, sum_t2 = np.zeros(span, np.float32), np.zeros(span, np.float32)
+        for j in range(row, row + size):
+            _add(line, one, grey[j, first:])
+            _add(line2, one, square[j, first:])
+        for k in range(size):
+            _add(sum_i, one, line[k:])
+            _add(sum_i2, one, line2[k:])
+        for j in range(size):
+            for k in range(size):
+                _add(cov, pattern[j, k], grey[row + j, first + k :])
+        open_water = whole[row : row + size].all()
+        if not open_water:
+            sum_m[:] = 0.0
+            for j in range(size):
+                for k in range(size):
+                    part = weight[row + j, first + k :]
+                    _add(sum_m, one, part)
+                    _add(sum_t, pattern[j, k], part)
+                    _add(sum_t2, squared[j, k], part)
+        for i in range(span):
+            if sum_m[i] < _LEAST_SHARE * area:
+                continue
+            if distance_px[y, min(x0 + (first + i) * step + middle, width - 1)] < clearance_px:
+                continue
+            var_t, joint = spread, cov[i]
+            if not open_water:
+                var_t = sum_t2[i] - sum_t[i] * sum_t[i] / sum_m[i]
+                joint = cov[i] - sum_t[i] * sum_i[i] / sum_m[i]
+            var_i = sum_i2[i] - sum_i[i] * sum_i[i] / sum_m[i]
+            found[row, first + i] = joint / np.sqrt(max(var_i * var_t, np.float32(1e-3)))
+    return found
+
+
+@compiled
+def _add(to: NDArray[np.float32], factor: np.float32, what: NDArray[np.float32]) -> None:
+    """Add a multiple of the first part of an array to another: a loop that runs several numbers at a time."""
+    for i in range(len(to)):
+        to[i] += factor * what[i]

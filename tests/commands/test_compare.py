@@ -1,0 +1,191 @@
+"""Two sessions, or a recording and its replay, are the same only where every element of every message is."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from dataclasses import make_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import flowrec.messages
+from flowrec import topics
+from flowrec.cli import app
+from flowrec.commands.compare import Comparison
+from flowrec.config import load_config, to_toml
+from flowrec.messages import Demand, FlowField, Tick
+from flowrec.store import SessionHeader, SessionWriter
+from tests.rewritten import array_of, rewrite
+from tests.store.made_up import HEADER, ticks_of
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+NAN, INF = float("nan"), float("inf")
+
+
+def run(*words: object) -> tuple[int, str]:
+    """Exit status and what was printed."""
+    done = CliRunner().invoke(app, [str(word) for word in words])
+    return done.exit_code, done.output
+
+
+def demand(pairs: list[list[float]], error_um: float = 0.0) -> Tick:
+    said = Demand(0, np.zeros(2), np.zeros(2), 0.0, error_um, False, np.array(pairs).reshape(-1, 2))
+    return Tick(stamp_ns=0, demand=said)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "replayed", "same"),
+    [
+        ([[1e4, 1e-3]], [[1e4, 5e-3]], False),
+        ([[1e4, 1.0]], [[1e4 * (1.0 + 1e-7), 1.0]], True),
+        ([[1e4, 1.0]], [[1e4 * (1.0 + 1e-5), 1.0]], False),
+        ([[1e4, 0.0]], [[1e4, 1e-9]], True),
+        ([[INF, 1.0]], [[INF, 2.0]], False),
+        ([[INF, 1.0]], [[INF, 1.0]], True),
+        ([[INF, 1.0]], [[-INF, 1.0]], False),
+        ([[NAN, 1.0]], [[NAN, 1.0]], True),
+        ([[NAN, 1.0]], [[INF, 1.0]], False),
+        ([[NAN, 1.0]], [[1.0, NAN]], False),
+        ([[1.0, 1.0]], [[1.0, NAN]], False),
+        ([[1e308, 1.0]], [[-1e308, 1.0]], False),
+        ([[1.0, 1.0]], [[1.0, 1.0], [1.0, 1.0]], False),
+    ],
+)  # fmt: skip
+def test_arrays_are_compared_element_by_element(
+    recorded: list[list[float]], replayed: list[list[float]], same: bool
+) -> None:
+    comparison = Comparison()
+    comparison.add(demand(recorded), demand(replayed))
+    assert comparison.same is same
+
+
+@pytest.mark.parametrize(("recorded", "replayed", "same"), [(NAN, NAN, True), (NAN, 1.0, False), (INF, NAN, False)])
+def test_single_numbers_that_are_not_finite_are_compared_too(recorded: float, replayed: float, same: bool) -> None:
+    comparison = Comparison()
+    comparison.add(demand([], recorded), demand([], replayed))
+    assert comparison.same is same
+
+
+def test_a_message_that_only_one_side_has_is_a_difference() -> None:
+    comparison = Comparison()
+    comparison.add(demand([]), Tick(stamp_ns=0))
+    assert not comparison.same
+
+
+def test_the_first_difference_names_the_element_and_both_values_the_recorded_one_first() -> None:
+    comparison = Comparison()
+    comparison.add(demand([[1.0, 2.0], [3.0, 4.0]]), demand([[1.0, 2.0], [3.5, 4.0]]))
+    assert str(comparison.first) == "/control/demand at 0.000 s: sent_um_s[1, 0] recorded 3.0, replayed 3.5"
+
+
+def double_time_to_go(channel: Any, _: Any, wire: Any) -> bool:
+    if channel.topic != "/plan/route" or not wire.HasField("time_to_go_s"):
+        return False
+    wire.time_to_go_s.data = (2.0 * array_of(wire.time_to_go_s)).astype("<f4").tobytes()
+    return True
+
+
+def test_a_session_whose_times_to_go_were_doubled_is_not_verified(tmp_path: Path) -> None:
+    assert rewrite(GOLDEN, tmp_path / "doubled.mcap", double_time_to_go) == 1
+    status, said = run("replay", tmp_path / "doubled.mcap", "--verify", "--json")
+    assert status == 3
+    found = json.loads(said)
+    assert "NOT the same" in found["lines"][-1]
+    first = found["topics"]["/plan/route"]["first"]
+    assert first["field"] == "time_to_go_s"
+    assert first["recorded"] == pytest.approx(2.0 * first["replayed"], rel=1e-5)
+
+
+def small_session(path: Path, ticks: list[Tick], parent: bool = False, sets: tuple[str, ...] = ()) -> Path:
+    parents = {"file": "a.mcap", "sha256": ""} if parent else {}
+    config = load_config(None, sets)
+    header = SessionHeader(to_toml(config), HEADER.chip_png, HEADER.chip_toml, HEADER.provenance, parents)
+    with SessionWriter(path, header, block=True, leave_out=config.recording.leave_out) as writer:
+        for tick in ticks:
+            writer.write(tick)
+    return path
+
+
+@pytest.fixture
+def ticks() -> list[Tick]:
+    return list(ticks_of(20))
+
+
+def test_images_of_another_size_are_a_difference(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    second = small_session(tmp_path / "b.mcap", list(ticks_of(20, shape=(40, 64))))
+    status, said = run("compare", first, second)
+    assert status == 3
+    assert "uint8 of shape (48, 64)" in said
+
+
+def test_one_message_that_differs_is_told_with_its_number_of_ticks(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    estimate = ticks[7].estimate
+    assert estimate is not None
+    here = estimate.position_um + np.array([0.0, 1.0])
+    ticks[7] = replace(ticks[7], estimate=replace(estimate, position_um=here))
+    second = small_session(tmp_path / "b.mcap", ticks)
+    status, said = run("compare", first, second, "--json")
+    found = json.loads(said)
+    assert status == 3
+    assert found["different_ticks"] == 1 and not found["same"]
+    assert found["topics"]["/robot/estimate"]["different"] == 1
+    assert found["topics"]["/robot/estimate"]["identical"] == 19
+    assert found["first"]["index"] == [1]
+    assert found["first"]["second"] == pytest.approx(found["first"]["first"] + 1.0)
+
+
+def test_a_tick_that_only_one_session_has_is_a_difference_of_that_tick_alone(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    second = small_session(tmp_path / "b.mcap", ticks[:9] + ticks[10:])
+    status, said = run("compare", first, second, "--json")
+    assert status == 3
+    assert json.loads(said)["ticks"] == 20
+    # The tick after it holds the state that the missing one would have brought, in new messages of its own.
+    assert json.loads(said)["different_ticks"] == 1
+
+
+def test_images_that_a_replay_did_not_copy_are_not_a_difference(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    second = small_session(tmp_path / "b.mcap", [replace(tick, frame=None) for tick in ticks], parent=True)
+    status, said = run("compare", first, second)
+    assert status == 0, said
+    assert "/camera/frame        not copied into b.mcap" in said
+    # In a session that is no replay they were lost.
+    third = small_session(tmp_path / "c.mcap", [replace(tick, frame=None) for tick in ticks])
+    assert run("compare", first, third)[0] == 3
+
+
+def test_what_was_left_out_of_a_recording_is_not_a_difference(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    second = small_session(tmp_path / "b.mcap", ticks, sets=("recording.leave_out=['/truth/*']",))
+    status, said = run("compare", first, second, "--json")
+    assert status == 0, said
+    assert json.loads(said)["not_recorded"] == {
+        "/truth/robot": "not recorded in b.mcap",
+        "/truth/flow": "not recorded in b.mcap",
+    }
+
+
+def test_a_replay_of_a_whole_mission_compares_as_the_same(session: Path, tmp_path: Path) -> None:
+    assert run("replay", session, "--out", tmp_path / "again.mcap", "--json")[0] == 0
+    status, said = run("compare", session, tmp_path / "again.mcap")
+    assert status == 0, said
+
+
+def test_fields_that_an_older_file_does_not_have_are_not_compared() -> None:
+    status, said = run("replay", GOLDEN, "--verify", "--json")
+    assert status == 0, said
+    assert json.loads(said)["not_recorded"]["/run/mission held_ns"] == "not recorded in golden.mcap"
+
+
+def test_a_field_of_tick_without_a_row_in_the_table_is_an_error_at_import(monkeypatch: pytest.MonkeyPatch) -> None:
+    wider = make_dataclass("Tick", [("extra", FlowField | None, None)], bases=(Tick,), frozen=True)
+    monkeypatch.setattr(flowrec.messages, "Tick", wider)
+    with pytest.raises(TypeError, match=r"topics\.py: .*extra"):
+        runpy.run_path(topics.__file__)

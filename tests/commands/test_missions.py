@@ -1,0 +1,105 @@
+"""Whole missions: the way the paper's robot goes, and honest ends."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flowrec.commands import replay as verb
+from flowrec.commands.record import GOOD_ENDS, Recorded, record
+from flowrec.commands.refly import refly
+from flowrec.commands.replay_report import before_and_after
+from flowrec.config import load_config
+from flowrec.store import SessionReader
+from tests.conftest import SMALL
+
+SESSIONS = Path(__file__).parents[2] / "sessions"
+# The island between the branches of the bifurcation: above it runs the long slow branch, below it the short fast one.
+ISLAND_ROW_UM = 2550.0
+CASES = ["case_02.npz", "case_05.npz", "case_08.npz"]
+
+
+def rows_where_it_swam(recorded: Recorded) -> np.ndarray:
+    """Rows of the true positions half way between the forks, while navigating."""
+    navigating, rows = False, []
+    for tick in SessionReader(recorded.path).ticks(with_frames=False):
+        navigating |= tick.mission is not None and tick.mission.phase == "navigate"
+        if navigating and tick.truth is not None and 2900.0 < tick.truth.position_um[0] < 3500.0:
+            rows.append(tick.truth.position_um[1])
+    return np.array(rows)
+
+
+def test_downstream_the_robot_takes_the_short_fast_branch(mission: Recorded) -> None:
+    rows = rows_where_it_swam(mission)
+    assert len(rows) > 5
+    assert np.all(rows > ISLAND_ROW_UM)
+
+
+@pytest.fixture(scope="module")
+def upstream(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    path = tmp_path_factory.mktemp("upstream") / "upstream.mcap"
+    return record(load_config(SESSIONS / "upstream.toml", SMALL), path)
+
+
+def test_upstream_it_takes_the_long_slow_branch_and_arrives(upstream: Recorded) -> None:
+    assert upstream.report.outcome == "reached"
+    assert upstream.report.contacts == 0
+    rows = rows_where_it_swam(upstream)
+    assert len(rows) > 5
+    assert np.all(rows < ISLAND_ROW_UM)
+
+
+def test_the_paper_planner_goes_upstream_the_same_way_but_slower(upstream: Recorded, tmp_path: Path) -> None:
+    done = verb.replay(upstream.path, verb.Change(plan="astar_paper"))
+    assert done.replayed.route is not None
+    assert done.recorded.route is not None
+    assert done.replayed.route.method == "astar_paper"
+    assert done.replayed.route.waypoints_um[:, 1].min() < ISLAND_ROW_UM - 500.0
+    assert done.replayed.route.arrival_s[-1] > done.recorded.route.arrival_s[-1]
+    flown = {row[0]: row[1:] for row in refly(done, tmp_path / "flown.mcap")}
+    assert flown["reflown_outcome"] == ("reached", "reached")
+    ours_s, paper_s = flown["reflown_navigation_s"]
+    assert paper_s > ours_s
+    assert SessionReader(tmp_path / "flown.mcap").outcome["outcome"] == "reached"
+
+
+def test_what_time_field_would_have_gained_over_the_paper_planner_is_gained_when_it_is_flown(tmp_path: Path) -> None:
+    sets = [*SMALL, "plan.method=astar_paper"]
+    recorded = record(load_config(SESSIONS / "upstream.toml", sets), tmp_path / "paper.mcap")
+    assert recorded.report.outcome == "reached"
+    done = verb.replay(recorded.path, verb.Change(plan="time_field"))
+    rows = {row[0]: row[1:] for row in [*before_and_after(done), *refly(done, None)]}
+    was_s, now_s = rows["travel_time_on_replayed_map_s"]
+    assert now_s < 0.995 * was_s
+    flown_was_s, flown_now_s = rows["reflown_navigation_s"]
+    assert flown_now_s < flown_was_s
+    assert flown_now_s / flown_was_s == pytest.approx(now_s / was_s, rel=0.03)
+
+
+def test_a_robot_slower_than_the_flow_says_that_it_can_not_go_back(tmp_path: Path) -> None:
+    sets = [*SMALL, "robot.max_speed_um_s=150"]
+    recorded = record(load_config(SESSIONS / "upstream.toml", sets), tmp_path / "slow.mcap")
+    assert recorded.report.outcome == "unreachable"
+    assert "too fast" in recorded.report.note
+    assert recorded.exit_status == 1
+
+
+def test_a_robot_that_is_not_in_view_is_not_found_and_nothing_is_driven(tmp_path: Path) -> None:
+    recorded = record(load_config(None, [*SMALL, "camera.um_per_px=2"]), tmp_path / "blind.mcap")
+    assert recorded.report.outcome == "not found"
+    assert recorded.exit_status == 1
+    for tick in SessionReader(recorded.path).ticks(with_frames=False):
+        assert tick.currents is not None
+        assert tick.currents.frequency_hz == 0.0
+
+
+@pytest.mark.skipif("FLOWREC_REFERENCE_DATA" not in os.environ, reason="FLOWREC_REFERENCE_DATA is not set")
+@pytest.mark.parametrize("case", CASES)
+def test_real_vessels_are_navigated_or_honestly_refused(case: str, tmp_path: Path) -> None:
+    path = Path(os.environ["FLOWREC_REFERENCE_DATA"]) / "vessels" / case
+    recorded = record(load_config(None, [f"chip.path={path}", "survey.share=0.5"]), tmp_path / "vessel.mcap")
+    assert recorded.report.outcome in (*GOOD_ENDS, "unreachable")
+    assert recorded.report.contacts <= 1

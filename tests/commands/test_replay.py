@@ -1,0 +1,196 @@
+"""A replay is the recording, from any tick; hidden state is caught; changed stages change what they should."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flowrec.commands import replay as verb
+from flowrec.commands.compare import compare_sessions
+from flowrec.commands.record import Recorded, record
+from flowrec.commands.replay import Change
+from flowrec.config import load_config
+from flowrec.errors import SessionError, UsageError
+from flowrec.estimation import Observer
+from flowrec.flow.metrics import relative_rmse
+from flowrec.messages import Estimate
+from flowrec.store import SessionReader
+from tests.conftest import SMALL
+
+
+def test_the_mission_reaches_its_goal_without_touching_a_wall(mission: Recorded) -> None:
+    assert mission.report.outcome == "reached"
+    assert mission.report.contacts == 0
+    assert mission.facts["frames_dropped"] == 0
+
+
+def test_the_same_seed_gives_the_same_messages(session: Path, tmp_path: Path) -> None:
+    again = record(load_config(None, SMALL), tmp_path / "again.mcap")
+    comparison = compare_sessions(SessionReader(session), SessionReader(again.path))
+    assert comparison.ticks > 200
+    assert comparison.identical, str(comparison.first)
+
+
+def test_a_replay_is_identical_tick_by_tick_and_its_worker_results_can_be_made_again(session: Path) -> None:
+    done = verb.replay(session, Change(), verify=True)
+    same, lines = verb.verdict(done)
+    assert same, lines
+    assert done.comparison.identical, str(done.comparison.first)
+    assert done.worker_check is not None
+    assert len(done.worker_check.results) >= 4  # solved, surveyed, refined, planned
+
+
+@pytest.mark.parametrize("share", [0.01, 0.23, 0.5, 0.77, 0.95])
+def test_a_replay_from_any_time_is_identical(session: Path, share: float) -> None:
+    reader = SessionReader(session)
+    done = verb.replay(session, Change(), from_s=round(share * reader.duration_s, 3), verify=True)
+    assert done.comparison.ticks > 5
+    assert done.comparison.identical, str(done.comparison.first)
+
+
+@pytest.mark.parametrize("where", ["the start", "an order under way", "the survey", "the end"])
+def test_a_recording_in_real_time_verifies_from_any_time(realtime_session: Path, where: str) -> None:
+    reader = SessionReader(realtime_session)
+    adopted = sorted(verb.adoption_stamps(reader).values())
+    start_ns = {
+        "the start": None,
+        "an order under way": adopted[1] - 1,
+        "the survey": adopted[1] + 100_000_000,
+        "the end": adopted[-1] - 1,
+    }[where]
+    from_s = start_ns / 1e9 if start_ns is not None else None
+    done = verb.replay(realtime_session, Change(), from_s=from_s, verify=True)
+    same, lines = verb.verdict(done)
+    assert same and done.comparison.identical, lines
+    assert done.worker_check is not None
+    made = sum(stamp_ns >= (start_ns or 0) for stamp_ns in adopted)
+    assert len(done.worker_check.results) == made >= 1, lines
+
+
+def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
+    realtime_session: Path, tmp_path: Path
+) -> None:
+    recorded = verb.adoption_stamps(SessionReader(realtime_session))
+    assert len(recorded) == 4  # solved, surveyed, refined, planned
+    out = tmp_path / "again.mcap"
+    done = verb.replay(realtime_session, Change(refine="assimilate"), out=out)
+    assert verb.adoption_stamps(SessionReader(out)) == recorded
+    assert done.comparison.same
+
+
+@dataclass(frozen=True, slots=True)
+class Forgetful(Observer):
+    """An observer that breaks the stage contract: it counts its calls outside the messages."""
+
+    calls: tuple[list[int], ...] = ([0],)
+
+    def estimate(self, previous, track, applied, robot, field=None) -> Estimate:  # type: ignore[no-untyped-def]
+        self.calls[0][0] += 1
+        honest = Observer.estimate(self, previous, track, applied, robot, field)
+        return replace(honest, flow_um_s=honest.flow_um_s + 1e-3 * self.calls[0][0])
+
+
+def test_planted_hidden_state_passes_from_the_start_and_is_caught_from_the_middle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import flowrec.pipeline as pipeline_room
+
+    honest = pipeline_room.assemble
+
+    def planted(config, chip):  # type: ignore[no-untyped-def]
+        pipeline = honest(config, chip)
+        return replace(pipeline, observer=Forgetful(config.observer.method, calls=([0],)))
+
+    for module in ("flowrec.commands.record", "flowrec.commands.replay"):
+        monkeypatch.setattr(f"{module}.assemble", planted)
+    path = record(load_config(None, [*SMALL, "duration_s=4"]), tmp_path / "planted.mcap").path
+    assert verb.replay(path, Change(), verify=True).comparison.identical
+    resumed = verb.replay(path, Change(), from_s=2.0, verify=True)
+    assert not resumed.comparison.identical
+    assert resumed.comparison.first is not None
+    assert resumed.comparison.first.topic == "/robot/estimate"
+
+
+def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp_path: Path) -> None:
+    done = verb.replay(session, Change(refine="assimilate"), out=tmp_path / "refined.mcap")
+    assert done.true_field is not None
+    assert done.replayed.assumed is not None
+    assert done.replayed.refined is not None
+    before = relative_rmse(done.replayed.assumed, done.true_field, done.chip.mask).v
+    after = relative_rmse(done.replayed.refined, done.true_field, done.chip.mask).v
+    assert after < 0.5 * before
+    written = SessionReader(tmp_path / "refined.mcap")
+    assert written.header.parent["file"] == session.name
+    assert written.header.start_unix_ns == SessionReader(session).header.start_unix_ns > 0
+    assert written.tick_before(written.last_ns).refined.same_as(done.replayed.refined)  # type: ignore[union-attr]
+
+
+def test_a_replay_can_refine_with_what_the_smoother_sees_in_hindsight(session: Path) -> None:
+    smoothed = Change(refine="assimilate", sets=("sampler.method=smoothed",))
+    done = verb.replay(session, smoothed)
+    assert done.true_field is not None and done.replayed.assumed is not None and done.replayed.refined is not None
+    before = relative_rmse(done.replayed.assumed, done.true_field, done.chip.mask).v
+    assert relative_rmse(done.replayed.refined, done.true_field, done.chip.mask).v < 0.3 * before
+    # No later than the work order itself, and other observations than the filter's.
+    filtered = verb.replay(session, Change(refine="assimilate"))
+    assert filtered.replayed.refined is not None
+    assert not done.replayed.refined.same_as(filtered.replayed.refined)
+    with pytest.raises(UsageError, match="needs observer"):
+        verb.replay(session, replace(smoothed, observer="luenberger"))
+
+
+def test_a_run_can_not_smooth_what_is_still_to_come() -> None:
+    with pytest.raises(UsageError, match="flowrec replay"):
+        record(load_config(None, [*SMALL, "sampler.method=smoothed"]))
+
+
+def test_another_controller_changes_the_commands_and_nothing_before_them(session: Path) -> None:
+    done = verb.replay(session, Change(controller="ff_fb"))
+    topics = done.comparison.topics
+    assert topics["/control/demand"].different > 0
+    assert topics["/robot/track"].different == topics["/robot/estimate"].different == 0
+    assert done.commands.changed > 0
+
+
+def test_another_observer_changes_estimates_and_leaves_tracks(session: Path) -> None:
+    done = verb.replay(session, Change(observer="luenberger"))
+    assert done.comparison.topics["/robot/track"].different == 0
+    assert done.comparison.topics["/robot/estimate"].different > 0
+
+
+def test_a_survey_alone_can_be_refined_and_planned_afterwards(tmp_path: Path) -> None:
+    sets = [*SMALL, "mission.phases=survey"]
+    survey = record(load_config(None, sets), tmp_path / "survey.mcap")
+    assert survey.report.outcome == "survey complete"
+    done = verb.replay(survey.path, Change(refine="assimilate"), out=tmp_path / "refined.mcap")
+    assert done.replayed.refined is not None
+    assert done.replayed.route is not None
+    assert done.replayed.route.reachable
+    navigate = [*SMALL, "mission.phases=navigate", f"start.field={tmp_path / 'refined.mcap'}"]
+    flown = record(load_config(None, navigate), tmp_path / "navigate.mcap")
+    assert flown.report.outcome == "reached"
+    first = next(iter(SessionReader(flown.path).messages("refined")))
+    np.testing.assert_array_equal(first.velocity_um_s, done.replayed.refined.velocity_um_s)  # type: ignore[attr-defined]
+
+
+def test_what_a_recording_has_settled_can_not_be_set(session: Path) -> None:
+    with pytest.raises(UsageError, match="can not change the camera"):
+        verb.replay(session, Change(sets=("camera.rate_hz=60",)))
+
+
+def test_verify_goes_without_changes(session: Path) -> None:
+    with pytest.raises(UsageError, match="--verify compares"):
+        verb.replay(session, Change(plan="astar_paper"), verify=True)
+
+
+def test_a_time_outside_the_session_is_refused(session: Path) -> None:
+    with pytest.raises(UsageError, match="runs from"):
+        verb.replay(session, Change(), from_s=1e6)
+
+
+def test_an_existing_output_is_not_overwritten(session: Path) -> None:
+    with pytest.raises(SessionError, match="is read by this command"):
+        verb.replay(session, Change(), out=session)

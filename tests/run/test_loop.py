@@ -1,0 +1,57 @@
+"""The one loop where something in it fails: what is in the file afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flowrec.commands.record import record
+from flowrec.config import load_config
+from flowrec.estimation import Observer
+from flowrec.messages import Estimate
+from flowrec.pipeline import assemble
+from flowrec.store import SessionReader
+from flowrec.units import NS_PER_S
+from tests.conftest import SMALL
+
+BREAKS_NS = NS_PER_S // 2
+
+
+@dataclass(frozen=True, slots=True)
+class Breaking(Observer):
+    """Fails at a certain frame."""
+
+    def estimate(self, previous, track, applied, robot, field=None) -> Estimate:  # type: ignore[no-untyped-def]
+        if track.stamp_ns >= BREAKS_NS:
+            raise ValueError("the observer is broken")
+        return Observer.estimate(self, previous, track, applied, robot, field)
+
+
+def test_a_stage_that_fails_leaves_the_inputs_that_broke_it_as_the_last_tick_and_nothing_made_of_them(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def planted(config, chip):  # type: ignore[no-untyped-def]
+        pipeline = assemble(config, chip)
+        return replace(pipeline, observer=Breaking(config.observer.method))
+
+    monkeypatch.setattr("flowrec.commands.record.assemble", planted)
+    path = tmp_path / "broken.mcap"
+    with pytest.raises(ValueError, match="the observer is broken"):
+        record(load_config(None, SMALL), path)
+    reader = SessionReader(path)
+    assert reader.outcome["outcome"] == "failed"
+    assert "the observer is broken" in reader.outcome["reason"]
+    *_, before, last = reader.ticks()
+    # The same run, whole: what arrived on that tick.
+    whole = next(tick for tick in SessionReader(session).ticks() if tick.stamp_ns >= BREAKS_NS)
+    assert last.stamp_ns == whole.stamp_ns > before.stamp_ns
+    assert last.frame is not None and whole.frame is not None
+    np.testing.assert_array_equal(last.frame.image, whole.frame.image)
+    assert last.applied is not None and last.applied.same_as(whole.applied)
+    assert before.applied is not None and not last.applied.same_as(before.applied)
+    for name in ("track", "estimate", "demand", "currents", "mission", "timing"):
+        made, known = getattr(last, name), getattr(before, name)
+        assert made is known is None or made.same_as(known), name

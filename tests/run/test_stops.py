@@ -1,0 +1,190 @@
+"""`flowrec record --realtime` stopped in every way: the order of what its driver is told, its file, its exit status.
+
+No assertion is on wall time: `python -m tests.campaigns.stops` measures.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from flowrec.commands import record as verb
+from flowrec.commands.replay import Change, replay
+from flowrec.config import load_config
+from flowrec.messages import OperatorEvent
+from flowrec.store import SessionReader
+from tests.campaigns.stops import KINDS, Ended, Kind, stop
+from tests.campaigns.trial import LoggedRig
+from tests.conftest import SMALL
+
+PATIENT = "safety.guard_timeout_s=20"  # where the guard's timer has no part
+
+
+def ended(kind: Kind | str, tmp_path: Path, *sets: str) -> Ended:
+    """A run stopped; its field is off and stays off, before the run returns and before the process is gone."""
+    done = stop(KINDS[kind] if isinstance(kind, str) else kind, tmp_path, *sets)
+    assert done.off_s is not None, done.stderr
+    told = [event for event, _ in done.after_cause()]
+    assert "zero" in told, done.stderr
+    assert "returns" not in told[: told.index("zero")]
+    return done
+
+
+def outcome(done: Ended) -> tuple[str, str]:
+    """How the file says it ended; it replays identically."""
+    reader = SessionReader(done.path)
+    assert replay(done.path, Change(), verify=True).comparison.identical
+    return reader.outcome["outcome"], reader.outcome["note"]
+
+
+def events(done: Ended) -> list[tuple[str, str]]:
+    found = SessionReader(done.path).messages("operator")
+    return [(event.action, event.text) for event in found if isinstance(event, OperatorEvent)]
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_takes_the_field_down_its_ramp_and_the_file_is_whole(name: str, tmp_path: Path) -> None:
+    done = ended(name, tmp_path, PATIENT)
+    sent = [amplitude_mt for event, amplitude_mt in done.after_cause() if event == "apply"]
+    assert sent == sorted(sent, reverse=True)
+    assert len(sent) > 3
+    assert sent[-1] == 0.0
+    assert done.status == 0
+    assert outcome(done)[0] == "stopped"
+    assert [action for action, _ in events(done)] == ["stop"]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("SIGQUIT", "SIGQUIT"), ("SIGUSR1", "SIGUSR1"), ("SIGUSR2", "SIGUSR2"), ("SIGTERM twice", "SIGTERM again")],
+)
+def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run(
+    name: str, says: str, tmp_path: Path
+) -> None:
+    done = ended(name, tmp_path, PATIENT)
+    told = done.after_cause()
+    late = [one for one in told[told.index(("zero", 0.0)) :] if one[0] == "apply" and one[1] > 0.0]
+    # A command that was under way at that moment is followed by another zero().
+    assert len(late) <= 1
+    assert [event for event, amplitude_mt in told if event == "zero" or amplitude_mt > 0.0][-1] == "zero"
+    assert done.status == 0, done.stderr
+    assert outcome(done)[0] == "stopped"
+    actions = events(done)
+    assert any(action == "zero" and says in text for action, text in actions), actions
+
+
+def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_path: Path) -> None:
+    done = ended("SIGTSTP", tmp_path, PATIENT)
+    stopped = (tmp_path / "driver.log.stopped").read_text().split("\n")
+    last = [line.split()[2:] for line in stopped if " apply " in line or " zero " in line][-1]
+    assert last[1] == "0"  # nothing with a field was the last word when the process stood still
+    assert any(" zero " in line for line in stopped)
+    assert done.status == 0
+    assert outcome(done) == ("stopped", "operator: zero field (SIGTSTP: Ctrl-Z)")
+    assert events(done) == [("zero", "operator: zero field (SIGTSTP: Ctrl-Z)")]
+
+
+@pytest.mark.parametrize("name", ["zero() takes 30 ms, SIGINT twice", "zero() raises 5 times, SIGINT twice"])
+def test_no_ctrl_c_interrupts_zero_and_one_that_raises_is_repeated(name: str, tmp_path: Path) -> None:
+    done = ended(name, tmp_path, PATIENT)
+    told = [event for event, _ in done.after_cause() if event.startswith("zero")]
+    if "raises" in name:
+        assert told.count("zero-raises") == 5
+        assert told.index("zero") > max(place for place, event in enumerate(told) if event == "zero-raises")
+        assert "zero() worked after 5 failures" in outcome(done)[1]
+    else:
+        assert told.count("zero-begins") == told.count("zero")  # each that was begun came to its end
+        assert outcome(done)[0] == "stopped"
+    assert done.status == 0
+
+
+@pytest.mark.parametrize("name", ["camera silent", "camera 1.4 s late", "stage never returns"])
+def test_a_loop_that_hangs_loses_its_field_while_it_hangs_and_the_replay_is_exact(name: str, tmp_path: Path) -> None:
+    done = ended(name, tmp_path)
+    assert done.after_cause()[:3] == [("cause", 0.0), ("zero-begins", 0.0), ("zero", 0.0)]
+    assert done.status == 1
+    assert "no tick for 0.5 s" in done.stderr
+    assert outcome(done) == ("failed", "guard: no tick for 0.5 s")
+    assert events(done) == [("zero", "guard: no tick for 0.5 s")]
+
+
+@pytest.mark.parametrize("name", ["camera stuck in C", "camera stuck in C, SIGINT three times, SIGTERM"])
+def test_a_camera_that_hangs_in_c_loses_the_field_and_the_process_ends_by_itself(name: str, tmp_path: Path) -> None:
+    done = ended(name, tmp_path)
+    assert [event for event, _ in done.after_cause()[-3:]] != ["returns"]  # the main thread has never come back
+    assert done.status == 1
+    assert "the main thread does not answer, the process ends without it" in done.stderr
+    assert done.file() in ("whole", "recovered")
+    assert replay(done.path, Change(), verify=True).comparison.identical
+
+
+def test_a_stage_that_raises_ends_the_run_after_the_field(tmp_path: Path) -> None:
+    done = ended("stage raises", tmp_path, PATIENT)
+    assert [event for event, _ in done.after_cause()[:3]] == ["cause", "zero-begins", "zero"]
+    assert done.status == 1
+    assert SessionReader(done.path).outcome["reason"] == "ValueError: a stage that fails"
+
+
+@pytest.mark.parametrize("name", ["worker killed", "worker stopped"])
+def test_a_worker_that_is_killed_or_stopped_ends_the_run_after_the_field(name: str, tmp_path: Path) -> None:
+    done = ended(name, tmp_path, PATIENT)
+    assert done.status == 1
+    assert SessionReader(done.path).outcome["outcome"] == "failed"
+
+
+def test_record_and_replay_are_functions_of_any_thread(tmp_path: Path) -> None:
+    errors: list[BaseException] = []
+    path = tmp_path / "thread.mcap"
+
+    def both() -> None:
+        try:
+            verb.record(load_config(None, [*SMALL, "duration_s=1"]), path, realtime=True)
+            replay(path, Change(), out=tmp_path / "again.mcap")
+        except BaseException as error:  # noqa: BLE001  told by the test
+            errors.append(error)
+
+    thread = threading.Thread(target=both)
+    thread.start()
+    thread.join()
+    assert errors == []
+    assert SessionReader(path).outcome["outcome"] == "time over"
+
+
+def test_record_as_a_function_leaves_signals_alone_and_zeroes_on_ctrl_c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log: list[tuple[str, float]] = []
+
+    class Rig(LoggedRig):
+        def arrived(self, number, inputs):  # type: ignore[no-untyped-def]
+            if number == 20:
+                log.append(("cause", 0.0))
+                signal.raise_signal(signal.SIGINT)
+            return inputs
+
+    logged = staticmethod(lambda event, amplitude_mt=0.0: log.append((event, amplitude_mt)))
+    monkeypatch.setattr(LoggedRig, "log", logged, raising=False)
+    monkeypatch.setattr(verb, "SimulatedRig", Rig)
+    with pytest.raises(KeyboardInterrupt):
+        verb.record(load_config(None, SMALL), tmp_path / "cut.mcap")
+    told = log[log.index(("cause", 0.0)) :]
+    assert ("zero", 0.0) in told
+    assert not [one for one in told if one[0] == "apply" and one[1] > 0.0]
+    assert SessionReader(tmp_path / "cut.mcap").outcome["outcome"] == "stopped"
+
+
+def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(tmp_path / "x.mcap")]
+    words += ["--set", "camera.rate_hz=60", "--set", "safety.guard_timeout_s=0.04"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert (
+        "safety.guard_timeout_s = 0.04: shorter than 3 frames at camera.rate_hz = 60; the nearest that works is 0.05"
+        in done.stderr
+    )
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,228 @@
+"""The guard on a clock that only the test moves: when the field goes, that it stays away, that zero() is repeated."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from flowrec.errors import RigError
+from flowrec.messages import Currents
+from flowrec.run.control import RAMP_PATIENCE_S, Desk, Interrupted
+from flowrec.run.watchdog import ZERO_PATIENCE_S, Guard
+
+
+class Driver:
+    """Coils that note what they are told, and a clock that stands still."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+        self.log: list[tuple[str, float]] = []
+        self.in_apply: Callable[[], None] = lambda: None
+        self.in_zero: Callable[[], None] = lambda: None
+
+    def clock(self) -> float:
+        return self.now_s
+
+    def apply(self, currents: Currents) -> None:
+        self.log.append(("apply", currents.amplitude_mt))
+        self.in_apply()
+
+    def zero(self) -> None:
+        self.in_zero()
+        self.log.append(("zero", 0.0))
+
+
+def field(amplitude_mt: float) -> Currents:
+    return Currents(0, 1.0, 0.0, amplitude_mt, 0.0, np.zeros(3), False)
+
+
+def until(happened: Callable[[], bool]) -> None:
+    """Wait for another thread; the limit is only against hanging."""
+    end_s = time.monotonic() + 30.0
+    while not happened():
+        assert time.monotonic() < end_s
+        time.sleep(0.001)
+
+
+def guarded(driver: Driver, **more: object) -> Guard:
+    """A guard whose thread the test is: it has begun, and `look` is called by hand."""
+    guard = Guard(driver, 0.5, clock=driver.clock, **more)  # type: ignore[arg-type]
+    guard._thread = threading.current_thread()
+    return guard
+
+
+def test_a_loop_that_hangs_loses_its_field_after_the_stated_time_and_not_before() -> None:
+    driver, told = Driver(), []
+    guard = guarded(driver, tripped=told.append)
+    guard.apply(field(4.0))
+    for _ in range(5):
+        driver.now_s += 0.45
+        assert guard.look() == pytest.approx(0.05)
+        guard.tick_ended()
+    driver.now_s += 0.499
+    guard.look()
+    assert ("zero", 0.0) not in driver.log
+    assert not guard.reason
+    driver.now_s += 0.002
+    guard.look()
+    assert driver.log == [("apply", 4.0), ("zero", 0.0)]
+    assert guard.hung
+    assert guard.off
+    assert told == ["guard: no tick for 0.5 s"]
+    driver.now_s += 60.0
+    guard.look()
+    assert len(driver.log) == 2
+
+
+def test_without_a_field_no_tick_is_missed_and_the_time_begins_with_the_field() -> None:
+    driver = Driver()
+    guard = guarded(driver)
+    guard.apply(field(0.0))
+    driver.now_s += 20.0  # the first tick of an installation compiles
+    guard.look()
+    guard.apply(field(1.0))
+    assert guard.look() == pytest.approx(0.5)
+    driver.now_s += 0.4
+    guard.apply(field(0.0))
+    driver.now_s += 20.0
+    guard.look()
+    assert not guard.reason
+
+
+def test_a_tick_that_ends_late_brings_no_field_back_and_a_command_under_way_is_followed_by_a_zero() -> None:
+    driver = Driver()
+    guard = guarded(driver)
+
+    def trip() -> None:
+        guard.trip("enough")
+        guard.look()  # zero() while the driver is still at work on the command
+
+    driver.in_apply = trip
+    guard.apply(field(4.0))
+    guard.look()
+    assert driver.log == [("apply", 4.0), ("zero", 0.0), ("zero", 0.0)]
+    driver.in_apply = lambda: None
+    guard.apply(field(4.0))
+    guard.apply(field(0.0))
+    assert driver.log[3:] == [("apply", 0.0)]
+
+
+def test_a_zero_that_raises_is_repeated_until_it_works_and_a_person_is_told() -> None:
+    driver, alarms, refusals = Driver(), [], iter([True] * 4)
+
+    def refuse() -> None:
+        driver.log.append(("refused", 0.0))
+        if next(refusals, False):
+            raise OSError("no answer")
+
+    driver.in_zero = refuse
+    guard = guarded(driver, alarm=alarms.append)
+    guard.trip("enough")
+    for _ in range(4):
+        assert guard.look() <= 0.02
+        assert not guard.off
+    guard.look()
+    assert guard.off
+    assert guard.failures == 4
+    assert [event for event, _ in driver.log] == ["refused"] * 5 + ["zero"]
+    until(lambda: len(alarms) == 2)
+    assert "no answer" in alarms[0]
+    assert "after 4 failures" in alarms[1]
+
+
+def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repeated() -> None:
+    driver = Driver()
+
+    def refuse() -> None:
+        driver.now_s += 0.1
+        raise OSError("no answer")
+
+    driver.in_zero = refuse
+    guard = Guard(driver, clock=driver.clock)
+    with guard.running(), pytest.raises(RigError, match=r"zero\(\) raised \d+ times: no answer.*by hand"):
+        guard.field_off()
+    assert driver.now_s > 100.0 + ZERO_PATIENCE_S
+    driver.in_zero = lambda: None
+    until(lambda: guard.off)
+    assert driver.log == [("zero", 0.0)]
+
+
+def test_ctrl_c_while_zero_is_at_work_comes_after_it() -> None:
+    driver, main = Driver(), threading.get_ident()
+
+    def slow() -> None:
+        for _ in range(2):
+            signal.pthread_kill(main, signal.SIGINT)
+            time.sleep(0.015)
+
+    driver.in_zero = slow
+    guard = Guard(driver)
+    with guard.running():
+        try:
+            guard.field_off()
+        except KeyboardInterrupt:
+            driver.log.append(("left", 0.0))
+        with contextlib.suppress(KeyboardInterrupt):
+            until(lambda: len(driver.log) == 2)
+    assert driver.log == [("zero", 0.0), ("left", 0.0)]
+
+
+def test_the_loop_is_left_in_the_blocks_it_has_marked_and_nowhere_else() -> None:
+    driver = Driver()
+    desk = Desk(driver.clock)
+    desk.ticking = True
+    desk.stop("enough")
+    with desk.interruptible:
+        assert not desk.leave_now  # there is time for a ramp
+    driver.now_s += 5.1
+    desk.interrupt()
+    with desk.left_when_late():
+        assert desk.stuck
+        with desk.interruptible:
+            desk.interrupt()
+        pytest.fail("the loop was not left")
+    desk.interrupt()
+    assert desk.unless_stopped(desk.interrupt, "otherwise") == "otherwise"
+    with pytest.raises(Interrupted), desk.interruptible:
+        desk.interrupt()
+    desk.interruptible.__enter__()
+    with pytest.raises(Interrupted):
+        desk.interrupt()
+    desk.interrupt()  # nothing raises again before the block is left
+
+
+def test_a_stop_that_is_late_takes_the_field_away_after_0_8_s_and_leaves_the_loop_after_1_1_s() -> None:
+    driver = Driver()
+    desk = Desk(driver.clock)
+    desk.ticking = True
+    desk.stop("enough")
+    told = desk.next(1, held=False)
+    assert told is not None and told.action == "stop"
+    driver.now_s += 0.79
+    assert desk.next(2, held=False) is None
+    driver.now_s += 0.02
+    told = desk.next(3, held=False)
+    assert told is not None and told.action == "zero"
+    with desk.interruptible:
+        driver.now_s += 0.28
+        assert not desk.leave_now
+        driver.now_s += 0.02
+        assert desk.leave_now
+
+
+def test_a_late_zero_keeps_the_reason_of_the_guard() -> None:
+    driver = Driver()
+    desk = Desk(driver.clock)
+    desk.stop("stopped by SIGINT: Ctrl-C")
+    desk.stop("guard: no tick for 0.5 s", zero=True)
+    driver.now_s += RAMP_PATIENCE_S + 0.1
+    event = desk.next(7, held=False)
+    assert event is not None
+    assert (event.action, event.text) == ("zero", "guard: no tick for 0.5 s")
+    assert desk.overdue

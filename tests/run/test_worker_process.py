@@ -1,0 +1,185 @@
+"""The process of the slow stages: the same results as at home, never in the way, never left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import textwrap
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowrec.commands.record import prepare
+from flowrec.config import load_config
+from flowrec.errors import FlowrecError
+from flowrec.messages import Mission, Tick
+from flowrec.pipeline import Pipeline
+from flowrec.run.jobs import work
+from flowrec.run.worker_process import WorkProcess
+from tests.conftest import HANG_S, SMALL, until
+
+# Found by this process and by its child: stages that fail in every way in which an answer can fail.
+HURDLES = """
+    import sys, threading, time
+    from dataclasses import dataclass
+
+    def explode():
+        raise RuntimeError("this can not be read back")
+
+    class TakesTwo(Exception):
+        def __init__(self, what, where):
+            super().__init__(f"{what} in {where}")
+
+    class Locked(Exception):
+        def __init__(self, text):
+            super().__init__(text)
+            self.lock = threading.Lock()
+
+    @dataclass
+    class Unreadable:
+        stamp_ns: int = 0
+        request: int = 0
+        def __reduce__(self):
+            return explode, ()
+
+    class Stage:
+        def __init__(self, *ways):
+            self.ways = list(ways)
+        def solve(self, chip):
+            how = self.ways.pop(0)
+            print("solving", how, file=sys.stderr, flush=True)
+            if how == "sleeps":
+                time.sleep(600)
+            if how == "raises":
+                raise ValueError("a plain reason")
+            if how == "takes two":
+                raise TakesTwo("leak", "valve")
+            if how == "holds a lock":
+                raise Locked("stuck valve")
+            if how == "exits":
+                sys.exit(7)
+            return Unreadable()
+"""
+
+
+@pytest.fixture(scope="module")
+def pipeline() -> Pipeline:
+    return prepare(load_config(None, SMALL))[2]
+
+
+@pytest.fixture
+def order() -> Tick:
+    nowhere = np.zeros(2)
+    return Tick(0, mission=Mission(0, "start", 0, 1, "solve", 0, nowhere, nowhere, False, "", ""))
+
+
+@pytest.fixture
+def working(
+    pipeline: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., WorkProcess]]:
+    """A process whose solver fails in the ways named, one for each order; none: the real one."""
+    (tmp_path / "hurdles.py").write_text(textwrap.dedent(HURDLES))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with ExitStack() as stack:
+
+        def start(*ways: str) -> WorkProcess:
+            if ways:
+                import hurdles  # type: ignore[import-not-found]
+            process = WorkProcess(replace(pipeline, solver=hurdles.Stage(*ways)) if ways else pipeline)
+            stack.callback(process.close)
+            return process
+
+        yield start
+
+
+def answer(process: WorkProcess) -> Any:
+    """The next result, or what was raised instead of one; None where it hangs."""
+    end = time.monotonic() + HANG_S
+    try:
+        while (result := process.result()) is None and time.monotonic() < end:
+            time.sleep(0.02)
+    except Exception as error:  # noqa: BLE001
+        return error
+    return result
+
+
+def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(pipeline, order, working) -> None:
+    process = working()
+    process.submit(order)
+    process.submit(order)
+    assert answer(process).same_as(work(pipeline, order))
+    assert answer(process).request == 1
+    os.kill(process._process.pid, signal.SIGKILL)
+    error = answer(process)
+    assert isinstance(error, FlowrecError)
+    assert "ended unasked (killed by SIGKILL)" in str(error)
+
+
+def test_a_process_that_is_stopped_while_the_mission_waits_for_it_is_told_of(order, working) -> None:
+    process = working("sleeps")
+    process.submit(order)
+    assert process.result() is None
+    os.kill(process._process.pid, signal.SIGSTOP)
+    assert "was stopped by a signal" in str(answer(process))
+
+
+def test_whatever_an_order_raises_or_answers_comes_back(order, working) -> None:
+    process = working("raises", "takes two", "holds a lock", "exits", "gives what can not be read")
+    errors = []
+    for _ in range(5):
+        process.submit(order)
+        errors.append(answer(process))
+    assert [type(error) for error in errors] == [ValueError, *4 * [FlowrecError]]
+    for error, told in zip(
+        errors, ("a plain reason", "leak in valve", "stuck valve", "SystemExit: 7", "can not be read back"), strict=True
+    ):
+        assert told in str(error)
+
+
+def test_what_the_process_printed_is_in_the_log_that_the_error_names_and_a_clean_end_leaves_none(
+    order, working, tmp_path: Path
+) -> None:
+    process = working("sleeps")
+    process.submit(order)
+    until(lambda: b"solving sleeps" in process._printed)
+    os.kill(process._process.pid, signal.SIGKILL)
+    log = Path(str(answer(process)).split("see ")[1].split(" for")[0])
+    assert "solving sleeps" in log.read_text()
+    log.unlink()
+    clean = working()
+    clean.submit(order)
+    answer(clean)
+    clean.close()
+    assert not list(tmp_path.glob("*.log"))
+
+
+def test_a_file_in_the_working_directory_does_not_shadow_a_library(
+    order, working, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = tmp_path / "desk"
+    desk.mkdir()
+    for name in ("filterpy", "scipy"):
+        (desk / f"{name}.py").write_text("raise SystemExit('the file of the user was run')")
+    monkeypatch.chdir(desk)
+    monkeypatch.syspath_prepend(str(desk))  # as python -m does
+    process = working()
+    process.submit(order)
+    result = answer(process)
+    assert not isinstance(result, BaseException), str(result)
+
+
+def test_a_process_that_is_closed_leaves_no_thread_and_no_open_pipe(order, working) -> None:
+    before = set(threading.enumerate())
+    process = working()
+    process.submit(order)
+    process.close()
+    until(lambda: set(threading.enumerate()) <= before)
+    assert all(pipe.closed for pipe in (process._process.stdin, process._process.stdout, process._process.stderr))
