@@ -29,6 +29,7 @@ from flowrec.control.mission import Commander
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
+from flowrec.methods import Methods
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.planning.free_space import Swift, swept_out, too_swift
 from flowrec.ranges import Fault, Range, faults, hints, range_of
@@ -405,6 +406,8 @@ def _names_of(hint: Any) -> list[str]:
     """The names that a setting can take; none where it takes others things."""
     if get_origin(hint) is Literal:
         return list(map(str, get_args(hint)))
+    if isinstance(hint, Methods):
+        return list(hint)
     return [name for part in get_args(hint) for name in _names_of(part)]
 
 

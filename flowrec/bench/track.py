@@ -118,7 +118,7 @@ def flights(law: Law, pace: Controller, world: World, seeds: int) -> list[Flight
     """One run per seed; without noise all are the same."""
     # What a parked robot's track would say of the camera.
     kalman = Kalman(position_noise_um=world.noise_um if world.noise_um > 0.0 else None)
-    observer = Observer(method=law.observer, kalman=kalman)  # type: ignore[arg-type]
+    observer = Observer(method=law.observer, kalman=kalman)
     controller, robot = replace(pace, method=law.method), world.robot(law.v_max_um_s)
     return [fly(controller, observer, robot, world, seed) for seed in range(seeds if world.noise_um > 0.0 else 1)]
 

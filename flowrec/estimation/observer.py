@@ -3,19 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated
 
 from flowrec.estimation.kalman import Kalman
 from flowrec.estimation.luenberger import Luenberger
 from flowrec.messages import Applied, Estimate, FlowField, Track
+from flowrec.methods import Method, Methods
 from flowrec.robot import Robot
+
+OBSERVERS = Methods(
+    "observer.method",
+    Method("kalman", "flowrec.estimation.kalman:Kalman", "Kalman filter for position and flow", ("kalman",)),
+    Method(
+        "kalman_map",
+        "flowrec.estimation.kalman:Kalman",
+        "the same with the best known flow field as its model",
+        ("kalman",),
+    ),
+    Method(
+        "luenberger", "flowrec.estimation.luenberger:Luenberger", "disturbance observer of the paper", ("luenberger",)
+    ),
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Observer:
     """Chooses the method; every method has the same verb."""
 
-    method: Literal["kalman", "kalman_map", "luenberger"] = "kalman"
+    method: Annotated[str, OBSERVERS] = "kalman"
     kalman: Kalman = field(default_factory=Kalman)
     luenberger: Luenberger = field(default_factory=Luenberger)
 
