@@ -167,7 +167,7 @@ def _stopped(pid: int) -> bool:
 
 def _worker_of(pid: int) -> int:
     children = [int(word) for task in Path(f"/proc/{pid}/task").iterdir() for word in _read(task / "children").split()]
-    return next(child for child in children if "work_process" in _read(Path(f"/proc/{child}/cmdline")))
+    return next(child for child in children if "worker_process" in _read(Path(f"/proc/{child}/cmdline")))
 
 
 def _read(path: Path) -> str:
