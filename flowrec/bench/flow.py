@@ -19,13 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion
 
 from flowrec.bench.figure_flow import Picture, draw, median_case, need_matplotlib
 from flowrec.bench.memory import peak_mb
-from flowrec.bench.vessels import make_up
 from flowrec.chip.chip import Chip
-from flowrec.chip.openings import border, run_around
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import FlowError, FlowrecError, UsageError
 from flowrec.estimation import Trimmed
@@ -33,6 +30,7 @@ from flowrec.flow import FlowSolver, cache
 from flowrec.flow.metrics import relative_rmse
 from flowrec.messages import FlowField, Observations
 from flowrec.refine import PiUnet, Refiner
+from flowrec.refine.training.vessels import draw_mask, make_case, with_mask_error
 from flowrec.terminal import progress, say, table
 
 MADE_UP = 10  # cases, where none are given
@@ -186,7 +184,7 @@ def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Troub
     """Refine one case, then look at its truth."""
     chip = read_vessel_case(case)
     observations = _observations(case, noise, share, trouble)
-    believed = with_wrong_mask(chip, trouble.mask)
+    believed = with_mask_error(chip, trouble.mask)
     solver, refiner = FlowSolver(k), METHODS[method]
     cache.forget()
     began, began_cpu = time.perf_counter(), time.process_time()
@@ -228,6 +226,18 @@ def _scored(
     )
 
 
+def make_up(folder: Path, count: int, seed: int = 0) -> None:
+    """Write `count` random vessel cases as made_up_NN.npz."""
+    made = 0
+    while made < count:
+        rng = np.random.default_rng([seed, 0xCA5E])
+        case = make_case(draw_mask(rng), rng)
+        seed += 1
+        if case is not None:
+            np.savez_compressed(folder / f"made_up_{made:02d}.npz", allow_pickle=False, **case)
+            made += 1
+
+
 def _observations(case: Path, noise: str, share: str, trouble: Trouble) -> Observations:
     """What the robot says it felt; nonsense differs from case to case and is the same for every method."""
     seed = int.from_bytes(case.stem.encode()[-4:], "little")
@@ -261,27 +271,6 @@ def with_outliers(observations: Observations, share: float, seed: int) -> Observ
     size = 3.0 * np.sqrt((flow**2).sum(axis=1).mean())
     flow[wrong] = size * rng.standard_normal((count, 2))
     return replace(observations, flow_um_s=flow)
-
-
-def with_wrong_mask(chip: Chip, how: str) -> Chip:
-    """The chip as somebody would have it who drew its walls one pixel off; openings stay where fluid is."""
-    if how == "right":
-        return chip
-    if how == "grown":
-        mask = binary_dilation(chip.mask)
-    elif how == "shrunk":
-        mask = binary_erosion(chip.mask, border_value=1)
-    elif how == "shifted":
-        mask = np.concatenate([chip.mask[:, :1], chip.mask[:, :-1]], axis=1)
-    else:
-        raise UsageError(f"bench flow: no wrong mask {how!r}; there are right, grown, shrunk, shifted")
-    openings = []
-    for opening in chip.openings:
-        middle = (opening.first + opening.last + (how == "shifted" and opening.side in ("top", "bottom"))) // 2
-        # An opening that is closed stays one pixel of solid, which the solver refuses by name.
-        first, last = run_around(border(mask, opening.side), middle) or (middle, middle)
-        openings.append(replace(opening, first=first, last=last))
-    return replace(chip, mask=mask, openings=tuple(openings))
 
 
 def show(figures: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from flowrec.bench.vessels import draw_mask
 from flowrec.chip.chip import Chip
 from flowrec.chip.openings import find_openings
 from flowrec.chip.vessel_case import read_vessel_case
@@ -22,6 +21,7 @@ from flowrec.planning.eikonal import descend, time_field
 from flowrec.planning.free_space import open_space
 from flowrec.planning.path_refinement import SPACING_PX, relax
 from flowrec.planning.timing import travel_time
+from flowrec.refine.training.vessels import draw_mask
 from flowrec.robot import Robot
 
 SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it

@@ -247,23 +247,6 @@ def bench_grid(
     show(measure(cases, k))
 
 
-@bench.command("train")
-def bench_train(
-    lessons: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of lessons; missing ones are made.")],
-    out: Annotated[Path, typer.Argument(metavar="FILE", help="Weights to write (*.safetensors).")],
-    network: Annotated[Literal["pi_unet", "unet"], typer.Option(help="Which network.")] = "pi_unet",
-    count: Annotated[int, typer.Option(min=4, help="Number of lessons.")] = 1800,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of four lessons each.")] = 4500,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Where to train.")] = "cpu",
-    seed: Annotated[int, typer.Option(min=0, help="Of lessons and weights.")] = 0,
-    overwrite: Overwrite = False,
-) -> None:
-    """Train a network's shipped weights on vessels drawn at random, with our own solver as the teacher."""
-    from flowrec.bench.train import Training, show, train
-
-    show(train(lessons, out, Training(network, count, steps, device=device, seed=seed), overwrite=overwrite))
-
-
 @bench.command("plan")
 def bench_plan(
     cases: Annotated[

@@ -1,9 +1,9 @@
 """U-Net, a baseline of the paper: data-driven, no physics. Trained on other vessels, applied once.
 
-The network of the PI-UNet with all that its trained form is told, the observations and where they speak along the
-channels too; but it has learned from true fields alone, and no equation enters. `flowrec bench train DIR FILE --network
-unet` makes the shipped weights. Without observations as input there is nothing to learn: wrong boundary values have no
-sign that other vessels could tell, and a network trained so keeps the error of the assumed field, 0.21.
+The network and inputs are those of the trained PI-UNet, observations and their spread along the channels included. It
+learns from true fields only, no equation enters; `python -m flowrec.refine.training DIR FILE --network unet` makes the
+shipped weights. Without observations there is nothing to learn: the sign of an error of the boundary values can not be
+known from other vessels, and a network trained so keeps the error of the assumed field, 0.21.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ def read_weights(path: Path, network: nn.Module) -> None:
         stored = load(path.read_bytes())
     except OSError as error:
         raise FlowError(
-            f"{path}: weights can not be read ({error.strerror}); train them with 'flowrec bench train'"
+            f"{path}: weights can not be read ({error.strerror}); train them with 'python -m flowrec.refine.training'"
         ) from error
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise FlowError(f"{path}: not a sound safetensors file ({error}); train the weights anew") from error

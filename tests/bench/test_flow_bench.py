@@ -8,7 +8,7 @@ import pytest
 
 from flowrec.bench import flow
 from flowrec.bench.figure_flow import Picture, draw, median_case, need_matplotlib
-from flowrec.bench.vessels import make_up
+from flowrec.bench.flow import make_up
 from flowrec.chip.vessel_case import read_observations, read_vessel_case
 from flowrec.errors import ChipError, UsageError
 from flowrec.flow import FlowSolver

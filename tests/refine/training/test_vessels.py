@@ -2,19 +2,19 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from flowrec.bench.vessels import draw_mask, make_case, make_up, thin
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import ChipError
 from flowrec.flow import FlowSolver
+from flowrec.refine.training.vessels import draw_mask, make_case, thin
 
 EIGHT = np.ones((3, 3))
 
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cases")
-    make_up(folder, 1)
-    return folder / "made_up_00.npz"
+    path = tmp_path_factory.mktemp("cases") / "case.npz"
+    np.savez(path, **made_case(0, truth_k=4))
+    return path
 
 
 def test_a_skeleton_is_thin_and_as_connected_as_its_mask():
@@ -69,10 +69,10 @@ def test_the_same_seed_makes_the_same_case():
         assert np.array_equal(value, second[key], equal_nan=np.asarray(value).dtype.kind == "f"), key
 
 
-def made_case(seed):
+def made_case(seed, truth_k=1):
     while True:
         rng = np.random.default_rng(seed)
-        made = make_case(draw_mask(rng), rng, 1)
+        made = make_case(draw_mask(rng), rng, truth_k)
         if made is not None:
             return made
         seed += 1

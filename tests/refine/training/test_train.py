@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from flowrec.bench.lessons import prepare, read_lessons
-from flowrec.bench.train import Training, train
 from flowrec.errors import UsageError
 from flowrec.refine import weights
 from flowrec.refine.case import Case
 from flowrec.refine.network import trained_network
 from flowrec.refine.network_inputs import Scene, turn
 from flowrec.refine.observation_operator import sight
+from flowrec.refine.training.lessons import prepare, read_lesson
+from flowrec.refine.training.train import Training, train
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def lessons(tmp_path_factory):
 def test_a_short_training_lowers_the_error_on_lessons_it_has_not_seen(lessons, tmp_path):
     folder, _ = lessons
     out = tmp_path / "weights.safetensors"
-    figures = train(folder, out, Training(lessons=8, steps=16, judged_every=8, learning_rate=4e-3, averaged=0.8))
+    figures = train(folder, out, Training(lessons=8, steps=16, validate_every=8, learning_rate=4e-3, average_decay=0.8))
     assert figures["best"] < figures["before"]
     assert figures["loss"][-1] < figures["loss"][0]
     weights.read_weights(out, trained_network())
@@ -32,7 +32,7 @@ def test_a_short_training_lowers_the_error_on_lessons_it_has_not_seen(lessons, t
 def test_the_same_seed_trains_the_same_bytes(lessons, tmp_path):
     folder, _ = lessons
     for name in ("a.safetensors", "b.safetensors"):
-        train(folder, tmp_path / name, Training("unet", lessons=8, steps=2, judged_every=2))
+        train(folder, tmp_path / name, Training("unet", lessons=8, steps=2, validate_every=2))
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
 
 
@@ -40,11 +40,11 @@ def test_a_vessel_case_is_not_taken_for_a_lesson(lessons, tmp_path):
     with np.load(lessons[1][0]) as data:
         np.savez(tmp_path / "case.npz", **{key: data[key] for key in data.files if not key.startswith("assumed_")})
     with pytest.raises(UsageError, match="not a lesson"):
-        read_lessons([tmp_path / "case.npz"])
+        read_lesson(tmp_path / "case.npz")
 
 
 def test_a_turned_scene_is_the_scene_of_the_turned_flow(lessons):
-    lesson = read_lessons(lessons[1][:1])[0]
+    lesson = read_lesson(lessons[1][0])
     seen = sight(lesson.observe(np.random.default_rng(0)), lesson.chip.mask, lesson.chip.um_per_px)
     scene = Scene.of([Case.of(lesson.assumed, seen, lesson.chip, cropped=False)])
     back = scene

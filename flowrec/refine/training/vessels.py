@@ -1,36 +1,44 @@
-"""Made-up vessel crops: masks, wrong assumptions, a robot's way and what it felt, in the keys of a vessel case.
+"""Random vessel networks with a true and an assumed flow, in the format of a vessel case (`chip/vessel_case.py`).
 
-For training, and for a bench that needs no data from elsewhere. The truth is our own solver's on a finer grid, so
-these cases judge a refinement, not the solver.
+The true flow is computed by flowrec's own solver, on a finer grid. The cases therefore measure a refinement, not the
+solver.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.ndimage import label
+from scipy.ndimage import binary_dilation, binary_erosion, label
 from scipy.sparse.csgraph import dijkstra
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.draw import draw_channel, smooth_curve
-from flowrec.chip.openings import border, find_openings
+from flowrec.chip.openings import border, find_openings, run_around
 from flowrec.chip.vessel_case import NOISES, SHARES
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 
 SIDE_PX = 128
-LONGEST_ROUTE_PX = 160
 Mask = NDArray[np.bool_]
+
+# A mask whose walls are drawn one pixel off, by name.
+MASK_ERRORS: dict[str, Callable[[Mask], Mask]] = {
+    "right": lambda mask: mask,
+    "grown": binary_dilation,
+    "shrunk": lambda mask: binary_erosion(mask, border_value=1),
+    "shifted": lambda mask: np.concatenate([mask[:, :1], mask[:, :-1]], axis=1),
+}
+_LONGEST_ROUTE_PX = 160
 _LETTER = {"left": "W", "right": "E", "top": "S", "bottom": "N"}
 
 
 def draw_mask(rng: np.random.Generator, side_px: int = SIDE_PX) -> Mask:
-    """A tree of vessels with some loops: one trunk from border to border, branches that start on what is there."""
+    """Draw a vessel tree with some loops: a trunk from border to border, then branches that start on a vessel."""
     gap = np.full((side_px, side_px), np.inf)
 
     def border_point() -> NDArray[np.float64]:
@@ -58,7 +66,7 @@ def draw_mask(rng: np.random.Generator, side_px: int = SIDE_PX) -> Mask:
         if len(inside) == 0:
             continue
         start = inside[rng.integers(len(inside))]
-        if rng.random() < 0.2:  # a loop: from vessel to vessel
+        if rng.random() < 0.2:  # a loop connects two vessels
             other = curves[rng.integers(len(curves))]
             end = other[rng.integers(len(other))]
         else:
@@ -68,20 +76,11 @@ def draw_mask(rng: np.random.Generator, side_px: int = SIDE_PX) -> Mask:
     return gap <= 0.0
 
 
-def crop_mask(image: Mask, rng: np.random.Generator, side_px: int = SIDE_PX) -> Mask:
-    """A random square of a large binary image (h, w), shrunk one to three times."""
-    shrink = float(rng.uniform(1.0, 3.0))
-    size = int(side_px * shrink)
-    row, column = (int(rng.integers(0, length - size)) for length in image.shape)
-    at = ((np.arange(side_px) + 0.5) * shrink).astype(np.intp)
-    return np.asarray(image[row + at][:, column + at])
-
-
 def make_case(mask: Mask, rng: np.random.Generator, truth_k: int = 4) -> dict[str, Any] | None:
-    """A case with the keys that `flowrec bench flow` reads, or None where the mask is no use; SI units.
+    """The arrays of a vessel case by key, in SI units; None if the mask does not suit.
 
-    Boundary values are wrong by up to 30 %, viscosity by up to 60 %, density by up to twice, and outlets are
-    assumed at 0 Pa while they are at up to a tenth of the pressure drop.
+    The assumed inlet speeds differ from the true ones by up to 30 %, the viscosity by up to 70 %, the density by up to
+    a factor of two. Outlets are assumed at 0 Pa; their true pressures are up to a tenth of the pressure drop.
     """
     mask = _largest(mask)
     openings = list(find_openings(mask))
@@ -149,20 +148,20 @@ def make_case(mask: Mask, rng: np.random.Generator, truth_k: int = 4) -> dict[st
     return case
 
 
-def make_up(folder: Path, count: int, seed: int = 0) -> None:
-    """Write `count` cases of drawn vessels as made_up_NN.npz."""
-    made = 0
-    while made < count:
-        rng = np.random.default_rng([seed, 0xCA5E])
-        case = make_case(draw_mask(rng), rng)
-        seed += 1
-        if case is not None:
-            np.savez_compressed(folder / f"made_up_{made:02d}.npz", allow_pickle=False, **case)
-            made += 1
+def with_mask_error(chip: Chip, error: str) -> Chip:
+    """The chip as drawn with one of MASK_ERRORS; its openings move to where the border of the new mask is open."""
+    mask = MASK_ERRORS[error](chip.mask)
+    openings = []
+    for opening in chip.openings:
+        middle = (opening.first + opening.last + (error == "shifted" and opening.side in ("top", "bottom"))) // 2
+        # A closed opening stays one solid pixel wide; the solver refuses it by name.
+        first, last = run_around(border(mask, opening.side), middle) or (middle, middle)
+        openings.append(replace(opening, first=first, last=last))
+    return replace(chip, mask=mask, openings=tuple(openings))
 
 
 def thin(mask: Mask) -> Mask:
-    """The skeleton of a mask, one pixel wide (Zhang and Suen, 1984)."""
+    """The skeleton of a mask, one pixel wide. Source: Zhang and Suen (1984)."""
     image = np.pad(mask, 1)
     while True:
         before = int(image.sum())
@@ -185,7 +184,7 @@ def _largest(mask: Mask) -> Mask:
 
 
 def _without_grazed(mask: Mask, openings: list[Opening]) -> Mask:
-    """Close the border where no opening is: a grazed channel is a wall there."""
+    """The mask with a wall along the border except at openings, for channels that only graze the border."""
     kept = np.zeros_like(mask)
     for o in openings:
         border(kept, o.side)[o.first : o.last + 1] = True  # a view
@@ -197,7 +196,7 @@ def _without_grazed(mask: Mask, openings: list[Opening]) -> Mask:
 
 
 def _route(skeleton: Mask, openings: list[Opening], rng: np.random.Generator) -> NDArray[np.int64] | None:
-    """(n, 2) rows and columns along the skeleton from beside one opening to beside another."""
+    """(n, 2) rows and columns of the shortest path along the skeleton between two random openings; None if short."""
     rows, columns = np.nonzero(skeleton)
     if len(rows) < 60:
         return None
@@ -226,5 +225,5 @@ def _route(skeleton: Mask, openings: list[Opening], rng: np.random.Generator) ->
     way = [goal]
     while way[-1] != source:
         way.append(int(before[way[-1]]))
-    way = way[::-1][:LONGEST_ROUTE_PX]
+    way = way[::-1][:_LONGEST_ROUTE_PX]
     return np.column_stack([rows[way], columns[way]]) if len(way) >= 60 else None
