@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField, Route
-from flowrec.planning.zermelo import bilinear
 from flowrec.system.numba_setup import compiled
 
 Raster = NDArray[np.float64]

@@ -25,11 +25,11 @@ from flowrec.bench.figure_flow import need_matplotlib
 from flowrec.bench.trips import SPEED_UM_S, Trip, World, best_time, draw_trip, magnified, worlds, worlds_of
 from flowrec.chip import clearance_um
 from flowrec.errors import UsageError
+from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField, Route
 from flowrec.planning import Planner, travel_time
 from flowrec.planning.free_space import Space, open_space
 from flowrec.planning.rrt import Rrt
-from flowrec.planning.zermelo import bilinear
 from flowrec.terminal import progress, say, table
 
 RATIOS = (0.5, 0.9, 1.3)  # fastest flow over the robot's speed

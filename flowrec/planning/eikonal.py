@@ -18,8 +18,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.interpolation import bilinear, bilinear_known
 from flowrec.planning.cost_rasters import Terrain
-from flowrec.planning.zermelo import bilinear, line_is_clear, segment_cost, step_cost, step_energy
+from flowrec.planning.zermelo import line_is_clear, segment_cost, step_cost, step_energy
 from flowrec.system.numba_setup import compiled
 
 Points = NDArray[np.float64]
@@ -418,26 +419,6 @@ def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: 
 
 
 @compiled
-def _between_known(times: Raster, x: float, y: float) -> float:
-    """Bilinear time at a point in px from those corners that have one; inf where they weigh less than a quarter."""
-    h, w = times.shape
-    if x < 0.0 or y < 0.0 or x > w - 1.0 or y > h - 1.0:
-        return math.inf
-    i = min(int(x), w - 2)
-    j = min(int(y), h - 2)
-    total = 0.0
-    weight = 0.0
-    for b in range(2):
-        for a in range(2):
-            t = times[j + b, i + a]
-            if t < math.inf:
-                share = (a * (x - i) + (1 - a) * (i + 1 - x)) * (b * (y - j) + (1 - b) * (j + 1 - y))
-                total += share * t
-                weight += share
-    return total / weight if weight >= 0.25 else math.inf
-
-
-@compiled
 def _descend(
     times: Raster,
     clearance: Raster,
@@ -485,7 +466,7 @@ def _descend(
                 tried = middle + (step if k % 2 == 0 else -step)
             dx = radius * math.cos(tried)
             dy = radius * math.sin(tried)
-            t = _between_known(times, x + dx, y + dy)
+            t = bilinear_known(times, x + dx, y + dy)
             if t >= left or t >= best:
                 continue
             mx = x + 0.5 * dx
@@ -516,7 +497,7 @@ def _descend(
         else:
             x += radius * math.cos(angle)
             y += radius * math.sin(angle)
-        left = _between_known(times, x, y)
+        left = bilinear_known(times, x, y)
         points[n, 0] = x
         points[n, 1] = y
         n += 1

@@ -15,8 +15,9 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.places import distance_um
 from flowrec.errors import FlowError, UsageError
 from flowrec.flow import sample
+from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField
-from flowrec.planning.zermelo import bilinear, line_is_clear
+from flowrec.planning.zermelo import line_is_clear
 from flowrec.ranges import Range
 from flowrec.robot import Robot
 

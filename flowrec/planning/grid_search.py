@@ -8,7 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.zermelo import bilinear, line_is_clear, step_time
+from flowrec.interpolation import bilinear
+from flowrec.planning.zermelo import line_is_clear, step_time
 from flowrec.system.numba_setup import compiled
 
 Raster = NDArray[np.float64]

@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.planning.zermelo import bilinear, lowest_clearance, segment_cost
+from flowrec.interpolation import bilinear
+from flowrec.planning.zermelo import lowest_clearance, segment_cost
 from flowrec.system.numba_setup import compiled
 
 Points = NDArray[np.float64]

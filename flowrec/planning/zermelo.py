@@ -12,24 +12,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.interpolation import bilinear, corner_weights
 from flowrec.system.numba_setup import compiled
 
 Raster = NDArray[np.float64]
-
-
-@compiled
-def bilinear(raster: Raster, x: float, y: float) -> float:
-    """Value of a raster (h, w) at a point in pixels; outside, that of the nearest border point."""
-    h, w = raster.shape
-    x = min(max(x, 0.0), w - 1.0)
-    y = min(max(y, 0.0), h - 1.0)
-    i = min(int(x), w - 2)
-    j = min(int(y), h - 2)
-    a = x - i
-    b = y - j
-    upper = raster[j, i] * (1.0 - a) + raster[j, i + 1] * a
-    lower = raster[j + 1, i] * (1.0 - a) + raster[j + 1, i + 1] * a
-    return float(upper * (1.0 - b) + lower * b)
 
 
 @compiled
@@ -97,17 +83,7 @@ def segment_cost(
     h, w = vx.shape
     total = 0.0
     for k in range(n):
-        # Three times `bilinear`, its corners found once.
-        x = min(max(x0 + (k + 0.5) * dx, 0.0), w - 1.0)
-        y = min(max(y0 + (k + 0.5) * dy, 0.0), h - 1.0)
-        i = min(int(x), w - 2)
-        j = min(int(y), h - 2)
-        a = x - i
-        b = y - j
-        p = (1.0 - a) * (1.0 - b)
-        q = a * (1.0 - b)
-        r = (1.0 - a) * b
-        s = a * b
+        j, i, p, q, r, s = corner_weights(x0 + (k + 0.5) * dx, y0 + (k + 0.5) * dy, h, w)
         total += step_cost(
             dx,
             dy,

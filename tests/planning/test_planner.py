@@ -5,8 +5,8 @@ import pytest
 
 from flowrec.chip import clearance_um
 from flowrec.errors import FlowError, UsageError
+from flowrec.interpolation import bilinear
 from flowrec.planning import Planner, travel_time
-from flowrec.planning.zermelo import bilinear
 from tests.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, open_water, poiseuille, robot
 
 START, GOAL = np.array([200.0, 250.0]), np.array([950.0, 620.0])

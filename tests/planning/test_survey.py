@@ -4,8 +4,8 @@ import pytest
 from flowrec.chip import ChipSettings, clearance_um, load_chip
 from flowrec.chip.places import opening_point_um
 from flowrec.flow import FlowSolver, sample
+from flowrec.interpolation import bilinear
 from flowrec.planning import SurveyPlanner
-from flowrec.planning.zermelo import bilinear
 from tests.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, robot
 
 
