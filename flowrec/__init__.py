@@ -1,3 +1,59 @@
-"""flowrec: flight recorder and replay lab for magnetic micro-robots that swim in flow."""
+"""flowrec: flight recorder and replay lab for magnetic micro-robots that swim in flow.
 
-__version__ = "0.1.0"
+    import flowrec
+
+    session = flowrec.open("a.mcap")          # only reads; nothing is loaded before it is used
+    session.outcome, session.at(3.0), session.fields["refined"]
+    flowrec.record(flowrec.load_config("my.toml"), "b.mcap")
+    flowrec.replay(session, flowrec.Change(refine="assimilate"))
+
+Every name is imported when it is first used: `import flowrec` takes milliseconds.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from flowrec.version import __version__ as __version__
+
+if TYPE_CHECKING:  # the same names as in the table below, for type checkers and editors
+    from flowrec.commands.check import check as check
+    from flowrec.commands.compare import compare as compare
+    from flowrec.commands.export import export as export
+    from flowrec.commands.info import info as info
+    from flowrec.commands.record import record as record
+    from flowrec.commands.replay import Change as Change
+    from flowrec.commands.replay import replay as replay
+    from flowrec.config import Config as Config
+    from flowrec.config import load_config as load_config
+    from flowrec.errors import FlowrecError as FlowrecError
+    from flowrec.session import Session as Session
+    from flowrec.session import open as open  # noqa: A004 - flowrec.open
+
+_MODULES = {
+    "Change": "commands.replay",
+    "Config": "config",
+    "FlowrecError": "errors",
+    "Session": "session",
+    "check": "commands.check",
+    "compare": "commands.compare",
+    "export": "commands.export",
+    "info": "commands.info",
+    "load_config": "config",
+    "open": "session",
+    "record": "commands.record",
+    "replay": "commands.replay",
+}
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'flowrec' has no attribute {name!r}")
+    found = globals()[name] = getattr(importlib.import_module(f"flowrec.{_MODULES[name]}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

@@ -189,9 +189,9 @@ def replay(
         for line in refinement_told(done):
             say(line)
     if view == "rrd" and target is not None:
-        from flowrec.commands.export import write_rrd_of
+        from flowrec.commands.export import export as write
 
-        write_rrd_of(target, overwrite=overwrite)
+        write(target, overwrite=overwrite)
 
 
 @app.command()
@@ -207,7 +207,7 @@ def view(
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session and open it in Rerun."""
-    from flowrec.commands.export import write_rrd_of
+    from flowrec.commands.export import export as write
     from flowrec.session import files_behind
     from flowrec.system.outputs import PICTURE, check_output
     from flowrec.terminal import say
@@ -218,7 +218,7 @@ def view(
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     if screenshot is not None:
         check_output(screenshot, PICTURE, inputs=files_behind(session), overwrite=overwrite)
-    rrd = session if session.suffix == ".rrd" else write_rrd_of(session, out, overwrite)
+    rrd = session if session.suffix == ".rrd" else write(session, out, overwrite)
     if as_json:
         typer.echo(_rrd_told(session, rrd))
     if screenshot is not None:
@@ -239,9 +239,9 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session without opening it."""
-    from flowrec.commands.export import write_rrd_of
+    from flowrec.commands.export import export as write
 
-    rrd = write_rrd_of(session, out, overwrite)
+    rrd = write(session, out, overwrite)
     if as_json:
         typer.echo(_rrd_told(session, rrd))
 
@@ -252,12 +252,12 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
-    from flowrec.commands.info import describe, facts_for_people
-
-    facts, topics = describe(session)
+    opened = flowrec.open(session)
+    facts, topics = flowrec.info(opened), opened.topics
     if as_json:
         typer.echo(json.dumps({"session": str(session), "facts": facts, "topics": topics}))
         return
+    from flowrec.commands.info import facts_for_people
     from flowrec.terminal import table
 
     table(session.name, ("", "value"), facts_for_people(facts))
@@ -362,10 +362,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare two sessions, every message of every tick; exit status 3 where they differ."""
-    from flowrec.commands.compare import compare_sessions
-    from flowrec.store import SessionReader
-
-    comparison = compare_sessions(SessionReader(first), SessionReader(second))
+    comparison = flowrec.compare(first, second)
     if as_json:
         typer.echo(json.dumps({"first_session": str(first), "second_session": str(second)} | comparison.as_json()))
     else:

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import flowrec
 from flowrec.clocks import read_clocks
+from flowrec.version import __version__
 
 PACKAGES = (
     "numpy",
@@ -30,12 +30,13 @@ PACKAGES = (
     "rerun-sdk",
     "pydantic",
 )
+PACKAGE = Path(__file__).resolve().parent
 _DIFF_LIMIT = 200_000  # characters; a larger change is cut and says so
 
 
 def provenance(anonymous: bool = False) -> dict[str, str]:
     """Facts about code, machine and moment as text, for the head of a session; `anonymous` leaves the machine out."""
-    facts = {"flowrec": flowrec.__version__, "python": platform.python_version()}
+    facts = {"flowrec": __version__, "python": platform.python_version()}
     if not anonymous:
         facts |= {"platform": platform.platform(), "host": platform.node(), "user": _user()}
     monotonic_ns, wall_ns = read_clocks()
@@ -54,13 +55,12 @@ def provenance(anonymous: bool = False) -> dict[str, str]:
 
 def _code(anonymous: bool) -> dict[str, str]:
     """The commit, and what differs from it: asked of git in a checkout, else as the wheel was built."""
-    source = Path(flowrec.__file__).resolve().parent
-    commit = _git(source, "rev-parse", "HEAD")
+    commit = _git(PACKAGE, "rev-parse", "HEAD")
     # Only a checkout of flowrec itself counts, not a repository that a virtual environment happens to lie in.
-    if not (commit and _git(source, "ls-files", "--error-unmatch", "__init__.py")):
-        return _built(source / "_build.json")
-    facts = {"git_commit": commit, "git_changed": str(bool(_git(source, "status", "--porcelain", "--", ".")))}
-    diff = "" if anonymous else _git(source, "diff", "HEAD", "--", ".")
+    if not (commit and _git(PACKAGE, "ls-files", "--error-unmatch", "__init__.py")):
+        return _built(PACKAGE / "_build.json")
+    facts = {"git_commit": commit, "git_changed": str(bool(_git(PACKAGE, "status", "--porcelain", "--", ".")))}
+    diff = "" if anonymous else _git(PACKAGE, "diff", "HEAD", "--", ".")
     if diff:
         cut = f"\n... cut at {_DIFF_LIMIT} characters" if len(diff) > _DIFF_LIMIT else ""
         facts["git_diff"] = diff[:_DIFF_LIMIT] + cut

@@ -1,143 +1,200 @@
-"""A session as the verbs handle it: what is written before the first frame, and what is read back to go on with it."""
+"""A recorded session, open for reading. Nothing heavy is imported until a message is read."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
-
-from flowrec.chip import chip_files, chip_from_files
-from flowrec.chip.chip import Chip
-from flowrec.config import Config, calibration_of, config_from_toml, to_toml
-from flowrec.errors import FlowrecError, SessionError
-from flowrec.messages import Route, Tick
-from flowrec.provenance import provenance
-from flowrec.store import Region, SessionHeader, SessionReader, SessionWriter, Snapshot, Split, encoding_for, files_of
+from flowrec.errors import FlowrecError, SessionError, UsageError
+from flowrec.store.metadata import SessionHeader
+from flowrec.store.part_continuity import Run, files_of
 from flowrec.store.paths import pieces
 from flowrec.store.session_metadata import Head
-from flowrec.store.shapes import beyond_measure
-from flowrec.topics import TOPICS
-from flowrec.units import seconds
+from flowrec.summary import Figures, of_text
+from flowrec.units import nanoseconds, seconds
 
-_QUEUE_S = 2.0
-_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
+if TYPE_CHECKING:
+    from flowrec.chip.chip import Chip
+    from flowrec.chip.registration import Calibration
+    from flowrec.config import Config
+    from flowrec.messages import Event, FlowField, Frame, Tick
+    from flowrec.store.reader import SessionReader
 
 
-def session_writer(
-    path: Path,
-    config: Config,
-    chip: Chip,
-    *,
-    parent: Path | None = None,
-    live: bool = False,
-    overwrite: bool = False,
-    in_pieces: bool = False,
-    derived: Mapping[str, float] | None = None,
-    inputs: Iterable[Path] = (),
-) -> SessionWriter:
-    """A new session file with its head written. `parent` is the session that it replays, named by content.
+class Session:
+    """A finished session, or one finished part of a run, open for reading; it never writes.
 
-    A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
-    `derived`: settings that nobody gave, by key; they are named in the head.
-    `inputs` are other files that the command reads; none of them, and none of the parent's, is replaced.
+    X.mcap is that file or, where there is none, the run whose parts are X.part001.mcap and so on. Times are session
+    time in s, the stamps of the ticks. Every attribute is read when it is first used. A session may be used as a
+    context manager; it is closed when it is collected, too.
+
+    Parameters
+    ----------
+    path : the session (.mcap).
+
+    Attributes
+    ----------
+    path : as it was named.
+
+    Raises
+    ------
+    SessionError : there is no such file, it is being recorded, was not finished, or is no session; reading damaged
+        messages raises it as well.
     """
-    header = session_header(config, chip)
-    if derived:
-        header = replace(header, provenance={**header.provenance, "derived": json.dumps(dict(derived))})
-    if parent is not None:
-        files = files_of(parent)
-        named = {"file": parent.name, "sha256": session_sha256(files)}
-        header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
-    header = replace(header, provenance={**header.provenance, **_durability(config, live=live)})
-    return SessionWriter(
-        path,
-        header,
-        frames=frames_of(config),
-        flush_s=config.recording.flush_s,
-        sync_s=config.recording.sync_s,
-        queue_limit_bytes=queue_bytes_of(config),
-        block=not live,
-        overwrite=overwrite,
-        pieces=_pieces_of(config) if in_pieces else None,
-        region=region_of(config, chip, again=parent is not None),
-        leave_out=config.recording.leave_out,
-        inputs=(*inputs, *(files_behind(parent) if parent is not None else ())),
-    )
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self.run = Run.at(self.path)
+
+    @classmethod
+    def of(cls, session: Session | Path | str) -> Session:
+        """The session itself, or that of a path."""
+        return session if isinstance(session, Session) else cls(session)
+
+    @cached_property
+    def header(self) -> SessionHeader:
+        """Configuration, chip, provenance and parent as they were written before the first message."""
+        with Head(self.run.pieces[0].path) as head:
+            return head.header
+
+    @property
+    def provenance(self) -> Mapping[str, str]:
+        """Where the session comes from: version, commit, packages, host, time, operator, seed; all text."""
+        return self.header.provenance
+
+    @cached_property
+    def outcome(self) -> Figures:
+        """How the run ended and what it came to; keys carry the unit, as in `duration_s`."""
+        return of_text(self.run.outcome)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first tick to the last, in s."""
+        return seconds(self.run.last_ns - self.run.first_ns)
+
+    @cached_property
+    def topics(self) -> dict[str, int]:
+        """Number of messages by topic."""
+        return self.run.counts()
+
+    @cached_property
+    def config(self) -> Config:
+        """The resolved configuration of the run; UsageError where it is not valid."""
+        from flowrec.config import config_from_toml
+
+        return config_from_toml(self.header.config_toml, f"{self.path}: config.toml inside")
+
+    @cached_property
+    def chip(self) -> Chip:
+        """The chip with its mask (h, w) and openings; ChipError where it is not valid."""
+        from flowrec.chip import chip_from_files
+
+        return chip_from_files(self.header.chip_png, self.header.chip_toml)
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """Camera pixels to chip coordinates in um."""
+        from flowrec.config import calibration_of
+
+        return calibration_of(self.config, self.chip)
+
+    @cached_property
+    def reader(self) -> SessionReader:
+        """The reader of the messages, by stamps in ns."""
+        from flowrec.store.reader import SessionReader
+
+        return SessionReader(self.path)
+
+    def ticks(self, start_s: float | None = None, *, with_frames: bool = True) -> Iterator[Tick]:
+        """All ticks, or those at and after `start_s`, each with every message known by then.
+
+        A message is new in a tick if it is another object than in the tick before. Without `with_frames` no image is
+        read, and ticks with nothing but a new image are left out.
+        """
+        start_ns = None if start_s is None else self.stamp_ns(start_s)
+        return self.reader.ticks(start_ns, with_frames=with_frames)
+
+    def at(self, time_s: float, *, with_frames: bool = True) -> Tick:
+        """The tick at or before a time, with every message known by then.
+
+        Raises
+        ------
+        UsageError : the session does not cover that time.
+        """
+        return self.reader.tick_before(self.stamp_ns(time_s), with_frames=with_frames)
+
+    @property
+    def last(self) -> Tick:
+        """The last tick, with every message known by then."""
+        return self.reader.tick_before(self.run.last_ns)
+
+    def messages(self, field: str) -> Iterator[Any]:
+        """All messages of one topic, named by its field of `Tick`, such as "estimate"; SessionError if unknown."""
+        return self.reader.messages(field)
+
+    @property
+    def frames(self) -> Iterator[Frame]:
+        """The recorded camera images, in order."""
+        return self.messages("frame")
+
+    @property
+    def events(self) -> list[Event]:
+        """What the run reported, in order."""
+        return list(self.messages("event"))
+
+    @property
+    def fields(self) -> dict[str, FlowField]:
+        """The last flow field of each kind that was recorded: "assumed", "refined" and, of a simulation, "true"."""
+        last = self.reader.tick_before(self.run.last_ns, with_frames=False)
+        found = {"assumed": last.assumed, "refined": last.refined, "true": last.true_field}
+        return {name: field for name, field in found.items() if field is not None}
+
+    def stamp_ns(self, time_s: float, flag: str = "") -> int:
+        """A time of the session in s as a stamp in ns; UsageError, which begins with `flag`, outside of the session."""
+        stamp_ns, first_ns, last_ns = nanoseconds(time_s), self.run.first_ns, self.run.last_ns
+        if not first_ns <= stamp_ns <= last_ns:
+            what = f"{flag} {time_s:g}".strip()
+            raise UsageError(f"{what}: {self.path} runs from {seconds(first_ns):g} s to {seconds(last_ns):g} s")
+        return stamp_ns
+
+    @property
+    def key(self) -> str:
+        """Hash of header and times, 32 hexadecimal digits, that tells this session from every other."""
+        header = self.header
+        content = (header.config_toml, sorted(header.provenance.items()), sorted(header.parent.items()))
+        return hashlib.sha256(repr((content, self.run.first_ns, self.run.last_ns)).encode()).hexdigest()[:32]
+
+    def close(self) -> None:
+        """Close the files; nothing more can be read."""
+        if "reader" in vars(self):
+            self.reader.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"Session({str(self.path)!r})"
 
 
-def _durability(config: Config, *, live: bool) -> dict[str, str]:
-    """How much of a run a kill takes at most, in s of stamps; of a ring, from its event on."""
-    camera, flush_s = config.camera, config.recording.flush_s
-    pixels_s = camera.width_px * camera.height_px * (camera.rate_hz or 0.0)
-    waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only where the disk is too slow
-    return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
+def open(path: Path | str) -> Session:  # noqa: A001 - flowrec.open
+    """Open a session (.mcap) for reading.
 
-
-def _start_unix_ns(file: Path) -> int:
-    with Head(file) as head:
-        return head.source.start_unix_ns
-
-
-def _pieces_of(config: Config) -> Split | Snapshot:
-    recording = config.recording
-    if recording.snapshot_before_s:
-        return Snapshot(recording.snapshot_before_s, recording.snapshot_after_s, recording.snapshot_mb)
-    return Split(recording.split_mb, recording.split_s)
-
-
-def region_of(config: Config, chip: Chip, again: bool = False) -> Region | None:
-    """Which part of most images is kept, as settings and tracker will have it; None: all.
-
-    `again`: the images were cut when they were recorded, and are kept as they are.
+    Raises
+    ------
+    SessionError : one line that says what the file is, and what to do.
     """
-    recording, camera = config.recording, config.camera
-    if recording.region == "whole":
-        return None
-    shape = (camera.height_px, camera.width_px)
-    sight = config.tracker.sight(chip, calibration_of(config, chip), config.robot, shape)
-    return Region(sight.pad_px + recording.region_pad_px, sight.everywhere_px, recording.full_every_s, cut=not again)
-
-
-def queue_bytes_of(config: Config) -> int:
-    """How much may wait for the disk, in bytes."""
-    camera, chosen_mb = config.camera, config.recording.queue_mb
-    if chosen_mb is not None:
-        return int(chosen_mb * 1e6)
-    images = int(_QUEUE_S * camera.width_px * camera.height_px * (camera.rate_hz or 0.0))
-    return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
-
-
-def frames_of(config: Config) -> str:
-    """How the images of a run travel, a name of store/frames.py."""
-    camera, chosen = config.camera, config.recording.frames
-    if chosen != "auto":
-        return chosen
-    if config.recording.region == "robot":
-        return "zstd"  # makes less of the black than delta in a fifth of its time (flowrec bench store)
-    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz or 0.0)
-
-
-def session_header(config: Config, chip: Chip) -> SessionHeader:
-    """Everything that must be in a file before its first frame; the session clock starts now."""
-    png, toml = chip_files(chip)
-    facts = provenance(config.recording.anonymous) | {
-        "operator": config.recording.operator,
-        "sample": config.recording.sample,
-        "notes": config.recording.notes,
-        "seed": str(config.simulated.seed),
-    }
-    if config.refine.weights_sha256:
-        facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
-    return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]))
+    return Session(path)
 
 
 def files_behind(path: Path) -> list[Path]:
-    """All files of a session and, where they are beside it, of those that it replays, one through the other.
+    """All files of a session and, where they are in the same folder, of those that it replays.
 
     None of them may be replaced by what is made of the session.
     """
@@ -149,23 +206,9 @@ def files_behind(path: Path) -> list[Path]:
     return files
 
 
-def session_key(reader: SessionReader) -> str:
-    """What tells a session from every other, by its head and its times: 32 hexadecimal digits."""
-    header = reader.header
-    told = (header.config_toml, sorted(header.provenance.items()), sorted(header.parent.items()))
-    return hashlib.sha256(repr((told, reader.first_ns, reader.last_ns)).encode()).hexdigest()[:32]
-
-
-def open_session(path: Path) -> tuple[SessionReader, Config, Chip]:
-    """A session with the configuration and the chip that it carries."""
-    reader = SessionReader(path)
-    config = config_from_toml(reader.header.config_toml, f"{path}: config.toml inside")
-    return reader, config, chip_from_files(reader.header.chip_png, reader.header.chip_toml)
-
-
 @contextlib.contextmanager
-def content_blamed(reader: SessionReader, done: str) -> Iterator[None]:
-    """What fails over numbers in a session that can not be is told as such; any other failure stays what it is.
+def content_blamed(session: Session, done: str) -> Iterator[None]:
+    """Turn a failure over absurd numbers in a session into a SessionError; any other failure stays what it is.
 
     `done` says what can not be done with the session, such as "replayed".
     """
@@ -174,23 +217,27 @@ def content_blamed(reader: SessionReader, done: str) -> Iterator[None]:
     except FlowrecError:
         raise
     except Exception as error:
-        said = next(_beyond_measure(reader), None)
-        if said is None:
+        fault = next(_absurd_numbers(session), None)
+        if fault is None:
             raise
         raise SessionError(
-            f"{reader.path}: {said}, so it can not be {done} ({type(error).__name__}: {error}); "
-            f"`flowrec check {reader.path}` says more"
+            f"{session.path}: {fault}, so it can not be {done} ({type(error).__name__}: {error}); "
+            f"`flowrec check {session.path}` says more"
         ) from error
 
 
-def _beyond_measure(reader: SessionReader) -> Iterator[str]:
+def _absurd_numbers(session: Session) -> Iterator[str]:
+    from flowrec.messages import Tick
+    from flowrec.store.shapes import beyond_measure
+    from flowrec.topics import TOPICS
+
     before = Tick()
-    for tick in reader.ticks(with_frames=False):
+    for tick in session.ticks(with_frames=False):
         for topic in TOPICS:
             message = getattr(tick, topic.field)
             if message is not None and message is not getattr(before, topic.field):
                 for name in beyond_measure(message):
-                    at_s = seconds(tick.stamp_ns - reader.first_ns)
+                    at_s = seconds(tick.stamp_ns - session.run.first_ns)
                     yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or a number beyond all measure"
         before = tick
 
@@ -202,8 +249,3 @@ def session_sha256(files: Sequence[Path]) -> str:
         with path.open("rb") as file:
             hashlib.file_digest(file, lambda: digest)
     return digest.hexdigest()
-
-
-def length_um(route: Route) -> float:
-    """Length of a route in um."""
-    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())

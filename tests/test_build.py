@@ -27,7 +27,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if (ROOT / name).exists():
             shutil.copy(ROOT / name, folder)
     (folder / "flowrec").mkdir()
-    for name in ("__init__.py", "provenance.py"):
+    for name in ("__init__.py", "provenance.py", "version.py"):
         shutil.copy(ROOT / "flowrec" / name, folder / "flowrec")
     git(folder, "init", "--quiet")
     git(folder, "add", ".")
@@ -65,10 +65,10 @@ def test_a_build_of_changed_sources_says_so(checkout: Path, tmp_path: Path) -> N
 def test_a_package_without_git_tells_the_commit_that_it_was_built_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import flowrec
+    from flowrec import provenance as room
     from flowrec.provenance import provenance
 
-    monkeypatch.setattr(flowrec, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(room, "PACKAGE", tmp_path)
     assert "git_commit" not in provenance()
     (tmp_path / "_build.json").write_text('{"git_commit": "0123abcd", "git_changed": true}')
     said = provenance()

@@ -16,6 +16,7 @@ from flowrec.cli import main
 from flowrec.commands import replay
 from flowrec.config import Config, load_config, resolve, with_sets
 from flowrec.errors import UsageError
+from flowrec.session import Session
 
 GOLDEN = Path(__file__).parents[1] / "sessions" / "golden.mcap"
 
@@ -173,9 +174,9 @@ def test_a_file_is_named_for_what_it_sets(tmp_path: Path) -> None:
 def test_a_replay_that_fails_over_a_recorded_setting_outside_of_its_range_names_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    reader, config, chip = replay.open_session(GOLDEN)
-    absurd = replace(config, health=replace(config.health, window_s=0.0))
-    monkeypatch.setattr(replay, "open_session", lambda _path: (reader, absurd, chip))
+    session = Session(GOLDEN)
+    absurd = replace(session.config, health=replace(session.config.health, window_s=0.0))
+    monkeypatch.setitem(vars(session), "config", absurd)
     with pytest.raises(Exception) as caught:  # noqa: PT011 - any: a traceback is what it must not be
-        replay.replay(GOLDEN, replay.Change())
+        replay.replay(session, replay.Change())
     assert "health.window_s = 0: must be from 0.05" in str(caught.value)

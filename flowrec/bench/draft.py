@@ -19,7 +19,7 @@ from mcap.data_stream import RecordBuilder
 from flowrec.chip import load_chip
 from flowrec.config import Config, load_config, resolve
 from flowrec.messages import Message, array_fields
-from flowrec.session import session_header
+from flowrec.session_writer import session_header
 from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations
 from flowrec.store.codec import encode_record
 from flowrec.store.frame_encodings import ENCODINGS

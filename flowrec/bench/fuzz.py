@@ -24,9 +24,9 @@ from flowrec.bench.draft import Draft, small_draft
 from flowrec.bench.memory import peak_mb
 from flowrec.bench.mutate import blind, spoil
 from flowrec.commands.check import check
-from flowrec.commands.info import describe, list_sessions
+from flowrec.commands.info import info, list_sessions
 from flowrec.errors import FlowrecError, printable
-from flowrec.session import open_session
+from flowrec.session import Session
 from flowrec.store import SessionReader, recover
 from flowrec.terminal import progress, table
 
@@ -109,6 +109,10 @@ class Campaign:
             if any(printable(line) != line for line in verdict.lines()):
                 raise AssertionError("the verdict is not safe on a terminal")
 
+        def opened() -> None:
+            with Session(path) as session:
+                _ = session.config, session.chip, session.reader
+
         def saved() -> None:
             done = recover(path, self._work / "saved.mcap")
             with SessionReader(done.path) as reader:
@@ -117,9 +121,9 @@ class Campaign:
 
         sound = {}
         for name, verb in (
-            ("info", lambda: describe(path)),
+            ("info", lambda: info(path)),
             ("ls", lambda: list_sessions(self._work)),
-            ("open", lambda: open_session(path)[0].close()),
+            ("open", opened),
             ("middle", middle),
             ("ticks", ticks),
             ("check", judged),

@@ -27,7 +27,7 @@ from flowrec.messages import Currents, Tick
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import LockstepWorker, Sink, run
-from flowrec.session import session_header
+from flowrec.session_writer import session_header
 from flowrec.store import SessionWriter
 from flowrec.terminal import progress, table
 from flowrec.view import LiveView

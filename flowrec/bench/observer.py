@@ -22,7 +22,7 @@ from flowrec.estimation.tuning import tune
 from flowrec.flow import sample
 from flowrec.messages import Applied, Estimate, FlowField, Health, Track
 from flowrec.robot import Robot
-from flowrec.session import open_session
+from flowrec.session import Session
 from flowrec.terminal import progress, say, table
 from flowrec.units import seconds
 
@@ -193,8 +193,9 @@ def measure(session: Path | None = None, figure: Path | None = None, seed: int =
 
 def recommend(path: Path) -> dict[str, Any]:
     """Settings of the Kalman filter that suit a recording, and the alarms that its observer would have raised."""
-    reader, config, _ = open_session(path)
-    ticks = [tick for tick in reader.ticks(with_frames=False) if tick.track is not None and tick.applied is not None]
+    session = Session(path)
+    config = session.config
+    ticks = [tick for tick in session.ticks(with_frames=False) if tick.track is not None and tick.applied is not None]
     tracks, applied = [tick.track for tick in ticks], [tick.applied for tick in ticks]
     fields = [tick.field for tick in ticks] if config.observer.method == "kalman_map" else None
     tuned = tune(tracks, applied, config.robot, config.observer.kalman, fields)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ import numpy as np
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.chip import load_chip
 from flowrec.config import load_config, resolve
-from flowrec.session import region_of
+from flowrec.session_writer import region_of
 from flowrec.store import Region, SessionWriter
 from flowrec.terminal import progress
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-import flowrec
 from flowrec.control.coil_calibration import CoilFit, advice, fit_coils
 from flowrec.control.coils import Coils
 from flowrec.control.excitations import read_excitations
 from flowrec.system.outputs import TOML, check_output, new_file
 from flowrec.terminal import say, table
+from flowrec.version import __version__
 
 _AXES = ("x", "y", "z")
 _EXACT_DIGITS = 9
@@ -45,7 +45,7 @@ def fragment(fit: CoilFit, path: Path) -> str:
     suspects = f"; {len(fit.suspects)} of them suspicious" if fit.suspects else ""
     rows = "".join(f"    {list(row)},\n" for row in _matrix(fit))
     return (
-        f"# By flowrec {flowrec.__version__} calibrate from {path.name} (sha256 {digest}...): "
+        f"# By flowrec {__version__} calibrate from {path.name} (sha256 {digest}...): "
         f"{len(fit.residual_mt)} excitations{suspects}.\n"
         f"# Residual rms {noise} mT in x, y, z; a field of 4 mT is known to {fit.uncertainty_mt:.2g} mT.\n"
         f"[coils]\nmt_per_a = [\n{rows}]\nbias_mt = {list(_bias(fit))}\n"

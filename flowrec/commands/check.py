@@ -10,12 +10,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import flowrec
 from flowrec.chip import chip_from_files
 from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_told, faults_of, skew_ppm
 from flowrec.config import Config, config_from_toml
 from flowrec.errors import FlowrecError, printable
 from flowrec.messages import Clocks, Frame, Message, Timing
+from flowrec.session import Session
 from flowrec.store import not_finite
 from flowrec.store.audit import Audit, audit
 from flowrec.store.part_continuity import fault_of, goes_on, without_part
@@ -25,6 +25,7 @@ from flowrec.summary import Figures, finite
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS, Role
 from flowrec.units import NS_PER_S, seconds
+from flowrec.version import __version__
 
 GAP_PERIODS = 1.5
 _GAPS_KEPT = 100  # the longest ones
@@ -140,19 +141,21 @@ def files_to_check(path: Path) -> list[Path]:
     return sorted(filter(part_number, pieces(path)), key=part_number) or [path]
 
 
-def check(path: Path, progress: Callable[[int], None] | None = None) -> Verdict:
+def check(session: Session | Path | str, progress: Callable[[int], None] | None = None) -> Verdict:
     """Read a whole session, finished or not, and judge it. Memory does not grow with the file.
 
     Of a run in parts each is judged, and whether they fit together.
 
     Parameters
     ----------
+    session : the session, or the path of one; that of a file without an end as well.
     progress : told how many bytes have been read.
 
     Raises
     ------
     SessionError : it is no session that this flowrec can read; its text says what it is.
     """
+    path = session.path if isinstance(session, Session) else Path(session)
     files = files_to_check(path)
     if files == [path]:
         return _check_file(path, progress)[0]
@@ -390,8 +393,8 @@ class _Clocks:
 
 def _judge_head(verdict: Verdict, found: Audit) -> Config | None:
     written = f"by flowrec {found.flowrec_version}"
-    if found.flowrec_version != flowrec.__version__:
-        written += f" (this is {flowrec.__version__}: flowrec replay --verify tells whether it still does the same)"
+    if found.flowrec_version != __version__:
+        written += f" (this is {__version__}: flowrec replay --verify tells whether it still does the same)"
     verdict.fact("written", written)
     if found.header is None:
         verdict.bad("head", f"its head is not whole: {found.header_fault}")

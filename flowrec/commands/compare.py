@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.config import config_from_toml
 from flowrec.errors import UsageError, printable
 from flowrec.messages import Message, Tick
-from flowrec.store import SessionReader
+from flowrec.session import Session
 from flowrec.store.topic_filter import is_left_out
 from flowrec.topics import BY_FIELD, TOPICS, Role, Topic
 from flowrec.units import seconds
@@ -41,18 +41,18 @@ class Side:
     copy: bool = False
 
     @classmethod
-    def of(cls, word: str, reader: SessionReader) -> Side:
+    def of(cls, word: str, session: Session) -> Side:
         """A session: without the topics that it leaves out, and the fields that its own schemas do not have."""
         try:
-            left_out = config_from_toml(reader.header.config_toml, f"{reader.path}").recording.leave_out
+            left_out = session.config.recording.leave_out
         except UsageError:  # the configuration of another flowrec: then every topic that it declares counts
             left_out = ()
-        copy = bool(reader.header.parent)
-        recorded = dict(reader.recorded_fields)
-        for name in recorded.keys() - reader.counts.keys():
+        copy = bool(session.header.parent)
+        recorded = dict(session.reader.recorded_fields)
+        for name in recorded.keys() - session.reader.counts.keys():
             if (copy and name == "frame") or is_left_out(BY_FIELD[name].path, left_out):
                 del recorded[name]
-        return cls(word, reader.path.name, recorded, copy)
+        return cls(word, session.path.name, recorded, copy)
 
     def lacks(self, topic: Topic) -> dict[str, str]:
         """What it does not record of a topic, `/topic` or `/topic field`, each with the words for it."""
@@ -306,15 +306,16 @@ def _is_json(value: object) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def compare_sessions(first: SessionReader, second: SessionReader) -> Comparison:
-    """Every message of every tick of two sessions, inputs and truth included; timings left out.
+def compare(first: Session | Path | str, second: Session | Path | str) -> Comparison:
+    """Compare every message of every tick of two sessions, inputs and truth included, diagnostics left out.
 
-    Ticks belong together by their stamps.
+    Ticks are paired by their stamps. Raises SessionError where one of the two can not be read.
     """
-    sides = Side.of("first", first), Side.of("second", second)
+    sessions = Session.of(first), Session.of(second)
+    sides = Side.of("first", sessions[0]), Side.of("second", sessions[1])
     comparison = Comparison(roles=(Role.INPUT, Role.OUTPUT, Role.TRUTH), sides=sides)
     with_frames = all("frame" in side.recorded for side in sides)
-    ticks = [iter(reader.ticks(with_frames=with_frames)) for reader in (first, second)]
+    ticks = [session.ticks(with_frames=with_frames) for session in sessions]
     was, now = next(ticks[0], None), next(ticks[1], None)
     while was is not None or now is not None:
         if was is not None and now is not None and was.stamp_ns == now.stamp_ns:

@@ -10,8 +10,8 @@ from flowrec.chip.chip import Chip
 from flowrec.config import Config
 from flowrec.errors import SessionError
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.session import content_blamed, files_behind, open_session, session_key
-from flowrec.store import SessionReader, files_of
+from flowrec.session import Session, content_blamed, files_behind
+from flowrec.store import files_of
 from flowrec.system.outputs import RRD, check_output
 from flowrec.terminal import progress, say
 from flowrec.view import Scene, is_made_from, write_rrd
@@ -31,7 +31,7 @@ def scene_of(config: Config, chip: Chip, pipeline: Pipeline, path: Path) -> Scen
     return Scene(chip, pipeline.calibration, pipeline.robot, path.stem, properties, windows=windows)
 
 
-def write_rrd_of(path: Path, out: Path | None = None, overwrite: bool = False) -> Path:
+def export(session: Session | Path | str, out: Path | None = None, overwrite: bool = False) -> Path:
     """Write the .rrd of a session; a replay is shown beside its parent, where that is still there.
 
     Parameters
@@ -44,31 +44,32 @@ def write_rrd_of(path: Path, out: Path | None = None, overwrite: bool = False) -
     ------
     SessionError : the session can not be read, or the file not be written; OutputError where it may not be.
     """
-    reader, config, chip = open_session(path)
-    key = session_key(reader)
+    session = Session.of(session)
+    path, key = session.path, session.key
     target = out if out is not None else path.with_suffix(RRD[0])
     overwrite = overwrite or (out is None and is_made_from(target, key))
     inputs = files_behind(path)
     check_output(target, RRD, inputs=inputs, overwrite=overwrite)
-    scene = replace(scene_of(config, chip, assemble(config, chip), path), key=key)
-    parent = _parent_of(path, reader)
+    pipeline = assemble(session.config, session.chip)
+    scene = replace(scene_of(session.config, session.chip, pipeline, path), key=key)
+    parent = _parent_of(session)
     began = time.perf_counter()
-    with progress(f"writing {target.name}", max(reader.duration_s, 1e-3)) as done:
+    with progress(f"writing {target.name}", max(session.duration_s, 1e-3)) as done:
         if parent is not None:
-            ticks, replayed = SessionReader(parent).ticks(), reader.ticks(with_frames=False)
+            ticks, replayed = Session(parent).ticks(), session.ticks(with_frames=False)
         else:
-            ticks, replayed = reader.ticks(), None
-        with content_blamed(reader, "drawn"):
+            ticks, replayed = session.ticks(), None
+        with content_blamed(session, "drawn"):
             write_rrd(target, scene, ticks, replayed, done, inputs=inputs, overwrite=overwrite)
     say(f"{target} written in {time.perf_counter() - began:.1f} s; open it with: rerun {target}")
     return target
 
 
-def _parent_of(path: Path, reader: SessionReader) -> Path | None:
+def _parent_of(session: Session) -> Path | None:
     """The session that was replayed, where it is there, all of it."""
     # A name only: a session from elsewhere does not say which files of this machine are opened.
-    name = Path(reader.header.parent.get("file", "")).name
-    parent = path.parent / name
+    name = Path(session.header.parent.get("file", "")).name
+    parent = session.path.parent / name
     try:
         return parent if name and all(file.is_file() for file in files_of(parent)) else None
     except SessionError:

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import SessionError
-from flowrec.store.metadata import Part, SessionHeader
+from flowrec.session import Session
+from flowrec.store.metadata import Part
 from flowrec.store.part_continuity import Run
 from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
-from flowrec.store.session_metadata import Head
 from flowrec.summary import name_of, of_text, shown
 from flowrec.system.locks import is_growing
 from flowrec.system.toml_file import parse_toml
@@ -30,20 +30,20 @@ _SAID_ELSE = ("reason", "duration")  # the second of older files, a sentence
 _CLOCK_READINGS = ("wall_ns", "monotonic_ns")
 
 
-def describe(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """Facts about a session, numbers with their units in the keys, and its message counts by topic.
+def info(session: Session | Path | str) -> dict[str, Any]:
+    """Facts about a session; numbers have their unit in the key, None is what is not known.
 
-    Reads no message, but for those that the parts of a run repeat.
+    Reads no message, but for those that the parts of a run repeat. Raises SessionError where there is no session.
     """
-    run = Run.at(path)
-    header = _header(run)
+    session = Session.of(session)
+    path, run, header = session.path, session.run, session.header
     outcome = run.outcome
     config = _table(header.config_toml, f"{path}: config.toml inside")
     said = header.provenance
     facts: dict[str, Any] = {
         "outcome": outcome.get("outcome", "unknown"),
         "note": _why(outcome),
-        "duration_s": _duration_s(run),
+        "duration_s": session.duration_s,
         "size_bytes": _size(run),
         "parts": len(run.pieces) if run.in_parts else None,
         **_chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
@@ -65,11 +65,11 @@ def describe(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
     if _at(config, "recording", "region") == "robot" and "frames_windows" not in outcome:
         facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
     told = of_text(outcome)
-    return facts | {key: value for key, value in told.items() if key not in (*facts, *_SAID_ELSE)}, run.counts()
+    return facts | {key: value for key, value in told.items() if key not in (*facts, *_SAID_ELSE)}
 
 
 def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The facts of `describe` in words, what is not known left out."""
+    """The facts of `info` in words, what is not known left out."""
     stages = ("observer", "refine", "plan", "control")
     width_um, height_um = facts.get("chip_width_um"), facts.get("chip_height_um")
     size = f", {width_um / 1000:.2f} x {height_um / 1000:.2f} mm" if width_um and height_um else ""
@@ -141,25 +141,16 @@ def _listed(path: Path, files: list[Path]) -> Listed:
     size = sum(file.stat().st_size for file in files)
     parts = len(files) if files != [path] else 0
     try:
-        run = Run.at(path)
-        head = _header(run)
-        outcome = run.outcome.get("outcome", "unknown"), _why(run.outcome)
+        session = Session(path)
+        head, said = session.header, session.run.outcome
+        outcome = said.get("outcome", "unknown"), _why(said)
         chip = str(_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
         recorded = head.provenance.get("wall_time", "")
-        return Listed(path.name, *outcome, size, _duration_s(run), chip, recorded, parts)
+        return Listed(path.name, *outcome, size, session.duration_s, chip, recorded, parts)
     except SessionError as error:
         unfinished = any(file.name.endswith(PARTIAL_SUFFIX) for file in files)
         what = "recording" if any(map(is_growing, files)) else "unfinished" if unfinished else "unreadable"
         return Listed(path.name, what, str(error).removeprefix(f"{path}: "), size, parts=parts)
-
-
-def _header(run: Run) -> SessionHeader:
-    with Head(run.pieces[0].path) as head:
-        return head.header
-
-
-def _duration_s(run: Run) -> float:
-    return seconds(run.last_ns - run.first_ns)
 
 
 def _size(run: Run) -> int:

@@ -22,15 +22,16 @@ from flowrec.commands.interactive import Unattended
 from flowrec.config import Config, derived, resolve
 from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.flow.metrics import relative_rmse
-from flowrec.messages import Demand, FlowField, Tick
+from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.free_space import no_room, swept_out, too_swift
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.disk_monitor import DiskWatch, refuse_below
 from flowrec.run.loop import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
 from flowrec.run.watchdog import Guard
-from flowrec.session import files_behind, length_um, session_writer
-from flowrec.store import SessionReader, SessionWriter, is_snapshot, taken
+from flowrec.session import Session, files_behind
+from flowrec.session_writer import session_writer
+from flowrec.store import SessionWriter, is_snapshot, taken
 from flowrec.store.paths import pieces, run_path
 from flowrec.summary import Figures, as_text, finite, rows_for_people
 from flowrec.system.outputs import MCAP, RRD, check_output
@@ -180,9 +181,7 @@ def default_path(config: Config, folder: Path | None = None) -> Path:
 
 def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
     """Assumed and refined flow at the end of an earlier session, on the same chip."""
-    reader = SessionReader(path)
-    last = reader.tick_before(reader.last_ns, with_frames=False)
-    fields = {name: field for name in ("assumed", "refined") if (field := getattr(last, name)) is not None}
+    fields = {name: field for name, field in Session(path).fields.items() if name != "true"}
     if "assumed" not in fields:
         raise UsageError(f"start.field = {path}: that session holds no flow field; survey and refine first")
     shape = fields["assumed"].velocity_um_s.shape[:2]
@@ -304,10 +303,10 @@ def record(
     if view == "rrd" and desk.reason:
         say(f"the run was stopped: no .rrd was made; flowrec export {path} makes it")
     elif view == "rrd":
-        from flowrec.commands.export import write_rrd_of
+        from flowrec.commands.export import export
 
         for name in recorded.sessions:
-            facts["rrd"] = str(write_rrd_of(name, overwrite=overwrite))
+            facts["rrd"] = str(export(name, overwrite=overwrite))
     return recorded
 
 
@@ -388,6 +387,11 @@ def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
         )
     refuse_below(config.recording.disk_floor_gb, path.resolve().parent)
     return path
+
+
+def length_um(route: Route) -> float:
+    """Length of a route in um."""
+    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
 
 
 def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:

@@ -13,7 +13,7 @@ from flowrec.messages import FlowField
 from flowrec.pipeline import assemble
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import LockstepWorker, Preloaded, RunReport, Sink, run
-from flowrec.session import session_writer
+from flowrec.session_writer import session_writer
 from flowrec.summary import Row
 from flowrec.terminal import say
 from flowrec.units import seconds

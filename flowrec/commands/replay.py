@@ -24,13 +24,14 @@ from flowrec.ranges import faults as range_faults
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run.jobs import FILLS, work
 from flowrec.run.loop import LockstepWorker, RunReport, Sink, run
-from flowrec.session import content_blamed, files_behind, open_session, session_writer
+from flowrec.session import Session, content_blamed, files_behind
+from flowrec.session_writer import session_writer
 from flowrec.store import SessionReader, SessionWriter, digest_faults
 from flowrec.summary import as_text
 from flowrec.system.outputs import MCAP, RRD, check_output
 from flowrec.terminal import warn
 from flowrec.topics import BY_FIELD
-from flowrec.units import nanoseconds, seconds
+from flowrec.units import seconds
 
 # Which results of the worker a changed section makes stale.
 STALE: dict[str, frozenset[str]] = {
@@ -164,8 +165,8 @@ def refly_path(out: Path) -> Path:
 
 
 def replay(
-    path: Path,
-    change: Change,
+    session: Session | Path | str,
+    change: Change | None = None,
     from_s: float | None = None,
     verify: bool = False,
     out: Path | None = None,
@@ -173,7 +174,7 @@ def replay(
     frames: bool = False,
     control: Unattended | None = None,
 ) -> Replayed:
-    """Replay `path` with `change`, in any thread; write the result to `out` when given.
+    """Replay a session with `change`, in any thread; write the result to `out` when given.
 
     Parameters
     ----------
@@ -182,7 +183,8 @@ def replay(
     frames : copy the camera's images to `out`.
     control : who attends it; None: nobody, it takes no signals and shows no progress.
     """
-    reader, recorded_config, chip = open_session(path)
+    session, change = Session.of(session), change if change is not None else Change()
+    path, reader, recorded_config, chip = session.path, session.reader, session.config, session.chip
     config = change.apply(recorded_config)
     stale = stale_results(recorded_config, config)
     if change.refine is not None:
@@ -193,11 +195,7 @@ def replay(
     pipeline = assemble(config, chip)
     if config.sampler.method == "smoothed":
         pipeline = replace(pipeline, hindsight=hindsight(reader, pipeline))
-    start_ns = nanoseconds(from_s) if from_s is not None else None
-    if start_ns is not None and not reader.first_ns <= start_ns <= reader.last_ns:
-        raise UsageError(
-            f"--from {from_s:g}: {path} runs from {seconds(reader.first_ns):g} s to {seconds(reader.last_ns):g} s"
-        )
+    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
     if reader.carried_ns is not None:
         # A piece of a run begins with what was known, not with a frame to work on.
         start_ns = max(start_ns or 0, reader.carried_ns + 1)
@@ -207,7 +205,7 @@ def replay(
     order = _order_under_way(reader, start)
     if order is not None:
         worker.submit(order)
-    sides = Side.of("recorded", reader), Side("replayed", "the replay")
+    sides = Side.of("recorded", session), Side("replayed", "the replay")
     checker = WorkerCheck(pipeline, start, order, Comparison(sides=sides)) if verify else None
     comparison, commands = Comparison(sides=sides), CommandDifference()
     truth: list[FlowField] = [] if start.true_field is None else [start.true_field]
@@ -226,7 +224,7 @@ def replay(
     first_ns = start_ns if start_ns is not None else reader.first_ns
     with ExitStack() as stack:
         stack.enter_context(_settings_blamed(path, config))
-        stack.enter_context(content_blamed(reader, "replayed"))
+        stack.enter_context(content_blamed(session, "replayed"))
         sinks: list[Sink] = []
         writer = None
         if out is not None:

@@ -8,7 +8,7 @@ from typing import Literal
 
 from mcap.records import Attachment, Metadata
 
-import flowrec
+from flowrec.version import __version__
 
 FORMAT_VERSION = 1
 PROFILE = "flowrec"
@@ -79,7 +79,7 @@ class SessionHeader:
 
 def records_of(header: SessionHeader) -> Iterator[Metadata | Attachment]:
     """The MCAP records of a header, in the order in which they are written."""
-    yield Metadata(SESSION, {"format_version": str(FORMAT_VERSION), "flowrec_version": flowrec.__version__})
+    yield Metadata(SESSION, {"format_version": str(FORMAT_VERSION), "flowrec_version": __version__})
     yield Metadata(PROVENANCE, dict(header.provenance))
     yield Metadata(PARENT, dict(header.parent))
     if header.part is not None:

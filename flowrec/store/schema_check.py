@@ -6,7 +6,6 @@ from dataclasses import fields
 
 from google.protobuf import descriptor_pb2
 
-import flowrec
 from flowrec.errors import SessionError
 from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
@@ -14,6 +13,7 @@ from flowrec.store.mcap_index import Summary
 from flowrec.store.roi import Region, region_from
 from flowrec.store.session_metadata import Head
 from flowrec.topics import BY_FIELD, BY_PATH
+from flowrec.version import __version__
 
 
 class Contents(Head):
@@ -70,7 +70,7 @@ class Contents(Head):
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
             f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
-            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {flowrec.__version__})"
+            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
         )
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.channels import declarations
 from flowrec.store.chunk import Sealed
@@ -21,6 +20,7 @@ from flowrec.store.paths import PARTIAL_SUFFIX, partial_path, pieces
 from flowrec.store.roi import Region
 from flowrec.store.segments import Tally
 from flowrec.system.outputs import MCAP, check_output, put_in_place, sync_directory, taken
+from flowrec.version import __version__
 
 
 class PieceError(SessionError):
@@ -98,7 +98,7 @@ class Piece:
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         try:
-            self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
+            self._file.start(PROFILE, f"flowrec {__version__}")
             for record in (*records_of(header), *declarations(making.frames, making.region)):
                 self._file.add(record)
         except OSError as error:

@@ -13,7 +13,6 @@ from typing import Self
 
 from mcap.records import ChunkIndex, Statistics
 
-import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.mcap_index import Summary
 from flowrec.store.mcap_reader import ForeignError, Source
@@ -29,6 +28,7 @@ from flowrec.store.metadata import (
     header_from,
     part_from,
 )
+from flowrec.version import __version__
 
 _METADATA_LIMIT_BYTES = 16 << 20
 _ATTACHMENTS_LIMIT_BYTES = 256 << 20
@@ -147,7 +147,7 @@ class Head:
         what = f"{self.source.path}: is a session of format {version!r}, written by flowrec {self.flowrec_version}"
         newer = version.isdecimal() and int(version) > FORMAT_VERSION
         need = f"install flowrec {self.flowrec_version} or later" if newer else "it is damaged or was edited"
-        raise SessionError(f"{what}; this is flowrec {flowrec.__version__} with format {FORMAT_VERSION}: {need}")
+        raise SessionError(f"{what}; this is flowrec {__version__} with format {FORMAT_VERSION}: {need}")
 
     def _by_topic(self, counts: Mapping[int, int]) -> dict[str, int]:
         found: Counter[str] = Counter()

@@ -6,8 +6,6 @@ import os
 import sys
 from pathlib import Path
 
-import flowrec
-
 
 def command(module: str, *words: str) -> list[str]:
     """What runs a module of ours as a program."""
@@ -20,7 +18,7 @@ def environment() -> dict[str, str]:
     There a file of the user, as filterpy.py, would shadow a library. Where flowrec itself is imported from the working
     directory (a checkout), that stays.
     """
-    home = str(Path(flowrec.__file__).resolve().parent.parent)
+    home = str(Path(__file__).resolve().parents[2])
     here = Path.cwd()
     kept = [place for place in sys.path if place and (place == home or Path(place).resolve() != here)]
     return os.environ | {"PYTHONPATH": os.pathsep.join(kept if home in kept else [home, *kept])}

@@ -15,14 +15,15 @@ import pytest
 
 from flowrec.clocks import ClockWatch, DeviceClock, read_clocks
 from flowrec.commands.check import check
-from flowrec.commands.info import describe, facts_for_people
+from flowrec.commands.info import facts_for_people, info
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.errors import RigError
 from flowrec.pipeline import Inputs
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import LockstepWorker, run
-from flowrec.session import session_writer
+from flowrec.session import Session
+from flowrec.session_writer import session_writer
 from flowrec.store import SessionReader, recover
 from tests.conftest import SMALL, until
 
@@ -104,7 +105,7 @@ def test_frames_that_go_back_in_time_enter_no_stage_and_are_counted_and_told(tmp
     assert verdict.exit_status == 3
     assert "3 frames whose stamp did not grow passed over" in [finding.text for finding in verdict.findings]
     assert "camera's clock" in verdict.facts["camera"]
-    facts, counts = describe(tmp_path / "s.mcap")
+    facts, counts = info(tmp_path / "s.mcap"), Session(tmp_path / "s.mcap").topics
     assert "3 frames whose stamp did not grow passed over" in facts["clocks"]
     assert counts["/run/clocks"] >= 3 and "wall ns" not in dict(facts_for_people(facts))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowrec.commands import replay as verb
-from flowrec.commands.compare import compare_sessions
+from flowrec.commands.compare import compare
 from flowrec.commands.record import Recorded, record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config
@@ -29,7 +29,7 @@ def test_the_mission_reaches_its_goal_without_touching_a_wall(mission: Recorded)
 
 def test_the_same_seed_gives_the_same_messages(session: Path, tmp_path: Path) -> None:
     again = record(load_config(None, SMALL), tmp_path / "again.mcap")
-    comparison = compare_sessions(SessionReader(session), SessionReader(again.path))
+    comparison = compare(session, again.path)
     assert comparison.ticks > 200
     assert comparison.identical, str(comparison.first)
 

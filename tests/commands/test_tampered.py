@@ -18,7 +18,7 @@ from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.config import load_config
 from flowrec.messages import Clocks, Drops, Health, Tick
-from flowrec.session import session_header
+from flowrec.session_writer import session_header
 from flowrec.store import SessionWriter, Split
 from flowrec.store.viewer_topics import MIRRORS
 from flowrec.topics import TOPICS, Role

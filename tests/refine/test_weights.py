@@ -9,7 +9,7 @@ from flowrec.config import load_config
 from flowrec.errors import FlowError
 from flowrec.refine import PiUnet, Refiner, weights
 from flowrec.refine.network import UNet, trained_network
-from flowrec.session import session_header
+from flowrec.session_writer import session_header
 
 
 class Trap:

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from flowrec.config import load_config
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
-from flowrec.session import frames_of
+from flowrec.session_writer import frames_of
 from flowrec.store import SessionReader, SessionWriter, codec, encoding_for, recover
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.image_codec import picture, row_differences

@@ -22,7 +22,7 @@ from flowrec.chip.vessel_case import KEYS as CASE_KEYS
 from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.cli import app
 from flowrec.commands.check import check
-from flowrec.commands.export import write_rrd_of
+from flowrec.commands.export import export
 from flowrec.config import config_from_toml
 from flowrec.errors import ChipError, FlowError, SessionError, UsageError, printable
 from flowrec.messages import Estimate, Frame, Message
@@ -239,14 +239,17 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
     inner = tmp_path / "inner"
     inner.mkdir()
     (tmp_path / "secret.mcap").write_bytes(DRAFT.build())
-    opened = []
-    monkeypatch.setattr("flowrec.commands.export.SessionReader", opened.append)
-    monkeypatch.setattr("flowrec.commands.export.write_rrd", lambda *_, **__: None)
+    drawn = []
+
+    def drawn_beside(_target, _scene, _ticks, replayed, *_, **__):
+        drawn.append(replayed)
+
+    monkeypatch.setattr("flowrec.commands.export.write_rrd", drawn_beside)
     for name in ("../secret.mcap", str(tmp_path / "secret.mcap"), "..", "a\0b", ""):
         parent = text("flowrec.parent") + _map({"file": name, "sha256": "0"})
         head = tuple(part for part in DRAFT.head if not part[1].startswith(text("flowrec.parent")))
-        write_rrd_of(file_of(inner, replace(DRAFT, head=(*head, (METADATA, parent)))))
-    assert not opened
+        export(file_of(inner, replace(DRAFT, head=(*head, (METADATA, parent)))))
+    assert drawn == [None] * 5
 
 
 def test_an_image_that_promises_more_than_it_has_is_refused(tmp_path):

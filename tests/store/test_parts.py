@@ -13,13 +13,14 @@ from flowrec.chip import load_chip
 from flowrec.cli import app
 from flowrec.commands import replay as verb
 from flowrec.commands.check import check
-from flowrec.commands.compare import compare_sessions
-from flowrec.commands.info import describe, list_sessions
+from flowrec.commands.compare import compare
+from flowrec.commands.info import info, list_sessions
 from flowrec.commands.replay import Change
 from flowrec.config import load_config, resolve
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
-from flowrec.session import session_header, session_sha256
+from flowrec.session import Session, session_sha256
+from flowrec.session_writer import session_header
 from flowrec.store import SessionReader, SessionWriter, recover_run
 from flowrec.store.metadata import Part
 from flowrec.store.paths import part_path, partial_path
@@ -241,12 +242,14 @@ def test_the_verbs_take_the_run(run, whole, tmp_path, rrd_only_begun):
     verdict = check(run)
     assert (verdict.word, verdict.exit_status, len(verdict.parts)) == ("good", 0, 4), verdict.lines()
     assert verdict.facts["parts"] == "4, each begins where the one before ends"
-    assert verdict.topics == {BY_FIELD[field].path: count for field, count in whole.counts.items()} == describe(run)[1]
-    assert describe(run)[0]["parts"] == 4
-    assert "part 2 of the run x, goes on from 1.17 s" in describe(part_path(run, 2))[0]["piece"]
+    assert (
+        verdict.topics == {BY_FIELD[field].path: count for field, count in whole.counts.items()} == Session(run).topics
+    )
+    assert info(run)["parts"] == 4
+    assert "part 2 of the run x, goes on from 1.17 s" in info(part_path(run, 2))["piece"]
     (row,) = list_sessions(run.parent)
     assert (row.name, row.outcome, row.parts) == ("x.mcap", "reached", 4)
-    assert compare_sessions(SessionReader(run), whole).identical
+    assert compare(run, whole.path).identical
     files = SessionReader(run).files
     joined = tmp_path / "joined"
     joined.write_bytes(b"".join(file.read_bytes() for file in files))

@@ -7,7 +7,7 @@ import pytest
 
 from flowrec.commands import replay as verb
 from flowrec.commands.check import check
-from flowrec.commands.info import describe
+from flowrec.commands.info import info
 from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config
@@ -86,7 +86,7 @@ def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(
         assert np.array_equal(whole.frame.image[y0:y1, x0:x1], cut.frame.image[y0:y1, x0:x1])
     verdict = check(path)
     assert verdict.exit_status == 0 and "exact for the recorded tracker" in verdict.facts["windows"]
-    assert "black elsewhere" in describe(path)[0]["frames_windows"]
+    assert "black elsewhere" in info(path)["frames_windows"]
     # Another controller looks at the same pixels; another tracker may not.
     out = tmp_path / "r.mcap"
     verb.replay(path, Change(sets=("tracker.search_radii=4",)), out=out, frames=True)

@@ -174,7 +174,7 @@ def test_what_is_no_session_is_named_as_what_it_is(tmp_path, session):
 
 def test_a_session_of_a_later_format_says_which_flowrec_it_needs(tmp_path, monkeypatch):
     monkeypatch.setattr(metadata, "FORMAT_VERSION", 2)
-    monkeypatch.setattr("flowrec.__version__", "9.9.0")
+    monkeypatch.setattr("flowrec.store.metadata.__version__", "9.9.0")
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
     monkeypatch.undo()
     with pytest.raises(SessionError, match=r"format '2'.*install flowrec 9\.9\.0 or later"):

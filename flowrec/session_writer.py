@@ -1,0 +1,127 @@
+"""A new session file: its header with configuration, chip and provenance, and how its messages are written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from flowrec.chip import chip_files
+from flowrec.chip.chip import Chip
+from flowrec.config import Config, calibration_of, to_toml
+from flowrec.provenance import provenance
+from flowrec.session import files_behind, session_sha256
+from flowrec.store import Region, SessionHeader, SessionWriter, Snapshot, Split, encoding_for, files_of
+from flowrec.store.session_metadata import Head
+
+_QUEUE_S = 2.0
+_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
+
+
+def session_writer(
+    path: Path,
+    config: Config,
+    chip: Chip,
+    *,
+    parent: Path | None = None,
+    live: bool = False,
+    overwrite: bool = False,
+    in_pieces: bool = False,
+    derived: Mapping[str, float] | None = None,
+    inputs: Iterable[Path] = (),
+) -> SessionWriter:
+    """A new session file with its head written. `parent` is the session that it replays, named by content.
+
+    A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
+    `derived`: settings that nobody gave, by key; they are named in the head.
+    `inputs` are other files that the command reads; none of them, and none of the parent's, is replaced.
+    """
+    header = session_header(config, chip)
+    if derived:
+        header = replace(header, provenance={**header.provenance, "derived": json.dumps(dict(derived))})
+    if parent is not None:
+        files = files_of(parent)
+        named = {"file": parent.name, "sha256": session_sha256(files)}
+        header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
+    header = replace(header, provenance={**header.provenance, **_durability(config, live=live)})
+    return SessionWriter(
+        path,
+        header,
+        frames=frames_of(config),
+        flush_s=config.recording.flush_s,
+        sync_s=config.recording.sync_s,
+        queue_limit_bytes=queue_bytes_of(config),
+        block=not live,
+        overwrite=overwrite,
+        pieces=_pieces_of(config) if in_pieces else None,
+        region=region_of(config, chip, again=parent is not None),
+        leave_out=config.recording.leave_out,
+        inputs=(*inputs, *(files_behind(parent) if parent is not None else ())),
+    )
+
+
+def _durability(config: Config, *, live: bool) -> dict[str, str]:
+    """How much of a run a kill takes at most, in s of stamps; of a ring, from its event on."""
+    camera, flush_s = config.camera, config.recording.flush_s
+    pixels_s = camera.width_px * camera.height_px * (camera.rate_hz or 0.0)
+    waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only where the disk is too slow
+    return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
+
+
+def _start_unix_ns(file: Path) -> int:
+    with Head(file) as head:
+        return head.source.start_unix_ns
+
+
+def _pieces_of(config: Config) -> Split | Snapshot:
+    recording = config.recording
+    if recording.snapshot_before_s:
+        return Snapshot(recording.snapshot_before_s, recording.snapshot_after_s, recording.snapshot_mb)
+    return Split(recording.split_mb, recording.split_s)
+
+
+def region_of(config: Config, chip: Chip, again: bool = False) -> Region | None:
+    """Which part of most images is kept, as settings and tracker will have it; None: all.
+
+    `again`: the images were cut when they were recorded, and are kept as they are.
+    """
+    recording, camera = config.recording, config.camera
+    if recording.region == "whole":
+        return None
+    shape = (camera.height_px, camera.width_px)
+    sight = config.tracker.sight(chip, calibration_of(config, chip), config.robot, shape)
+    return Region(sight.pad_px + recording.region_pad_px, sight.everywhere_px, recording.full_every_s, cut=not again)
+
+
+def queue_bytes_of(config: Config) -> int:
+    """How much may wait for the disk, in bytes."""
+    camera, chosen_mb = config.camera, config.recording.queue_mb
+    if chosen_mb is not None:
+        return int(chosen_mb * 1e6)
+    images = int(_QUEUE_S * camera.width_px * camera.height_px * (camera.rate_hz or 0.0))
+    return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
+
+
+def frames_of(config: Config) -> str:
+    """How the images of a run travel, a name of store/frames.py."""
+    camera, chosen = config.camera, config.recording.frames
+    if chosen != "auto":
+        return chosen
+    if config.recording.region == "robot":
+        return "zstd"  # makes less of the black than delta in a fifth of its time (flowrec bench store)
+    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz or 0.0)
+
+
+def session_header(config: Config, chip: Chip) -> SessionHeader:
+    """Everything that must be in a file before its first frame; the session clock starts now."""
+    png, toml = chip_files(chip)
+    facts = provenance(config.recording.anonymous) | {
+        "operator": config.recording.operator,
+        "sample": config.recording.sample,
+        "notes": config.recording.notes,
+        "seed": str(config.simulated.seed),
+    }
+    if config.refine.weights_sha256:
+        facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
+    return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]))

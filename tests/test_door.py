@@ -1,0 +1,149 @@
+"""`import flowrec` is the door: it costs nothing, opens sessions that only read, and runs the verbs."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from types import FunctionType
+
+import numpy as np
+import pytest
+
+import flowrec
+from flowrec.errors import SessionError, UsageError
+from flowrec.messages import Tick
+from tests.conftest import HANG_S, SMALL, until
+
+ROOT = Path(__file__).parents[1]
+GOLDEN = ROOT / "sessions" / "golden.mcap"
+
+
+def imported_by(code: str) -> set[str]:
+    """Names of the modules that a new interpreter has after running `code`."""
+    words = [sys.executable, "-c", f"{code}\nimport sys; print(*sys.modules)"]
+    return set(subprocess.run(words, check=True, capture_output=True, text=True, cwd=ROOT).stdout.split())
+
+
+def test_importing_flowrec_imports_nothing_else() -> None:
+    found = imported_by("import flowrec")
+    assert {name for name in found if name.startswith("flowrec")} == {"flowrec", "flowrec.version"}
+    assert not found & {"numpy", "mcap", "pydantic"}
+
+
+def test_opening_a_session_and_its_outcome_need_no_array_library() -> None:
+    code = f"import flowrec; s = flowrec.open({str(GOLDEN)!r}); s.outcome, s.duration_s, s.topics, s.provenance"
+    assert not imported_by(code) & {"numpy", "scipy", "torch", "pydantic", "foxglove"}
+
+
+def test_reading_ticks_needs_no_stage() -> None:
+    code = f"import flowrec; next(flowrec.open({str(GOLDEN)!r}).ticks())"
+    found = imported_by(code)
+    assert "numpy" in found
+    assert not found & {"torch", "scipy.stats", "rerun", "filterpy", "flowrec.pipeline", "flowrec.config"}
+
+
+def test_every_public_name_is_there_documented_and_known_to_type_checkers() -> None:
+    tree = ast.parse(Path(flowrec.__file__).read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    declared = {alias.asname for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert declared == set(flowrec.__all__) <= set(dir(flowrec))
+    assert (Path(flowrec.__file__).parent / "py.typed").is_file()
+    for name in flowrec.__all__:
+        assert inspect.getdoc(getattr(flowrec, name)), name
+
+
+def test_every_attribute_of_a_session_is_documented() -> None:
+    for name, member in vars(flowrec.Session).items():
+        if not name.startswith("_"):
+            assert inspect.getdoc(member), name
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="nosuch"):
+        flowrec.nosuch  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_session_gives_all_that_a_notebook_shows() -> None:
+    with flowrec.open(GOLDEN) as session:
+        ticks = list(session.ticks(with_frames=False))
+        assert session.outcome["outcome"] == "reached"
+        assert session.outcome["ticks"] == len(ticks)
+        assert session.config.mission.phases
+        assert session.chip.mask.any()
+        assert session.duration_s == pytest.approx((ticks[-1].stamp_ns - ticks[0].stamp_ns) / 1e9)
+        middle_s = ticks[len(ticks) // 2].stamp_ns / 1e9
+        assert session.at(middle_s, with_frames=False).stamp_ns == ticks[len(ticks) // 2].stamp_ns
+        assert next(session.ticks(middle_s)).stamp_ns == ticks[len(ticks) // 2].stamp_ns
+        assert session.last.stamp_ns == ticks[-1].stamp_ns
+        assert next(iter(session.frames)).image.ndim == 2
+        assert sum(1 for _ in session.frames) == session.topics["/camera/frame"]
+        assert [event.text for event in session.events]
+        assert {"assumed", "refined", "true"} == set(session.fields)
+        assert session.fields["true"].velocity_um_s.shape == (*session.chip.mask.shape, 2)
+        assert session.calibration.to_px(np.zeros((1, 2))).shape == (1, 2)
+        assert session.provenance["flowrec"]
+        assert len(list(session.messages("route"))) == session.topics["/plan/route"]
+        assert flowrec.info(session)["outcome"] == "reached"
+
+
+def test_a_time_outside_of_a_session_is_refused_with_its_times() -> None:
+    with pytest.raises(UsageError, match=r"golden\.mcap runs from 0"):
+        flowrec.open(GOLDEN).at(1e6)
+
+
+def test_the_verbs_take_a_session_or_a_path() -> None:
+    session = flowrec.open(GOLDEN)
+    assert flowrec.compare(session, str(GOLDEN)).identical
+    assert flowrec.check(session).word == flowrec.check(GOLDEN).word == "good"
+    done = flowrec.replay(session, flowrec.Change(plan="astar_paper"))
+    assert done.replayed.route is not None
+    assert done.replayed.route.method == "astar_paper"
+
+
+def test_opening_and_reading_leaves_the_folder_as_it_is(session: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in session.parent.iterdir()}
+    with flowrec.open(session) as opened:
+        assert sum(1 for _ in opened.ticks()) == opened.outcome["ticks"]
+        assert flowrec.check(opened).word == "good"
+    assert {path: path.stat().st_mtime_ns for path in session.parent.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["nowhere.mcap", "a_folder", "text.mcap"])
+def test_what_is_no_session_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    (tmp_path / "a_folder").mkdir()
+    (tmp_path / "text.mcap").write_text("not a session")
+    with pytest.raises(SessionError, match=name) as caught:
+        flowrec.open(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_finished_part_can_be_read_while_another_process_records_the_next_one(tmp_path: Path) -> None:
+    sets = [word for setting in (*SMALL, "recording.split_s=0.5") for word in ("--set", setting)]
+    out = tmp_path / "run.mcap"
+    words = [sys.executable, "-m", "flowrec", "record", "--realtime", "--duration", "60", "--out", out, *sets]
+    process = subprocess.Popen([*map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        part = tmp_path / "run.part002.mcap"
+        until(part.exists)
+        with flowrec.open(part) as session:
+            ticks = list(session.ticks())
+            assert len(ticks) > 5
+            assert all(isinstance(tick, Tick) for tick in ticks)
+            assert session.at(session.last.stamp_ns / 1e9).stamp_ns == ticks[-1].stamp_ns
+        with pytest.raises(SessionError, match="being recorded just now"):
+            flowrec.open(out)
+    finally:
+        process.terminate()
+        assert process.wait(timeout=HANG_S) == 0
+    assert flowrec.open(out).outcome["outcome"] == "stopped"
+
+
+def test_a_recording_can_be_opened_by_what_record_returns(tmp_path: Path) -> None:
+    config = flowrec.load_config(None, [*SMALL, "duration_s=1"])
+    assert isinstance(config, flowrec.Config)
+    recorded = flowrec.record(config, tmp_path / "short.mcap")
+    assert flowrec.open(recorded.path).outcome["ticks"] == recorded.report.ticks
+    assert isinstance(flowrec.record, FunctionType)
