@@ -1,0 +1,105 @@
+"""The result of `flowrec check`: facts, findings, figures, and the judgement that follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from flowrec.errors import printable
+from flowrec.summary import Figures
+
+_JUDGEMENTS = {
+    "good": (0, "GOOD: whole, and can be replayed"),
+    "usable": (3, "USABLE: can be replayed, but something was lost or is odd"),
+    "bad": (1, "NOT USABLE as it is"),
+}
+_MARKS = {"bad": "!!", "odd": "! "}
+
+
+class Level(StrEnum):
+    """How serious a finding is."""
+
+    BAD = "bad"  # the session can not be used as it is
+    ODD = "odd"  # something was lost or is unusual; the session can be used
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A time without a frame."""
+
+    at_s: float  # of its beginning, since the first tick
+    length_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is not as it should be."""
+
+    level: Level
+    about: str
+    text: str
+
+
+@dataclass(slots=True)
+class Verdict:
+    """What `flowrec check` reports.
+
+    Attributes
+    ----------
+    path : the file.
+    findings : what is not as it should be.
+    facts : what was examined, as text by name.
+    figures : the same in numbers, with the unit in the key.
+    topics : messages read, by topic.
+    gaps : the longest times without a frame, in order of time; `gap_count` is the number of all.
+    parts : the verdicts on the parts of a run that was split.
+    """
+
+    path: Path
+    findings: list[Finding] = field(default_factory=list)
+    facts: dict[str, str] = field(default_factory=dict)
+    figures: Figures = field(default_factory=dict)
+    topics: dict[str, int] = field(default_factory=dict)
+    gaps: list[Gap] = field(default_factory=list)
+    gap_count: int = 0
+    parts: list[Verdict] = field(default_factory=list)
+
+    @property
+    def word(self) -> Literal["good", "usable", "bad"]:
+        """The judgement."""
+        levels = {finding.level for finding in self.findings}
+        return "bad" if Level.BAD in levels else "usable" if levels else "good"
+
+    @property
+    def exit_status(self) -> int:
+        """0 good, 3 usable but something was lost or is odd, 1 not readable or not to be replayed."""
+        return _JUDGEMENTS[self.word][0]
+
+    def odd(self, about: str, text: str) -> None:
+        """Add a finding: something was lost or is unusual."""
+        self.findings.append(Finding(Level.ODD, about, printable(text)))
+
+    def bad(self, about: str, text: str) -> None:
+        """Add a finding: the session can not be replayed as it is."""
+        self.findings.append(Finding(Level.BAD, about, printable(text)))
+
+    def fact(self, about: str, text: str) -> None:
+        """Add a fact."""
+        self.facts[about] = printable(text)
+
+    def lines(self) -> list[str]:
+        """The verdict as lines of text, the judgement first."""
+        lines = [printable(f"{self.path.name}: {_JUDGEMENTS[self.word][1]}")]
+        ordered = sorted(self.findings, key=lambda finding: list(_MARKS).index(finding.level))
+        lines += [f"  {_MARKS[finding.level]} {finding.text}" for finding in ordered]
+        width = max(map(len, self.facts), default=0)
+        return [*lines, *(f"  {name:{width}s}  {text}" for name, text in self.facts.items())]
+
+    def as_json(self) -> dict[str, Any]:
+        """The whole verdict for JSON."""
+        content = asdict(self)
+        del content["path"]
+        head = {"session": str(self.path), "verdict": self.word, "exit_status": self.exit_status}
+        return head | content | {"parts": [part.as_json() for part in self.parts]}
