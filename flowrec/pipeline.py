@@ -6,7 +6,7 @@ All state between ticks is the previous Tick, so the pipeline can be resumed any
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,31 +19,40 @@ from flowrec.config import Config, calibration_of
 from flowrec.control import Coils, Controller
 from flowrec.control.events import narrate
 from flowrec.control.mission import Commander
+from flowrec.declarations import Role, Source
+from flowrec.enums import Action
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEvent, Route, Tick, Track, Truth
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
+from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.vision import Tracker, missed
 
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
-    """Everything that reaches one tick from outside: the rig, the operator, the worker."""
+    """What reaches one tick from outside: from the rig, the operator and the worker. None: nothing new."""
 
     stamp_ns: int
-    frame: Frame | None  # None only in a replay whose recording had to drop the image
+    frame: Frame | None  # None only in a replay of a recording that had to drop the image
     applied: Applied
     operator: OperatorEvent | None = None
     assumed: FlowField | None = None  # adopted on this tick
     refined: FlowField | None = None
     route: Route | None = None
-    track: Track | None = None  # the recorded one, where `frame` was dropped
-    # For the record only: handed past the pipeline to the sinks, no stage sees them.
-    truth: Truth | None = None
-    true_field: FlowField | None = None
-    clock: Fit | None = None  # of the camera's clock, by which the stamp was made or is judged
+    truth: Truth | None = None  # for the record only, no stage reads it
+    true_field: FlowField | None = None  # likewise
+    track: Track | None = None  # the recorded one, if `frame` was dropped
+    clock: Fit | None = None  # of the camera's clock, with which the stamp was made
+
+
+# Fields of a Tick that arrive from outside, and those of them that stay known until the next message.
+ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.TRUTH))
+HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
+if {each.name for each in fields(Inputs)} != {"stamp_ns", "track", "clock", *ARRIVING}:
+    raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,33 +135,47 @@ def _no_lap(_stage: str) -> None:
     """Ignore the end of a stage."""
 
 
+def with_inputs(last: Tick, inputs: Inputs) -> Tick:
+    """The tick after `last` before any stage has run: what was known, and what came in."""
+    new = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
+    return replace(last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, **new)
+
+
 def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], None] = _no_lap) -> Tick:
-    """The tick after `last`, given what came in. `lap(stage)` is called as each stage ends, for timing only."""
+    """The tick after `last`, given its inputs. `lap(stage)` is called as each stage ends, for timing only."""
     p = pipeline
-    assumed = inputs.assumed or last.assumed
-    refined = inputs.refined or last.refined
-    route = inputs.route or last.route
+    tick = with_inputs(last, inputs)
+    flow, route = tick.field, tick.route
     track = _seen(p, last.track, inputs)
     lap("track")
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, refined or assumed)
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow)
     # The robot as it is felt, where the observer estimates how far it rolls per revolution.
     robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
     # Runs recorded before step-out was looked for replay without it.
     looked = inputs.applied if inputs.applied.image_since_ns is not None else None
     wall_um = _wall_um(p, estimate.position_um)
-    health = p.health.watch(last.health, last.estimate, estimate, refined or assumed, p.robot, looked, wall_um)
+    health = p.health.watch(last.health, last.estimate, estimate, flow, p.robot, looked, wall_um)
     robot = robot.limited_to(health.limit_hz)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
     mission = p.commander.decide(
-        last.mission, track, estimate, assumed, refined, route, inputs.operator, last.demand, robot, inputs.applied
+        last.mission,
+        track,
+        estimate,
+        tick.assumed,
+        tick.refined,
+        route,
+        inputs.operator,
+        last.demand,
+        robot,
+        inputs.applied,
     )
     demand = p.controller.control(
         last.demand,
         mission,
         route,
         estimate,
-        refined or assumed,
+        flow,
         robot,
         p.clearance_um,
         p.chip.um_per_px,
@@ -160,19 +183,12 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         p.observer.method == "kalman_map",
     )
     asked = inputs.operator
-    cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == "zero"
+    cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
     cut = cut or mission.field_off
     currents = p.coils.drive(last.currents, demand, robot, mission.finished, cut)
     lap("control")
     tick = replace(
-        last,
-        stamp_ns=inputs.stamp_ns,
-        frame=inputs.frame,
-        applied=inputs.applied,
-        operator=inputs.operator or last.operator,
-        assumed=assumed,
-        refined=refined,
-        route=route,
+        tick,
         track=track,
         estimate=estimate,
         health=health,
@@ -180,8 +196,6 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         mission=mission,
         demand=demand,
         currents=currents,
-        truth=None,
-        true_field=None,
     )
     event = narrate(last, tick, p.controller.method)
     return replace(tick, event=event) if event is not None else tick

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from flowrec.messages import Event, FlowField, Frame, Tick
     from flowrec.store.reader import SessionReader
 
+_LARGEST_NUMBER = 1e15  # no run holds a larger one: a million kilometres in um
+
 
 class Session:
     """A finished session, or one finished part of a run, open for reading; it never writes.
@@ -227,8 +229,8 @@ def content_blamed(session: Session, done: str) -> Iterator[None]:
 
 
 def _absurd_numbers(session: Session) -> Iterator[str]:
+    from flowrec.declarations import invalid_numbers
     from flowrec.messages import Tick
-    from flowrec.store.shapes import beyond_measure
     from flowrec.topics import TOPICS
 
     before = Tick()
@@ -236,7 +238,7 @@ def _absurd_numbers(session: Session) -> Iterator[str]:
         for topic in TOPICS:
             message = getattr(tick, topic.field)
             if message is not None and message is not getattr(before, topic.field):
-                for name in beyond_measure(message):
+                for name in invalid_numbers(message, _LARGEST_NUMBER):
                     at_s = seconds(tick.stamp_ns - session.run.first_ns)
                     yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or a number beyond all measure"
         before = tick

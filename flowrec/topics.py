@@ -1,85 +1,63 @@
-"""The one table of what is recorded: field of Tick, topic path, type, role and tolerances.
-
-Writer, reader, viewer, compare and replay iterate it; a new message is one row here and one dataclass.
-"""
+"""Table of topics, derived from the annotations of `Tick`. Writer, reader, viewer, compare and replay iterate it."""
 
 import dataclasses
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from enum import Enum
+import types
+from collections.abc import Iterable
+from typing import get_args, get_type_hints
 
-from flowrec import messages as m
-
-
-class Role(Enum):
-    """What replay does with a topic."""
-
-    INPUT = "input"  # fed back in: enough to replay
-    OUTPUT = "output"  # what the stages said: recomputed and compared
-    DIAGNOSTIC = "diagnostic"  # timings and drops: never compared
-    TRUTH = "truth"  # known to a simulator only: kept for judging, seen by no stage
+from flowrec.declarations import Message, Source, Topic, message_fields
+from flowrec.enums import WorkOrder
+from flowrec.messages import FlowField, Tick
 
 
-# Absolute tolerance of a field where nothing else is said, in its own unit: rounding of values up to 1e4.
-_ATOL = 1e-8
+def topics_of(tick_type: type) -> tuple[Topic, ...]:
+    """The topics that the annotations of a tick's fields declare, in order.
 
-
-@dataclass(frozen=True, slots=True)
-class Topic:
-    """One row. Two floats are the same when |recorded - replayed| <= atol + rtol |recorded|, element by element.
-
-    The tolerances are for files made on another machine; on the same one a replay is exact. Everything but floats
-    is compared exactly.
-
-    Attributes
-    ----------
-    rtol : relative tolerance; 0: all of the topic is compared exactly.
-    atols : absolute tolerances by field of the message, in the field's unit, where they are not `_ATOL`.
+    Raises
+    ------
+    TypeError : a declaration is missing, is used twice, or contradicts another one.
     """
+    hints = get_type_hints(tick_type, include_extras=True)
+    names = [each.name for each in dataclasses.fields(tick_type) if each.name != "stamp_ns"]
+    topics = []
+    for name in names:
+        declared = next((note for note in get_args(hints[name])[1:] if isinstance(note, Topic)), None)
+        options = get_args(get_args(hints[name])[0]) if declared is not None else ()
+        kind = next((option for option in options if isinstance(option, type) and issubclass(option, Message)), None)
+        if declared is None or kind is None or types.NoneType not in options:
+            raise TypeError(f"Tick.{name}: declare it as Annotated[SomeMessage | None, Topic(path, source)] = None")
+        if (declared.made_by is not None) != (declared.source is Source.WORKER):
+            raise TypeError(f"Tick.{name}: made_by=SlowStage(...) belongs to Source.WORKER and to no other source")
+        for each in message_fields(kind):
+            if each.dtype is not None and each.shape is None:
+                raise TypeError(f"{kind.__name__}.{each.name}: declare its shape, as in Annotated[Vector, Shape(2)]")
+        unknown = declared.atols.keys() - {each.name for each in message_fields(kind)}
+        unknown |= set(declared.made_by.reads) - set(names) if declared.made_by is not None else set()
+        if unknown:
+            raise TypeError(f"Tick.{name}: its declaration names fields that do not exist: {sorted(unknown)}")
+        topics.append(dataclasses.replace(declared, field=name, type=kind))
+    if len({topic.path for topic in topics}) != len(topics):
+        raise TypeError("Tick: two fields are declared with the same topic path")
+    answered = [order for topic in topics if topic.made_by is not None for order in topic.made_by.orders]
+    if sorted(answered) != sorted(WorkOrder):
+        raise TypeError(f"Tick: each work order needs one field that answers it; declared are {sorted(answered)}")
+    return tuple(topics)
 
-    field: str
-    path: str
-    type: type[m.Message]
-    role: Role
-    rtol: float = 0.0
-    atols: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
-    def atol_of(self, name: str) -> float:
-        """Absolute tolerance of a field of the message, in the field's unit."""
-        return self.atols.get(name, _ATOL if self.rtol else 0.0)
+def stale_results(sections: Iterable[str]) -> frozenset[str]:
+    """The results of the worker that depend on sections of the configuration, directly or through another result."""
+    changed = frozenset(sections)
+    stale: set[str] = set()
+    for _ in WORKER_FIELDS:  # a result may depend on every other one
+        for name, made_by in WORKER_FIELDS.items():
+            if changed & set(made_by.settings) or stale & set(made_by.reads):
+                stale.add(name)
+    return frozenset(stale)
 
 
-_ASSUMED = {"velocity_um_s": 1e-4, "std_um_s": 1e-4, "pressure_pa": 1e-7}
-_REFINED = {"velocity_um_s": 1e-3, "std_um_s": 1e-3, "pressure_pa": 1e-6}
-_ROUTE = {"waypoints_um": 1e-4, "arrival_s": 1e-6, "time_to_go_s": 1e-6}
-
-TOPICS: tuple[Topic, ...] = (
-    Topic("frame", "/camera/frame", m.Frame, Role.INPUT),
-    Topic("applied", "/coils/applied", m.Applied, Role.INPUT),
-    Topic("operator", "/operator/events", m.OperatorEvent, Role.INPUT),
-    # Results of the worker. They come late, so the tick that adopts them is an input of the replay;
-    # their values are recomputed and compared by `replay --verify`.
-    Topic("assumed", "/flow/assumed", m.FlowField, Role.INPUT, 1e-5, _ASSUMED),
-    Topic("refined", "/flow/refined", m.FlowField, Role.INPUT, 1e-4, _REFINED),
-    Topic("route", "/plan/route", m.Route, Role.INPUT, 1e-5, _ROUTE),
-    Topic("track", "/robot/track", m.Track, Role.OUTPUT, 1e-6),
-    Topic("estimate", "/robot/estimate", m.Estimate, Role.OUTPUT, 1e-6, {"covariance": 1e-6}),
-    Topic("health", "/run/health", m.Health, Role.OUTPUT, 1e-6),
-    Topic("observations", "/flow/observations", m.Observations, Role.OUTPUT, 1e-6),
-    Topic("mission", "/run/mission", m.Mission, Role.OUTPUT, 1e-6),
-    Topic("demand", "/control/demand", m.Demand, Role.OUTPUT, 1e-6),
-    Topic("currents", "/coils/command", m.Currents, Role.OUTPUT, 1e-6),
-    Topic("event", "/run/events", m.Event, Role.OUTPUT),
-    Topic("timing", "/run/timing", m.Timing, Role.DIAGNOSTIC),
-    Topic("drops", "/run/drops", m.Drops, Role.DIAGNOSTIC),
-    Topic("truth", "/truth/robot", m.Truth, Role.TRUTH),
-    Topic("true_field", "/truth/flow", m.FlowField, Role.TRUTH),
-    Topic("clocks", "/run/clocks", m.Clocks, Role.DIAGNOSTIC),
-)
-
+TOPICS = topics_of(Tick)
 BY_FIELD = {topic.field: topic for topic in TOPICS}
 BY_PATH = {topic.path: topic for topic in TOPICS}
-
-_without_row = {each.name for each in fields(m.Tick)} - {"stamp_ns"} ^ BY_FIELD.keys()
-if _without_row or len(BY_FIELD) != len(TOPICS) or len(BY_PATH) != len(TOPICS):
-    raise TypeError(f"topics.py: each field of Tick needs one row of its own in TOPICS; see to {sorted(_without_row)}")
+WORKER_FIELDS = {topic.field: topic.made_by for topic in TOPICS if topic.made_by is not None}
+FLOW_FIELDS = tuple(name for name in WORKER_FIELDS if BY_FIELD[name].type is FlowField)
+ANSWERED_BY = {order: name for name, made_by in WORKER_FIELDS.items() for order in made_by.orders}

@@ -18,13 +18,12 @@ from mcap.data_stream import RecordBuilder
 
 from flowrec.chip import load_chip
 from flowrec.config import Config, load_config, resolve
-from flowrec.messages import Message, array_fields
+from flowrec.declarations import Message, array_fields, message_fields
 from flowrec.session_writer import session_header
 from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations
 from flowrec.store.codec import encode_record
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.metadata import records_of
-from flowrec.store.shapes import shapes_of
 from flowrec.topics import TOPICS
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -171,8 +170,8 @@ _UNTROUBLED = {"rate": 1.0, "unit": 0.0} | dict.fromkeys(
 def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Generator) -> Message:
     """A message of some type with shapes that fit and numbers that mean nothing."""
     lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4, "o": 2}
-    shapes = shapes_of(kind)
-    arrays = dict(array_fields(kind))  # type: ignore[arg-type]
+    shapes = {each.name: each.shape.lengths for each in message_fields(kind) if each.shape is not None}
+    arrays = dict(array_fields(kind))
     values: dict[str, Any] = {}
     for name, hint in typing.get_type_hints(kind).items():
         if name in arrays:

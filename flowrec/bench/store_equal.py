@@ -25,7 +25,8 @@ import zstandard
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
 from flowrec.bench.store_writers import frames_given, poses_given
-from flowrec.messages import FlowField, Message, Track
+from flowrec.declarations import Message, message_fields
+from flowrec.messages import FlowField, Track
 from flowrec.run.loop import SWITCH_S
 from flowrec.store import chunk, encoder, mcap_writer
 from flowrec.store.channels import SLOTS, declarations
@@ -33,7 +34,7 @@ from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.codec import codec_of, encode
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_writer import McapFile
-from flowrec.store.schema import Schema, forms_of
+from flowrec.store.schema import Schema
 from flowrec.system.realtime_priority import first_of_all
 from flowrec.terminal import progress, table
 from flowrec.topics import BY_FIELD
@@ -145,7 +146,7 @@ def lines_of(name: str) -> int:
 
 def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
     """What makes the payload of a message by protobuf's own runtime."""
-    wire, forms = codec_of(message_type).schema.wire, forms_of(message_type)
+    wire, forms = codec_of(message_type).schema.wire, message_fields(message_type)
 
     def by_protobuf(message: Any) -> bytes:
         made = wire()

@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
+from flowrec.declarations import Image
 from flowrec.errors import SessionError
-from flowrec.messages import Image, OperatorEvent, Tick
+from flowrec.messages import OperatorEvent, Tick
 from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
 from flowrec.store.paths import PARTIAL_SUFFIX, pieces
 from flowrec.terminal import progress, table

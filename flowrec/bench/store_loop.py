@@ -17,7 +17,8 @@ from flowrec.bench.store_rivals import BareProcess, BareThread
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
-from flowrec.messages import Frame, Image, OperatorEvent, Tick
+from flowrec.declarations import Image
+from flowrec.messages import Frame, OperatorEvent, Tick
 from flowrec.run.loop import LockstepWorker, Sink, run
 from flowrec.store import SessionWriter, Snapshot
 from flowrec.system.realtime_priority import first_of_all

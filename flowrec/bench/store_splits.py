@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
-from flowrec.messages import FlowField, Image, OperatorEvent, Tick
+from flowrec.declarations import Image
+from flowrec.messages import FlowField, OperatorEvent, Tick
 from flowrec.run.loop import SWITCH_S
 from flowrec.store import SessionWriter, Snapshot, Split
 from flowrec.terminal import progress, table

@@ -13,7 +13,8 @@ import numpy as np
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from mcap.writer import CompressionType, Writer
 
-from flowrec.messages import Applied, Estimate, Frame, Image, Message, Tick, Track
+from flowrec.declarations import Image, Message
+from flowrec.messages import Applied, Estimate, Frame, Tick, Track
 from flowrec.store import SessionHeader, SessionWriter
 from flowrec.store.channels import SLOTS, declarations
 from flowrec.store.chunk import ChunkBuilder

@@ -13,6 +13,7 @@ from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_told, faults_of, sk
 from flowrec.commands.check_tally import GAP_PERIODS, Tally
 from flowrec.commands.verdict import Finding, Gap, Verdict
 from flowrec.config import Config, config_from_toml
+from flowrec.declarations import Role
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
 from flowrec.store.audit import audit
@@ -21,7 +22,7 @@ from flowrec.store.paths import part_number, part_path, pieces
 from flowrec.store.topic_filter import is_left_out
 from flowrec.summary import finite
 from flowrec.system.locks import is_growing
-from flowrec.topics import BY_FIELD, TOPICS, Role
+from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import NS_PER_S, seconds
 from flowrec.version import __version__
 

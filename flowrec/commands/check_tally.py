@@ -9,8 +9,8 @@ import heapq
 from collections import Counter
 
 from flowrec.commands.verdict import Gap
-from flowrec.messages import Clocks, Frame, Message, Timing
-from flowrec.store import not_finite
+from flowrec.declarations import Message, invalid_numbers
+from flowrec.messages import Clocks, Frame, Timing
 from flowrec.store.audit import Audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -90,7 +90,7 @@ class Tally:
 
     def add(self, name: str, log_ns: int, message: Message) -> None:
         """Count one message: its field of Tick, the time of its tick in ns, itself."""
-        for wrong in not_finite(message):
+        for wrong in invalid_numbers(message):
             self.not_finite[f"{BY_FIELD[name].path} {wrong}"] += 1
         self.latest_ns[name] = stamp_ns = message.stamp_ns  # type: ignore[attr-defined]
         if log_ns == self._keyframe_ns:

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.declarations import Message, Role, Topic
 from flowrec.errors import UsageError, printable
-from flowrec.messages import Message, Tick
+from flowrec.messages import Tick
 from flowrec.session import Session
 from flowrec.store.topic_filter import is_left_out
-from flowrec.topics import BY_FIELD, TOPICS, Role, Topic
+from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import seconds
 
 Fields = Mapping[str, frozenset[str]]  # names of message fields, by field of Tick

@@ -16,6 +16,7 @@ from flowrec.run.loop import LockstepWorker, Preloaded, RunReport, Sink, run
 from flowrec.session_writer import session_writer
 from flowrec.summary import Row
 from flowrec.terminal import say
+from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
 
@@ -42,7 +43,7 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[Row
         pipeline = assemble(flown, done.chip)
         rig = SimulatedRig.of(pipeline, flown, true_field=flow)
         known: Mapping[str, FlowField] = {
-            key: value for key in ("assumed", "refined") if (value := getattr(tick, key)) is not None
+            key: value for key in FLOW_FIELDS if (value := getattr(tick, key)) is not None
         }
         worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
         sinks: list[Sink] = []

@@ -12,17 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec import topics
 from flowrec.chip.chip import Chip
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
 from flowrec.config import Config, with_sets
+from flowrec.enums import WorkOrder
 from flowrec.errors import FlowrecError, SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
 from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.ranges import faults as range_faults
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.run.jobs import FILLS, work
+from flowrec.run.jobs import work
 from flowrec.run.loop import LockstepWorker, RunReport, Sink, run
 from flowrec.session import Session, content_blamed, files_behind
 from flowrec.session_writer import session_writer
@@ -30,21 +32,9 @@ from flowrec.store import SessionReader, SessionWriter, digest_faults
 from flowrec.summary import as_text
 from flowrec.system.outputs import MCAP, RRD, check_output
 from flowrec.terminal import warn
-from flowrec.topics import BY_FIELD
+from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS
 from flowrec.units import seconds
 
-# Which results of the worker a changed section makes stale.
-STALE: dict[str, frozenset[str]] = {
-    "flow": frozenset({"assumed", "refined", "route"}),
-    "tracker": frozenset({"refined", "route"}),
-    "observer": frozenset({"refined", "route"}),
-    "sampler": frozenset({"refined", "route"}),
-    "refine": frozenset({"refined", "route"}),
-    "mission": frozenset({"refined", "route"}),
-    "robot": frozenset({"route"}),
-    "survey": frozenset({"route"}),
-    "plan": frozenset({"route"}),
-}
 # What a recording has settled once and for all.
 FIXED = ("chip", "camera", "rig", "simulated")
 
@@ -136,17 +126,14 @@ class Replayed:
 
 def stale_results(recorded: Config, changed: Config) -> frozenset[str]:
     """The worker results that must be made anew; changing what a recording has settled is a UsageError."""
-    stale: frozenset[str] = frozenset()
-    for section in fields(Config):
-        if getattr(recorded, section.name) == getattr(changed, section.name):
-            continue
-        if section.name in FIXED:
+    sections = [each.name for each in fields(Config) if getattr(recorded, each.name) != getattr(changed, each.name)]
+    for section in sections:
+        if section in FIXED:
             raise UsageError(
-                f"--set {section.name}...: a replay can not change the {section.name} of a recording; "
+                f"--set {section}...: a replay can not change the {section} of a recording; "
                 "record again, or use --refly"
             )
-        stale |= STALE.get(section.name, frozenset())
-    return stale
+    return topics.stale_results(sections)
 
 
 def check_outputs(path: Path, out: Path, *, refly: bool, rrd: bool, overwrite: bool) -> None:
@@ -188,7 +175,7 @@ def replay(
     config = change.apply(recorded_config)
     stale = stale_results(recorded_config, config)
     if change.refine is not None:
-        stale |= STALE["refine"]
+        stale |= topics.stale_results(["refine"])
     if verify and (stale or config != recorded_config):
         raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
     config = _warned_of_windows(reader, recorded_config, config)
@@ -321,7 +308,7 @@ def hindsight(reader: SessionReader, pipeline: Pipeline) -> Callable[[int], Obse
 def adoption_stamps(reader: SessionReader) -> dict[int, int]:
     """For each work order of a recording, by number, the tick that adopted its result."""
     stamps: dict[int, int] = {}
-    for name in ("assumed", "refined", "route"):
+    for name in WORKER_FIELDS:
         for message in reader.messages(name):
             assert isinstance(message, FlowField | Route)
             stamps[message.request] = message.stamp_ns
@@ -352,16 +339,18 @@ class WorkerCheck:
         if order is None or order.mission is None:
             return
         wanted, seen = order.mission.wanted, order.observations
-        if wanted == "refine" and seen is not None and seen.stamp_ns > order.mission.requested_ns:
+        if wanted == WorkOrder.REFINE and seen is not None and seen.stamp_ns > order.mission.requested_ns:
             # Ordered before this piece of a run begins, from fewer observations than are repeated in it.
             self._taken.add(order.mission.request)
-            self.results.append(f"{BY_FIELD[FILLS[wanted]].path}: ordered in the part before, taken as recorded")
+            self.results.append(
+                f"{BY_FIELD[ANSWERED_BY[WorkOrder.REFINE]].path}: ordered in the part before, taken as recorded"
+            )
         else:
             self._made[order.mission.request] = work(pipeline, order)
 
     def see(self, tick: Tick) -> None:
         """Take note of one tick: new orders are worked on, adopted results compared."""
-        for name in ("assumed", "refined", "route"):
+        for name in WORKER_FIELDS:
             adopted = getattr(tick, name)
             if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._taken:
                 continue
@@ -391,7 +380,7 @@ def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
     mission = start.mission
     if mission is None or not mission.wanted:
         return None
-    answer = getattr(start, FILLS[mission.wanted])
+    answer = getattr(start, ANSWERED_BY[WorkOrder(mission.wanted)])
     if answer is not None and answer.request == mission.request:
         return None
     return reader.tick_before(max(mission.requested_ns, reader.first_ns))

@@ -14,6 +14,7 @@ from flowrec.messages import FlowField, Observations, Route, Tick
 from flowrec.planning import travel_time
 from flowrec.run.jobs import no_observations
 from flowrec.summary import Row, finite
+from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
 _SAME_MAP = 1e-3  # of the largest speed: no table shows less
@@ -34,7 +35,7 @@ def before_and_after(done: Replayed) -> list[Row]:
     observations = now.observations or was.observations or no_observations(0)
     rows: list[Row] = [("map", _map_name(was), _map_name(now))]
     if done.true_field is not None:
-        for name in ("assumed", "refined"):
+        for name in FLOW_FIELDS:
             key = f"{name}_flow_error"
             rows.append((key, _flow_error(done, getattr(was, name)), _flow_error(done, getattr(now, name))))
     count = len(observations.position_um)

@@ -20,9 +20,10 @@ from typing import Annotated, Any
 
 import numpy as np
 
+from flowrec.declarations import Matrix
 from flowrec.estimation.process_model import ISOTROPIC, Floats, Layout, noise, onward, slope_of
 from flowrec.flow import sample
-from flowrec.messages import Applied, Estimate, FlowField, Matrix, Track
+from flowrec.messages import Applied, Estimate, FlowField, Track
 from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowrec.declarations import Matrix
 from flowrec.estimation.kalman import Kalman, carried, memory_s
-from flowrec.messages import Applied, Estimate, Matrix, Observations, Track
+from flowrec.messages import Applied, Estimate, Observations, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from flowrec.messages import Currents, Tick
-from flowrec.pipeline import Inputs
+from flowrec.pipeline import ARRIVING, Inputs
 from flowrec.store import SessionReader
 
 
@@ -40,26 +40,15 @@ class RecordedRig:
                 before = replace(before, frame=tick.frame)
                 continue
             self.recorded = tick
-            frame = tick.frame if tick.frame is not before.frame else None
-            track = None
-            if frame is None:
+            names = [name for name in ARRIVING if name not in self._recompute]
+            new = {name: message for name in names if (message := getattr(tick, name)) is not getattr(before, name)}
+            if new.get("frame") is None:
                 if tick.track is None or tick.track is before.track:
                     before = tick
                     continue  # a crash left the inputs without an image: nothing to replay
                 self.frames_missing += 1
-                track = tick.track
-            yield Inputs(
-                stamp_ns=tick.stamp_ns,
-                frame=frame,
-                applied=tick.applied,
-                operator=tick.operator if tick.operator is not before.operator else None,
-                assumed=tick.assumed if self._adopted("assumed", tick, before) else None,
-                refined=tick.refined if self._adopted("refined", tick, before) else None,
-                route=tick.route if self._adopted("route", tick, before) else None,
-                track=track,
-                truth=tick.truth if tick.truth is not before.truth else None,
-                true_field=tick.true_field if tick.true_field is not before.true_field else None,
-            )
+                new["track"] = tick.track
+            yield Inputs(tick.stamp_ns, **({"frame": None} | new))
             before = tick
 
     def apply(self, currents: Currents) -> None:
@@ -67,6 +56,3 @@ class RecordedRig:
 
     def zero(self) -> None:
         """Recorded coils hear nothing."""
-
-    def _adopted(self, field: str, tick: Tick, before: Tick) -> bool:
-        return field not in self._recompute and getattr(tick, field) is not getattr(before, field)

@@ -14,9 +14,6 @@ from flowrec.messages import FlowField, Observations, Route, Tick
 from flowrec.pipeline import Pipeline
 from flowrec.planning import warm_up as warm_up_planning
 
-# Which field of the Tick each order fills.
-FILLS = {"solve": "assumed", "refine": "refined", "survey_route": "route", "route": "route"}
-
 
 def no_observations(stamp_ns: int) -> Observations:
     """The empty set, for a run that refines before it has surveyed."""

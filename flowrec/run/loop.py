@@ -11,14 +11,16 @@ from functools import partial
 from typing import Any, Protocol
 
 from flowrec.clocks import ClockWatch
+from flowrec.enums import WorkOrder
 from flowrec.errors import RigError
-from flowrec.messages import Currents, FlowField, OperatorEvent, Route, Tick, Timing
-from flowrec.pipeline import Inputs, Pipeline, step
+from flowrec.messages import Currents, FlowField, Mission, OperatorEvent, Route, Tick, Timing
+from flowrec.pipeline import Inputs, Pipeline, step, with_inputs
 from flowrec.rigs.frame_checks import Arrivals
 from flowrec.run.control import Desk
-from flowrec.run.jobs import FILLS, work
+from flowrec.run.jobs import work
 from flowrec.run.watchdog import Guard
 from flowrec.run.worker_process import WorkProcess
+from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
 from flowrec.units import nanoseconds, seconds
 
 SWITCH_S = 1e-4
@@ -71,6 +73,11 @@ class Worker(Protocol):
         """Let go of processes."""
 
 
+def _answered_by(mission: Mission) -> str:
+    """The field of Tick that the result of the pending work order goes to."""
+    return ANSWERED_BY[WorkOrder(mission.wanted)]
+
+
 class LockstepWorker:
     """Adopts each result a fixed time after its order: same seed, same session, however fast the machine is.
 
@@ -83,7 +90,7 @@ class LockstepWorker:
         pipeline: Pipeline,
         adopt_after_s: float,
         schedule: Mapping[int, int] | None = None,
-        fills: Iterable[str] = ("assumed", "refined", "route"),
+        fills: Iterable[str] = WORKER_FIELDS,
     ) -> None:
         self._pipeline = pipeline
         self._after_ns = nanoseconds(adopt_after_s)
@@ -93,7 +100,7 @@ class LockstepWorker:
 
     def submit(self, order: Tick) -> None:
         assert order.mission is not None
-        if FILLS[order.mission.wanted] in self._fills:
+        if _answered_by(order.mission) in self._fills:
             self._order = order
 
     def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
@@ -103,7 +110,7 @@ class LockstepWorker:
         assert mission is not None
         if stamp_ns < self._schedule.get(mission.request, mission.requested_ns + self._after_ns):
             return {}
-        return {FILLS[mission.wanted]: replace(self.drain(), stamp_ns=stamp_ns)}
+        return {_answered_by(mission): replace(self.drain(), stamp_ns=stamp_ns)}
 
     def drain(self) -> FlowField | Route:
         """Do the pending order now."""
@@ -129,16 +136,9 @@ class ProcessWorker:
 
     def submit(self, order: Tick) -> None:
         assert order.mission is not None
-        known = Tick(
-            stamp_ns=order.stamp_ns,
-            assumed=order.assumed,
-            refined=order.refined,
-            health=order.health,
-            observations=order.observations,
-            mission=order.mission,
-        )
-        self._fills = FILLS[order.mission.wanted]
-        self._process.submit(known)
+        self._fills = _answered_by(order.mission)
+        needed = {name: getattr(order, name) for name in WORKER_FIELDS[self._fills].reads}
+        self._process.submit(Tick(order.stamp_ns, mission=order.mission, **needed))
 
     def due(self, stamp_ns: int) -> Mapping[str, FlowField | Route]:
         result = self._process.result() if self._fills else None
@@ -259,7 +259,7 @@ def run(
                     tick = step(pipeline, last, inputs, lap)
             except Exception:
                 guard.take_away()
-                _write(sinks, _only_inputs(last, inputs))
+                _write(sinks, with_inputs(last, inputs))
                 raise
             assert tick.currents is not None
             assert tick.mission is not None
@@ -347,17 +347,3 @@ def _growing(inputs: Iterator[Inputs], after_ns: int, report: RunReport, clocks:
                 f"the rig's frames have gone back in time by {seconds(after_ns - arrived.stamp_ns):.3f} s, {len(lost)}"
                 " in a row; see to the camera's clock, then record again"
             )
-
-
-def _only_inputs(last: Tick, inputs: Inputs) -> Tick:
-    """The tick that could not be completed: what was known before, and the inputs that broke it."""
-    return replace(
-        last,
-        stamp_ns=inputs.stamp_ns,
-        frame=inputs.frame,
-        applied=inputs.applied,
-        operator=inputs.operator or last.operator,
-        assumed=inputs.assumed or last.assumed,
-        refined=inputs.refined or last.refined,
-        route=inputs.route or last.route,
-    )

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from flowrec.store.ring_buffer import Snapshot
     from flowrec.store.roi import Region, lit
     from flowrec.store.run_recovery import recover_run
-    from flowrec.store.shapes import not_finite
     from flowrec.store.split import Split
     from flowrec.store.writer import SessionWriter
 
@@ -33,7 +32,6 @@ _HOME = {
     "files_of": "part_continuity",
     "is_snapshot": "paths",
     "lit": "roi",
-    "not_finite": "shapes",
     "recover": "recovery",
     "recover_run": "run_recovery",
     "taken": "paths",
@@ -52,7 +50,6 @@ __all__ = [
     "files_of",
     "is_snapshot",
     "lit",
-    "not_finite",
     "recover",
     "recover_run",
     "taken",

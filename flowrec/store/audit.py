@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
+from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.messages import Message
 from flowrec.store.codec import decode, message_stamp
 from flowrec.store.digest import Digests
 from flowrec.store.mcap_reader import DamageError, Record, Source, UnfinishedError
@@ -20,7 +20,6 @@ from flowrec.store.roi import Region
 from flowrec.store.scan import Scan, scan
 from flowrec.store.schema_check import Contents
 from flowrec.store.session_metadata import Head
-from flowrec.store.shapes import misfit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
@@ -186,7 +185,7 @@ class _Reading:
                 assert isinstance(record.payload, memoryview)
                 schema = self._schemas[record.channel]
                 message = decode(BY_FIELD[name].type, record.payload, record.sequence, schema, self._start_unix_ns)
-                wrong = misfit(message)
+                wrong = shape_error(message)
             except SessionError as error:
                 wrong = str(error)
             if wrong:

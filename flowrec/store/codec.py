@@ -15,13 +15,14 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from flowrec.declarations import Message, MessageField, message_fields
 from flowrec.errors import SessionError
-from flowrec.messages import Event, Frame, Message, OperatorEvent
+from flowrec.messages import Event, Frame, OperatorEvent
 from flowrec.store import standard
 from flowrec.store.encoder import encoder_of
 from flowrec.store.form import Codec, Payload
 from flowrec.store.frame_encodings import FRAME_CODECS, RAW_IMAGE
-from flowrec.store.schema import ARRAY_DATA, FieldForm, array_schema, forms_of, schema_of
+from flowrec.store.schema import ARRAY_DATA, array_schema, schema_of
 from flowrec.store.wire import LARGE_BYTES, cut_out, own
 
 _M = TypeVar("_M", bound=Message)
@@ -111,7 +112,7 @@ def message_stamp(message: Message) -> int:
 
 def _without_surrogates(message: _M) -> _M:
     changes = {}
-    for form in forms_of(type(message)):
+    for form in message_fields(type(message)):
         value = getattr(message, form.name)
         changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
     return type(message)(**changes)
@@ -119,8 +120,8 @@ def _without_surrogates(message: _M) -> _M:
 
 def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview, int], Any]:
     parse = wire.FromString
-    unpackers = [_unpacker(form) for form in forms_of(message_type)]
-    arrays = {number: form for number, form in enumerate(forms_of(message_type), 1) if form.kind == "array"}
+    unpackers = [_unpacker(form) for form in message_fields(message_type)]
+    arrays = {number: form for number, form in enumerate(message_fields(message_type), 1) if form.kind == "array"}
 
     def decode(payload: bytes | memoryview, sequence: int) -> Any:
         if len(payload) < LARGE_BYTES or not arrays:
@@ -138,7 +139,7 @@ def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview
     return decode
 
 
-def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
+def _unpacker(form: MessageField) -> Callable[[Any], Any]:
     name, dtype = form.name, form.dtype
     present: Callable[[Any], Any]
     if form.kind == "vector":

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from flowrec.declarations import MessageField, message_fields
 from flowrec.store.form import Payload
-from flowrec.store.schema import ARRAY_DATA, FieldForm, forms_of
+from flowrec.store.schema import ARRAY_DATA
 from flowrec.store.wire import BYTES, FIXED64, VARINT, head_of, tag, varint
 
 _DOUBLE = struct.Struct("<d")
@@ -34,8 +35,9 @@ def encoder_of(message_type: type[Any]) -> Callable[[Any], Payload]:
 
     It raises TypeError or ValueError for a value that does not fit its declaration.
     """
-    puts = [(form.name, form.optional, _put_of(form, number)) for number, form in enumerate(forms_of(message_type), 1)]
-    has_arrays = any(form.kind == "array" for form in forms_of(message_type))
+    forms = message_fields(message_type)
+    puts = [(form.name, form.optional, _put_of(form, number)) for number, form in enumerate(forms, 1)]
+    has_arrays = any(form.kind == "array" for form in forms)
     values_of = operator.attrgetter(*(name for name, _, _ in puts), "stamp_ns")  # twice, so that it is never alone
 
     def encode(message: Any) -> Payload:
@@ -52,7 +54,7 @@ def encoder_of(message_type: type[Any]) -> Callable[[Any], Payload]:
     return encode
 
 
-def _put_of(form: FieldForm, number: int) -> _Put:
+def _put_of(form: MessageField, number: int) -> _Put:
     """Appends a field's value to the parts of a message; what is empty is left out, where it has no presence."""
     kinds: dict[Any, Callable[[int, bool], _Put]] = {
         int: _int,

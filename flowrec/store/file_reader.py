@@ -10,15 +10,15 @@ from typing import Any
 
 from mcap.records import ChunkIndex
 
+from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.messages import Frame, Message
+from flowrec.messages import Frame
 from flowrec.store.chunk_stream import by_time, lane, threads
 from flowrec.store.codec import decode
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.image_codec import PIXELS_LIMIT
 from flowrec.store.mcap_reader import DamageError, Record
 from flowrec.store.schema_check import Contents
-from flowrec.store.shapes import misfit
 from flowrec.topics import BY_FIELD
 
 Kept = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
@@ -137,7 +137,7 @@ class FileReader:
         try:
             schema = self.contents.schemas[record.channel]
             message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema, self._source.start_unix_ns)
-            wrong = misfit(message)
+            wrong = shape_error(message)
         except SessionError as error:
             wrong = str(error)
         if not wrong:
@@ -157,7 +157,7 @@ class FileReader:
             frame = decode(Frame, record.payload, record.sequence, schema, self._source.start_unix_ns)
         except SessionError:
             return record
-        sound = not misfit(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
+        sound = not shape_error(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
         return record._replace(payload=frame) if sound else record
 
     def _restored(self, record: Record) -> Message | None:

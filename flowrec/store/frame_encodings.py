@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.messages import Frame, Image
+from flowrec.declarations import Image
+from flowrec.messages import Frame
 from flowrec.store.form import Codec, Payload
 from flowrec.store.image_codec import PIXELS_LIMIT, jpeg, picture, png, row_differences
 from flowrec.store.schema import Schema, foxglove_schema

@@ -26,7 +26,7 @@ from flowrec.store.mcap_index import Summary, records_of, stream_of, summary_fro
 from flowrec.store.mcap_writer import MAGIC
 
 if TYPE_CHECKING:
-    from flowrec.messages import Message
+    from flowrec.declarations import Message
 
 # Of one chunk before compression: a flow field on 1900 x 1900 pixels. What a tick knows, such a chunk on its way into
 # the next tick, and an image on its way are what reading needs at most: with the program itself less than 512 MB.

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.messages import Frame, Image, Track
+from flowrec.declarations import Image
+from flowrec.messages import Frame, Track
 from flowrec.units import nanoseconds
 
 Window = tuple[int, int, int, int]  # x0, y0, x1, y1 in camera px, the latter two exclusive

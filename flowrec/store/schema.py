@@ -9,16 +9,13 @@ The secret of this file is the wire layout. Fields are numbered in the order of 
 from __future__ import annotations
 
 import functools
-import types
-import typing
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, cast
+from dataclasses import dataclass
+from typing import Any
 
 import foxglove.messages
-import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from flowrec.messages import array_fields
+from flowrec.declarations import message_fields
 
 _Field = descriptor_pb2.FieldDescriptorProto
 _SCALARS: dict[Any, Any] = {
@@ -51,40 +48,6 @@ class Schema:
     wire: Any
 
 
-@dataclass(frozen=True, slots=True)
-class FieldForm:
-    """How one field of a dataclass travels: `kind` is int, float, bool, str, "vector" or "array"."""
-
-    name: str
-    kind: Any
-    optional: bool
-    dtype: np.dtype[Any] | None
-
-
-def forms_of(message_type: type[Any]) -> tuple[FieldForm, ...]:
-    """The wire form of each field, in order.
-
-    Raises
-    ------
-    TypeError : an annotation that no wire form is known for; a defect of messages.py.
-    """
-    hints = typing.get_type_hints(message_type, include_extras=True)
-    dtypes = dict(array_fields(cast(Any, message_type)))
-    forms = []
-    for field in fields(message_type):
-        hint, optional = hints[field.name], False
-        if typing.get_origin(hint) in (typing.Union, types.UnionType):
-            options = [option for option in typing.get_args(hint) if option is not types.NoneType]
-            hint, optional = options[0], True
-        kind = typing.get_args(hint)[1] if typing.get_origin(hint) is Annotated else hint
-        if kind == "vector" and optional:
-            kind = "array"  # a repeated field can not be absent
-        if kind not in _SCALARS and kind not in ("vector", "array"):
-            raise TypeError(f"{message_type.__name__}.{field.name}: no wire form for {hint!r}")
-        forms.append(FieldForm(field.name, kind, optional, dtypes.get(field.name)))
-    return tuple(forms)
-
-
 @functools.cache
 def array_schema() -> Schema:
     """`flowrec.Array`: shape, numpy's name of the little-endian dtype, and the values in C order."""
@@ -101,7 +64,7 @@ def schema_of(message_type: type[Any]) -> Schema:
     name = message_type.__name__
     file = descriptor_pb2.FileDescriptorProto(name=f"flowrec/{name}.proto", package="flowrec", syntax="proto3")
     message = file.message_type.add(name=name)
-    for number, form in enumerate(forms_of(message_type), 1):
+    for number, form in enumerate(message_fields(message_type), 1):
         field = message.field.add(name=form.name, number=number, label=_Field.LABEL_OPTIONAL)
         if form.kind == "vector":
             field.type, field.label = _Field.TYPE_DOUBLE, _Field.LABEL_REPEATED

@@ -6,8 +6,8 @@ from dataclasses import fields
 
 from google.protobuf import descriptor_pb2
 
+from flowrec.declarations import defaulted_fields
 from flowrec.errors import SessionError
-from flowrec.messages import defaulted_fields
 from flowrec.store.codec import codec_of
 from flowrec.store.mcap_index import Summary
 from flowrec.store.roi import Region, region_from

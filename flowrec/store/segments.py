@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-from flowrec.messages import Frame, Message
+from flowrec.declarations import Message
+from flowrec.messages import Frame
 from flowrec.store.write_queue import Entry, News
 
 

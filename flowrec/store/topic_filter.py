@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
 
+from flowrec.declarations import Role
 from flowrec.errors import UsageError
 from flowrec.store.channels import FRAME_PATH
 from flowrec.store.viewer_topics import MIRRORS
-from flowrec.topics import TOPICS, Role
+from flowrec.topics import TOPICS
 
 # A replay goes on from what the stages said; without images it takes the tracks as they were recorded.
 _NEEDED = {topic.path for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {FRAME_PATH}

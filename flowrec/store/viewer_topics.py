@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.messages import Estimate, FlowField, Message, Route, Track, Vector
+from flowrec.declarations import Message, Vector
+from flowrec.messages import Estimate, FlowField, Route, Track
 from flowrec.store.form import Payload
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.standard import timestamp

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from typing import NamedTuple
 
-from flowrec.messages import Message
+from flowrec.declarations import Message
 from flowrec.store.roi import Window
 
 News = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table

@@ -15,8 +15,9 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from flowrec.declarations import Message, array_fields
 from flowrec.errors import SessionError
-from flowrec.messages import Drops, Frame, Message, Tick, Track, array_fields
+from flowrec.messages import Drops, Frame, Tick, Track
 from flowrec.store.channels import FRAME_PATH
 from flowrec.store.frame_decimation import Thinning
 from flowrec.store.frame_encodings import ENCODINGS

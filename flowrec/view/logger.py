@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from flowrec.declarations import Image
 from flowrec.flow import sample
 from flowrec.messages import (
     Currents,
@@ -19,7 +20,6 @@ from flowrec.messages import (
     FlowField,
     Frame,
     Health,
-    Image,
     Mission,
     OperatorEvent,
     Route,

@@ -16,7 +16,8 @@ import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
-from flowrec.messages import Frame, Image, Track
+from flowrec.declarations import Image
+from flowrec.messages import Frame, Track
 from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds

@@ -17,11 +17,12 @@ from flowrec.chip import load_chip
 from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.config import load_config
+from flowrec.declarations import Role
 from flowrec.messages import Clocks, Drops, Health, Tick
 from flowrec.session_writer import session_header
 from flowrec.store import SessionWriter, Split
 from flowrec.store.viewer_topics import MIRRORS
-from flowrec.topics import TOPICS, Role
+from flowrec.topics import TOPICS
 from tests.conftest import SMALL
 from tests.rewritten import leaves_of, parser_of, rewrite
 from tests.store.made_up import ticks_of

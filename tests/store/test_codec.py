@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from flowrec.declarations import Matrix, Message, Vector, array_fields, defaulted_fields, message_fields
 from flowrec.errors import SessionError
-from flowrec.messages import Event, Frame, Matrix, Message, OperatorEvent, Track, Vector, array_fields, defaulted_fields
+from flowrec.messages import Event, Frame, OperatorEvent, Track
 from flowrec.store import codec
-from flowrec.store.schema import forms_of
 from flowrec.topics import TOPICS
 
 TYPES = sorted({topic.type for topic in TOPICS}, key=lambda kind: kind.__name__)
@@ -38,7 +38,7 @@ class Maybe(Message):
 def messages(draw, kind):
     dtypes = dict(array_fields(kind))
     values = {}
-    for form in forms_of(kind):
+    for form in message_fields(kind):
         if form.optional and draw(st.booleans()):
             values[form.name] = None
         elif form.name in dtypes:
@@ -156,7 +156,7 @@ def test_a_file_made_before_a_field_existed_is_read_with_its_default(kind):
         form.name: {"vector": np.zeros(2), "array": np.zeros((2, 2))}.get(form.kind)
         if form.kind in ("vector", "array")
         else form.kind(1)
-        for form in forms_of(kind)
+        for form in message_fields(kind)
         if form.name not in defaulted_fields(kind)
     }
     plain = kind(**needed)

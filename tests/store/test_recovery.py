@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from flowrec.commands import replay as verb
 from flowrec.commands.compare import compare
 from flowrec.commands.replay import Change
+from flowrec.declarations import Role
 from flowrec.errors import SessionError
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.store import SessionReader, SessionWriter, recover
@@ -21,7 +22,7 @@ from flowrec.store.mcap_reader import Source
 from flowrec.store.recorder import Recorder
 from flowrec.store.scan import scan
 from flowrec.system.locks import is_growing
-from flowrec.topics import TOPICS, Role
+from flowrec.topics import TOPICS
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_trouble import KILLED, names_in
 

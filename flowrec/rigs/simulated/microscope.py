@@ -17,7 +17,7 @@ from scipy.special import ndtri
 
 from flowrec.chip.clearance import clearance_um
 from flowrec.chip.registration import Calibration
-from flowrec.messages import Image
+from flowrec.declarations import Image
 from flowrec.rig_settings import CameraSettings
 from flowrec.system.numba_setup import compiled
 

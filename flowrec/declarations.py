@@ -1,0 +1,272 @@
+"""What an annotation of a message field or of a field of `Tick` can say: shape, finiteness, topic, source, tolerances.
+
+messages.py declares every record with these. The wire format (store/schema.py), the checks of what was read from a
+file and the table of topics (topics.py) are derived from them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields
+from enum import Enum
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.enums import WorkOrder
+
+# The second word is the wire form: a `vector` becomes a repeated double that viewers can plot,
+# an `array` keeps its shape and its bytes.
+Vector = Annotated[NDArray[np.float64], "vector"]
+Matrix = Annotated[NDArray[np.float64], "array"]
+Raster = Annotated[NDArray[np.float32], "array"]
+Image = Annotated[NDArray[np.uint8], "array"]
+
+_MAY_BE_EMPTY = "nmo"
+
+
+@dataclass(frozen=True, slots=True, init=False)
+class Shape:
+    """Annotation of an array field: its shape, and whether all of its numbers must be finite.
+
+    A letter stands for any length, the same one throughout a message. `n`, `m` and `o` may be zero, other letters not.
+    """
+
+    lengths: tuple[int | str, ...]
+    finite: bool
+
+    def __init__(self, *lengths: int | str, finite: bool = True) -> None:
+        object.__setattr__(self, "lengths", lengths)
+        object.__setattr__(self, "finite", finite)
+
+
+NanFloat = Annotated[float, Shape(finite=False)]  # a number for which NaN or infinity has a meaning
+
+
+@dataclass(frozen=True, slots=True)
+class MessageField:
+    """One field of a message type.
+
+    Attributes
+    ----------
+    kind : int, float, bool, str, "vector" or "array".
+    optional : the field may be None.
+    dtype : of an array, else None.
+    shape : None where the declaration gives none, as for every plain number.
+    """
+
+    name: str
+    kind: Any
+    optional: bool
+    dtype: np.dtype[Any] | None
+    shape: Shape | None
+
+    @property
+    def is_float(self) -> bool:
+        """Whether its numbers are floating-point numbers."""
+        return self.kind is float if self.dtype is None else self.dtype.kind == "f"
+
+    @property
+    def finite(self) -> bool:
+        """Whether NaN and infinity are excluded."""
+        return self.shape is None or self.shape.finite
+
+
+_FIELDS: dict[type, tuple[MessageField, ...]] = {}
+_ARRAYS: dict[type, tuple[tuple[str, np.dtype[Any]], ...]] = {}  # for Message.__post_init__, which runs often
+
+
+def message_fields(message_type: type) -> tuple[MessageField, ...]:
+    """The fields of a message type, in order.
+
+    Raises
+    ------
+    TypeError : an annotation that has no wire form.
+    """
+    if message_type not in _FIELDS:
+        _FIELDS[message_type] = tuple(_declared(message_type))
+    return _FIELDS[message_type]
+
+
+def _declared(message_type: type) -> Iterator[MessageField]:
+    hints = typing.get_type_hints(message_type, include_extras=True)
+    for each in fields(message_type):
+        hint, optional = hints[each.name], False
+        if typing.get_origin(hint) in (typing.Union, types.UnionType):
+            hint = next(option for option in typing.get_args(hint) if option is not types.NoneType)
+            optional = True
+        kind, *notes = typing.get_args(hint) if typing.get_origin(hint) is Annotated else (hint,)
+        shape = next((note for note in notes if isinstance(note, Shape)), None)
+        dtype = None
+        if typing.get_origin(kind) is np.ndarray:
+            dtype = np.dtype(typing.get_args(typing.get_args(kind)[1])[0])
+            kind = "array" if optional else notes[0]  # a repeated field can not be absent
+        if kind not in (int, float, bool, str, "vector", "array"):
+            raise TypeError(f"{message_type.__name__}.{each.name}: no wire form for {hint!r}")
+        yield MessageField(each.name, kind, optional, dtype, shape)
+
+
+def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
+    """Name and dtype of each array field of a message type, in order."""
+    found = _ARRAYS.get(message_type)
+    if found is None:
+        found = tuple((each.name, each.dtype) for each in message_fields(message_type) if each.dtype is not None)
+        _ARRAYS[message_type] = found
+    return found
+
+
+def defaulted_fields(message_type: type) -> frozenset[str]:
+    """Names of the fields with a default. A file made before such a field existed does not have it.
+
+    The default must be what the absence of the field means on the wire: None, an empty vector, 0, False or "".
+    """
+    return frozenset(
+        each.name for each in fields(message_type) if each.default is not MISSING or each.default_factory is not MISSING
+    )
+
+
+class Message:
+    """Base of all records: sets the dtype of the arrays and makes them read-only."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for name, dtype in array_fields(type(self)):
+            given = getattr(self, name)
+            if given is None:
+                continue
+            array = np.ascontiguousarray(given, dtype)
+            if array.flags.writeable:
+                array = array.view()
+                array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def same_as(self, other: object) -> bool:
+        """Whether the other record is the same bit for bit (NaN equals NaN)."""
+        if type(other) is not type(self):
+            return False
+        for part in fields(self):  # type: ignore[arg-type]
+            mine, theirs = getattr(self, part.name), getattr(other, part.name)
+            if isinstance(mine, np.ndarray) and isinstance(theirs, np.ndarray):
+                if mine.shape != theirs.shape or mine.tobytes() != theirs.tobytes():
+                    return False
+            elif mine != theirs and not (mine != mine and theirs != theirs):
+                return False
+        return True
+
+
+def shape_error(message: Message) -> str:
+    """Which array of a message has another shape than its declaration; '' if none has.
+
+    The wire keeps any shape, so a damaged or forged file is stopped here before anybody computes with it.
+    """
+    lengths: dict[str, int] = {}
+    for each in message_fields(type(message)):
+        array = getattr(message, each.name)
+        if each.dtype is None or each.shape is None or array is None:
+            continue
+        wanted = each.shape.lengths
+        fits = array.ndim == len(wanted)
+        for found, length in zip(array.shape, wanted, strict=False):
+            if isinstance(length, int):
+                fits = fits and found == length
+            else:
+                fits = fits and lengths.setdefault(length, found) == found and (found > 0 or length in _MAY_BE_EMPTY)
+        if not fits:
+            return f"{each.name} has the shape {array.shape} where ({', '.join(map(str, wanted))}) belongs"
+    return ""
+
+
+def invalid_numbers(message: Message, limit: float | None = None) -> tuple[str, ...]:
+    """Names of the fields that hold NaN or infinity where these are excluded, or a finite number of `limit` or more."""
+    found = []
+    for each in message_fields(type(message)):
+        value = getattr(message, each.name)
+        if value is None or not each.is_float:
+            continue
+        finite = np.isfinite(value)
+        if (each.finite and not finite.all()) or (limit is not None and (np.abs(value)[finite] >= limit).any()):
+            found.append(each.name)
+    return tuple(found)
+
+
+class Role(Enum):
+    """What replay does with a topic."""
+
+    INPUT = "input"  # fed in again: enough to replay
+    OUTPUT = "output"  # computed again and compared
+    DIAGNOSTIC = "diagnostic"  # timings and losses: never compared
+    TRUTH = "truth"  # known to a simulator only: kept for evaluation, no stage reads it
+
+
+class Source(Enum):
+    """Where the messages of a topic come from."""
+
+    CAMERA = Role.INPUT, "the image of this tick; never held from one tick to the next"
+    RIG = Role.INPUT, "read back from the rig with each frame"
+    OPERATOR = Role.INPUT, "asked by a person; held until the next one"
+    WORKER = Role.INPUT, "the result of a slow stage; held until the next one"
+    STAGE = Role.OUTPUT, "computed in pipeline.step"
+    LOOP = Role.DIAGNOSTIC, "measured by the loop or by the writer"
+    SIMULATOR = Role.TRUTH, "the simulated world; never held from one tick to the next"
+
+    def __init__(self, role: Role, _meaning: str) -> None:
+        self.role = role
+
+
+@dataclass(frozen=True, slots=True)
+class SlowStage:
+    """How a result of the worker is made.
+
+    Attributes
+    ----------
+    orders : the work orders (`Mission.wanted`) that it answers.
+    reads : fields of the ordering tick that are needed, besides its stamp and the mission.
+    settings : sections of the configuration on which it depends, besides those on which what it reads depends.
+    """
+
+    orders: tuple[WorkOrder, ...]
+    reads: tuple[str, ...]
+    settings: tuple[str, ...]
+
+
+# Absolute tolerance of a field unless stated otherwise, in the field's unit: rounding of values up to 1e4.
+_ATOL = 1e-8
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """Annotation of a field of `Tick`: what is recorded there.
+
+    Two floats are the same when |recorded - replayed| <= atol + rtol |recorded|, element by element. The tolerances
+    are for files made on another machine; on the same one a replay is exact. Everything but floats is compared exactly.
+
+    Attributes
+    ----------
+    path : of the topic in the session file.
+    rtol : relative tolerance; 0: all of the topic is compared exactly.
+    atols : absolute tolerances by field of the message, in the field's unit, where they are not the default.
+    made_by : how the worker makes it; for `Source.WORKER` only.
+    field, type : name and message type of the field; topics.py fills them in from `Tick`.
+    """
+
+    path: str
+    source: Source
+    rtol: float = 0.0
+    atols: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    made_by: SlowStage | None = None
+    field: str = ""
+    type: type[Message] = Message
+
+    @property
+    def role(self) -> Role:
+        """What replay does with it."""
+        return self.source.role
+
+    def atol_of(self, name: str) -> float:
+        """Absolute tolerance of a field of the message, in the field's unit."""
+        return self.atols.get(name, _ATOL if self.rtol else 0.0)

@@ -1,0 +1,87 @@
+"""The words that files and messages use for a phase, a work order, an outcome, a level, an operator's action.
+
+Each is a `StrEnum`: a member equals the text that a session file holds. Message fields stay `str`, because a file of
+another version may hold a word that is not listed here.
+"""
+
+from enum import StrEnum
+
+
+class Phase(StrEnum):
+    """What the mission does."""
+
+    START = "start"
+    SURVEY = "survey"
+    REFINE = "refine"
+    PLAN = "plan"
+    NAVIGATE = "navigate"
+    DONE = "done"
+
+
+class WorkOrder(StrEnum):
+    """Work of a slow stage that a mission can order."""
+
+    SOLVE = "solve"
+    SURVEY_ROUTE = "survey_route"
+    REFINE = "refine"
+    ROUTE = "route"
+
+
+class Outcome(StrEnum):
+    """How a run or a session ended."""
+
+    REACHED = "reached"
+    SURVEY_COMPLETE = "survey complete"
+    REFINE_COMPLETE = "refine complete"
+    PLAN_COMPLETE = "plan complete"
+    STOPPED = "stopped"  # by a person, a signal or the disk monitor
+    TIME_OVER = "time over"  # the time that the run was given
+    TIMEOUT = "timeout"  # the time limit of a phase
+    UNREACHABLE = "unreachable"
+    NOT_FOUND = "not found"  # the robot was never seen
+    LOST = "lost"
+    GAVE_UP = "gave up"
+    FAILED = "failed"
+    REPLAYED = "replayed"
+    # Of a file rather than of a run.
+    ENDED = "ended"
+    CUT = "cut"  # recovered, with a loss
+    CONTINUED = "continued"  # the next part follows
+    SNAPSHOT = "snapshot"
+
+    @property
+    def completes_mission(self) -> bool:
+        """Whether the mission has done what its phases asked for."""
+        return self in (
+            Outcome.REACHED,
+            Outcome.SURVEY_COMPLETE,
+            Outcome.REFINE_COMPLETE,
+            Outcome.PLAN_COMPLETE,
+        )
+
+
+class Level(StrEnum):
+    """Severity of an event."""
+
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Action(StrEnum):
+    """What a person did."""
+
+    STOP = "stop"
+    MARK = "mark"
+    NOTE = "note"
+    PAUSE = "pause"
+    RESUME = "resume"
+    ZERO = "zero"
+
+
+class Alarm(StrEnum):
+    """Why the observer can not be believed."""
+
+    NIS = "nis"
+    PULSATION = "pulsation"
+    TRACKING = "tracking"
