@@ -86,4 +86,4 @@ def _solve(cells: int, reynolds: float) -> tuple[NDArray[np.float64], NDArray[np
     equations = assembled(box, 1)
     push = equations.momentum.sliding @ np.array([0.0, 0.0, 1.0, 0.0])
     moving = np.append(equations.steady(np.zeros(0), reynolds / cells, 100, 1e-9, push), 0.0)
-    return moving[equations.grid.number_u], moving[equations.grid.number_v]
+    return moving[equations.grid.u.number], moving[equations.grid.v.number]

@@ -35,7 +35,7 @@ def cylinder_case(px_per_diameter: int, k: int, walls: Walls) -> dict[str, Any]:
     grid = equations.grid
     p = np.append(equations.pressure(load[:, None])[:, 0] * mu / h, 0.0)[grid.number_p]
     padded = np.append(moving, 0.0)
-    u, v = padded[grid.number_u], padded[grid.number_v]  # fluxes, which are velocities where no wall cuts the faces
+    u, v = padded[grid.u.number], padded[grid.v.number]  # fluxes, which are velocities where no wall cuts the faces
     bottom = (grid.fluid.shape[0] / k - MARGIN_PX) * k  # row of the lower wall
     left, right = (round(x / h) for x in _BOX_M[:2])
     top, low = (round(bottom - y / h) for y in (_BOX_M[3], _BOX_M[2]))

@@ -26,8 +26,9 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import FlowError, FlowrecError, UsageError
 from flowrec.estimation import Trimmed
-from flowrec.flow import FlowSolver, cache
-from flowrec.flow.metrics import relative_rmse
+from flowrec.flow import FlowSolver
+from flowrec.flow.linear_solver import clear_cache
+from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import FlowField, Observations
 from flowrec.refine import PiUnet, Refiner
 from flowrec.refine.training.vessels import draw_mask, make_case, with_mask_error
@@ -186,7 +187,7 @@ def _one(case: Path, method: str, noise: str, share: str, k: int, trouble: Troub
     observations = _observations(case, noise, share, trouble)
     believed = with_mask_error(chip, trouble.mask)
     solver, refiner = FlowSolver(k), METHODS[method]
-    cache.forget()
+    clear_cache()
     began, began_cpu = time.perf_counter(), time.process_time()
     assumed = solver.solve(believed)
     field = refiner.refine(assumed, observations, believed, solver)

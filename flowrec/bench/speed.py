@@ -62,7 +62,7 @@ def _measure(pattern: Pattern, side: int, k: int) -> dict[str, Any]:
     # Mass: of the speeds the solver carries, in units of the fastest.
     moving = equations.linear(np.array([[float(o.kind == "inlet")] for o in chip.openings]))[:, 0]
     padded = np.append(moving, 0.0)
-    u, v = padded[equations.grid.number_u], padded[equations.grid.number_v]
+    u, v = padded[equations.grid.u.number], padded[equations.grid.v.number]
     lost = np.abs(np.diff(u, axis=1) + np.diff(v, axis=0)).max() / np.abs(moving).max()
     return {
         "pattern": pattern,

@@ -13,6 +13,7 @@ import difflib
 import itertools
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,9 @@ MIN_OPENING_PX = 3
 DEFAULT_INLET_UM_S = 200.0
 
 
-def border(mask: NDArray[np.bool_], side: Side) -> NDArray[np.bool_]:
-    """Fluid along one side of a mask (h, w): from the top for left and right, from the left for top and bottom."""
-    line: NDArray[np.bool_] = {"left": mask[:, 0], "right": mask[:, -1], "top": mask[0], "bottom": mask[-1]}[side]
+def border(image: NDArray[Any], side: Side) -> NDArray[Any]:
+    """View of one side of an image (h, w): from the top for left and right, from the left for top and bottom."""
+    line: NDArray[Any] = {"left": image[:, 0], "right": image[:, -1], "top": image[0], "bottom": image[-1]}[side]
     return line
 
 

@@ -21,7 +21,7 @@ from flowrec.commands.auto_recovery import look_after
 from flowrec.commands.interactive import Unattended
 from flowrec.config import Config, derived, resolve
 from flowrec.errors import SessionError, UnreachableError, UsageError
-from flowrec.flow.metrics import relative_rmse
+from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.free_space import no_room, swept_out, too_swift

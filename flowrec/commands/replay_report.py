@@ -9,7 +9,7 @@ import numpy as np
 from flowrec.commands.record import length_um
 from flowrec.commands.replay import Replayed
 from flowrec.flow import sample
-from flowrec.flow.metrics import relative_rmse
+from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import FlowField, Observations, Route, Tick
 from flowrec.planning import travel_time
 from flowrec.run.jobs import no_observations

@@ -1,12 +1,11 @@
-"""Chip and boundary values to a flow field: grid, equations, solver, sampling.
+"""Chip and boundary values to a flow field.
 
-Secrets: what a mask tells of its walls (contour), where they lie on the grid (outline), numbering of faces (grid), the
-flow between walls along one grid line (lines), the balance of a face (momentum), conservation of mass (stream),
-factorisation and Newton's method (system), units and messages (solver), interpolation (sampling).
+level_set, contour_smoothing: where the walls of a mask lie. grid, wall_stencils, momentum, streamfunction: the discrete
+Navier-Stokes equations. linear_solver, newton_solver: their solution. sensitivities: its derivatives with respect to
+boundary values and fluid. solver: the stage. sampling: values and errors of a finished field.
 """
 
-from flowrec.flow.modes import FlowModes
 from flowrec.flow.sampling import sample
 from flowrec.flow.solver import FlowSolver
 
-__all__ = ["FlowModes", "FlowSolver", "sample"]
+__all__ = ["FlowSolver", "sample"]

@@ -1,15 +1,15 @@
-"""The smoothest outline that a mask allows.
+"""Smoothest contour that a mask allows.
 
-A mask is a sample: all it tells is that a wall passes between two neighbouring pixel centres, one in fluid and one in
-solid. Each such pair is a gate, and the outline has one point near each. Among all curves that is taken whose
-curvature changes least and which keeps nearest to the middles of the gates,
+A mask only says that the wall passes between two neighbouring pixel centres of which one is fluid and one is solid.
+Each such pair is a gate, and the contour has one point near each gate. Of all curves through the gates this is the one
+whose curvature changes least and that stays closest to the midpoints of the gates:
 
-    min  int l^6 (d kappa / ds)^2 + d^2 ds,   kappa = curvature, d = distance from the middles,
+    min  int l^6 (d kappa / ds)^2 + d^2 ds,   kappa = curvature, d = distance from the midpoints.
 
-with a length l that is made smaller, step by step, where the curve would leave the gates: there the wall bends.
-Straight walls and circles cost nothing, so an oblique wall comes out straight however long its steps, and neither
-channels nor islands shrink. What the gates leave open nobody can know: at a slope of p / q pixels the place of a
-straight wall is known to 1 / (2 sqrt(p^2 + q^2)) pixels, which is 0.35 at 45 degrees.
+The length l is reduced step by step where the curve would miss gates, since the wall bends there. Straight walls and
+circles have no cost, so an oblique wall comes out straight whatever the length of its steps, and neither channels nor
+islands shrink. The gates leave an uncertainty that nothing can remove: at a slope of p / q pixels they determine a
+straight wall to 1 / (2 sqrt(p^2 + q^2)) pixels, which is 0.35 at 45 degrees.
 """
 
 from __future__ import annotations
@@ -26,18 +26,20 @@ from scipy.sparse.csgraph import connected_components
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STIFFNESS_PX = 8.0  # l of a wall that keeps to its gates: wobbles shorter than about 2 pi l are steps of the mask
-SOFTENING = 16.0  # of l^6, around gates that are missed
-SOFTENED = 2  # gates to either side of a missed one
-SLACK_PX = 0.05  # a gate is missed by more than that
+STIFFNESS_PX = 8.0  # l of a wall that stays in its gates: wobbles shorter than about 2 pi l come from the mask's steps
+SOFTENING = 16.0  # divides l^6 around gates that the curve misses
+SOFTENED = 2  # number of gates on either side of a missed one
+SLACK_PX = 0.05  # a gate is missed by more than this
 ITERATIONS = 8
-FARTHEST_PX = 0.6  # from the middle of a gate; half a pixel is its end
-GATES_PER_STIFFNESS = 8  # at least, of a closed wall
-BLUR = 4  # passes of 1 2 1 over the directions of the last approximation
+FARTHEST_PX = 0.6  # largest offset from the midpoint of a gate; the gate ends at half a pixel
+GATES_PER_STIFFNESS = 8  # at least, on a closed wall
+BLUR = 4  # passes of the kernel 1 2 1 over the tangents of the last iterate
 SHORTEST_PX = 0.3  # least distance of two points along the wall
-WRAP = 32  # closed walls are continued around by this many gates
-BEYOND_PX = 2.0  # walls go straight on beyond the image's border
-LARGEST_SHIFT_PX = 0.25  # of a closed wall, towards the area of its pixels
+WRAP = 32  # number of gates by which a closed wall is continued at both ends
+BEYOND_PX = 2.0  # length of the straight continuation beyond the image's border
+LARGEST_SHIFT_PX = 0.25  # of a closed wall, so that it encloses the area of its pixels
+
+STEP = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # x, y of the directions right, down, left, up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,38 +49,42 @@ class Gates:
     middle: Floats  # (n, 2) x, y in pixels; (0, 0) is the centre of the first pixel
     inward: Floats  # (n, 2) unit vector from solid to fluid
     wall: Ints  # (n,) number of the wall, ascending
-    closed: NDArray[np.bool_]  # (walls,) whether it returns to its first gate; else it ends at the image's border
+    closed: NDArray[np.bool_]  # (walls,) whether the wall returns to its first gate; else it ends at the image's border
 
 
-def gates(mask: NDArray[np.bool_]) -> Gates:
+def find_gates(mask: NDArray[np.bool_]) -> Gates:
     """Gates of a mask. Fluid pixels that touch at corners only are not connected."""
     h, w = mask.shape
-    edges = []  # (row, column) of the edge's begin on the pixels' corners, and its direction (right, down, left, up)
-    r, c = np.nonzero(~mask[:-1] & mask[1:])
-    edges.append((r + 1, c, np.zeros_like(r)))
-    r, c = np.nonzero(mask[:, :-1] & ~mask[:, 1:])
-    edges.append((r, c + 1, np.ones_like(r)))
-    r, c = np.nonzero(mask[:-1] & ~mask[1:])
-    edges.append((r + 1, c + 1, np.full_like(r, 2)))
-    r, c = np.nonzero(~mask[:, :-1] & mask[:, 1:])
-    edges.append((r + 1, c + 1, np.full_like(r, 3)))
-    row, column, way = (np.concatenate(part) for part in zip(*edges, strict=True))
-    step = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])  # x, y of the directions
-    n = len(row)
+    down, across = mask[1:], mask[:, 1:]
+    parts = []  # (row, column) of the edge's begin on the pixels' corners, and its direction
+    for direction, (edge, begin) in enumerate(
+        (
+            (~mask[:-1] & down, (1, 0)),
+            (mask[:, :-1] & ~across, (0, 1)),
+            (mask[:-1] & ~down, (1, 1)),
+            (~mask[:, :-1] & across, (1, 1)),
+        )
+    ):
+        r, c = np.nonzero(edge)
+        parts.append((r + begin[0], c + begin[1], np.full_like(r, direction)))
+    row, column, way = (np.concatenate(part) for part in zip(*parts, strict=True))
     leaving = np.full(((h + 1) * (w + 1), 4), -1, np.int64)
-    leaving[row * (w + 1) + column, way] = np.arange(n)
-    end = (row + step[way, 1]) * (w + 1) + column + step[way, 0]
-    # Where four edges meet, turning right stays with the same fluid pixel.
+    leaving[row * (w + 1) + column, way] = np.arange(len(row))
+    end = (row + STEP[way, 1]) * (w + 1) + column + STEP[way, 0]
+    # Where four edges meet, a turn to the right stays with the same fluid pixel.
     right, ahead, left = (leaving[end, (way + turn) % 4] for turn in (1, 0, 3))
     after = np.where(right >= 0, right, np.where(ahead >= 0, ahead, left))
     order, wall, closed = _ordered(after)
-    begin = np.stack([column, row], axis=1) - 0.5
-    inward = step[(way + 1) % 4].astype(np.float64)
-    return Gates((begin + 0.5 * step[way])[order], inward[order], wall, closed)
+    begin_xy = np.stack([column, row], axis=1) - 0.5
+    inward = STEP[(way + 1) % 4].astype(np.float64)
+    return Gates((begin_xy + 0.5 * STEP[way])[order], inward[order], wall, closed)
 
 
 def _ordered(after: Ints) -> tuple[Ints, Ints, NDArray[np.bool_]]:
-    """Order of edges along their walls, the wall of each, and which walls are closed."""
+    """Order of the edges along their walls, the number of the wall of each, and which walls are closed.
+
+    `after` (n,) is the edge that follows each edge, -1 at the image's border.
+    """
     n = len(after)
     if n == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool)
@@ -89,12 +95,12 @@ def _ordered(after: Ints) -> tuple[Ints, Ints, NDArray[np.bool_]]:
     )
     closed = np.ones(count, bool)
     closed[wall[~linked]] = False
-    # A closed wall is cut before its first edge.
+    # A closed wall begins at its first edge: cut the link back to it.
     _, first = np.unique(wall, return_index=True)
     follow = np.where(linked, after, edge)
     cut = closed[wall] & (follow == first[wall])
     follow[cut] = edge[cut]
-    # Steps to the end of the wall, by doubling.
+    # Number of steps to the end of the wall, by pointer doubling.
     left, jump = (follow != edge).astype(np.int64), follow
     while (jump[jump] != jump).any():
         left = left + left[jump]
@@ -103,35 +109,36 @@ def _ordered(after: Ints) -> tuple[Ints, Ints, NDArray[np.bool_]]:
     return order, wall[order].astype(np.int64), closed
 
 
-def curves(mask: NDArray[np.bool_], pieces: int) -> tuple[Floats, Floats]:
-    """Straight pieces of the outline: begins and ends (n, 2), x, y in pixels, with the fluid on their right.
+def contour_segments(mask: NDArray[np.bool_], per_gate: int) -> tuple[Floats, Floats]:
+    """Straight segments of the contour: begins and ends (n, 2), x, y in pixels, with the fluid on their right.
 
-    Each stretch from one gate to the next is cut into `pieces`; walls that end at the image's border go straight on.
+    The curve from one gate to the next is divided into `per_gate` segments. Walls that end at the image's border are
+    continued in a straight line.
     """
-    crossed = gates(mask)
+    crossed = find_gates(mask)
     n = len(crossed.wall)
     if n == 0:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    point = smoothest(crossed)
+    point = _smoothest(crossed)
     size = np.bincount(crossed.wall)
     first = np.cumsum(size) - size
     last = first + size - 1
     before, after = np.arange(n) - 1, np.arange(n) + 1
     closed = crossed.closed
     before[first], after[last] = np.where(closed, last, first), np.where(closed, first, last)
-    knots, tangent = _cubic(point, before, after, pieces)
-    # What a closed wall encloses is known: its pixels. It matters where there are few.
+    knots, tangent = _cubic(point, before, after, per_gate)
+    # The area of a closed wall is that of its pixels. The correction matters for small islands.
     along = crossed.inward[:, [1, 0]] * [1.0, -1.0]
     wanted = _enclosed(crossed.middle, crossed.middle + along, crossed.wall)
     found = sum(_enclosed(a, b, crossed.wall) for a, b in itertools.pairwise(knots))
     around = np.bincount(crossed.wall, np.hypot(*(point[after] - point).T))
-    # Both areas count positive where the fluid is inside.
+    # Both areas are positive where the fluid is inside.
     shift = np.where(
         closed, np.clip((wanted - found) / np.maximum(around, 1e-9), -LARGEST_SHIFT_PX, LARGEST_SHIFT_PX), 0.0
     )
     outward = tangent[:, [1, 0]] * [1.0, -1.0]
     point = point + shift[crossed.wall, None] * outward
-    knots, tangent = _cubic(point, before, after, pieces)
+    knots, tangent = _cubic(point, before, after, per_gate)
     on = after != np.arange(n)
     begins, ends = [knots[:-1, on].reshape(-1, 2)], [knots[1:, on].reshape(-1, 2)]
     open_ = ~closed
@@ -141,14 +148,14 @@ def curves(mask: NDArray[np.bool_], pieces: int) -> tuple[Floats, Floats]:
 
 
 def _enclosed(a: Floats, b: Floats, wall: Ints) -> Floats:
-    """Areas (walls,) under the pieces a to b (n, 2)."""
+    """Signed areas (walls,) enclosed by the segments a to b (n, 2): the shoelace formula."""
     return np.asarray(0.5 * np.bincount(wall, a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
 
 
-def _cubic(point: Floats, before: Ints, after: Ints, pieces: int) -> tuple[Floats, Floats]:
-    """Knots (pieces + 1, n, 2) of the curve from each point to the next, and its unit tangents (n, 2) there.
+def _cubic(point: Floats, before: Ints, after: Ints, per_gate: int) -> tuple[Floats, Floats]:
+    """Knots (per_gate + 1, n, 2) of the curve from each point to the next, and its unit tangents (n, 2) at the points.
 
-    The tangent is that of the circle through a point and its neighbours, and the curve the cubic between two.
+    The tangent is that of the circle through a point and its two neighbours; the curve is the cubic Hermite spline.
     """
     back, ahead = point - point[before], point[after] - point
     sb, sa = (np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-9)[:, None] for d in (back, ahead))
@@ -156,17 +163,14 @@ def _cubic(point: Floats, before: Ints, after: Ints, pieces: int) -> tuple[Float
     lone = (sb[:, 0] < 1e-8) | (sa[:, 0] < 1e-8)
     tangent[lone] = (back / sb + ahead / sa)[lone]
     tangent /= np.maximum(np.hypot(tangent[:, 0], tangent[:, 1]), 1e-9)[:, None]
-    u = np.linspace(0.0, 1.0, pieces + 1)[:, None, None]
+    u = np.linspace(0.0, 1.0, per_gate + 1)[:, None, None]
     swing = u * (1.0 - u) * sa * ((1.0 - u) * tangent - u * tangent[after])
     straight = u * u * (3.0 - 2.0 * u) * ahead
     return np.asarray(point + straight + swing), tangent
 
 
-def smoothest(crossed: Gates) -> Floats:
-    """Points (n, 2) of the outline, one beside each gate: x, y in pixels."""
-    n = len(crossed.wall)
-    if n == 0:
-        return np.zeros((0, 2))
+def _smoothest(crossed: Gates) -> Floats:
+    """Points (n, 2) of the contour, one near each gate: x, y in pixels."""
     size = np.bincount(crossed.wall)
     start = np.cumsum(size) - size
     wrap = np.where(crossed.closed, WRAP, 0)
@@ -176,20 +180,20 @@ def smoothest(crossed: Gates) -> Floats:
     k = np.arange(long.sum()) - offset[wall] - wrap[wall]
     source = start[wall] + k % size[wall]
     own = (k >= 0) & (k < size[wall])
-    # A closed wall of few gates bends at each of them.
+    # A closed wall of few gates bends at each of them, so it must be less stiff.
     stiffness = np.where(crossed.closed, np.minimum(STIFFNESS_PX, size / GATES_PER_STIFFNESS), STIFFNESS_PX)
     relaxed = _relax(crossed.middle[source], crossed.inward[source], wall, stiffness[wall])
-    result = np.empty((n, 2))
+    result = np.empty_like(crossed.middle)
     result[source[own]] = relaxed[own]
     return result
 
 
 def _relax(middle: Floats, inward: Floats, wall: Ints, stiffness: Floats) -> Floats:
-    """Points (n, 2) beside the middles of gates on open walls, for a stiffness l (n,) to begin with.
+    """Points (n, 2) near the midpoints of gates on open walls, for an initial stiffness length l (n,) in pixels.
 
-    Each point is its middle moved along the normal of the wall. d kappa / ds is the third divided difference over
-    four points in the direction of the normal; normals and distances are those of the last approximation, so that
-    every step is a banded least-squares problem.
+    Each point is a midpoint moved along the normal of the wall. d kappa / ds is the third divided difference over four
+    points in the direction of the normal. Normals and distances are those of the last iterate, so every iteration is
+    a banded linear least-squares problem.
     """
     n = len(wall)
     if n < 4:
@@ -215,7 +219,7 @@ def _relax(middle: Floats, inward: Floats, wall: Ints, stiffness: Floats) -> Flo
         normals = _across(_unit(both))
         knots = np.zeros((n - 3, 4))
         knots[:, 1:] = np.cumsum([length[:-2], length[1:-1], length[2:]], axis=0).T
-        # Row i: jacobian @ offsets + target, offsets along the normals of points i to i + 3.
+        # Residual i is jacobian[i] @ offsets + target[i], with the offsets along the normals of points i to i + 3.
         jacobian, target = np.empty_like(knots), np.zeros(len(knots))
         scale = 6.0 * np.sqrt(weight * length[1:-1]) * whole
         for m in range(4):
@@ -240,10 +244,10 @@ def _relax(middle: Floats, inward: Floats, wall: Ints, stiffness: Floats) -> Flo
 
 
 def _unit(vector: Floats) -> Floats:
-    """Vectors (n, 2) of length 1, or 0 where they vanish."""
+    """Vectors (n, 2) scaled to length 1, or 0 where they vanish."""
     return np.asarray(vector / np.maximum(np.hypot(vector[:, 0], vector[:, 1]), 1e-9)[:, None])
 
 
 def _across(vector: Floats) -> Floats:
-    """Vectors (n, 2) turned by a right angle."""
+    """Vectors (n, 2) turned by a right angle, from x to y."""
     return np.stack([-vector[:, 1], vector[:, 0]], axis=1)

@@ -1,4 +1,4 @@
-"""The staggered (MAC) grid: which faces move, how they are numbered, and the way back to pixels."""
+"""Staggered (MAC) grid: which faces carry flow, their numbering, and averages over pixels."""
 
 from __future__ import annotations
 
@@ -9,185 +9,186 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from flowrec.chip.chip import Chip, Kind, Side
+from flowrec.chip.chip import Chip, Kind, Opening, Side
+from flowrec.chip.openings import SIDES, border
 from flowrec.errors import FlowError
-from flowrec.flow.level_set import Outline, outline
+from flowrec.flow.contour_smoothing import Floats, Ints
+from flowrec.flow.level_set import LevelSet, from_mask
 
 WALL, OPEN, OUTLET, INLET = range(4)  # kinds of a face
 
-# A face of which less is open counts as shut: what passes there is this share squared of a whole face's flux.
-SHUT = 0.02
+# A face with a smaller open fraction counts as closed: its flux would be this fraction squared of an open face's.
+CLOSED = 0.02
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+UPRIGHT = ("left", "right")  # sides whose openings consist of upright faces
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Faces:
+    """The faces of one velocity component: upright ones (h, w + 1) for u, level ones (h + 1, w) for v."""
+
+    kind: NDArray[np.int8]
+    number: Ints  # of the faces through which fluid can move; -1 elsewhere
+    low: Floats  # where the fluid part of a face begins, 0 to 1
+    high: Floats  # where it ends
+
+    @property
+    def T(self) -> Faces:  # noqa: N802 - as numpy's
+        """The same with rows and columns exchanged."""
+        return Faces(self.kind.T, self.number.T, self.low.T, self.high.T)
 
 
 @dataclass(frozen=True, slots=True)
-class Mouth:
+class GridOpening:
     """An opening on the subcells: its faces on the border, in order along the side."""
 
     side: Side
     kind: Kind
-    faces: Ints  # (m,) numbers of moving faces
+    faces: Ints  # (m,) numbers
     inward: float  # sign of the face velocity that points into the chip
-    profile: Floats  # (m,) fluxes of the parabola whose sum is that of speed 1 over the opening's pixels
+    profile: Floats  # (m,) fluxes of a parabola whose sum is that of mean speed 1 over the opening's pixels
     vertices: tuple[Ints, Ints]  # rows and columns of the m + 1 ends of the faces
+
+    @property
+    def streamfunction_sign(self) -> float:
+        """Sign of the inflow as a change of the stream function along the side."""
+        return self.inward if self.side in UPRIGHT else -self.inward
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """Cells of k x k a pixel. u lives on vertical faces (h, w + 1), v on horizontal ones (h + 1, w), p in cells.
+    """Cells of 1 / k of a pixel. u lives on upright faces (h, w + 1), v on level faces (h + 1, w), p in cells (h, w).
 
-    Walls cut faces: fluid moves through a share of them. What is solved for is the flux of each face over the side
-    of a cell, its velocity times its share, so that the fluxes of the four sides of any cell add up to nothing.
-    Only faces through which fluid can move are numbered, u first; -1 elsewhere.
+    Walls cut faces: fluid moves through a fraction of them. The unknown is the flux of each face over the side of a
+    cell, that is its velocity times its open fraction, so the fluxes through the four sides of any cell sum to zero.
+    Only faces through which fluid can move are numbered, first those of u, then those of v.
     """
 
     k: int
-    fluid: NDArray[np.bool_]  # (h, w) subcells, whole or cut, that fluid from an opening can enter
-    kind_u: NDArray[np.int8]
-    kind_v: NDArray[np.int8]
-    number_u: Ints
-    number_v: Ints
-    number_p: Ints  # (h, w)
+    fluid: NDArray[np.bool_]  # (h, w) cells, whole or cut, that are connected to an opening
+    u: Faces
+    v: Faces
+    number_p: Ints  # (h, w) numbers of the cells, -1 elsewhere
     faces: int
     cells: int
-    mouths: tuple[Mouth, ...]
-    ends_u: tuple[Floats, Floats]  # (h, w + 1) each: where the fluid part of a face begins and ends, 0 to 1
-    ends_v: tuple[Floats, Floats]  # (h + 1, w)
-    level: Floats  # as in Outline
-    stepped: bool
+    openings: tuple[GridOpening, ...]
+    walls: LevelSet
     mask: NDArray[np.bool_]  # the chip's pixels
 
     @property
-    def share(self) -> Floats:
+    def open_fraction(self) -> Floats:
         """(faces,) the part of each face that is fluid."""
-        share = np.empty(self.faces)
-        for number, (low, high) in ((self.number_u, self.ends_u), (self.number_v, self.ends_v)):
-            open_ = number >= 0
-            share[number[open_]] = (high - low)[open_]
-        return share
+        fraction = np.empty(self.faces)
+        for faces in (self.u, self.v):
+            numbered = faces.number >= 0
+            fraction[faces.number[numbered]] = (faces.high - faces.low)[numbered]
+        return fraction
 
-    def velocity(self, moving: Floats) -> Floats:
-        """Pixel averages (..., h, w, 2) of velocity from fluxes (..., faces): zero in solid."""
-        lead = moving.shape[:-1]
-        padded = np.concatenate([moving, np.zeros((*lead, 1))], axis=-1)
-        u, v = padded[..., self.number_u], padded[..., self.number_v]
-        cells = np.stack(
-            [0.5 * (u[..., :, 1:] + u[..., :, :-1]), 0.5 * (v[..., 1:, :] + v[..., :-1, :])],
-            axis=-1,
-        )
-        return np.asarray(self._blocks(cells).mean(axis=(-4, -2)) * self.mask[..., None])
+    def velocity(self, flux: Floats) -> Floats:
+        """Pixel averages (h, w, 2) of the velocity for fluxes (faces,): zero in solid."""
+        padded = np.append(flux, 0.0)
+        u, v = padded[self.u.number], padded[self.v.number]
+        cells = np.stack([0.5 * (u[:, 1:] + u[:, :-1]), 0.5 * (v[1:] + v[:-1])], axis=-1)
+        return np.asarray(self._blocks(cells).mean(axis=(1, 3)) * self.mask[..., None])
 
     def pressure(self, cells: Floats) -> Floats:
-        """Averages (..., h, w) over the fluid subcells of each pixel of cell values (..., cells): zero in solid."""
-        padded = np.concatenate([cells, np.zeros((*cells.shape[:-1], 1))], axis=-1)
-        total = self._blocks(padded[..., self.number_p][..., None]).sum(axis=(-4, -2))[..., 0]
-        count = self._blocks(self.fluid[..., None]).sum(axis=(-4, -2))[..., 0]
+        """Averages (h, w) over the fluid cells of each pixel of cell values (cells,): zero in solid."""
+        total = self._blocks(np.append(cells, 0.0)[self.number_p][..., None]).sum(axis=(1, 3))[..., 0]
+        count = self._blocks(self.fluid[..., None]).sum(axis=(1, 3))[..., 0]
         return np.asarray(total / np.maximum(count, 1) * self.mask)
 
-    def _blocks(self, cells: NDArray[np.generic]) -> NDArray[np.float64]:
-        """(..., h k, w k, c) as (..., h, k, w, k, c)."""
-        *lead, h, w, channels = cells.shape
-        return cells.reshape(*lead, h // self.k, self.k, w // self.k, self.k, channels).astype(np.float64)
+    def _blocks(self, cells: NDArray[np.generic]) -> Floats:
+        """(h k, w k, c) as (h, k, w, k, c)."""
+        h, w, channels = cells.shape
+        return cells.reshape(h // self.k, self.k, w // self.k, self.k, channels).astype(np.float64)
 
 
-def parabola(low: Floats, high: Floats) -> Floats:
+def _parabola(low: Floats, high: Floats) -> Floats:
     """Fluxes (m,) through faces from low to high along an opening, of the parabola of mean 1 between its walls."""
     first, last = low[0], high[-1]
     a, b = (low - first) / (last - first), (high - first) / (last - first)
     return np.asarray((last - first) * ((3.0 * b**2 - 2.0 * b**3) - (3.0 * a**2 - 2.0 * a**3)), np.float64)
 
 
-def build(chip: Chip, k: int, drawn: Outline | None = None) -> Grid:
-    """Number the faces and cells of a chip; its walls are those of an outline, where one is given.
+def build(chip: Chip, k: int, walls: LevelSet | None = None) -> Grid:
+    """Number the faces and cells of a chip. `walls` replaces those of the mask.
 
     Raises
     ------
     FlowError
-        If an opening has no fluid behind it.
+        If the pixels of an opening are not one run of fluid.
     """
-    drawn = outline(chip.mask, k, chip.walls) if drawn is None else drawn
-    h, w = drawn.shape
-    level = drawn.level
-    ends_u, ends_v = _ends(level), _ends(level.T)
-    ends_v = (ends_v[0].T, ends_v[1].T)
-    open_u, open_v = (high - low >= SHUT for low, high in (ends_u, ends_v))
-    apart = _parted(level)
-    open_u[:, 1:] &= ~apart
-    open_u[:, :-1] &= ~apart
-    open_v[1:] &= ~apart
-    open_v[:-1] &= ~apart
-    spans = [_span(chip, level, open_u, open_v, k, index) for index in range(len(chip.openings))]
-    kind_u, kind_v = np.zeros((h, w + 1), np.int8), np.zeros((h + 1, w), np.int8)
+    walls = from_mask(chip.mask, k, chip.walls) if walls is None else walls
+    level = walls.level
+    low_u, high_u = _fluid_part(level)
+    low_v, high_v = (end.T for end in _fluid_part(level.T))
+    open_u, open_v = high_u - low_u >= CLOSED, high_v - low_v >= CLOSED
+    split = _split_cells(level)
+    open_u[:, 1:] &= ~split
+    open_u[:, :-1] &= ~split
+    open_v[1:] &= ~split
+    open_v[:-1] &= ~split
+    places = [
+        _opening_faces(chip, level, open_u if opening.side in UPRIGHT else open_v, k, index)
+        for index, opening in enumerate(chip.openings)
+    ]
+    kind_u, kind_v = np.zeros(open_u.shape, np.int8), np.zeros(open_v.shape, np.int8)
     kind_u[:, 1:-1] = np.where(open_u[:, 1:-1], OPEN, WALL)
     kind_v[1:-1] = np.where(open_v[1:-1], OPEN, WALL)
-    for opening, at in zip(chip.openings, spans, strict=True):
-        kinds = kind_u if opening.side in ("left", "right") else kind_v
-        kinds[at] = INLET if opening.kind == "inlet" else OUTLET
-    fluid = _fed(kind_u, kind_v)
+    for opening, place in zip(chip.openings, places, strict=True):
+        (kind_u if opening.side in UPRIGHT else kind_v)[place] = INLET if opening.kind == "inlet" else OUTLET
+    fluid = _connected(kind_u, kind_v)
     kind_u[:, 1:][~fluid], kind_u[:, :-1][~fluid] = WALL, WALL
     kind_v[1:][~fluid], kind_v[:-1][~fluid] = WALL, WALL
     number_u, u_faces = _numbered(kind_u != WALL, 0)
     number_v, faces = _numbered(kind_v != WALL, u_faces)
     number_p, cells = _numbered(fluid, 0)
-    mouths = []
-    for opening, (rows, columns) in zip(chip.openings, spans, strict=True):
-        upright = opening.side in ("left", "right")
-        ends = [np.append(rows, rows[-1] + upright), np.append(columns, columns[-1] + (not upright))]
-        low, high = (np.arange(len(rows)) + end[rows, columns] for end in (ends_u if upright else ends_v))
-        profile = parabola(low, high)
-        mouths.append(
-            Mouth(
-                opening.side,
-                opening.kind,
-                (number_u if upright else number_v)[rows, columns],
-                1.0 if opening.side in ("left", "top") else -1.0,
-                # The flux is that of the named pixels, however wide a smooth outline makes the opening.
-                profile * (opening.width_px * k / profile.sum()),
-                (ends[0], ends[1]),
-            )
-        )
-    return Grid(
-        k,
-        fluid,
-        kind_u,
-        kind_v,
-        number_u,
-        number_v,
-        number_p,
-        faces,
-        cells,
-        tuple(mouths),
-        ends_u,
-        ends_v,
-        level,
-        drawn.stepped,
-        chip.mask,
+    u, v = Faces(kind_u, number_u, low_u, high_u), Faces(kind_v, number_v, low_v, high_v)
+    openings = tuple(
+        _grid_opening(opening, u if opening.side in UPRIGHT else v, place, k)
+        for opening, place in zip(chip.openings, places, strict=True)
+    )
+    return Grid(k, fluid, u, v, number_p, faces, cells, openings, walls, chip.mask)
+
+
+def _grid_opening(opening: Opening, faces: Faces, place: tuple[Ints, Ints], k: int) -> GridOpening:
+    """An opening whose faces have these rows and columns."""
+    rows, columns = place
+    upright = opening.side in UPRIGHT
+    start = np.arange(len(rows))
+    profile = _parabola(start + faces.low[place], start + faces.high[place])
+    return GridOpening(
+        opening.side,
+        opening.kind,
+        faces.number[place],
+        1.0 if opening.side in ("left", "top") else -1.0,
+        # The flux is that of the opening's pixels, however wide a smooth contour makes it.
+        profile * (opening.width_px * k / profile.sum()),
+        (np.append(rows, rows[-1] + upright), np.append(columns, columns[-1] + (not upright))),
     )
 
 
-def _ends(level: Floats) -> tuple[Floats, Floats]:
+def _fluid_part(level: Floats) -> tuple[Floats, Floats]:
     """Begin and end (h, w + 1) of the fluid part of upright faces, 0 to 1; end <= begin where there is none.
 
-    The level runs straight between the ends of a face and its middle.
+    The level is linear between the ends of a face and its midpoint.
     """
     first, middle, last = level[:-1:2, ::2], level[1::2, ::2], level[2::2, ::2]
 
     def crossing(solid: Floats, fluid: Floats) -> Floats:
         return np.asarray(-solid / np.maximum(fluid - solid, 1e-12))
 
-    wet_first, wet, wet_last = first > 0.0, middle > 0.0, last > 0.0
-    low = np.where(wet, 0.5 * crossing(first, middle), 0.5 + 0.5 * crossing(middle, last))
-    high = np.where(wet, 1.0 - 0.5 * crossing(last, middle), 0.5 - 0.5 * crossing(middle, first))
-    low = np.where(wet_first, 0.0, np.where(wet | wet_last, low, 1.0))
-    high = np.where(wet_last, 1.0, np.where(wet | wet_first, high, 0.0))
-    split = wet_first & wet_last & ~wet
+    fluid_first, fluid, fluid_last = first > 0.0, middle > 0.0, last > 0.0
+    low = np.where(fluid, 0.5 * crossing(first, middle), 0.5 + 0.5 * crossing(middle, last))
+    high = np.where(fluid, 1.0 - 0.5 * crossing(last, middle), 0.5 - 0.5 * crossing(middle, first))
+    low = np.where(fluid_first, 0.0, np.where(fluid | fluid_last, low, 1.0))
+    high = np.where(fluid_last, 1.0, np.where(fluid | fluid_first, high, 0.0))
+    split = fluid_first & fluid_last & ~fluid
     return np.where(split, 0.5, low), np.where(split, 0.5, high)
 
 
-def _parted(level: Floats) -> NDArray[np.bool_]:
-    """Cells (h, w) with solid in the middle and separate fluid beside it: nothing may pass through."""
+def _split_cells(level: Floats) -> NDArray[np.bool_]:
+    """Cells (h, w) with solid in the centre and separate fluid at their sides: nothing may pass through."""
     corner, upright, flat = level[::2, ::2] > 0.0, level[1::2, ::2] > 0.0, level[::2, 1::2] > 0.0
     ring = [corner[:-1, :-1], flat[:-1], corner[:-1, 1:], upright[:, 1:], corner[1:, 1:], flat[1:], corner[1:, :-1]]
     ring.append(upright[:, :-1])
@@ -196,49 +197,38 @@ def _parted(level: Floats) -> NDArray[np.bool_]:
 
 
 def _numbered(where: NDArray[np.bool_], start: int) -> tuple[Ints, int]:
-    """Consecutive numbers from `start` where true, -1 elsewhere, and the next free one."""
+    """Consecutive numbers from `start` where true, -1 elsewhere, and the next free number."""
     count = int(np.count_nonzero(where))
     numbers = np.full(where.shape, -1, np.int64)
     numbers[where] = np.arange(start, start + count)
     return numbers, start + count
 
 
-def _span(
-    chip: Chip, level: Floats, open_u: NDArray[np.bool_], open_v: NDArray[np.bool_], k: int, index: int
-) -> tuple[Ints, Ints]:
-    """Rows and columns of the border faces of opening `index`: the run of open ones with most of its pixels."""
+def _opening_faces(chip: Chip, level: Floats, open_: NDArray[np.bool_], k: int, index: int) -> tuple[Ints, Ints]:
+    """Rows and columns of the border faces of opening `index`: the run of open faces with most of its pixels."""
     opening = chip.openings[index]
-    drawn, line, corner = {
-        "left": (chip.mask[:, 0], open_u[:, 0], level[::2, 0]),
-        "right": (chip.mask[:, -1], open_u[:, -1], level[::2, -1]),
-        "top": (chip.mask[0], open_v[0], level[0, ::2]),
-        "bottom": (chip.mask[-1], open_v[-1], level[-1, ::2]),
-    }[opening.side]
-    named = drawn[max(opening.first, 0) : opening.last + 1]
-    # Faces that hang together, numbered by the run they are in.
+    line, corner = border(open_, opening.side), border(level[::2, ::2], opening.side)
+    pixels = border(chip.mask, opening.side)[max(opening.first, 0) : opening.last + 1]
+    begin, end = max(opening.first, 0) * k, (opening.last + 1) * k
+    # Faces that are connected along the border have the same run number.
     run = np.cumsum(~(line & np.append(False, line[:-1] & (corner[1:-1] > 0.0))))
-    core = run[max(opening.first, 0) * k : (opening.last + 1) * k]
-    core = core[line[max(opening.first, 0) * k : (opening.last + 1) * k]]
-    if len(core) == 0 or len(named) != opening.width_px or not named.all():
+    core = run[begin:end][line[begin:end]]
+    if len(core) == 0 or len(pixels) != opening.width_px or not pixels.all():
         raise FlowError(
             f"opening {index} ({opening.side} {opening.first}..{opening.last}) of chip '{chip.name}' is not one run "
             f"of fluid (k={k}, walls={chip.walls}): correct its pixels, or try walls='pixel'"
         )
     along = np.flatnonzero(line & (run == np.bincount(core).argmax()))
-    # Fluid that lies beyond the named pixels by more than an outline can stays shut.
+    # A smooth contour can widen an opening by a pixel; fluid farther beyond its pixels stays closed.
     slack = k if chip.walls == "smooth" else 0
-    along = along[(along >= opening.first * k - slack) & (along < (opening.last + 1) * k + slack)]
-    still = np.zeros_like(along)
-    return {
-        "left": (along, still),
-        "right": (along, still + open_u.shape[1] - 1),
-        "top": (still, along),
-        "bottom": (still + open_v.shape[0] - 1, along),
-    }[opening.side]
+    along = along[(along >= opening.first * k - slack) & (along < end + slack)]
+    images = np.meshgrid(*map(np.arange, open_.shape), indexing="ij")
+    rows, columns = (border(image, opening.side)[along] for image in images)
+    return rows, columns
 
 
-def _fed(kind_u: NDArray[np.int8], kind_v: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """The cells that an opening reaches; ponds have no flow and no defined pressure. All of them in a closed box."""
+def _connected(kind_u: NDArray[np.int8], kind_v: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Cells (h, w) connected to an opening: ponds have no flow and no defined pressure. In a closed box all cells."""
     h, w = kind_v.shape[0] - 1, kind_u.shape[1] - 1
     cell = np.arange(h * w).reshape(h, w)
     right, down = kind_u[:, 1:-1] != WALL, kind_v[1:-1] != WALL
@@ -248,13 +238,9 @@ def _fed(kind_u: NDArray[np.int8], kind_v: NDArray[np.int8]) -> NDArray[np.bool_
         sp.coo_array((np.ones(len(one), bool), (one, two)), shape=(h * w, h * w)), directed=False
     )
     labels = labels.reshape(h, w)
-    sides = [
-        (kind_u[:, 0], labels[:, 0]),
-        (kind_u[:, -1], labels[:, -1]),
-        (kind_v[0], labels[0]),
-        (kind_v[-1], labels[-1]),
-    ]
-    fed = np.concatenate([line[kinds != WALL] for kinds, line in sides])
-    if len(fed) == 0:
-        fed = labels.ravel()[np.concatenate([one, two])]
-    return np.isin(labels, fed)
+    at_openings = np.concatenate(
+        [border(labels, side)[border(kind_u if side in UPRIGHT else kind_v, side) != WALL] for side in SIDES]
+    )
+    if len(at_openings) == 0:
+        at_openings = labels.ravel()[np.concatenate([one, two])]
+    return np.isin(labels, at_openings)

@@ -1,7 +1,7 @@
-"""LU factors of a matrix on a grid, and why SuperLU makes them.
+"""LU factorisation of the grid's sparse matrices, and the LRU cache that keeps factors and solutions.
 
-Measured on one thread of a shared 2.8 GHz Xeon, Stokes matrices, seconds to factorise / to solve, and MB beyond what
-was loaded:
+SuperLU with minimum-degree ordering was chosen by measurement. On one thread of a shared 2.8 GHz Xeon, Stokes
+matrices, seconds to factorise / seconds to solve, and MB of memory beyond what was in use:
 
     mask                    unknowns  SuperLU, MMD        multifrontal         UMFPACK       PARDISO       CHOLMOD
     open 512 x 512, k=1      259,584  8.9 / 0.11,  665    2.6 / 0.14, 1213     6.0 / 0.48    6.3 / 0.28    -
@@ -11,15 +11,18 @@ was loaded:
     vessels 1024, k=1         69,071  0.9 / 0.03,   67    1.2 / 0.07,  257     2.6 / 0.17    3.9 / 0.15    1.1 / 0.03
     vessels 128, k=4          26,483  0.8 / 0.01,   55    0.5 / 0.03,  209     1.0 / 0.09    1.5 / 0.08    0.4 / 0.02
 
-SuperLU and multifrontal (a nested dissection of our own with dense fronts) ran side by side, the others minutes apart
-under another load: they tell the order of magnitude. CHOLMOD needs symmetric values, which neither cut walls nor
-convection have. UMFPACK and PARDISO are as quick, not quicker, where channels are channels, and no better kept than
-what SciPy brings; multifrontal pays on wide open masks only, with twice the memory. SuperLU with a geometric nested
-dissection, with METIS and KLU were slower than with minimum degree.
+SuperLU and multifrontal (a nested dissection with dense fronts, written for the comparison) ran side by side; the
+others ran minutes apart under another load and show the order of magnitude only. CHOLMOD needs a symmetric matrix,
+which neither cut walls nor convection give. UMFPACK and PARDISO are about as fast on channels and are maintained no
+better than SciPy. Multifrontal is faster on wide open masks only and needs twice the memory. SuperLU with geometric
+nested dissection, SuperLU with METIS, and KLU were slower than SuperLU with minimum degree.
 """
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,23 +30,40 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
+from flowrec.chip.chip import Chip
+
 Floats = NDArray[np.float64]
+
+# Factors take about 5 kB a cell: the cache holds two gigabytes, or one large chip with its results.
+LARGEST_CELLS, FEWEST_ENTRIES = 400_000, 4
+
+_entries: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
+_lock = threading.Lock()
 
 
 class Factors(Protocol):
-    """What is left of a matrix that was factorised."""
+    """A factorised matrix."""
 
     def solve(self, right: Floats) -> Floats:
-        """Solution (n,) or (n, m) of right sides of the same shape."""
+        """Solution (n,) or (n, m) for right sides of the same shape."""
+
+
+class _EmptyFactors:
+    """Factors of the matrix of size zero."""
+
+    @staticmethod
+    def solve(right: Floats) -> Floats:
+        """Solution (0, ...)."""
+        return right
 
 
 def factorise(matrix: Any) -> Factors:
-    """LU factors of a sparse matrix (n, n) of symmetric pattern whose diagonal blocks are well conditioned.
+    """LU factors of a sparse matrix (n, n) with a symmetric pattern and well conditioned diagonal blocks.
 
-    Values need not be symmetric.
+    The values need not be symmetric.
     """
-    if matrix.shape[0] == 0:  # a channel of one cell between inlets has no freedom left
-        return _Nothing()
+    if matrix.shape[0] == 0:  # a channel of one cell between inlets has no degree of freedom
+        return _EmptyFactors()
     factors: Factors = splu(
         sp.csc_matrix(matrix),
         permc_spec="MMD_AT_PLUS_A",
@@ -53,10 +73,45 @@ def factorise(matrix: Any) -> Factors:
     return factors
 
 
-class _Nothing:
-    """Factors of the empty matrix."""
+def cached(key: Hashable, cells: int, compute: Callable[[], Any]) -> Any:
+    """The result of `compute` for this key, from the cache if it is still there.
 
-    @staticmethod
-    def solve(right: Floats) -> Floats:
-        """Solution (0, ...)."""
-        return right
+    The key must hold every input of `compute`, so that the cache can not change a result. `cells` is the size of the
+    result in grid cells; the least recently used results are dropped when their sum is too large.
+    """
+    with _lock:
+        if key in _entries:
+            _entries.move_to_end(key)
+            return _entries[key][0]
+    result = compute()
+    with _lock:
+        _entries[key] = (result, cells)
+        total = sum(size for _, size in _entries.values())
+        while total > LARGEST_CELLS and len(_entries) > FEWEST_ENTRIES:
+            total -= _entries.popitem(last=False)[1][1]
+    return result
+
+
+def clear_cache() -> None:
+    """Drop all cached results, as in a process that has just started."""
+    with _lock:
+        _entries.clear()
+
+
+def chip_key(chip: Chip) -> Hashable:
+    """All of a chip except its name, as part of a cache key."""
+    return (
+        chip.mask.shape,
+        chip.mask.tobytes(),
+        chip.um_per_px,
+        chip.openings,
+        chip.viscosity_mpa_s,
+        chip.density_kg_m3,
+        chip.depth_um,
+        chip.walls,
+    )
+
+
+def cell_count(chip: Chip, k: int) -> int:
+    """Number of fluid cells on k x k subcells a pixel."""
+    return int(chip.mask.sum()) * k * k

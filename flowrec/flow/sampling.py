@@ -1,46 +1,38 @@
-"""The flow between the pixel centres."""
+"""Use of a flow field: its value between pixel centres, its error, and values of fluid pixels as an image."""
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowrec.errors import FlowError
+from flowrec.interpolation import cell_at, cells_at
 from flowrec.messages import FlowField
 
 
 def sample(field: FlowField, points_um: ArrayLike) -> NDArray[np.float64]:
-    """Velocity (..., 2) in um/s at points (..., 2) in um: bilinear, zero outside the mask's image.
+    """Velocity (..., 2) in um/s at points (..., 2) in um, by bilinear interpolation; zero outside the mask's image.
 
-    Within the outer half pixel the border's values hold. One point takes a few microseconds, for use in a loop.
+    In the outer half pixel the value of the border pixel holds. A single point takes a few microseconds, for use in
+    the control loop.
     """
-    points = np.asarray(points_um, np.float64)
+    points = np.asarray(points_um, np.float64) / field.um_per_px
     velocity = field.velocity_um_s
     if points.ndim == 1:
-        return np.array(_one(velocity, float(points[0]) / field.um_per_px, float(points[1]) / field.um_per_px))
-    h, w = velocity.shape[:2]
-    x, y = points[..., 0] / field.um_per_px, points[..., 1] / field.um_per_px
-    inside = (x >= -0.5) & (x <= w - 0.5) & (y >= -0.5) & (y <= h - 0.5)
-    x = np.clip(np.where(inside, x, 0.0), 0.0, w - 1.0)
-    y = np.clip(np.where(inside, y, 0.0), 0.0, h - 1.0)
-    column, row = np.minimum(x.astype(np.intp), max(w - 2, 0)), np.minimum(y.astype(np.intp), max(h - 2, 0))
-    right, below = np.minimum(column + 1, w - 1), np.minimum(row + 1, h - 1)
-    a, b = (x - column)[..., None], (y - row)[..., None]
-    upper = (1.0 - a) * velocity[row, column] + a * velocity[row, right]
-    lower = (1.0 - a) * velocity[below, column] + a * velocity[below, right]
-    return np.asarray(np.where(inside[..., None], (1.0 - b) * upper + b * lower, 0.0), np.float64)
+        return np.array(_at_point(velocity, float(points[0]), float(points[1])))
+    cells = cells_at(points, velocity.shape)
+    return np.where(cells.inside[..., None], cells.interpolate(velocity), 0.0)
 
 
-def _one(velocity: NDArray[np.float32], x: float, y: float) -> tuple[float, float]:
+def _at_point(velocity: NDArray[np.float32], x: float, y: float) -> tuple[float, float]:
     """The same at one point (x, y) in pixels, in the same order of operations, without numpy's overhead."""
     h, w = velocity.shape[:2]
     if not (-0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5):
         return 0.0, 0.0
-    x, y = min(max(x, 0.0), w - 1.0), min(max(y, 0.0), h - 1.0)
-    column, row = min(math.floor(x), max(w - 2, 0)), min(math.floor(y), max(h - 2, 0))
-    right, below = min(column + 1, w - 1), min(row + 1, h - 1)
-    a, b = x - column, y - row
+    row, column, below, right, a, b = cell_at(x, y, velocity.shape)
     item = velocity.item
     vx, vy = (
         (1.0 - b) * ((1.0 - a) * item(row, column, c) + a * item(row, right, c))
@@ -48,3 +40,44 @@ def _one(velocity: NDArray[np.float32], x: float, y: float) -> tuple[float, floa
         for c in (0, 1)
     )
     return vx, vy
+
+
+@dataclass(frozen=True, slots=True)
+class FieldError:
+    """Relative RMSE over the fluid pixels, of each component and of the vector."""
+
+    vx: float
+    vy: float
+    v: float
+
+
+def relative_rmse(field: FlowField, truth: FlowField, mask: NDArray[np.bool_]) -> FieldError:
+    """sqrt(sum |v - v*|^2 / sum |v*|^2) over the fluid pixels of a mask (h, w), as in the paper's Table I.
+
+    A true field at rest gives NaN.
+
+    Raises
+    ------
+    FlowError
+        If the two fields have different sizes.
+    """
+    if field.velocity_um_s.shape != truth.velocity_um_s.shape:
+        raise FlowError(
+            f"flow fields of {field.velocity_um_s.shape[:2]} and {truth.velocity_um_s.shape[:2]} pixels can not be "
+            "compared; use fields of the same chip"
+        )
+    error = (field.velocity_um_s - truth.velocity_um_s)[mask].astype(np.float64)
+    true = truth.velocity_um_s[mask].astype(np.float64)
+
+    def ratio(error: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+        total = float((true**2).sum())
+        return float(np.sqrt((error**2).sum() / total)) if total > 0 else float("nan")
+
+    return FieldError(ratio(error[:, 0], true[:, 0]), ratio(error[:, 1], true[:, 1]), ratio(error, true))
+
+
+def fluid_image(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[Any]:
+    """Values (n, ...) of the fluid pixels in raster order as an image (h, w, ...) that is 0 in solid."""
+    image = np.zeros((*mask.shape, *values.shape[1:]), values.dtype)
+    image[mask] = values
+    return image

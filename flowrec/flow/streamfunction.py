@@ -1,8 +1,9 @@
-"""Flows without divergence: every admissible face velocity is w = C z + B q with a stream function z.
+"""Divergence-free flows: every admissible face flux is w = C z + B q with a stream function z.
 
-The stream function lives on the corners of the cells; a face carries the difference of its two ends. A wall carries
-nothing, so all its corners share one value; an inlet carries what it is told, so its corners follow from each other.
-The pressure drops out of C' (momentum), which leaves one small, well posed system, and mass is conserved to rounding.
+The stream function is defined on the corners of the cells; the flux of a face is the difference between its two ends.
+A wall has no flux, so all its corners have one value. An inlet has a prescribed flux, so its corners follow from one
+another. The pressure drops out of C' (momentum), which leaves one small, well posed system, and mass is conserved to
+rounding.
 """
 
 from __future__ import annotations
@@ -15,19 +16,20 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from flowrec.errors import FlowError
-from flowrec.flow.grid import WALL, Floats, Grid, Ints
+from flowrec.flow.contour_smoothing import Floats, Ints
+from flowrec.flow.grid import WALL, Grid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stream:
+class StreamBasis:
     """The basis: w (faces,) = curl @ z + inflow @ values."""
 
     curl: Any  # C (faces, unknowns)
     inflow: Floats  # B (faces, openings): columns of outlets are zero
 
 
-def assemble(grid: Grid) -> Stream:
-    """Basis of the divergence-free flows of a grid that obey walls and inlets.
+def assemble(grid: Grid) -> StreamBasis:
+    """Basis of the divergence-free flows of a grid that satisfy walls and inlets.
 
     Raises
     ------
@@ -39,63 +41,53 @@ def assemble(grid: Grid) -> Stream:
     # w = psi[head] - psi[tail]: u = d psi/dy, v = -d psi/dx.
     tail = np.concatenate([corner[:-1].ravel(), corner[:, 1:].ravel()])
     head = np.concatenate([corner[1:].ravel(), corner[:, :-1].ravel()])
-    wall = np.concatenate([grid.kind_u.ravel(), grid.kind_v.ravel()]) == WALL
+    wall = np.concatenate([grid.u.kind.ravel(), grid.v.kind.ravel()]) == WALL
     joined = sp.coo_array((np.ones(wall.sum(), bool), (tail[wall], head[wall])), shape=(corner.size, corner.size))
     _, label = connected_components(joined, directed=False)
     tail, head = label[tail[~wall]].astype(np.int64), label[head[~wall]].astype(np.int64)
 
     root, offset = _chain_inlets(grid, label[corner].astype(np.int64))
-    openings, faces = len(grid.mouths), grid.faces
-    # The gauge is the wall that most faces touch: it would be the densest row of the system.
-    ends = np.concatenate([root[tail], root[head]])
-    count = np.bincount(ends)
-    gauge = int(np.argmax(count))
+    # The gauge is the wall with most faces: its row would be the densest of the system.
+    count = np.bincount(np.concatenate([root[tail], root[head]]))
     unknown = np.full(len(root), -1, np.int64)
     used = np.flatnonzero(count)
-    used = used[used != gauge]
+    used = used[used != np.argmax(count)]
     unknown[used] = np.arange(len(used))
-    rows = np.arange(faces)
-    parts = [(rows, unknown[root[head]], 1.0), (rows, unknown[root[tail]], -1.0)]
-    curl = sum(
-        sp.coo_array((np.full((c >= 0).sum(), s), (r[c >= 0], c[c >= 0])), shape=(faces, len(used)))
-        for r, c, s in parts
-    )
-    # Row 0 of the table: corners that no inlet has moved.
-    table = np.stack([np.zeros(openings), *offset.values()])
+    rows, columns = np.tile(np.arange(grid.faces), 2), unknown[root[np.concatenate([head, tail])]]
+    signs, free = np.repeat([1.0, -1.0], grid.faces), columns >= 0
+    curl = sp.csr_array((signs[free], (rows[free], columns[free])), shape=(grid.faces, len(used)))
+    curl.eliminate_zeros()
+    # Row 0 of the table: corners without an offset.
+    table = np.stack([np.zeros(len(grid.openings)), *offset.values()])
     place = np.zeros(len(root), np.int64)
     place[list(offset)] = np.arange(1, len(table))
-    inflow = table[place[head]] - table[place[tail]]
-    curl = sp.csr_array(curl)
-    curl.eliminate_zeros()
-    return Stream(curl, inflow)
+    return StreamBasis(curl, table[place[head]] - table[place[tail]])
 
 
 def _chain_inlets(grid: Grid, label: Ints) -> tuple[Ints, dict[int, Floats]]:
-    """Tie the corners of inlets together: root of every label, and its offset (openings,) where there is one.
+    """Connect the corners of inlets: root of every label, and its offset (openings,) where there is one.
 
     psi[label] = psi[root] + offset @ values.
     """
-    openings = len(grid.mouths)
+    openings = len(grid.openings)
     root = np.arange(int(label.max()) + 1)
     offset: dict[int, Floats] = {}
     members: dict[int, list[int]] = {}
-    for index, mouth in enumerate(grid.mouths):
-        if mouth.kind != "inlet":
+    for index, opening in enumerate(grid.openings):
+        if opening.kind != "inlet":
             continue
-        corners = label[mouth.vertices]
-        # Walking along a side, psi grows by u on upright faces and falls by v on level ones.
-        sign = mouth.inward * (1.0 if mouth.side in ("left", "right") else -1.0)
-        for a, b, share in zip(corners[:-1].tolist(), corners[1:].tolist(), mouth.profile, strict=True):
-            ra, rb = int(root[a]), int(root[b])
-            if ra == rb:
+        corners = label[opening.vertices].tolist()
+        for a, b, flux in zip(corners[:-1], corners[1:], opening.profile, strict=True):
+            root_a, root_b = int(root[a]), int(root[b])
+            if root_a == root_b:
                 raise FlowError(
-                    f"inlet {index} ({mouth.side}) leads into fluid without an outlet: make one of its openings one"
+                    f"inlet {index} ({opening.side}) leads into fluid without an outlet: make one of its openings one"
                 )
             shift = offset.get(a, np.zeros(openings)).copy()
-            shift[index] += sign * share
+            shift[index] += opening.streamfunction_sign * flux
             shift -= offset.get(b, np.zeros(openings))
-            for node in members.pop(rb, [rb]):
+            for node in members.pop(root_b, [root_b]):
                 offset[node] = offset.get(node, np.zeros(openings)) + shift
-                root[node] = ra
-                members.setdefault(ra, [ra]).append(node)
+                root[node] = root_a
+                members.setdefault(root_a, [root_a]).append(node)
     return root, offset

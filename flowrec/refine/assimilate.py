@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
-from flowrec.flow.cache import cells_of, chip_key, kept
-from flowrec.flow.sensitivities import FlowResponse, State, fluid_image
+from flowrec.flow.linear_solver import cached, cell_count, chip_key
+from flowrec.flow.sampling import fluid_image
+from flowrec.flow.sensitivities import Remainder, Sensitivities
 from flowrec.messages import FlowField
 from flowrec.ranges import Range
 from flowrec.refine.discretisation_error import ModelError
@@ -108,7 +109,7 @@ class Assimilate:
         bent = False
         for _ in range(self.max_steps):
             state = response.approach(prior.offset(found.mean), state)
-            beyond = response.seen(state.beyond)
+            beyond = response.pixels(state.flux)
             if state.step <= self.tolerance:
                 break
             # Only the amplitudes follow; whom to trust is asked again at the end.
@@ -168,7 +169,7 @@ class Assimilate:
                 self.depth_std_share,
                 self.inlet_shape_std,
             )
-            response = solver.response(chip, self.depth_std_share > 0.0, self.inlet_shape_std > 0.0)
+            response = solver.sensitivities(chip, self.depth_std_share > 0.0, self.inlet_shape_std > 0.0)
             pressure = response.pressure(np.zeros(response.modes.shape[0]), response.start())
             prior = Prior.of(widths, chip, float(np.ptp(pressure)))
             grid = self.model.of(chip, solver, response)
@@ -181,7 +182,7 @@ class Assimilate:
             left = np.maximum(grid.left_std, 1e-3 * grid.left_std.max() + 1e-9)
             return _Ready(response, prior, columns, base, np.repeat(left[:, None], 2, axis=1))
 
-        made: _Ready = kept((self, solver, chip_key(chip)), cells_of(chip, solver.k) // 10, make)
+        made: _Ready = cached((self, solver, chip_key(chip)), cell_count(chip, solver.k) // 10, make)
         return made
 
 
@@ -189,7 +190,7 @@ class Assimilate:
 class _Ready:
     """The linear model of a chip: velocity = base + z columns, and its error; compact (..., n, 2) um/s."""
 
-    response: FlowResponse
+    response: Sensitivities
     prior: Prior
     columns: Floats  # (beliefs + 1, n, 2)
     base: Floats  # (n, 2)
@@ -203,7 +204,7 @@ class _Explained:
     chip: Chip
     ready: _Ready
     found: Fit
-    state: State
+    state: Remainder
     beyond: Floats  # (n, 2) um/s what inertia adds to the linear model
     chi_squared: Floats  # (m,) of each observation, with two degrees of freedom
 

@@ -60,8 +60,8 @@ class Case:
         for number, opening in enumerate(chip.openings):
             along = slice(opening.first, opening.last + 1)
             sign = 1.0 if opening.kind == "inlet" else -1.0
-            border(openings, opening.side)[along] = sign  # type: ignore[arg-type]  # a view
-            border(door, opening.side)[along] = number + 1  # type: ignore[arg-type]
+            border(openings, opening.side)[along] = sign
+            border(door, opening.side)[along] = number + 1
         px_m, mu = chip.um_per_px * M_PER_UM, initial.viscosity_mpa_s * PA_S_PER_MPA_S
         speed = float(np.abs(initial.velocity_um_s).max())
         unit_pressure = mu * speed * M_PER_UM / px_m

@@ -17,7 +17,8 @@ from scipy.ndimage import uniform_filter
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
-from flowrec.flow.sensitivities import FlowResponse, fluid_image
+from flowrec.flow.sampling import fluid_image
+from flowrec.flow.sensitivities import Sensitivities
 from flowrec.ranges import Range
 from flowrec.refine.observation_operator import Floats
 
@@ -41,13 +42,13 @@ class ModelError:
     # of the speed around a pixel: all of it, where there is no coarser grid (k = 1)
     coarse_share: Annotated[float, Range(1e-6, 10.0)] = 0.02
 
-    def of(self, chip: Chip, solver: FlowSolver, response: FlowResponse) -> GridError:
+    def of(self, chip: Chip, solver: FlowSolver, response: Sensitivities) -> GridError:
         """Of the flow at `response`, and of its modes. D is that of Stokes flow: inertia hardly changes it."""
         speed = around(chip.mask, response.base)
         if solver.k > 1:
             try:
                 fine, coarse = (
-                    replace(solver, k=k, convection=False).response(chip) for k in (solver.k, solver.k // 2)
+                    replace(solver, k=k, convection=False).sensitivities(chip) for k in (solver.k, solver.k // 2)
                 )
             except FlowError:
                 pass  # an opening too narrow for the coarse grid

@@ -15,7 +15,7 @@ from flowrec.commands.replay import Change
 from flowrec.config import load_config
 from flowrec.errors import SessionError, UsageError
 from flowrec.estimation import Observer
-from flowrec.flow.metrics import relative_rmse
+from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Estimate
 from flowrec.store import SessionReader
 from tests.conftest import SMALL

@@ -10,9 +10,9 @@ from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import find_openings, guess_inlets
 from flowrec.flow import FlowSolver
 from flowrec.flow import newton_solver as systems
-from flowrec.flow.contour_smoothing import curves
+from flowrec.flow.contour_smoothing import contour_segments
 from flowrec.flow.grid import INLET
-from flowrec.flow.level_set import analytic, outline
+from flowrec.flow.level_set import from_distance, from_mask
 
 SPEED = 100.0
 UM_PER_PX = 10.0
@@ -63,7 +63,7 @@ def solved(chip, k, drawn=None):
 
 def divergence(equations, moving):
     padded = np.append(moving, 0.0)
-    u, v = padded[equations.grid.number_u], padded[equations.grid.number_v]
+    u, v = padded[equations.grid.u.number], padded[equations.grid.v.number]
     return np.abs(np.diff(u, axis=1) + np.diff(v, axis=0)).max() / np.abs(moving).max()
 
 
@@ -71,7 +71,7 @@ def divergence(equations, moving):
 @pytest.mark.parametrize("degrees", [0.0, 7.0, 20.0, 31.0, 45.0])
 def test_a_plane_channel_at_any_angle_is_solved_without_error_when_its_walls_are_known(width, degrees):
     channel = Oblique(width, degrees, (0.13, 0.27))
-    drawn = analytic(channel.distance, channel.chip.mask.shape, 1)
+    drawn = from_distance(channel.distance, channel.chip.mask.shape, 1)
     equations, moving, pressure = solved(channel.chip, 1, drawn)
     assert divergence(equations, moving) < 1e-13
     # What is left are faces open by less than a fiftieth.
@@ -84,7 +84,7 @@ def test_a_shallow_channel_at_any_angle_has_the_resistance_of_brinkmans_equation
     # mu u'' - 12 mu u / H^2 = dp/dx between walls at +-a, of mean speed U: with r = sqrt(12) / H
     # dp/dx = -mu r^2 U / (1 - tanh(r a) / (r a)), here over the slope -3 mu U / a^2 without friction.
     channel = Oblique(8.0, degrees, (0.13, 0.27))
-    drawn = analytic(channel.distance, channel.chip.mask.shape, 2)
+    drawn = from_distance(channel.distance, channel.chip.mask.shape, 2)
     chip = replace(channel.chip, depth_um=depth_px * UM_PER_PX)
     _, _, pressure = solved(chip, 2, drawn)
     ra = np.sqrt(12.0) / depth_px * channel.width / 2
@@ -99,11 +99,11 @@ def test_a_very_shallow_channel_flows_as_fast_in_cut_faces_as_in_its_middle(degr
     # Depth much below the width: v = -H^2 / (12 mu) grad p, the same everywhere but for H / sqrt(12) beside the walls,
     # here 0.07 px.
     channel = Oblique(8.0, degrees, (0.13, 0.27))
-    drawn = analytic(channel.distance, channel.chip.mask.shape, 1)
+    drawn = from_distance(channel.distance, channel.chip.mask.shape, 1)
     equations, moving, _ = solved(replace(channel.chip, depth_um=0.25 * UM_PER_PX), 1, drawn)
-    j, i = np.nonzero(equations.grid.number_u >= 0)
-    faces = equations.grid.number_u[j, i]
-    share = equations.grid.share[faces]
+    j, i = np.nonzero(equations.grid.u.number >= 0)
+    faces = equations.grid.u.number[j, i]
+    share = equations.grid.open_fraction[faces]
     core = np.abs(channel.places(i - 0.5, j)[0]) < channel.length / 8
     speed = moving[faces] / share / (SPEED * 1e-6 * np.cos(channel.angle))
     whole, cut = speed[core & (share == 1.0)], speed[core & (share < 1.0) & (share > 0.1)]
@@ -143,7 +143,8 @@ def test_a_bend_between_circles_converges_at_second_order():
     turn, radius = np.arctan2(y + 0.5, x + 0.5), np.hypot(x + 0.5, y + 0.5)
     core = (np.abs(radius - (inner + outer) / 2) < 1.5) & (np.abs(turn - np.pi / 4) < 0.2)
     slopes = [
-        np.polyfit(turn[core], solved(chip, k, analytic(distance, mask.shape, k))[2][core], 1)[0] for k in (1, 2, 4)
+        np.polyfit(turn[core], solved(chip, k, from_distance(distance, mask.shape, k))[2][core], 1)[0]
+        for k in (1, 2, 4)
     ]
     # Stokes flow along circles: u = G / (2 mu) (r ln r + B r + C / r) for a pressure that grows by G per radian.
     b, c = np.linalg.solve([[inner, 1 / inner], [outer, 1 / outer]], [-inner * np.log(inner), -outer * np.log(outer)])
@@ -175,16 +176,18 @@ def test_no_mask_makes_mass_vanish_or_the_flow_wild(walls, k):
         grid = equations.grid
         assert np.isfinite(moving).all() and np.isfinite(pressure).all()
         assert divergence(equations, moving) < 1e-12
-        fluxes = np.array([mouth.inward * moving[mouth.faces].sum() for mouth in grid.mouths])
+        fluxes = np.array([opening.inward * moving[opening.faces].sum() for opening in grid.openings])
         asked = [SPEED * 2e-6 * o.width_px * k for o in chip.openings if o.kind == "inlet"]
-        assert [f for f, m in zip(fluxes, grid.mouths, strict=True) if m.kind == "inlet"] == pytest.approx(asked)
+        assert [f for f, m in zip(fluxes, grid.openings, strict=True) if m.kind == "inlet"] == pytest.approx(asked)
         assert abs(fluxes.sum()) < 1e-10 * np.abs(fluxes).max()
         # Nowhere faster than all of the flux through a pixel, as a parabola.
-        assert np.abs(moving / grid.share).max() < 3.0 * max(asked) / k
+        assert np.abs(moving / grid.open_fraction).max() < 3.0 * max(asked) / k
         # The pressure balances every face, so no loop is left open.
         drive = chip.boundary_values * 1e-6
         load = equations.residual(moving, drive, 0.0)
-        free = np.setdiff1d(np.arange(grid.faces), np.concatenate([m.faces for m in grid.mouths if m.kind == "inlet"]))
+        free = np.setdiff1d(
+            np.arange(grid.faces), np.concatenate([m.faces for m in grid.openings if m.kind == "inlet"])
+        )
         rest = load - equations.momentum.gradient @ equations.pressure(load[:, None])[:, 0]
         assert np.abs(rest[free]).max() < 1e-8 * np.abs(load[free]).max()
 
@@ -196,13 +199,13 @@ def test_the_outline_keeps_the_sides_of_pixels_and_the_area_of_islands():
             y, x = np.mgrid[:26, :26]
             island = np.hypot(x - x0, y - y0) < radius
             for mask, sign in ((island, 1.0), (~island, -1.0)):
-                a, b = curves(mask, 2)
+                a, b = contour_segments(mask, 2)
                 area = 0.5 * sign * np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
                 assert area == pytest.approx(island.sum(), rel=0.05)
     for seed in range(6):
         mask = nasty(seed).mask
         for k in (1, 2):
-            level = outline(mask, k, "smooth").level
+            level = from_mask(mask, k, "smooth").level
             assert np.array_equal(level[k :: 2 * k, k :: 2 * k] > 0.0, mask)
 
 
@@ -223,8 +226,8 @@ def test_a_lid_drives_a_closed_box():
     push = equations.momentum.sliding @ [0.0, 0.0, 1.0, 0.0]
     moving = equations.steady(np.zeros(0), reynolds / n, 40, 1e-9, push=push)
     assert divergence(equations, moving) < 1e-13
-    u = np.append(moving, 0.0)[equations.grid.number_u[:, n // 2]]
+    u = np.append(moving, 0.0)[equations.grid.u.number[:, n // 2]]
     # Ghia, Ghia and Shin (1982), table I, Re 100: -0.2109 at y = 0.4531; finer solutions have -0.2140.
     assert u.min() == pytest.approx(-0.2140, abs=0.006)
     assert np.isfinite(equations.pressure(equations.residual(moving, np.zeros(0), reynolds / n, push)[:, None])).all()
-    assert (equations.grid.kind_u != INLET).all()
+    assert (equations.grid.u.kind != INLET).all()

@@ -8,7 +8,8 @@ from scipy.ndimage import binary_erosion
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.errors import FlowError
-from flowrec.flow import FlowSolver, cache, sample
+from flowrec.flow import FlowSolver, sample
+from flowrec.flow.linear_solver import clear_cache
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
 from flowrec.refine.discretisation_error import ModelError, around
@@ -129,7 +130,7 @@ def test_what_is_kept_changes_no_result(twin):
     doubled = replace(case.observations, flow_um_s=2.0 * case.observations.flow_um_s)
     Refiner().refine(case.assumed, doubled, case.chip, case.solver)
     warm = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
-    cache.forget()
+    clear_cache()
     cold = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
     assert warm.same_as(cold)
 
@@ -209,7 +210,7 @@ def test_the_note_says_that_only_two_inlets_together_are_seen():
 
 def test_a_skewed_inlet_is_found_where_it_may_be_one(twin):
     case = twin(noise=0.0)
-    shaped = case.solver.response(case.chip, shapes=True)
+    shaped = case.solver.sensitivities(case.chip, shapes=True)
     skew = shaped.modes[len(case.chip.openings) + 1]
     image = np.zeros((*case.chip.mask.shape, 2))
     image[case.chip.mask] = shaped.base + 40.0 * skew
