@@ -25,7 +25,7 @@ from flowrec.chip.io import CHIP_KEYS
 from flowrec.chip.places import named_opening, opening_point_um
 from flowrec.chip.registration import Calibration
 from flowrec.control import Coils, Controller
-from flowrec.control.mission import Commander
+from flowrec.control.mission import MissionStateMachine
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
@@ -109,7 +109,7 @@ class Config:
     refine: Refiner = field(default_factory=Refiner)
     survey: SurveyPlanner = field(default_factory=SurveyPlanner)
     plan: Planner = field(default_factory=Planner)
-    mission: Commander = field(default_factory=Commander)
+    mission: MissionStateMachine = field(default_factory=MissionStateMachine)
     control: Controller = field(default_factory=Controller)
     coils: Coils = field(default_factory=Coils)
     safety: Safety = field(default_factory=Safety)
@@ -318,7 +318,7 @@ def _point(chip: Chip, place: tuple[float, float] | str, what: str, robot: Robot
     return place
 
 
-def _refuse_apart(chip: Chip, mission: Commander) -> None:
+def _refuse_apart(chip: Chip, mission: MissionStateMachine) -> None:
     """Start and goal must lie in one connected channel."""
     channels, count = label(chip.mask)
     rows, columns = chip.mask.shape
@@ -427,10 +427,10 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
             "all of a run; set one of them to 0"
         )
-    if config.control.method == "policy" and config.plan.method != "time_field":
+    if "time_to_go" in config.control.needs and config.plan.method != "time_field":
         raise UsageError(
-            f"{origin('control.method', 'plan.method')}: control.method = 'policy' goes down the time to go, which "
-            f"plan.method = {config.plan.method!r} does not know; set plan.method = 'time_field', or "
+            f"{origin('control.method', 'plan.method')}: control.method = {config.control.method!r} needs the time to "
+            f"go, which plan.method = {config.plan.method!r} does not know; set plan.method = 'time_field', or "
             "control.method = 'vector'"
         )
 

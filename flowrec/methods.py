@@ -22,6 +22,8 @@ class Method:
     summary : what it does, in one line.
     options : names of the settings of the stage that this method reads; those of no other row belong to the stage.
     extra : extra of pyproject.toml that installs what the method needs, "" if it needs none.
+    needs : what the method requires of other stages, or of its own inputs, besides what all methods get.
+    provides : what the method states in its result besides what all methods state.
     """
 
     name: str
@@ -29,6 +31,8 @@ class Method:
     summary: str
     options: tuple[str, ...] = ()
     extra: str = ""
+    needs: tuple[str, ...] = ()
+    provides: tuple[str, ...] = ()
 
     def load(self) -> Any:
         """What implements the method.

@@ -17,8 +17,8 @@ from flowrec.chip.registration import Calibration
 from flowrec.clocks import Fit
 from flowrec.config import Config, calibration_of
 from flowrec.control import Coils, Controller
-from flowrec.control.events import narrate
-from flowrec.control.mission import Commander
+from flowrec.control.events import event_of
+from flowrec.control.mission import MissionStateMachine
 from flowrec.declarations import Role, Source
 from flowrec.enums import Action
 from flowrec.estimation import HealthMonitor, Observer, Sampler
@@ -68,10 +68,10 @@ class Pipeline:
     observer: Observer
     health: HealthMonitor
     sampler: Sampler
-    commander: Commander
+    mission: MissionStateMachine
     controller: Controller
     coils: Coils
-    # The slow ones: run by work.py on order of the commander.
+    # The slow ones: run by work.py on order of the mission state machine.
     solver: FlowSolver
     refiner: Refiner
     survey: SurveyPlanner
@@ -92,7 +92,7 @@ def assemble(config: Config, chip: Chip) -> Pipeline:
         observer=config.observer,
         health=config.health,
         sampler=config.sampler,
-        commander=config.mission,
+        mission=config.mission,
         controller=config.control,
         coils=config.coils,
         solver=config.flow,
@@ -158,7 +158,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     robot = robot.limited_to(health.limit_hz)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")
-    mission = p.commander.decide(
+    mission = p.mission.update(
         last.mission,
         track,
         estimate,
@@ -180,7 +180,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         p.clearance_um,
         p.chip.um_per_px,
         _strength(p.coils, last),
-        p.observer.method == "kalman_map",
+        p.observer.uses_map,
     )
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
@@ -197,5 +197,5 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         demand=demand,
         currents=currents,
     )
-    event = narrate(last, tick, p.controller.method)
+    event = event_of(last, tick, "time_to_go" in p.controller.needs)
     return replace(tick, event=event) if event is not None else tick

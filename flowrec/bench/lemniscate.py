@@ -101,9 +101,9 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
         track = Track(stamp, True, seen, 1.0, 0, 10.0, np.zeros(4))
         applied = Applied(stamp, 0.0, 0.0, 1.0, np.zeros(3), np.array([turned.real, turned.imag]))
         estimate = observer.estimate(estimate, track, applied, robot, field)
-        known = observer.method == "kalman_map"
+        known = observer.uses_map
         demand = controller.control(
-            demand, mission, route, estimate, field, robot, None, _UM_PER_PX, observer_knows_map=known
+            demand, mission, route, estimate, field, robot, None, _UM_PER_PX, estimate_uses_map=known
         )
         flow = 1j * SPIN_PER_S * z
         miss = math.hypot(estimate.flow_um_s[0] - flow.real, estimate.flow_um_s[1] - flow.imag)

@@ -19,7 +19,6 @@ from flowrec.bench.figure_flow import need_matplotlib
 from flowrec.bench.figure_track import draw
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, Flight, World, fly, lemniscate
 from flowrec.control import Controller
-from flowrec.control.controller import Method
 from flowrec.estimation import Observer
 from flowrec.estimation.kalman import Kalman
 from flowrec.terminal import progress, table
@@ -37,7 +36,7 @@ STEP_OUTS_UM_S = (600.0, 500.0)
 class Law:
     """A controller with its observer."""
 
-    method: Method
+    method: str
     observer: str
     v_max_um_s: float = V_MAX_UM_S
 

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.control.coil_calibration import CoilFit, advice, fit_coils
+from flowrec.control.coil_calibration import CoilFit, advice, fit_coils, read_excitations
 from flowrec.control.coils import Coils
-from flowrec.control.excitations import read_excitations
 from flowrec.system.outputs import TOML, check_output, new_file
 from flowrec.terminal import say, table
 from flowrec.version import __version__

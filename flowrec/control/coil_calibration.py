@@ -1,73 +1,158 @@
-"""The coils' calibration: field = A current + bias, by least squares, and how far it is to be trusted."""
+"""Calibration of the coils from measured fields: field = A current + bias by least squares, with its uncertainty."""
 
 from __future__ import annotations
 
+import csv
+import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from flowrec.control.coil_limits import WORST_CONDITION, named
-from flowrec.control.excitations import Excitations
+from flowrec.control.amplifier import WORST_CONDITION, direction_name
 from flowrec.errors import UsageError
 
+CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
+FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
+_COLUMNS = CURRENTS + FIELDS
+_HEADER = ",".join(_COLUMNS)
+_UNIT_NAMES = {"a": "ampere", "mt": "millitesla"}
 _UNKNOWNS = 4  # of each axis: three coils and the bias
 _LEAST_ROWS = _UNKNOWNS + 1
 _GOOD_ROWS = 12
-_CHANCE = 0.05  # that a calibration without a bad row is said to have one
-_WEAK_EXCITATION = 0.05  # share of the strongest direction of the currents
+_GOOD_SET = f"{_GOOD_ROWS} are recommended: each coil alone with both signs, then some of all three at once"
+_SIGNIFICANCE = 0.05  # probability that a calibration without a wrong row is reported to have one
+_WEAK_EXCITATION = 0.05  # fraction of the strongest direction of the currents
 _NOMINAL_MT = 4.0
+_DIRECTIONS = 400  # in which the uncertainty is evaluated
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Excitations:
+    """Rows of the file. Axes are those of the chip: x and y as in the image, z up from the floor."""
+
+    currents_a: NDArray[np.float64]  # (n, 3)
+    field_mt: NDArray[np.float64]  # (n, 3)
+    lines: tuple[int, ...]  # (n,) line of each row in the file
+    name: str
+
+
+def read_excitations(path: Path) -> Excitations:
+    """Read a CSV file of currents that were set and fields that a probe at the robot's position showed.
+
+    Its columns are i_x_a, i_y_a, i_z_a, b_x_mt, b_y_mt, b_z_mt in any order; lines that begin with # are comments.
+
+    Raises
+    ------
+    UsageError : a file that can not be read, with the line.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise UsageError(f"{path}: no such file; expected rows of {_HEADER}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: can not be read as a CSV file ({error})") from error
+    rows = [
+        (number, [cell.strip() for cell in next(csv.reader([line]))])
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not rows:
+        raise UsageError(f"{path}: is empty; the first line is {_HEADER}, then one row for each excitation")
+    header_line, header = rows[0]
+    columns = _columns(header, f"{path}:{header_line}")
+    values = [_numbers(cells, columns, len(header), f"{path}:{number}") for number, cells in rows[1:]]
+    table = np.array(values, np.float64).reshape(-1, 6)
+    return Excitations(table[:, :3], table[:, 3:], tuple(number for number, _ in rows[1:]), path.name)
+
+
+def _columns(header: list[str], where: str) -> list[int]:
+    """Index of each of the six columns."""
+    given = [name.lower() for name in header]
+    if len(given) == 1 and ";" in given[0]:
+        raise UsageError(f"{where}: columns are separated by ';'; save it with commas, and points in the numbers")
+    for name in _COLUMNS:
+        if given.count(name) == 1:
+            continue
+        if given.count(name) > 1:
+            raise UsageError(f"{where}: two columns are named {name}; leave one")
+        stem, _, unit = name.rpartition("_")
+        other = next((word for word in given if stem in (word.rpartition("_")[0], word)), None)
+        if other is not None:
+            raise UsageError(
+                f"{where}: column {other!r} where {name!r} belongs: give it in {_UNIT_NAMES[unit]}, and say so in its "
+                "name"
+            )
+        raise UsageError(f"{where}: no column {name}; the header is {_HEADER}")
+    return [given.index(name) for name in _COLUMNS]
+
+
+def _numbers(cells: list[str], columns: list[int], count: int, where: str) -> list[float]:
+    """The six values of a row."""
+    if len(cells) != count:
+        raise UsageError(f"{where}: {len(cells)} values where the header has {count} columns; correct that line")
+    values = []
+    for column, name in zip(columns, _COLUMNS, strict=True):
+        try:
+            value = float(cells[column])
+        except ValueError as error:
+            raise UsageError(f"{where}: {name} = {cells[column]!r} is no number; correct that line") from error
+        if not math.isfinite(value):
+            raise UsageError(f"{where}: {name} = {cells[column]}: give a finite number or leave the row out")
+        values.append(value)
+    return values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilFit:
-    """B = A i + b with its doubts; arrays by axis of the field (rows) and coil (columns), both x, y, z."""
+    """B = A i + b with uncertainties; arrays by axis of the field (rows) and coil (columns), both x, y, z."""
 
     excitations: Excitations
     mt_per_a: NDArray[np.float64]  # (3, 3) A
     mt_per_a_std: NDArray[np.float64]  # (3, 3) standard errors
     bias_mt: NDArray[np.float64]  # (3,)
     bias_std_mt: NDArray[np.float64]  # (3,)
-    residual_mt: NDArray[np.float64]  # (n, 3) measured less fitted
+    residual_mt: NDArray[np.float64]  # (n, 3) measured minus fitted
     noise_mt: NDArray[np.float64]  # (3,) of one reading: sqrt(sum of squares / degrees of freedom)
-    freedom: int  # rows less unknowns
-    left_out_mt: NDArray[np.float64]  # (n, 3) measured less what the other rows foretell; NaN where they can not
-    score: NDArray[np.float64]  # (n, 3) that, in its own standard deviations (externally studentised); NaN likewise
-    suspicion: float  # a score beyond this is hardly chance, for all rows and axes together; inf without freedom
+    freedom: int  # degrees of freedom: rows minus unknowns
+    left_out_mt: NDArray[np.float64]  # (n, 3) measured minus predicted by the other rows; NaN where they can not
+    score: NDArray[np.float64]  # (n, 3) that in its own standard deviations (externally studentised); NaN likewise
+    suspicion: float  # critical score for all rows and axes together; inf without degrees of freedom
     uncertainty_mt: float  # standard error of a nominal field in the worst direction, from the fit alone
 
     @property
     def suspects(self) -> list[int]:
-        """Rows to look at again, worst first."""
+        """Rows whose residual is significant, worst first."""
         worst = np.nan_to_num(np.abs(self.score), posinf=np.inf).max(axis=1)
         return [int(row) for row in np.argsort(-worst) if worst[row] > self.suspicion]
 
     @property
     def unchecked(self) -> list[int]:
-        """Rows that no other row confirms: without them the fit has no answer, so any error in them passes."""
+        """Rows that no other row confirms: without them the fit is singular, so an error in them is not visible."""
         return [int(row) for row in np.flatnonzero(np.isnan(self.left_out_mt).any(axis=1))]
 
     @property
     def condition(self) -> float:
-        """The strongest direction of the coils over the weakest: how many times the current one field can cost."""
+        """Condition number of A: the largest ratio of the currents that two fields of one amplitude need."""
         return float(np.linalg.cond(self.mt_per_a))
 
     @property
     def weakest(self) -> tuple[str, float]:
-        """The direction of the field that costs most current, and what one ampere makes there, mT/A."""
-        directions, strength, _ = np.linalg.svd(self.mt_per_a)
-        return named(directions[:, -1]), float(strength[-1])
+        """The direction of the field that needs most current, and the field per ampere there, mT/A."""
+        directions, gain, _ = np.linalg.svd(self.mt_per_a)
+        return direction_name(directions[:, -1]), float(gain[-1])
 
 
 def fit_coils(excitations: Excitations) -> CoilFit:
-    """The calibration that the rows say.
+    """Fit A and b by least squares.
 
-    Leave-one-out residuals come from the leverages h of the one fit: e / (1 - h).
+    Leave-one-out residuals follow from the leverages h of the one fit: e / (1 - h).
 
     Raises
     ------
-    UsageError : rows that do not suffice, and which to add; coils that do not span the room.
+    UsageError : too few or dependent rows, and which to add; coils whose fields are linearly dependent.
     """
     currents, field, where = excitations.currents_a, excitations.field_mt, excitations.name
     _refuse_too_little(excitations)
@@ -85,18 +170,18 @@ def fit_coils(excitations: Excitations) -> CoilFit:
     left_out = residual / free
     score, suspicion = np.full_like(residual, np.nan), np.inf
     if freedom > 1:
-        # One probe, one noise: that of all axes of the other rows, as one axis alone has too few to tell a bad row by.
-        # A set that fits exactly has none, and nothing stands out of nothing.
+        # All axes share one probe and so one noise, estimated from all axes of the other rows: one axis alone has too
+        # few of them. The floor keeps rounding errors of an exact fit from being significant.
         others = np.maximum((residual**2).sum() - (residual**2 / free).sum(1), 0.0) / (3 * (freedom - 1))
         floor = (1e-12 * max(float(np.abs(field).max()), 1e-12)) ** 2
         score = residual / np.sqrt((others[:, None] + floor) * free)
-        suspicion = float(student.ppf(1.0 - 0.5 * _CHANCE / residual.size, 3 * (freedom - 1)))
+        suspicion = float(student.ppf(1.0 - 0.5 * _SIGNIFICANCE / residual.size, 3 * (freedom - 1)))
     A = solution[:3].T
-    strength = np.linalg.svd(A, compute_uv=False)
-    if strength[-1] * WORST_CONDITION <= strength[0]:
+    directions, gain, _ = np.linalg.svd(A)
+    if gain[-1] * WORST_CONDITION <= gain[0]:
         raise UsageError(
-            f"{where}: these coils make no field along {named(np.linalg.svd(A)[0][:, -1])} ({strength[-1]:.3g} mT/A, "
-            f"{strength[0]:.3g} in the best direction); is a coil not connected, or a probe axis dead?"
+            f"{where}: these coils make no field along {direction_name(directions[:, -1])} ({gain[-1]:.3g} mT/A, "
+            f"{gain[0]:.3g} in the best direction); is a coil not connected, or a probe axis dead?"
         )
     return CoilFit(
         excitations=excitations,
@@ -115,43 +200,38 @@ def fit_coils(excitations: Excitations) -> CoilFit:
 
 
 def advice(fit: CoilFit) -> list[str]:
-    """What would make it better, in sentences; empty where nothing would much."""
-    said, lines = [], fit.excitations.lines
+    """How to improve the calibration, in sentences; empty if nothing would improve it much."""
+    sentences, lines = [], fit.excitations.lines
     for row in fit.suspects:
         axis = int(np.nanargmax(np.abs(fit.score[row])))
-        said.append(
+        sentences.append(
             f"line {lines[row]}: b_{'xyz'[axis]}_mt is {fit.left_out_mt[row, axis]:+.3g} mT off what the other rows "
-            f"foretell ({abs(fit.score[row, axis]):.0f} standard deviations); measure it again or leave it out"
+            f"predict ({abs(fit.score[row, axis]):.0f} standard deviations); measure it again or leave it out"
         )
     if fit.unchecked:
-        said.append(
+        sentences.append(
             f"line {', '.join(str(lines[row]) for row in fit.unchecked)}: no other row excites what this one does, so "
             "an error in it would not be seen; add its opposite"
         )
     if len(lines) < _GOOD_ROWS:
-        said.append(
-            f"{len(lines)} rows leave {fit.freedom} to judge the residuals by; {_GOOD_ROWS} do well: each coil alone "
-            "with both signs, then some of all three at once"
-        )
-    currents = fit.excitations.currents_a
-    one_sided = [
-        "xyz"[c] for c in range(3) if currents[:, c].min() > -0.2 * currents[:, c].max() or currents[:, c].max() <= 0.0
-    ]
+        sentences.append(f"{len(lines)} rows leave {fit.freedom} degrees of freedom for the residuals; {_GOOD_SET}")
+    low, high = fit.excitations.currents_a.min(axis=0), fit.excitations.currents_a.max(axis=0)
+    one_sided = ["xyz"[c] for c in range(3) if low[c] > -0.2 * high[c] or high[c] <= 0.0]
     if one_sided:
-        said.append(
+        sentences.append(
             f"coil {', '.join(one_sided)} was driven one way only: add rows with the opposite sign, to tell the bias "
             "from the coil"
         )
-    return said
+    return sentences
 
 
 def _refuse_too_little(excitations: Excitations) -> None:
-    """Raise UsageError where the rows can not tell the twelve unknowns apart, and say what to add."""
+    """Raise UsageError if the rows do not determine the twelve unknowns, and say what to add."""
     currents, where = excitations.currents_a, excitations.name
     if len(currents) < _LEAST_ROWS:
         raise UsageError(
             f"{where}: {len(currents)} rows; three coils and a bias take {_UNKNOWNS}, and {_LEAST_ROWS} to see any "
-            f"residual; {_GOOD_ROWS} do well: each coil alone with both signs, then some of all three at once"
+            f"residual; {_GOOD_SET}"
         )
     spread = currents - currents.mean(0)
     _, size, directions = np.linalg.svd(spread, full_matrices=False)
@@ -178,11 +258,11 @@ def _refuse_too_little(excitations: Excitations) -> None:
 def _uncertainty_mt(
     A: NDArray[np.float64], bias: NDArray[np.float64], variance: NDArray[np.float64], unscaled: NDArray[np.float64]
 ) -> float:
-    """Standard error of the field, by the fit alone, where a nominal one is asked for; the worst of 400 directions."""
-    k = np.arange(400) + 0.5
-    up, around = 1.0 - k / 200.0, np.pi * (1.0 + 5.0**0.5) * k
-    ring = np.sqrt(1.0 - up**2)
-    wanted = _NOMINAL_MT * np.column_stack([ring * np.cos(around), ring * np.sin(around), up])
-    x = np.column_stack([np.linalg.solve(A, (wanted - bias).T).T, np.ones(len(k))])
+    """Standard error of a nominal field, from the fit alone: the largest over directions on a spiral on the sphere."""
+    k = np.arange(_DIRECTIONS) + 0.5
+    z, azimuth = 1.0 - k / (0.5 * _DIRECTIONS), np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z**2)
+    field = _NOMINAL_MT * np.column_stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z])
+    x = np.column_stack([np.linalg.solve(A, (field - bias).T).T, np.ones(len(k))])
     spread = np.einsum("ni,ij,nj->n", x, unscaled, x)
     return float(np.sqrt(spread.max() * variance.sum()))

@@ -1,10 +1,13 @@
-"""The commander: which phase a run is in, what work it waits for, and when it is over."""
+"""The mission state machine: the phase of a run, the work order that it waits for, and the end of the run.
+
+Notes and outcomes are part of recorded sessions and are compared exactly in a replay: their texts do not change.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
@@ -17,14 +20,46 @@ Phase = Literal["survey", "refine", "plan", "navigate"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Place = tuple[Coordinate, Coordinate] | str
+_SWEPT_RADII, _RETURNED_RADII = 2.0, 1.0  # from its position, of a held robot
+_EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """What the state machine knows after one frame."""
+
+    track: Track
+    estimate: Estimate
+    assumed: FlowField | None
+    refined: FlowField | None
+    route: Route | None
+    operator: OperatorEvent | None
+    demand: Demand | None  # of the frame before; its error is the distance of the robot from its route
+    robot: Robot
+    applied: Applied | None
+
+    @property
+    def now_ns(self) -> int:
+        return self.track.stamp_ns
+
+    @property
+    def command(self) -> str:
+        """What the operator asked for on this frame, '' if nothing."""
+        return self.operator.action if self.operator is not None and self.operator.stamp_ns == self.now_ns else ""
+
+    def result(self, mission: Mission) -> FlowField | Route | None:
+        """The result that the mission waits for, once it has arrived."""
+        results = {"solve": self.assumed, "refine": self.refined, "survey_route": self.route, "route": self.route}
+        result = results.get(mission.wanted)
+        return result if result is not None and result.request == mission.request else None
 
 
 @dataclass(frozen=True, slots=True)
-class Commander:
+class MissionStateMachine:
     """Phases of the mission and the limits that end it.
 
-    `phases` is any selection of survey, refine, plan, navigate; navigate always plans first. `start` and `goal`
-    are points (x, y) in um on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
+    `phases` is any selection of survey, refine, plan, navigate; navigate always plans first. `start` and `goal` are
+    points (x, y) in um on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
     """
 
     phases: tuple[Phase, ...] = PHASES
@@ -33,23 +68,22 @@ class Commander:
     goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
     survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0
     navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
-    # no route is followed for longer than this many times its planned time, and 5 s
+    # no route is followed for longer than this factor times its planned duration, plus 5 s
     patience: Annotated[float, Range(0.1, 1e3)] = 3.0
-    # solved, refined and planned so often and still blown off: it is no use
+    # number of work orders after which a robot that is blown off its route once more gives up
     orders_limit: Annotated[int, Range(1, 1_000_000)] = 20
-    find_limit_s: Annotated[float, Range(0.01, 1e5)] = (
-        3.0  # to see the robot for the first time, or again after the field was switched off
-    )
-    # in a row without seeing it before the run gives up
+    # to see the robot for the first time, or again after the field was switched off
+    find_limit_s: Annotated[float, Range(0.01, 1e5)] = 3.0
+    # consecutive frames without the robot after which the run ends
     lost_limit_frames: Annotated[int, Range(1, 1_000_000_000)] = 90
-    # without sight of the robot: it stays where it is ...
+    # time without sight of the robot after which it is held
     hold_after_s: Annotated[float, Range(0.0, 60.0)] = 0.5
-    # ... and the field is switched off until it is seen again
+    # time without sight of the robot after which the field is switched off until it is seen again
     zero_after_s: Annotated[float, Range(0.0, 60.0)] = 1.4
-    # None: six radii; blown this far off the route, plan anew
+    # distance from the route beyond which a new one is planned; None: six radii
     replan_error_um: Annotated[float, Range(1.0, math.inf)] | None = None
 
-    def decide(
+    def update(
         self,
         previous: Mission | None,
         track: Track,
@@ -64,115 +98,96 @@ class Commander:
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
-        `demand` is the one of the frame before: it tells how far the robot is from its route. Where `applied` does
-        not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
+        `demand` is that of the frame before: its error is the distance of the robot from its route. Where `applied`
+        does not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
         """
-        now_ns = track.stamp_ns
-        asked = operator.action if operator is not None and operator.stamp_ns == now_ns else ""
+        now = _Frame(track, estimate, assumed, refined, route, operator, demand, robot, applied)
         if previous is None:
-            first = self._first(now_ns, assumed)
-            return self._told(first, now_ns, operator, asked) if asked else first
+            return self._after_command(self._first(now), now)
         if previous.finished:
             return previous
-        if (told := self._told(previous, now_ns, operator, asked)).finished:
-            return told
-        if (verdict := self._lost(previous, track, now_ns)) is not None:
-            return verdict
-        if told is not previous:
-            return told
-        if applied is not None and (sight := self._blinded(previous, track, applied)) is not previous:
-            return sight
-        if previous.blind_since_ns is not None:
-            return previous
+        commanded = self._after_command(previous, now)
+        if commanded.finished:
+            return commanded
+        lost = self._lost(previous, now)
+        if lost is not None:
+            return lost
+        if commanded is not previous:
+            return commanded
+        without_sight = self._without_sight(previous, now)
+        if without_sight is not previous or previous.blind_since_ns is not None:
+            return without_sight
         if previous.held_since_ns is not None:
-            return self._swept(previous, now_ns, track, demand, robot)
-        answer = self._answer(previous, assumed, refined, route)
-        if previous.wanted and answer is None:
-            return previous
-        return self._advance(previous, now_ns, track, estimate, answer, route, demand, robot)
+            return _held(previous, now)
+        result = now.result(previous)
+        return previous if previous.wanted and result is None else self._advance(previous, now, result)
 
-    def _first(self, now_ns: int, assumed: FlowField | None) -> Mission:
-        goal = np.asarray(self.goal, np.float64)
-        known = assumed is not None  # a field of an earlier session was handed in
+    def _first(self, now: _Frame) -> Mission:
+        has_field = now.assumed is not None  # of an earlier session
         return Mission(
-            stamp_ns=now_ns,
+            stamp_ns=now.now_ns,
             phase="start",
-            since_ns=now_ns,
-            request=0 if known else 1,
-            wanted="" if known else "solve",
-            requested_ns=now_ns,
+            since_ns=now.now_ns,
+            request=0 if has_field else 1,
+            wanted="" if has_field else "solve",
+            requested_ns=now.now_ns,
             start_um=np.asarray(self.start, np.float64),
-            goal_um=goal,
+            goal_um=np.asarray(self.goal, np.float64),
             finished=False,
             outcome="",
             note="",
         )
 
-    def _told(self, mission: Mission, now_ns: int, operator: OperatorEvent | None, asked: str) -> Mission:
-        """What the operator's word makes of the mission; the mission itself where it makes no difference.
+    def _after_command(self, mission: Mission, now: _Frame) -> Mission:
+        """The mission after the operator's command; the mission itself if there is none.
 
-        A held mission does not go on, whatever it waits for, and its limits of time wait with it.
+        A held mission does not advance, whatever it waits for, and its time limits are suspended.
         """
-        if asked in ("stop", "zero"):
-            note = operator.text if operator is not None else ""
-            return self._finish(mission, now_ns, "stopped", note or f"operator: {asked}")
-        since_ns = mission.held_since_ns
-        if asked == "pause" and since_ns is None:
-            return replace(mission, stamp_ns=now_ns, held_since_ns=now_ns)
-        if asked == "resume" and since_ns is not None:
-            held_ns = mission.held_ns + now_ns - since_ns
-            return replace(mission, stamp_ns=now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
+        command, since_ns = now.command, mission.held_since_ns
+        if command in ("stop", "zero"):
+            note = now.operator.text if now.operator is not None else ""
+            return _finish(mission, now, "stopped", note or f"operator: {command}")
+        if command == "pause" and since_ns is None:
+            return replace(mission, stamp_ns=now.now_ns, held_since_ns=now.now_ns)
+        if command == "resume" and since_ns is not None:
+            held_ns = mission.held_ns + now.now_ns - since_ns
+            return replace(mission, stamp_ns=now.now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
         return mission
 
-    @staticmethod
-    def _swept(held: Mission, now_ns: int, track: Track, demand: Demand | None, robot: Robot) -> Mission:
-        """Whether a held robot is carried off its place: said from two radii on, taken back within one."""
-        if not track.seen or demand is None or not math.isfinite(demand.error_um):
-            return held
-        swept = demand.error_um > (1.0 if held.swept else 2.0) * robot.radius
-        return held if swept == held.swept else replace(held, stamp_ns=now_ns, swept=swept)
-
-    @staticmethod
-    def _passed_s(mission: Mission, now_ns: int) -> float:
-        """How long the phase has lasted, the time under a hold left out."""
-        held_ns = mission.held_ns if mission.held_since_ns is None else mission.held_ns + now_ns - mission.held_since_ns
-        return seconds(now_ns - mission.since_ns - held_ns)
-
-    def _lost(self, previous: Mission, track: Track, now_ns: int) -> Mission | None:
-        if track.seen:
+    def _lost(self, previous: Mission, now: _Frame) -> Mission | None:
+        """The end of a run whose robot was not found, or not seen for too many frames."""
+        if now.track.seen:
             return None
         if previous.phase == "start":
-            if self._passed_s(previous, now_ns) > self.find_limit_s:
-                return self._finish(
-                    previous,
-                    now_ns,
-                    "not found",
+            if _elapsed_s(previous, now) > self.find_limit_s:
+                note = (
                     f"no robot seen in the image for {self.find_limit_s:g} s; is it in view (camera.um_per_px), "
-                    "and of the size in robot.radius_um?",
+                    "and of the size in robot.radius_um?"
                 )
-        elif track.lost_frames > self.lost_limit_frames:
+                return _finish(previous, now, "not found", note)
+        elif now.track.lost_frames > self.lost_limit_frames:
             why = f"{previous.blind}, " if previous.blind else "robot not seen in "
-            return self._finish(previous, now_ns, "lost", f"{why}{track.lost_frames} frames")
+            return _finish(previous, now, "lost", f"{why}{now.track.lost_frames} frames")
         return None
 
-    def _blinded(self, previous: Mission, track: Track, applied: Applied) -> Mission:
-        """Hold, then no field, then the end for a robot that is out of sight; on its way again when it is seen.
+    def _without_sight(self, previous: Mission, now: _Frame) -> Mission:
+        """Without sight of the robot: hold it, then switch the field off, then end; continue when it is seen again.
 
-        Where it was carried meanwhile, a route that is too far off is planned anew, as after any other disturbance.
+        If it was carried too far off its route meanwhile, a new one is planned as after any other disturbance.
         """
-        now_ns, seen_ns, image_ns = track.stamp_ns, track.seen_ns, applied.image_since_ns
-        if seen_ns is None or image_ns is None:  # never seen, so nothing is driven yet; or an older file
+        applied, now_ns, seen_ns = now.applied, now.now_ns, now.track.seen_ns
+        if applied is None or seen_ns is None or applied.image_since_ns is None:  # never seen yet, or an older session
             return previous
-        if track.seen:
+        if now.track.seen:
             if previous.blind_since_ns is None:
                 return previous
             return replace(previous, stamp_ns=now_ns, blind_since_ns=None, blind="", field_off=False)
         unseen_s = seconds(now_ns - seen_ns)
         why = f"robot not seen since {seconds(seen_ns):.1f} s"
         if applied.repeats_image:
-            why = f"the camera repeats one image since {seconds(image_ns):.1f} s"
+            why = f"the camera repeats one image since {seconds(applied.image_since_ns):.1f} s"
         if unseen_s >= self.zero_after_s + self.find_limit_s:
-            return self._finish(previous, now_ns, "lost", why)
+            return _finish(previous, now, "lost", why)
         if unseen_s >= self.zero_after_s and not previous.field_off:
             since_ns = now_ns if previous.blind_since_ns is None else previous.blind_since_ns
             return replace(previous, stamp_ns=now_ns, blind_since_ns=since_ns, blind=why, field_off=True)
@@ -180,140 +195,129 @@ class Commander:
             return replace(previous, stamp_ns=now_ns, blind_since_ns=now_ns, blind=why)
         return previous
 
-    @staticmethod
-    def _answer(
-        mission: Mission, assumed: FlowField | None, refined: FlowField | None, route: Route | None
-    ) -> FlowField | Route | None:
-        """The result that the mission waits for, once it is there."""
-        answers = {"solve": assumed, "refine": refined, "survey_route": route, "route": route}
-        result = answers.get(mission.wanted)
-        return result if result is not None and result.request == mission.request else None
-
-    def _advance(
-        self,
-        previous: Mission,
-        now_ns: int,
-        track: Track,
-        estimate: Estimate,
-        answer: FlowField | Route | None,
-        route: Route | None,
-        demand: Demand | None,
-        robot: Robot,
-    ) -> Mission:
-        """What follows when no work is pending, or it has just been answered."""
-        if not track.seen and previous.phase != "start":
-            return previous  # nothing is begun with a robot that is out of sight
-        if previous.phase == "start":
-            if isinstance(answer, Route):  # the survey's
-                if answer.reachable:
-                    return self._enter(previous, now_ns, "survey", answer.reason)
-                return self._next_after("survey", previous, now_ns, estimate, f"no survey: {answer.reason}")
-            if not track.seen:
-                return replace(previous, stamp_ns=now_ns, wanted="") if previous.wanted else previous
+    def _advance(self, previous: Mission, now: _Frame, result: FlowField | Route | None) -> Mission:
+        """The next state when no work is pending, or its result has just arrived."""
+        phase, route = previous.phase, now.route
+        if not now.track.seen and phase != "start":
+            return previous  # nothing begins while the robot is out of sight
+        if phase == "start":
+            if isinstance(result, Route):  # of the survey
+                if result.reachable:
+                    return _transition(previous, now, "survey", result.reason)
+                return self._next_phase("survey", previous, now, f"no survey: {result.reason}")
+            if not now.track.seen:
+                return replace(previous, stamp_ns=now.now_ns, wanted="") if previous.wanted else previous
             if "survey" in self.phases:
-                return self._order(previous, now_ns, "start", "survey_route", estimate)
-            return self._next_after("survey", previous, now_ns, estimate, "")
-        if previous.phase == "survey":
-            assert route is not None
-            late = self._passed_s(previous, now_ns) > self._limit_s(self.survey_limit_s, route)
-            if late or self._at_end(estimate, route, demand, robot):
-                note = "survey cut short by its time limit" if late else ""
-                return self._next_after("survey", previous, now_ns, estimate, note)
-            return previous
-        if previous.phase == "refine":
-            return self._next_after("refine", previous, now_ns, estimate, "")
-        if previous.phase == "plan":
-            assert isinstance(answer, Route)
-            if not answer.reachable:
-                return self._finish(previous, now_ns, "unreachable", answer.reason)
-            return self._next_after("plan", previous, now_ns, estimate, answer.reason)
+                return _order(previous, now, "start", "survey_route")
+            return self._next_phase("survey", previous, now)
+        if phase == "refine":
+            return self._next_phase("refine", previous, now)
+        if phase == "plan":
+            assert isinstance(result, Route)
+            if not result.reachable:
+                return _finish(previous, now, "unreachable", result.reason)
+            return self._next_phase("plan", previous, now, result.reason)
         assert route is not None
-        return self._navigate(previous, now_ns, track, estimate, route, demand, robot)
+        if phase == "survey":
+            late = _elapsed_s(previous, now) > self._time_limit_s(self.survey_limit_s, route)
+            if late or _at_end(now, route):
+                return self._next_phase("survey", previous, now, "survey cut short by its time limit" if late else "")
+            return previous
+        return self._navigate(previous, now, route)
 
-    def _limit_s(self, limit_s: float, route: Route) -> float:
-        """How long a route may be followed: a robot that is stuck will not get there by waiting."""
-        return min(limit_s, self.patience * float(route.arrival_s[-1]) + 5.0)
+    def _time_limit_s(self, limit_s: float, route: Route) -> float:
+        """How long a route may be followed: for a robot that is stuck, waiting does not help."""
+        return min(limit_s, self.patience * float(route.arrival_s[-1]) + _EXTRA_S)
 
-    def _navigate(
-        self,
-        previous: Mission,
-        now_ns: int,
-        track: Track,
-        estimate: Estimate,
-        route: Route,
-        demand: Demand | None,
-        robot: Robot,
-    ) -> Mission:
-        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else robot.radius
-        if track.seen and math.dist(estimate.position_um, previous.goal_um) <= tolerance_um:
-            return self._finish(previous, now_ns, "reached", "")
-        limit_s = self._limit_s(self.navigate_limit_s, route)
-        if self._passed_s(previous, now_ns) > limit_s:
+    def _navigate(self, previous: Mission, now: _Frame, route: Route) -> Mission:
+        """At the goal, too late, too far off the route, or still on the way."""
+        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius
+        if math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
+            return _finish(previous, now, "reached")
+        limit_s = self._time_limit_s(self.navigate_limit_s, route)
+        if _elapsed_s(previous, now) > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
-            return self._finish(previous, now_ns, "timeout", note)
-        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * robot.radius
-        if track.seen and demand is not None and demand.error_um > limit_um:
-            if previous.request >= self.orders_limit:
-                note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
-                return self._finish(previous, now_ns, "gave up", note)
-            note = f"blown {demand.error_um:.0f} um off the route: planning anew"
-            return self._order(previous, now_ns, "plan", "route", estimate, note)
+            return _finish(previous, now, "timeout", note)
+        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius
+        if now.demand is None or not now.demand.error_um > limit_um:
+            return previous
+        if previous.request >= self.orders_limit:
+            note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
+            return _finish(previous, now, "gave up", note)
+        return _order(
+            previous, now, "plan", "route", f"blown {now.demand.error_um:.0f} um off the route: planning anew"
+        )
+
+    def _next_phase(self, done: Phase, previous: Mission, now: _Frame, note: str = "") -> Mission:
+        """Enter the first selected phase after `done`, or end the run."""
+        selected = {*self.phases, "plan"} if "navigate" in self.phases else set(self.phases)
+        phase = next((phase for phase in PHASES[PHASES.index(done) + 1 :] if phase in selected), None)
+        if phase is None:
+            return _finish(previous, now, f"{done} complete", note)
+        wanted = {"refine": "refine", "plan": "route"}.get(phase)
+        return _order(previous, now, phase, wanted, note) if wanted else _transition(previous, now, phase, note)
+
+
+def _held(previous: Mission, now: _Frame) -> Mission:
+    """Whether a held robot is swept away: from two radii off its position on, until it is back within one."""
+    if not now.track.seen or now.demand is None or not math.isfinite(now.demand.error_um):
         return previous
+    limit_radii = _RETURNED_RADII if previous.swept else _SWEPT_RADII
+    swept = now.demand.error_um > limit_radii * now.robot.radius
+    return previous if swept == previous.swept else replace(previous, stamp_ns=now.now_ns, swept=swept)
 
-    def _next_after(self, done: str, previous: Mission, now_ns: int, estimate: Estimate, note: str) -> Mission:
-        """Enter the first chosen phase behind `done`, or end the run."""
-        chosen = [*self.phases, "plan"] if "navigate" in self.phases else list(self.phases)
-        for phase in PHASES[PHASES.index(done) + 1 :]:
-            if phase not in chosen:
-                continue
-            if phase == "refine":
-                return self._order(previous, now_ns, "refine", "refine", estimate, note)
-            if phase == "plan":
-                return self._order(previous, now_ns, "plan", "route", estimate, note)
-            return self._enter(previous, now_ns, "navigate", note)
-        return self._finish(previous, now_ns, f"{done} complete", note)
 
-    @staticmethod
-    def _at_end(estimate: Estimate, route: Route, demand: Demand | None, robot: Robot) -> bool:
-        """Reached, or the reference has arrived and the robot is as near as it will come."""
-        close = math.dist(estimate.position_um, route.waypoints_um[-1]) <= robot.radius
-        arrived = demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2 * robot.radius
-        return close or arrived
+def _elapsed_s(mission: Mission, now: _Frame) -> float:
+    """How long the phase has lasted, without the time during which it was held."""
+    held_ns = mission.held_ns
+    if mission.held_since_ns is not None:
+        held_ns += now.now_ns - mission.held_since_ns
+    return seconds(now.now_ns - mission.since_ns - held_ns)
 
-    @staticmethod
-    def _enter(previous: Mission, now_ns: int, phase: str, note: str) -> Mission:
-        return replace(previous, stamp_ns=now_ns, phase=phase, since_ns=now_ns, wanted="", note=note, held_ns=0)
 
-    @staticmethod
-    def _order(previous: Mission, now_ns: int, phase: str, wanted: str, estimate: Estimate, note: str = "") -> Mission:
-        return replace(
-            previous,
-            stamp_ns=now_ns,
-            phase=phase,
-            since_ns=previous.since_ns if phase == previous.phase else now_ns,
-            held_ns=previous.held_ns if phase == previous.phase else 0,
-            request=previous.request + 1,
-            wanted=wanted,
-            requested_ns=now_ns,
-            start_um=estimate.position_um,
-            note=note,
-        )
+def _at_end(now: _Frame, route: Route) -> bool:
+    """Whether the robot is at the end of a route, or the reference is and the robot as near as it comes."""
+    if math.dist(now.estimate.position_um, route.waypoints_um[-1]) <= now.robot.radius:
+        return True
+    demand = now.demand
+    return demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * now.robot.radius
 
-    @staticmethod
-    def _finish(previous: Mission, now_ns: int, outcome: str, note: str) -> Mission:
-        return replace(
-            previous,
-            stamp_ns=now_ns,
-            phase="done",
-            since_ns=now_ns,
-            wanted="",
-            finished=True,
-            outcome=outcome,
-            note=note,
-            held_since_ns=None,
-            held_ns=0,
-            swept=False,
-            blind_since_ns=None,
-            blind="",
-            field_off=False,
-        )
+
+def _transition(
+    previous: Mission, now: _Frame, phase: str, note: str = "", wanted: str = "", **changes: Any
+) -> Mission:
+    """The mission in a phase, which begins now unless it is the present one."""
+    new = phase != previous.phase
+    return replace(
+        previous,
+        stamp_ns=now.now_ns,
+        phase=phase,
+        since_ns=now.now_ns if new else previous.since_ns,
+        held_ns=0 if new else previous.held_ns,
+        wanted=wanted,
+        note=note,
+        **changes,
+    )
+
+
+def _order(previous: Mission, now: _Frame, phase: str, wanted: str, note: str = "") -> Mission:
+    """The mission in a phase that waits for a new work order."""
+    request, start_um = previous.request + 1, now.estimate.position_um
+    return _transition(previous, now, phase, note, wanted, request=request, requested_ns=now.now_ns, start_um=start_um)
+
+
+def _finish(previous: Mission, now: _Frame, outcome: str, note: str = "") -> Mission:
+    """The finished mission."""
+    return _transition(
+        previous,
+        now,
+        "done",
+        note,
+        finished=True,
+        outcome=outcome,
+        held_since_ns=None,
+        swept=False,
+        blind_since_ns=None,
+        blind="",
+        field_off=False,
+    )

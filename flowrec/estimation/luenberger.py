@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.messages import Applied, Estimate, Track
+from flowrec.messages import Applied, Estimate, FlowField, Track
 from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
@@ -22,7 +22,14 @@ class Luenberger:
     # one sigma, for the stated covariance only; None: 4 % of the radius
     position_noise_um: Annotated[float, Range(1e-4, 1e4)] | None = None
 
-    def estimate(self, previous: Estimate | None, track: Track, applied: Applied, robot: Robot) -> Estimate:
+    def estimate(
+        self,
+        previous: Estimate | None,
+        track: Track,
+        applied: Applied,
+        robot: Robot,
+        field: FlowField | None = None,
+    ) -> Estimate:
         """The position is the measured one; the covariance is nominal: noise through the low pass, no dynamics."""
         sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius
         moved = robot.um_per_rev * applied.turns

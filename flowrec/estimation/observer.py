@@ -11,28 +11,28 @@ from flowrec.messages import Applied, Estimate, FlowField, Track
 from flowrec.methods import Method, Methods
 from flowrec.robot import Robot
 
+_KALMAN, _LUENBERGER = "flowrec.estimation.kalman:Kalman", "flowrec.estimation.luenberger:Luenberger"
+# The only option of a row is the section of its settings, an object of the class that implements it.
 OBSERVERS = Methods(
     "observer.method",
-    Method("kalman", "flowrec.estimation.kalman:Kalman", "Kalman filter for position and flow", ("kalman",)),
-    Method(
-        "kalman_map",
-        "flowrec.estimation.kalman:Kalman",
-        "the same with the best known flow field as its model",
-        ("kalman",),
-    ),
-    Method(
-        "luenberger", "flowrec.estimation.luenberger:Luenberger", "disturbance observer of the paper", ("luenberger",)
-    ),
+    Method("kalman", _KALMAN, "Kalman filter for position and flow", ("kalman",)),
+    Method("kalman_map", _KALMAN, "the same with the best known flow field as its model", ("kalman",), needs=("map",)),
+    Method("luenberger", _LUENBERGER, "disturbance observer of the paper", ("luenberger",)),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """Chooses the method; every method has the same verb."""
+    """Settings of the observer stage; `method` selects a row of OBSERVERS."""
 
     method: Annotated[str, OBSERVERS] = "kalman"
     kalman: Kalman = field(default_factory=Kalman)
     luenberger: Luenberger = field(default_factory=Luenberger)
+
+    @property
+    def uses_map(self) -> bool:
+        """Whether the estimate corrects the flow field rather than ignoring it."""
+        return "map" in OBSERVERS[self.method].needs
 
     def estimate(
         self,
@@ -42,10 +42,16 @@ class Observer:
         robot: Robot,
         field: FlowField | None = None,
     ) -> Estimate:
-        """The belief after this frame. The robot's own displacement is um_per_rev times the turns really applied.
+        """The estimate after this frame. The robot's own displacement is um_per_rev times the turns really applied.
 
-        `field` is the best flow known, which only `kalman_map` looks at; without one it is `kalman`.
+        Parameters
+        ----------
+        field : the best flow known; ignored by methods that do not use a map. Without one, kalman_map is kalman.
+
+        Raises
+        ------
+        UsageError : `method` is not in the table.
         """
-        if self.method == "luenberger":
-            return self.luenberger.estimate(previous, track, applied, robot)
-        return self.kalman.estimate(previous, track, applied, robot, field if self.method == "kalman_map" else None)
+        settings = getattr(self, OBSERVERS[self.method].options[0])
+        estimate: Estimate = settings.estimate(previous, track, applied, robot, field if self.uses_map else None)
+        return estimate

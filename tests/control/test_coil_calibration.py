@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 from flowrec.cli import app
 from flowrec.commands.calibrate import as_sets, calibrate
 from flowrec.config import load_config
-from flowrec.control.coil_calibration import advice, fit_coils
-from flowrec.control.excitations import Excitations, read_excitations
+from flowrec.control.coil_calibration import Excitations, advice, fit_coils, read_excitations
 from flowrec.errors import UsageError
 from flowrec.system.outputs import OutputError
 
@@ -100,7 +99,7 @@ def test_a_row_that_nothing_confirms_is_named():
 @pytest.mark.parametrize(
     ("currents", "says"),
     [
-        (CURRENTS[:4], "4 rows; three coils and a bias take 4, and 5 to see any residual; 12 do well"),
+        (CURRENTS[:4], "4 rows; three coils and a bias take 4, and 5 to see any residual; 12 are recommended"),
         (CURRENTS * [1, 1, 0], "coil z was hardly driven; add rows with the currents 0,0,2 and 0,0,-2 A"),
         (
             CURRENTS * [0, 0, 1],
@@ -128,7 +127,7 @@ def test_a_probe_with_a_dead_axis_makes_no_coils():
     ("text", "says"),
     [
         ("", r": is empty; the first line is i_x_a,i_y_a,i_z_a,b_x_mt"),
-        ("i_x_a;i_y_a;i_z_a\n1;2;3\n", r":1: columns are parted by ';'"),
+        ("i_x_a;i_y_a;i_z_a\n1;2;3\n", r":1: columns are separated by ';'"),
         (HEADER.replace("b_z_mt", "b_z_ut"), r":1: column 'b_z_ut' where 'b_z_mt' belongs: give it in millitesla"),
         (HEADER.replace("i_y_a", "i_y"), r":1: column 'i_y' where 'i_y_a' belongs: give it in ampere"),
         (HEADER.replace("i_y_a", "i_x_a"), r":1: two columns are named i_x_a"),

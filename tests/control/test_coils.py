@@ -8,7 +8,7 @@ from flowrec.chip import load_chip
 from flowrec.config import load_config, resolve
 from flowrec.control import Coils
 from flowrec.control.amplifier import Amplifier
-from flowrec.control.coils import reach_of
+from flowrec.control.coils import field_limits
 from flowrec.errors import UsageError
 from flowrec.messages import Currents, Demand
 from flowrec.robot import Robot
@@ -145,8 +145,12 @@ def test_voltages_limit_the_field_and_the_frequency_at_once_where_they_agree():
     share = fast.amplitude_mt / 4.0
     assert fast.saturated and 0.3 < share < 0.95
     assert fast.frequency_hz == pytest.approx(18.0 * share), "all the frequency that this field lets the robot follow"
-    assert reach_of(coils).room_mt(fast.frequency_hz) == pytest.approx(fast.amplitude_mt), "all the field for it"
-    assert fast.frequency_hz > 1.05 * 18.0 * reach_of(coils).room_mt(18.0) / 4.0, "more than at the full frequency"
+    assert field_limits(coils).max_amplitude_mt(fast.frequency_hz) == pytest.approx(fast.amplitude_mt), (
+        "all the field for it"
+    )
+    assert fast.frequency_hz > 1.05 * 18.0 * field_limits(coils).max_amplitude_mt(18.0) / 4.0, (
+        "more than at the full frequency"
+    )
     assert slow.amplitude_mt == fast.amplitude_mt, "no waiting for the field when the frequency rises again"
     assert coils.fastest_um_s(ROBOT) == pytest.approx(25.0 * fast.frequency_hz)
     volts = np.abs([c.voltages_v for c in said])

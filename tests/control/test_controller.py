@@ -5,7 +5,7 @@ import pytest
 
 from flowrec.chip import clearance_um
 from flowrec.control import Controller
-from flowrec.control.delay_compensation import blend
+from flowrec.control.delay_compensation import corrected_flow
 from flowrec.messages import Demand, Estimate, Route
 from tests.control.plant import CENTRE_UM, ROBOT, field_of, fly, lemniscate, mission, straight, vortex
 
@@ -99,11 +99,13 @@ def test_where_the_robot_turns_into_another_stream_the_map_is_believed_over_an_o
         0, CENTRE_UM + 25.0, np.array([300.0, 0.0]), np.diag([1.0, 1.0, 100.0, 100.0]), 2.0, CENTRE_UM, True
     )
     sent = np.array([[400.0, -300.0]])
-    turning = blend(corner, stale, sent, 0.3, 0.3).at(stale.position_um)
+    turning = corrected_flow(corner, stale, sent, 0.3, 0.3).at(stale.position_um)
     np.testing.assert_allclose(turning, [0.0, 300.0], atol=30.0)
     steady = field_of(lambda x, y: (0.0 * x, 300.0 + 0.0 * x))
     seen = replace(stale, flow_um_s=np.array([40.0, 330.0]))
-    np.testing.assert_allclose(blend(steady, seen, sent, 0.3, 0.3).at(stale.position_um), [40.0, 330.0], atol=3.0)
+    np.testing.assert_allclose(
+        corrected_flow(steady, seen, sent, 0.3, 0.3).at(stale.position_um), [40.0, 330.0], atol=3.0
+    )
 
 
 def test_a_new_phase_starts_its_route_at_the_beginning_and_a_finished_mission_asks_for_nothing():

@@ -1,4 +1,4 @@
-"""The commander: order of phases, waiting for work, and every way to end."""
+"""The mission state machine: order of phases, waiting for work, and every way to end."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.control.mission import Commander
+from flowrec.control.mission import MissionStateMachine
 from flowrec.messages import Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
 from flowrec.robot import Robot
 
@@ -27,10 +27,10 @@ def route(request: int, reachable: bool = True) -> Route:
 
 
 class World:
-    """Feeds a commander, second by second, with a robot at a place and results as they are handed over."""
+    """Updates a state machine, second by second, with a robot at a place and results as they are handed over."""
 
     def __init__(self, **settings) -> None:  # type: ignore[no-untyped-def]
-        self.commander = Commander(start=(0.0, 500.0), goal=GOAL, **settings)
+        self.machine = MissionStateMachine(start=(0.0, 500.0), goal=GOAL, **settings)
         self.mission: Mission | None = None
         self.time_s = 0.0
         self.results: dict[str, object] = {"assumed": None, "refined": None, "route": None}
@@ -42,7 +42,7 @@ class World:
         estimate = Estimate(stamp, at, np.zeros(2), np.eye(4), math.nan, at, seen)
         demand = Demand(stamp, np.zeros(2), at, 0.0, error_um, False, np.zeros((0, 2)))
         event = OperatorEvent(stamp, operator, "") if operator else None
-        self.mission = self.commander.decide(
+        self.mission = self.machine.update(
             self.mission,
             track,
             estimate,

@@ -7,8 +7,8 @@ from flowrec.chip import clearance_um
 from flowrec.commands.record import record
 from flowrec.config import load_config
 from flowrec.control import Controller
-from flowrec.control.policy import astray_um, downhill
-from flowrec.control.wall_barrier import _clearance_and_slope
+from flowrec.control.policy import distance_to_known, steepest_descent
+from flowrec.control.wall_barrier import clearance_and_slope
 from flowrec.errors import UsageError
 from flowrec.flow import sample
 from flowrec.messages import Estimate, Route
@@ -44,7 +44,7 @@ def homeward_route(time_to_go_s, goal_um=GOAL_UM, **changes):
 
 
 def clearance_at(walls_um, point_px):
-    return _clearance_and_slope(walls_um, point_px)[0]
+    return clearance_and_slope(walls_um, point_px)[0]
 
 
 def arrival_s(run, goal_um, within_um):
@@ -63,7 +63,7 @@ def test_in_uniform_flow_the_policy_swims_as_zermelo_says(flow):
         if np.hypot(*(point - GOAL_UM)) < 500.0:
             continue
         best = GOAL_UM - point - flow * zermelo_s(point, flow)
-        chosen = downhill(times, PX_UM, point, 100.0, flow / V)
+        chosen = steepest_descent(times, PX_UM, point, 100.0, flow / V)
         assert chosen @ best / np.hypot(*best) > np.cos(np.radians(3.0))
 
 
@@ -116,7 +116,7 @@ def test_between_two_ways_that_are_equally_fast_it_takes_one_of_them():
     goal = np.array([1500.0, 0.0])
     times = np.min([np.hypot(*(points - c).transpose(2, 0, 1)) + np.hypot(*(goal - c)) for c in corners], axis=0) / V
     for offset in (-20.0, 0.0, 20.0):
-        heading = downhill(times.astype(np.float32), PX_UM, np.array([1700.0, 2500.0 + offset]), 100.0)
+        heading = steepest_descent(times.astype(np.float32), PX_UM, np.array([1700.0, 2500.0 + offset]), 100.0)
         assert abs(heading[1]) > 0.6, "along the kink it would be 0"
 
 
@@ -124,12 +124,12 @@ def test_outside_of_what_it_knows_it_turns_back_and_says_how_far_it_has_strayed(
     times = zermelo_s(pixels_um(), np.zeros(2)).astype(np.float32)
     times[:, 60:] = np.inf
     lost = np.array([4000.0, 2000.0])
-    np.testing.assert_allclose(downhill(times, PX_UM, lost, 100.0), [-1.0, 0.0], atol=1e-9)
-    assert astray_um(times, PX_UM, lost) == pytest.approx(4000.0 - 59 * PX_UM, abs=PX_UM)
-    assert astray_um(times, PX_UM, np.array([1010.0, 1030.0])) == 0.0
+    np.testing.assert_allclose(steepest_descent(times, PX_UM, lost, 100.0), [-1.0, 0.0], atol=1e-9)
+    assert distance_to_known(times, PX_UM, lost) == pytest.approx(4000.0 - 59 * PX_UM, abs=PX_UM)
+    assert distance_to_known(times, PX_UM, np.array([1010.0, 1030.0])) == 0.0
     nowhere = np.full_like(times, np.inf)
-    assert astray_um(nowhere, PX_UM, lost) == np.inf
-    np.testing.assert_array_equal(downhill(nowhere, PX_UM, lost, 100.0), [0.0, 0.0])
+    assert distance_to_known(nowhere, PX_UM, lost) == np.inf
+    np.testing.assert_array_equal(steepest_descent(nowhere, PX_UM, lost, 100.0), [0.0, 0.0])
 
 
 def test_blown_off_the_route_it_plans_nothing_anew_unless_no_way_is_known_there():

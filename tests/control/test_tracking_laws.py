@@ -1,16 +1,15 @@
 """Laws, pace and limits in closed form."""
 
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 import pytest
 
 from flowrec.control import Controller
-from flowrec.control.controller import Method
-from flowrec.control.delay_compensation import blend
-from flowrec.control.tracking_laws import ff_fb_law, ff_fb_literal_law
-from flowrec.control.trajectory import bearable_pace, nearest_on
+from flowrec.control.controller import CONTROLLERS
+from flowrec.control.delay_compensation import corrected_flow
+from flowrec.control.tracking_laws import FeedforwardFeedback, LiteralFeedforwardFeedback
+from flowrec.control.trajectory import feasible_pace, nearest_time
 from flowrec.messages import Estimate, Route
 from tests.control.plant import ROBOT, field_of, fly, mission, straight
 
@@ -33,14 +32,15 @@ def test_as_printed_the_mean_of_two_headings_near_180_degrees_points_the_other_w
     moving, still = np.array([-300.0, 0.0]), np.zeros(2)
     ahead = np.array([-300.0, 0.1])  # pi less a little, while the error points to -pi and a little
     error = np.array([-20.0, -20.0])
-    assert ff_fb_law(error, ahead, still, 1.0, 0.0)[0] < -200.0
-    assert ff_fb_literal_law(error, ahead, still, 1.0, 0.0)[0] > 0.0
+    laws = [kind(1.0).law for kind in (FeedforwardFeedback, LiteralFeedforwardFeedback)]
+    assert laws[0](error, ahead, still, 0.0)[0] < -200.0
+    assert laws[1](error, ahead, still, 0.0)[0] > 0.0
     # Away from the cut they are one and the same.
-    pair = [law(-error, -moving, still, 1.0, 0.0) for law in (ff_fb_law, ff_fb_literal_law)]
+    pair = [law(-error, -moving, still, 0.0) for law in laws]
     np.testing.assert_allclose(pair[0], pair[1])
 
 
-@pytest.mark.parametrize("method", get_args(Method))
+@pytest.mark.parametrize("method", list(CONTROLLERS))
 @pytest.mark.parametrize("strength", [1.0, 0.4, 0.0])
 def test_no_law_ever_asks_for_more_than_the_field_of_the_moment_can_drive(method, strength):
     controller = Controller(method=method)
@@ -82,10 +82,10 @@ def test_the_laws_differ_in_the_flow_that_they_make_up_for():
 )
 def test_the_pace_of_the_reference_is_the_fastest_that_the_robot_can_keep(flow, pace):
     planned, flow = np.array([600.0, 0.0]), np.array(flow)
-    found = bearable_pace(planned, flow, 300.0, 1.0)
+    found = feasible_pace(planned, flow, 300.0, 1.0)
     assert found == pytest.approx(pace)
-    assert bearable_pace(np.zeros(2), flow, 300.0, 1.0) == 1.0
-    assert bearable_pace(planned, flow, 300.0, 0.2) <= 0.2
+    assert feasible_pace(np.zeros(2), flow, 300.0, 1.0) == 1.0
+    assert feasible_pace(planned, flow, 300.0, 0.2) <= 0.2
 
 
 def test_a_reference_faster_than_the_robot_is_slowed_before_the_robot_is_lost():
@@ -121,7 +121,7 @@ def test_a_path_of_one_point_is_a_place_to_hold_and_one_of_none_is_no_route():
     run = fly(Controller(), point, lambda x, y: (60.0, -20.0), 4.0, (2500.0, 2500.0), None, robot=WEAK)
     assert np.hypot(*(run.position_um[-500:] - [2600.0, 2450.0]).T).max() < 5.0
     nothing = Route(0, 1, "nothing", True, "", np.zeros((0, 2)), np.zeros(0))
-    for method in get_args(Method):
+    for method in list(CONTROLLERS):
         demand = after_a_frame(Controller(method=method), nothing, (2500.0, 2500.0), STILL)
         np.testing.assert_allclose(demand.reference_um, [2500.0, 2500.0])
         assert np.isfinite(after_a_frame(Controller(method=method), point, (2500.0, 2500.0), STILL).velocity_um_s).all()
@@ -137,14 +137,14 @@ def test_a_route_that_begins_far_away_waits_for_the_robot_at_its_beginning():
 
 def test_the_place_on_a_route_nearest_to_a_robot_is_that_of_the_projection():
     route = straight(speed_um_s=300.0)
-    assert nearest_on(route, np.array([1234.0, 2700.0])) == pytest.approx((1234.0 - 500.0) / 300.0)
-    assert nearest_on(route, np.array([0.0, 0.0])) == 0.0
+    assert nearest_time(route, np.array([1234.0, 2700.0])) == pytest.approx((1234.0 - 500.0) / 300.0)
+    assert nearest_time(route, np.array([0.0, 0.0])) == 0.0
 
 
 def test_an_observer_that_knows_the_map_is_not_thought_to_lag_behind_it():
     corner = field_of(lambda x, y: (300.0 * (x < 2500.0), 300.0 * (x >= 2500.0)))
     place, sent = np.array([2575.0, 2525.0]), np.array([[400.0, -300.0]])
     corrected = Estimate(0, place, np.array([20.0, 330.0]), np.diag([1.0, 1.0, 4.0, 4.0]), 2.0, place, True)
-    np.testing.assert_allclose(blend(corner, corrected, sent, 0.3, 0.0).at(place), [20.0, 330.0], atol=1.0)
-    doubted = blend(corner, corrected, sent, 0.3, 0.3).at(place)
+    np.testing.assert_allclose(corrected_flow(corner, corrected, sent, 0.3, 0.0).at(place), [20.0, 330.0], atol=1.0)
+    doubted = corrected_flow(corner, corrected, sent, 0.3, 0.3).at(place)
     assert np.hypot(*(doubted - [0.0, 300.0])) < 10.0, "as one that lags it is hardly believed just behind a corner"

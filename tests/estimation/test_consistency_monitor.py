@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.control.events import narrate
+from flowrec.control.events import event_of
 from flowrec.estimation import HealthMonitor, Kalman, Observer
 from flowrec.messages import Estimate, Health, Tick
 from flowrec.store.codec import encode
@@ -66,8 +66,8 @@ def test_the_beginning_and_the_end_of_an_alarm_are_told() -> None:
     nothing = np.zeros(0)
     well = Health(1, "", 2.0, 0.0, 9.0, 1.0, 0.02, 0.1, nothing, nothing, nothing, np.zeros(2), 0.0)
     ill = replace(well, stamp_ns=2, alarm="nis; pulsation", pulsation_share=0.5, nis=4.0)
-    began = narrate(Tick(1, health=well), Tick(2, health=ill))
+    began = event_of(Tick(1, health=well), Tick(2, health=ill))
     assert began is not None and began.level == "warning" and "pulsates at 1.0 Hz by 50%" in began.text
-    assert narrate(Tick(2, health=ill), Tick(3, health=replace(ill, stamp_ns=3))) is None
-    over = narrate(Tick(2, health=ill), Tick(3, health=replace(well, stamp_ns=3)))
+    assert event_of(Tick(2, health=ill), Tick(3, health=replace(ill, stamp_ns=3))) is None
+    over = event_of(Tick(2, health=ill), Tick(3, health=replace(well, stamp_ns=3)))
     assert over is not None and over.level == "info" and "alarm over: pulsation" in over.text

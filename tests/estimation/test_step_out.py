@@ -13,7 +13,7 @@ import flowrec.commands.record as verb
 from flowrec.commands import replay
 from flowrec.commands.record import record
 from flowrec.config import Config, load_config
-from flowrec.control.events import narrate
+from flowrec.control.events import event_of
 from flowrec.estimation import HealthMonitor
 from flowrec.messages import Applied, Estimate, FlowField, Health, Tick
 from flowrec.pipeline import Pipeline
@@ -89,7 +89,7 @@ def test_a_limit_that_does_not_help_is_lifted_and_not_tried_again_at_once() -> N
     seen = limits(found)
     assert len(seen) == 3 and seen[0] is None and seen[1] == pytest.approx(0.8 * 24.0, rel=0.02) and seen[2] is None
     lowered, lifted = [k for k in range(1, len(found)) if found[k].limit_hz != found[k - 1].limit_hz]
-    told = [narrate(Tick(k - 1, health=found[k - 1]), Tick(k, health=found[k])) for k in (lowered, lifted)]
+    told = [event_of(Tick(k - 1, health=found[k - 1]), Tick(k, health=found[k])) for k in (lowered, lifted)]
     assert told[0] is not None and told[0].level == "warning" and "limited to 19.2 Hz" in told[0].text
     assert told[1] is not None and "no step-out" in told[1].text
 

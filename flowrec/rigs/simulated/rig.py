@@ -21,7 +21,7 @@ from flowrec.chip.registration import Calibration
 from flowrec.clocks import DeviceClock
 from flowrec.config import Config
 from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import Order, Rotation, course
+from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.errors import RigError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
@@ -134,7 +134,7 @@ class SimulatedRig:
         self._coils = coils
         # What the coils were told last and where their field is; what is on its way: (stamp of its effect, command).
         self._acting: Currents | None = None
-        self._rotation = Rotation()
+        self._rotation = FieldState()
         self._coming: list[tuple[int, Currents]] = []
         self._latest: Currents | None = None
         # Set by zero(), in any thread: one attribute, which the loop's thread looks at whenever the world goes on. A
@@ -241,13 +241,13 @@ class SimulatedRig:
             self._acting = self._coming.pop(0)[1]
 
     def _turn(self, swimmer: Swimmer, command: Currents, duration_s: float) -> NDArray[np.float64]:
-        """Let the field turn, and the robot with it, as control/rotation.py says. Returns the turns (2,)."""
-        way = course(self._rotation, _order(command))
+        """Let the field turn, and the robot with it, as control/field_rotation.py describes. Returns the turns (2,)."""
+        way = field_motion(self._rotation, _order(command))
         self._rotation = way.after(duration_s)
         turns = np.zeros(2)
         full_mt = self._coils.amplitude_mt if self._coils is not None else 0.0
         strength = min(command.amplitude_mt / full_mt, 1.0) if full_mt > 0.0 else float(command.amplitude_mt > 0.0)
-        for leg in way.legs(duration_s):
+        for leg in way.segments(duration_s):
             swimmer.advance(leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
             if strength > 0.0:
                 heading = np.array([math.cos(leg.heading_rad), math.sin(leg.heading_rad)])
@@ -262,11 +262,11 @@ class SimulatedRig:
         if self._coils is not None:
             field = self._coils.field_mt(now.phase_rad, now.plane_rad, command.amplitude_mt)
             currents = self._coils.currents_a(field, command.amplitude_mt)
-        heading = course(now, _order(command)).heading_rad(0.0)
+        heading = field_motion(now, _order(command)).heading_rad(0.0)
         return Applied(stamp_ns, command.frequency_hz, heading, command.amplitude_mt, currents, turns)
 
 
-def _order(command: Currents) -> Order:
+def _order(command: Currents) -> FieldCommand:
     """What a command asks of the field; its amplitude, already on a ramp, at once."""
     c = command
-    return Order(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz)
+    return FieldCommand(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import Order, Rotation, course
+from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.messages import Currents
 
 BLOCK_S = 0.01  # of a buffered output: two of them queued make 20 ms of the delay from command to motion
@@ -26,19 +26,19 @@ class Block:
     field_mt: NDArray[np.float64]  # (n, 3) of the coils, with the bias compensated
     currents_a: NDArray[np.float64]  # (n, 3)
     voltages_v: NDArray[np.float64]  # (n, 3) each held until the next sample
-    after: Rotation  # at the first sample of the next block
+    after: FieldState  # at the first sample of the next block
 
 
-def block(coils: Coils, state: Rotation, order: Order, count: int) -> Block:
+def block(coils: Coils, state: FieldState, order: FieldCommand, count: int) -> Block:
     """`count` samples from a state on, under an order."""
-    way, rate = course(state, order), coils.amplifier.output_hz
+    way, rate = field_motion(state, order), coils.amplifier.output_hz
     time = np.arange(count) / rate
-    currents, voltages = coils.sampled(state, order, count)
+    currents, voltages = coils.output_samples(state, order, count)
     field = coils.field_mt(way.phase(time), way.plane(time), way.amplitude(time))
     return Block(field, currents[:-1], voltages, way.after(count / rate))
 
 
-def tail(coils: Coils, state: Rotation, order: Order) -> Block:
+def tail(coils: Coils, state: FieldState, order: FieldCommand) -> Block:
     """The way to nothing: the field goes on turning while its amplitude ramps down; the last sample is zero volts.
 
     For a stop, and to follow the last block that was ordered: whoever feeds the outputs queues it as soon as no next
@@ -57,13 +57,13 @@ def tail(coils: Coils, state: Rotation, order: Order) -> Block:
     )
 
 
-def outputs(coils: Coils, state: Rotation, currents: Currents, block_s: float = BLOCK_S) -> Block:
+def outputs(coils: Coils, state: FieldState, currents: Currents, block_s: float = BLOCK_S) -> Block:
     """The next block under a command; its voltages (n, 3) are what a card's buffer takes.
 
     The command may have been given for any earlier state: the field goes to it from the one it is in, and a weaker
     one than `limit_hz` was meant for turns no faster than it can be followed.
     """
-    asked = coils.state_and_order(currents)[1]
+    asked = coils.state_and_command(currents)[1]
     share = min(state.amplitude_mt / asked.amplitude_mt, 1.0) if asked.amplitude_mt > 0.0 else 1.0
     limit_hz = asked.limit_hz * share
     order = replace(asked, limit_hz=limit_hz, frequency_hz=min(asked.frequency_hz, limit_hz))
