@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,8 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
-
-from flowrec.errors import UsageError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,12 +38,6 @@ class Picture:
     flow_um_s: NDArray[np.floating]  # (n, 2) what was measured there
 
 
-def need_matplotlib() -> None:
-    """Raise UsageError where matplotlib is not installed."""
-    if importlib.util.find_spec("matplotlib") is None:
-        raise UsageError("--figure needs matplotlib, which is not installed: pip install 'flowrec[notebook]'")
-
-
 def median_case(rows: list[dict[str, Any]]) -> str:
     """The case whose error without refinement is the (lower) median; by the first method where fvm was not run."""
     first = "fvm" if any(row["method"] == "fvm" for row in rows) else rows[0]["method"]
@@ -59,7 +50,6 @@ def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
 
     `rows` are those of `flowrec bench flow`, of all cases. One colour scale serves all speeds, one all errors.
     """
-    need_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.bench.figure_flow import INK, QUIET, need_matplotlib
+from flowrec.bench.figure_flow import INK, QUIET
 
 _COLOURS = {"down": "#2f6f8f", "up": "#b5532a"}
 _TOP = 3.0  # what is beyond is drawn on the edge
@@ -16,7 +16,6 @@ _GOOD = ("reached", "unreachable", "refused")
 
 def draw(path: Path, figures: dict[str, Any]) -> None:
     """Write a PNG from the figures of the bench: one panel per map (surveyed, assumed)."""
-    need_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

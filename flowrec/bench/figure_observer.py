@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.bench.figure_flow import INK, QUIET, need_matplotlib
+from flowrec.bench.figure_flow import INK, QUIET
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,6 @@ def draw(path: Path, time_s: Floats, truth: Floats, curves: dict[str, Floats], r
 
     `truth` and each of `curves` are (n, 2) um/s at `time_s` (n,); `rows` are those of `flowrec bench observer`.
     """
-    need_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowrec.bench.figure_flow import INK, MM_PER_UM, QUIET, SOLID, need_matplotlib
+from flowrec.bench.figure_flow import INK, MM_PER_UM, QUIET, SOLID
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,6 @@ DRAWN = ("astar_length:8", "astar_paper", "rrt", "rrt_star", "time_field")
 
 def draw(path: Path, shown: list[tuple[World, Trip, dict[str, Route]]], rows: list[dict[str, Any]]) -> None:
     """Write a PNG. `shown` are channels with their routes upstream, `rows` those of `flowrec bench plan`."""
-    need_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.bench.figure_flow import INK, MM_PER_UM, QUIET, need_matplotlib
+from flowrec.bench.figure_flow import INK, MM_PER_UM, QUIET
 from flowrec.bench.lemniscate import PERIOD_S, Flight
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ def draw(path: Path, curve_um: NDArray[np.floating], first: dict[str, Flight], o
 
     `curve_um` (n, 2) is the reference; flights are by name; all in um about the curve's middle.
     """
-    need_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -6,18 +6,18 @@ the sinks. The four kinds of run take turns, so that a drift of the machine's sp
 
 from __future__ import annotations
 
-import os
-import platform
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
+from flowrec.bench.harness import Results
 from flowrec.chip.chip import Chip
 from flowrec.commands.export import scene_of
 from flowrec.commands.record import prepare
@@ -99,7 +99,7 @@ def prepare_inputs(config: Config, pipeline: Pipeline, ticks: int) -> list[Input
     return prepared
 
 
-def measure(ticks: int, rounds: int = 2) -> dict[str, Any]:
+def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] = 900, rounds: int = 2) -> Results:
     """Milliseconds of a tick per kind of run, their ratios, and the speed of a replay without refinement."""
     config, chip, pipeline = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
     prepared = prepare_inputs(config, pipeline, ticks)
@@ -125,7 +125,6 @@ def measure(ticks: int, rounds: int = 2) -> dict[str, Any]:
         for kind in KINDS
     }
     return {
-        "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
         "frames": {"width_px": config.camera.width_px, "height_px": config.camera.height_px, "rate_hz": RATE_HZ},
         "ticks_per_run": len(prepared),
         "rows": rows,

@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import math
 import multiprocessing
-import os
-import platform
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from flowrec.bench.shares import paired, wilson
+from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, vessel_cases, wilson
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.commands.record import refuse_adrift
 from flowrec.config import Config, load_config, resolve
-from flowrec.errors import FlowrecError, UsageError
+from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import assemble
@@ -121,14 +120,21 @@ class Logbook:
 
 
 def measure(
-    seeds: int = 40,
-    cases: Path | None = None,
-    policies: Sequence[str] = ("policy", "vector", "paper"),
-    world: World = World(),
+    seeds: Annotated[int, typer.Option(min=1, help="Worlds; every policy flies all of them, both ways.")] = 40,
+    cases: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz), besides the built-in chips.")
+    ] = None,
+    policies: Annotated[str, typer.Option(metavar="A,B", help=f"Of {', '.join(POLICIES)}.")] = "policy,vector,paper",
+    flow_error: Annotated[float, typer.Option(help="Relative error of each inlet flow.")] = 0.1,
+    outlet_error: Annotated[float, typer.Option(help="Same of outlet pressures, of the drop across the chip.")] = 0.0,
+    latency: Annotated[
+        float | None, typer.Option(metavar="S", help="From command to motion; 0.04, less in swift channels.")
+    ] = None,
+    sets: Sets = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    figure: FigureFile = None,
     maps: Sequence[str] = ("surveyed", "assumed"),
-    figure: Path | None = None,
-    jobs: int = 1,
-) -> dict[str, Any]:
+) -> Results:
     """Rows per mission, a summary per policy, and the policies compared on the trips that both arrived from.
 
     Seeds take the bifurcation, the vessels and each of the `cases` (*.npz), as it is and slowed down, in turn.
@@ -138,22 +144,15 @@ def measure(
     UsageError
         If there is no such policy or no case, or a figure is wanted and matplotlib is not installed.
     """
-    if figure is not None:
-        from flowrec.bench.figure_flow import need_matplotlib
-
-        need_matplotlib()
-    unknown = [name for name in policies if name not in POLICIES]
-    if unknown:
-        raise UsageError(f"bench missions: no policy {', '.join(map(repr, unknown))}; there are {', '.join(POLICIES)}")
-    paths = sorted(cases.glob("*.npz")) if cases is not None else []
-    if cases is not None and not paths:
-        raise UsageError(f"{cases}: no vessel case (*.npz) in it")
+    names = chosen("bench missions: no policy", policies, POLICIES)
+    world = World(flow_error, outlet_error, latency, tuple(sets or ()))
+    paths = [] if cases is None else vessel_cases(cases)
     orders = [
         (seed, chip_of(seed, paths), way, how, policy, world)
         for seed in range(1, seeds + 1)
         for way, how in TRIPS
         if how in maps
-        for policy in policies
+        for policy in names
     ]
     rows: list[Row] = []
     with progress("flying", len(orders)) as done:
@@ -167,12 +166,11 @@ def measure(
                     rows.append(row)
                     done(len(rows))
     figures = {
-        "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
         "world": asdict(world),
         "seeds": seeds,
         "rows": [asdict(row) for row in rows],
-        "summary": {policy: summary([row for row in rows if row.policy == policy]) for policy in policies},
-        "pairs": {f"{a} / {b}": compared(rows, a, b) for a, b in combinations(policies, 2)},
+        "summary": {policy: summary([row for row in rows if row.policy == policy]) for policy in names},
+        "pairs": {f"{a} / {b}": compared(rows, a, b) for a, b in combinations(names, 2)},
     }
     if figure is not None:
         from flowrec.bench.figure_missions import draw

@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from flowrec.bench.figure_flow import need_matplotlib
 from flowrec.bench.figure_observer import draw
+from flowrec.bench.harness import FigureFile, Results, Seed
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, RATE_HZ, SPIN_PER_S, place_um, vortex_map
 from flowrec.estimation import HealthMonitor, Kalman, Luenberger, Observer, smooth
 from flowrec.estimation.tuning import tune
@@ -122,7 +123,13 @@ def _alarm(estimates: list[Estimate]) -> tuple[str, float | None]:
     return ", ".join(sorted(names)), first
 
 
-def measure(session: Path | None = None, figure: Path | None = None, seed: int = 0) -> dict[str, Any]:
+def measure(
+    session: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Also recommend settings for this recording.")
+    ] = None,
+    figure: FigureFile = None,
+    seed: Seed = 0,
+) -> Results:
     """Error per case and observer. With a recorded session also what settings it recommends.
 
     Raises
@@ -130,8 +137,6 @@ def measure(session: Path | None = None, figure: Path | None = None, seed: int =
     UsageError
         If a figure is wanted and matplotlib is not installed, or the session is too short.
     """
-    if figure is not None:
-        need_matplotlib()
     rows: list[dict[str, Any]] = []
     curves: dict[str, Floats] = {}
     truth: Floats | None = None

@@ -6,22 +6,20 @@ All planners plan at the robot's full speed in the flow as it is, and the same j
 from __future__ import annotations
 
 import itertools
-import os
-import platform
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from flowrec.bench.drive import drive
-from flowrec.bench.figure_flow import need_matplotlib
+from flowrec.bench.harness import Cases, FigureFile, Names, Quick, Results, Seed, chosen
 from flowrec.bench.trips import SPEED_UM_S, Trip, World, best_time, draw_trip, magnified, worlds, worlds_of
 from flowrec.chip import clearance_um
 from flowrec.errors import UsageError
@@ -77,16 +75,16 @@ def _installed(methods: Iterable[str]) -> list[str]:
 
 
 def measure(
-    cases: Path | None = None,
-    trips: int = 40,
-    tree_channels: int = 10,
-    tree_iterations: int = 4000,
-    figure: Path | None = None,
+    cases: Cases = None,
+    trips: Annotated[int, typer.Option(min=1, help="Channels, one trip through each, down and up.")] = 40,
+    tree_channels: Annotated[int, typer.Option("--trees", help="Channels in which rrt and rrt_star plan.")] = 10,
+    tree_iterations: Annotated[int, typer.Option("--iterations", min=1, help="Iterations of rrt and rrt_star.")] = 4000,
+    figure: FigureFile = None,
+    methods: Names = None,
+    seed: Seed = 0,
+    quick: Quick = False,
     side_px: int = SIDE_PX,
-    methods: Sequence[str] | None = None,
-    seed: int = 0,
-    quick: bool = False,
-) -> dict[str, Any]:
+) -> Results:
     """Rows per trip, flow, direction and planner, their summaries, robustness, policy and speed.
 
     rrt and rrt_star plan in the first `tree_channels` channels only. `quick` leaves out robustness, policy and speed.
@@ -96,11 +94,7 @@ def measure(
     UsageError
         If there are no cases or no such method, or a figure is wanted and matplotlib is not installed.
     """
-    if figure is not None:
-        need_matplotlib()
-    chosen = tuple(_installed(METHODS) if methods is None else dict.fromkeys(methods))
-    if unknown := [name for name in chosen if name not in METHODS]:
-        raise UsageError(f"bench plan: no method {', '.join(map(repr, unknown))}; there are {', '.join(METHODS)}")
+    names = tuple(_installed(METHODS)) if methods is None else chosen("bench plan: no method", methods, METHODS)
     source = worlds(side_px, seed) if cases is None else worlds_of(cases)
     rows: list[Row] = []
     robust: list[dict[str, Any]] = []
@@ -115,7 +109,7 @@ def measure(
                 ends = trip.ends(direction)
                 optimum = best_time(world, field, *ends, SPEED_UM_S)[0]
                 found = {}
-                for method in chosen:
+                for method in names:
                     planner = METHODS[method]
                     if planner.method.startswith("rrt"):
                         if number >= tree_channels:
@@ -133,10 +127,9 @@ def measure(
     if not rows:
         raise UsageError(f"{cases}: no vessel case (*.npz) in it through which a trip leads")
     figures = {
-        "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
         "rows": [asdict(row) for row in rows],
-        "summary": {method: _summary([row for row in rows if row.method == method]) for method in chosen},
-        "ratios": _ratios(rows, chosen),
+        "summary": {method: _summary([row for row in rows if row.method == method]) for method in names},
+        "ratios": _ratios(rows, names),
         "robust": _share_of(robust),
         "policy": _policy_table(policy),
         "speed": None if quick else _speed(),

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import scipy
 
 from flowrec.bench.cavity import cavity_case
 from flowrec.bench.channel import bend_case, oblique_case, straight_case
 from flowrec.bench.cylinder import cylinder_case
+from flowrec.bench.harness import Quick, Results
 from flowrec.bench.speed import speed_case
 from flowrec.terminal import table
 
@@ -75,7 +73,7 @@ _TABLES: dict[str, tuple[str, dict[str, str]]] = {
 }
 
 
-def measure(quick: bool = False) -> dict[str, Any]:
+def measure(quick: Quick = False) -> Results:
     """All figures; `quick` leaves out what takes more than a second."""
     rows: list[dict[str, Any]] = []
 
@@ -98,14 +96,6 @@ def measure(quick: bool = False) -> dict[str, Any]:
         jobs += [("posts", 512, 1), ("posts", 1024, 1)]
     add("speed", (speed_case(pattern, side, k) for pattern, side, k in jobs))  # type: ignore[arg-type]
     return {
-        "machine": {
-            "cores": os.cpu_count(),
-            "threads": os.environ.get("OMP_NUM_THREADS", "default"),
-            "platform": platform.platform(),
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "scipy": scipy.__version__,
-        },
         "rows": rows,
         "summary": _summary(rows),
     }

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.bench.memory import peak_mb
+from flowrec.bench.harness import peak_mb
 from flowrec.chip.builtin import straight
 from flowrec.chip.chip import Chip
 from flowrec.chip.io import without_pockets

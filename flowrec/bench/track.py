@@ -6,17 +6,15 @@ it follows no reference.
 
 from __future__ import annotations
 
-import os
-import platform
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from scipy.spatial import KDTree
 
-from flowrec.bench.figure_flow import need_matplotlib
 from flowrec.bench.figure_track import draw
+from flowrec.bench.harness import FigureFile, Results
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, Flight, World, fly, lemniscate
 from flowrec.control import Controller
 from flowrec.estimation import Observer
@@ -80,10 +78,10 @@ class Score:
     demand_um_s: float  # the largest
 
 
-def measure(seeds: int = 5, figure: Path | None = None) -> dict[str, Any]:
+def measure(
+    seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5, figure: FigureFile = None
+) -> Results:
     """Every law in both worlds, and the laws where step-out binds, with and without retiming."""
-    if figure is not None:
-        need_matplotlib()
     flown: dict[tuple[str, str], list[Flight]] = {}
     total = len(LAWS) * len(WORLDS) + 2 * len(STEP_OUTS_UM_S) * len(PACES)
     bound: list[Score] = []
@@ -104,7 +102,6 @@ def measure(seeds: int = 5, figure: Path | None = None) -> dict[str, Any]:
         ours = {name: flown[name, "all"][0] for name in OURS}
         draw(figure, lemniscate(1).waypoints_um - CENTRE_UM, first, ours)
     return {
-        "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
         "seeds": seeds,
         "v_max_um_s": V_MAX_UM_S,
         "worlds": {name: asdict(world) for name, world in WORLDS.items()},

@@ -9,8 +9,8 @@ import pytest
 
 from flowrec.bench import missions
 from flowrec.bench.figure_missions import draw
+from flowrec.bench.harness import paired, wilson
 from flowrec.bench.missions import World, chip_of, compared, fly, optimum_s, summary
-from flowrec.bench.shares import paired, wilson
 from flowrec.chip import load_chip
 from flowrec.chip.settings import ChipSettings
 from flowrec.errors import UsageError
@@ -122,6 +122,6 @@ def test_seeds_take_chips_in_turn_and_wrong_requests_are_said_at_once(tmp_path):
         :3
     ]
     with pytest.raises(UsageError, match="no policy 'luck'"):
-        missions.measure(1, None, ["luck"])
+        missions.measure(1, None, "luck")
     with pytest.raises(UsageError, match="no vessel case"):
-        missions.measure(1, tmp_path, ["vector"])
+        missions.measure(1, tmp_path, "vector")

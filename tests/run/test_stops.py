@@ -1,6 +1,6 @@
 """`flowrec record --realtime` stopped in every way: the order of what its driver is told, its file, its exit status.
 
-No assertion is on wall time: `python -m tests.campaigns.stops` measures.
+No assertion is on wall time: `python -m tests.perf.stops` measures.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from flowrec.commands.replay import Change, replay
 from flowrec.config import load_config
 from flowrec.messages import OperatorEvent
 from flowrec.store import SessionReader
-from tests.campaigns.stops import KINDS, Ended, Kind, stop
-from tests.campaigns.trial import LoggedRig
 from tests.conftest import SMALL
+from tests.perf.stop_trial import LoggedRig
+from tests.perf.stops import KINDS, Ended, Kind, stop
 
 PATIENT = "safety.guard_timeout_s=20"  # where the guard's timer has no part
 

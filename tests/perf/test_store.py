@@ -5,10 +5,10 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from flowrec.bench import store_equal
-from flowrec.bench.store_kills import kills
-from flowrec.bench.store_loop import soak
-from flowrec.bench.store_writers import LOADS, WRITERS
+from tests.perf import store_equal
+from tests.perf.store_kills import kills
+from tests.perf.store_loop import soak
+from tests.perf.store_writers import LOADS, WRITERS
 
 
 @pytest.mark.parametrize("load", LOADS[:2], ids=lambda load: load.name)  # the third is the second, larger

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.declarations import Image
 from flowrec.errors import SessionError
 from flowrec.messages import OperatorEvent, Tick
@@ -24,6 +23,7 @@ from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
 from flowrec.store.paths import PARTIAL_SUFFIX, pieces
 from flowrec.terminal import progress, table
 from flowrec.units import seconds
+from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _SHORTEST_S, _LONGEST_S = 0.1, 2.5
 _PART_S = 0.4
@@ -78,7 +78,7 @@ def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[
     of more than that. In parts, the finished ones must be whole, and no tick may be missing between.
     """
     kinds = _kinds(split_s or _PART_S)
-    moments = random.Random(0)  # noqa: S311  moments, not secrets
+    moments = random.Random(0)
     rows = {}
     with tempfile.TemporaryDirectory(dir=folder) as name, progress("killing", count * len(kinds)) as done:
         for place, kind in enumerate(kinds):

@@ -1,4 +1,4 @@
-"""The writers that `flowrec bench store` compares, and what they are given to write."""
+"""The writers that `python -m tests.perf.store` compares, and the messages that they write."""
 
 from __future__ import annotations
 

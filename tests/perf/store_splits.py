@@ -1,4 +1,4 @@
-"""What going on in another file, or in memory, does to the control loop: `flowrec bench store --split S`."""
+"""Cost of split files and of the ring buffer for the control loop: `python -m tests.perf.store --split S`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.declarations import Image
 from flowrec.messages import FlowField, OperatorEvent, Tick
 from flowrec.run.loop import SWITCH_S
 from flowrec.store import SessionWriter, Snapshot, Split
 from flowrec.terminal import progress, table
+from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 1224, 1024  # what two cores that do other things as well keep up with

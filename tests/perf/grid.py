@@ -1,17 +1,19 @@
-"""`flowrec bench grid`: the numbers of refine/model_error.py anew, for when the solver's walls have changed.
+"""`python -m tests.perf.grid DIR`: fit the constants of refine/discretisation_error.py, after a change of the solver.
 
 Cases whose truth comes from a fine grid are solved with their true parameters on the grid in use and on one twice as
-coarse. What the fine grid still adds is a share of the difference between the two; what is left is the local error.
+coarse. The remaining error is modelled as a fraction of the difference of the two, plus a local error.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
+from flowrec.bench.harness import Results, run, vessel_cases
 from flowrec.chip.vessel_case import read_true_chip, read_true_velocity, read_vessel_case
 from flowrec.errors import UsageError
 from flowrec.flow import FlowSolver
@@ -21,16 +23,16 @@ from flowrec.terminal import table
 WITHIN_TWO = 0.9545  # of a Gaussian
 
 
-def measure(folder: Path, k: int = 2) -> dict[str, Any]:
+def measure(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Vessel cases (*.npz) with a truth on a fine grid.")],
+    k: Annotated[int, typer.Option("-k", help="Subcells of the solver per pixel side: 2 or 4.")] = 2,
+) -> Results:
     """Per case the error with and without the share, and the settings of ModelError that fit all cases."""
     if k < 2:
-        raise UsageError("bench grid: -k 1 has no coarser grid; choose 2 or 4")
-    cases = sorted(folder.glob("*.npz"))
-    if not cases:
-        raise UsageError(f"{folder}: no vessel case (*.npz) in it")
+        raise UsageError("grid: -k 1 has no coarser grid; choose 2 or 4")
     rows: list[dict[str, Any]] = []
     local = []
-    for case in cases:
+    for case in vessel_cases(folder):
         believed = read_vessel_case(case)
         chip, truth = read_true_chip(case, believed), read_true_velocity(case)[believed.mask]
         fine, coarse = (
@@ -69,3 +71,7 @@ def show(figures: dict[str, Any]) -> None:
     ]
     settings = ", ".join(f"{name} = {figures[name]:.3f}" for name in ("share", "share_std", "left_share"))
     table(f"Error of the grid at k = {figures['k']}: {settings}", ("case", "share", "error", "left"), rows)
+
+
+if __name__ == "__main__":
+    run(measure, show)

@@ -1,45 +1,60 @@
-"""`flowrec bench store`: what recording costs, beside a bare mcap Writer and a bare foxglove-sdk writer.
+"""`python -m tests.perf.store`: cost of recording, compared with plain mcap and foxglove-sdk writers.
 
-The writers take turns on the same data in memory-backed storage where there is some, so that the disk does not
-blur them; what the disk itself takes is measured apart, where the session would be written.
+The writers take turns with the same data on memory-backed storage, if there is any, so that the disk does not add
+noise. The throughput of the disk is measured separately, where the session would be written.
 """
 
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import tempfile
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
-from flowrec.bench.store_kills import kills
-from flowrec.bench.store_kills import show as show_kills
-from flowrec.bench.store_loop import soak, stall
-from flowrec.bench.store_region import regions
-from flowrec.bench.store_splits import show_splits, splits
-from flowrec.bench.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
+from flowrec.bench.harness import Results, run
 from flowrec.store import SessionReader, SessionWriter, recover
 from flowrec.terminal import progress, table
+from tests.perf import store_equal
+from tests.perf.store_kills import kills
+from tests.perf.store_kills import show as show_kills
+from tests.perf.store_loop import soak, stall
+from tests.perf.store_region import regions
+from tests.perf.store_splits import show_splits, splits
+from tests.perf.store_writers import LOADS, WRITERS, Load, made_up_header, pictures, ticks_of
 
-_MEMORY = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is made in it
+_MEMORY = Path("/dev/shm")
 _AIM = {"p99_ratio": 1.2, "disk_mb_s": 350.0, "throughput": 0.9}
 
 
 def measure(
-    folder: Path | None = None, quick: bool = False, minutes: float = 0.0, killed: int = 0, split_s: float = 0.0
-) -> dict[str, Any]:
+    folder: Annotated[
+        Path | None, typer.Option("--at", metavar="DIR", help="Which disk; by default that of temporary files.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer messages and rounds, half a minute.")] = False,
+    minutes: Annotated[float, typer.Option(min=0.0, help="Only measure memory while recording for so long.")] = 0.0,
+    killed: Annotated[
+        int, typer.Option("--kills", min=0, help="Only kill so many recordings of each kind and recover them.")
+    ] = 0,
+    split_s: Annotated[
+        float,
+        typer.Option("--split", min=0.0, metavar="S", help="Only measure the loop while files are split after S."),
+    ] = 0.0,
+    equal: Annotated[
+        bool, typer.Option("--equal", help="Only compare writers and encoders with the libraries', at equal terms.")
+    ] = False,
+) -> Results:
     """Throughput of each writer, stall of the control step, read, seek and recovery times.
 
-    `folder` is where the disk is measured and the stall is; by default that for temporary files. With `minutes`
-    nothing but memory is measured, for so long; with `killed` nothing but what so many kills of each kind cost. With
-    `split_s` the killed runs in parts go on in another file after so many seconds; alone, what that does to the control
-    loop is measured.
+    With `killed`, `split_s` is the length of the parts of the runs that are recorded in parts.
     """
+    if equal:
+        return {"equal": store_equal.measure(*((1, 0.1, 0.5) if quick else (3, 1.0, 3.0)))}
     if minutes:
         return {"soak": soak(minutes, folder, keeping=False), "soak_ring": soak(minutes, folder, keeping=True)}
     if killed:
@@ -56,7 +71,6 @@ def measure(
             reading = _reading(fast, 300 if quick else 3000)
             windows = regions(fast, 1.0 if quick else 10.0)
         return {
-            "machine": {"cores": os.cpu_count(), "platform": platform.platform(), "python": platform.python_version()},
             "storage": {"throughput": str(fast.parent), "stall": str(disk.parent)},
             "disk_mb_s": _disk_mb_s(disk, 100e6 if quick else 1e9),
             "throughput": throughput,
@@ -153,6 +167,9 @@ def show(figures: dict[str, Any]) -> None:
         rows = [(name.replace("_", " "), *(f"{found[name]:.1f}" for found in both)) for name in names]
         table("Soak, 640x512 at 100 Hz", ("", "all of it", "a ring of 30 s"), rows)
         return
+    if "equal" in figures:
+        store_equal.show(figures["equal"])
+        return
     if "splits" in figures:
         show_splits(figures["splits"])
         return
@@ -214,3 +231,7 @@ def show(figures: dict[str, Any]) -> None:
             for row in figures["regions"]
         ],
     )
+
+
+if __name__ == "__main__":
+    run(measure, show)

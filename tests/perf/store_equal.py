@@ -1,4 +1,4 @@
-"""`flowrec bench store --equal`: our MCAP writer and protobuf encoder beside the libraries', at equal terms.
+"""`python -m tests.perf.store --equal`: our MCAP writer and protobuf encoder beside the libraries', at equal terms.
 
 The writers are given the same bytes and pack them into chunks of 1 MiB with zstd at level 1, in one thread. The
 encoders are given the same messages and must give the same bytes. Speed is measured alone. The stall is measured at a
@@ -24,7 +24,6 @@ import numpy as np
 import zstandard
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
-from flowrec.bench.store_writers import frames_given, poses_given
 from flowrec.declarations import Message, message_fields
 from flowrec.messages import FlowField, Track
 from flowrec.run.loop import SWITCH_S
@@ -38,6 +37,7 @@ from flowrec.store.schema import Schema
 from flowrec.system.realtime_priority import first_of_all
 from flowrec.terminal import progress, table
 from flowrec.topics import BY_FIELD
+from tests.perf.store_writers import frames_given, poses_given
 
 _CHUNK_BYTES = 1 << 20
 _STEP_NS = 1_000_000
@@ -222,7 +222,7 @@ def measure(rounds: int = 3, share: float = 1.0, stall_s: float = 3.0) -> list[d
         for name in ENCODERS:
             jobs.append((what, name, max(round(count * share), 20), rate_hz, partial(_encoding, given, name)))
     rows: dict[tuple[str, str], list[dict[str, float]]] = {}
-    memory = Path("/dev/shm")  # noqa: S108  a folder with a name of its own is made in it
+    memory = Path("/dev/shm")
     with (
         tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder,
         progress("at equal terms", rounds * (len(jobs) + 1)) as done,

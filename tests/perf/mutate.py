@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import zstandard
 
-from flowrec.bench.draft import (
+from tests.store.drafts import (
     ATTACHMENT,
     ATTACHMENT_INDEX,
     CHANNEL,

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.chip import load_chip
 from flowrec.config import load_config, resolve
 from flowrec.session_writer import region_of
 from flowrec.store import Region, SessionWriter
 from flowrec.terminal import progress
+from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _CAMERAS = ((640, 512, 100.0), (2448, 2048, 60.0))
 _ENCODINGS = ("raw", "zstd", "delta")

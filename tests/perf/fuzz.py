@@ -18,17 +18,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Annotated, Any
 
-from flowrec.bench.draft import Draft, small_draft
-from flowrec.bench.memory import peak_mb
-from flowrec.bench.mutate import blind, spoil
+import typer
+
+from flowrec.bench.harness import Results, Seed, peak_mb, run
 from flowrec.commands.check import check
 from flowrec.commands.info import info, list_sessions
 from flowrec.errors import FlowrecError, printable
 from flowrec.session import Session
 from flowrec.store import SessionReader, recover
 from flowrec.terminal import progress, table
+from tests.perf.mutate import blind, spoil
+from tests.store.drafts import Draft, small_draft
 
 TIME_LIMIT_S = 20.0
 MEMORY_LIMIT_MB = 270.0  # besides the 240 MB of the program itself: together less than 512
@@ -61,7 +63,7 @@ class Campaign:
         with SessionReader(path) as reader:
             self._stamps = [tick.stamp_ns for tick in reader.ticks()]
         if check(path).word != "good":
-            raise FlowrecError(f"{path}: the session to be spoiled is not good; mend bench/draft.py first")
+            raise FlowrecError(f"{path}: the session to be spoiled is not good; mend tests/store/drafts.py first")
         path.unlink()
         _forget_peak()
         self._base_mb = peak_mb()
@@ -152,21 +154,23 @@ class Campaign:
         return [f"wrote {stray}" for stray in strays]
 
 
-def measure(files: int = 2000, seed: int = 0) -> dict[str, Any]:
-    """Read so many spoiled files, with the seeds from `seed` on; figures, and faults with their seeds."""
+def measure(
+    count: Annotated[int, typer.Option(min=1, help="Number of corrupted sessions.")] = 2000, seed: Seed = 0
+) -> Results:
+    """Corrupt and read `count` files, with the seeds from `seed` on; counts, and faults with their seeds."""
     folder = Path(tempfile.mkdtemp(prefix="flowrec-fuzz-"))
     began, cpu = time.perf_counter(), time.process_time()
     try:
-        with _without_waiting_for_the_disk(), progress("spoiling and reading", files) as done:
+        with _without_waiting_for_the_disk(), progress("corrupting and reading", count) as done:
             campaign = Campaign(folder)
             base_mb = peak_mb()
-            for number in range(files):
+            for number in range(count):
                 campaign.run(seed + number)
                 done(number + 1)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return {
-        "files": files,
+        "files": count,
         "first_seed": seed,
         "kinds": dict(campaign.kinds),
         "ends": dict(sorted(campaign.ends.items())),
@@ -239,3 +243,7 @@ def _forget_peak() -> None:
     """Let the peak of memory begin anew (Linux)."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+if __name__ == "__main__":
+    run(measure, show)

@@ -1,4 +1,4 @@
-"""One run that is stopped: `python -m tests.campaigns.trial KIND OUT LOG [key=value ...]`, in a process of its own.
+"""One run that is stopped: `python -m tests.perf.stop_trial KIND OUT LOG [key=value ...]`, in a process of its own.
 
 The rig is the simulated one, in real time, with a driver that writes a line for all that it is told:
 `time_s thread event amplitude_mt`, with the time of CLOCK_MONOTONIC, which all processes share. KIND names a fault of

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from flowrec.bench.memory import peak_mb
+from flowrec.bench.harness import peak_mb
 from flowrec.store import SessionReader
 from flowrec.units import nanoseconds
 

@@ -16,12 +16,19 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO
 
 import numpy as np
+import typer
 import zstandard
 
-from flowrec.bench.draft import (
+from flowrec.bench.harness import Results, run
+from flowrec.store.channels import FRAMES, SLOTS, STATE
+from flowrec.store.codec import encode_record
+from flowrec.terminal import progress, table
+from flowrec.topics import TOPICS
+from flowrec.units import NS_PER_S
+from tests.store.drafts import (
     CHUNK,
     CHUNK_INDEX,
     DATA_END,
@@ -37,11 +44,6 @@ from flowrec.bench.draft import (
     small_draft,
     text,
 )
-from flowrec.store.channels import FRAMES, SLOTS, STATE
-from flowrec.store.codec import encode_record
-from flowrec.terminal import progress, table
-from flowrec.topics import TOPICS
-from flowrec.units import NS_PER_S
 
 _FLUSH_S = 0.5
 _FRAME_CHUNK_BYTES = 1 << 20
@@ -65,7 +67,10 @@ class Load:
 LOADS = (Load(640, 512, 100.0), Load(2448, 2048, 60.0))
 
 
-def measure(gigabytes: float = 10.0, folder: Path | None = None) -> dict[str, Any]:
+def measure(
+    gigabytes: Annotated[float, typer.Option("--gb", min=0.01, help="Size of each session (sparse files).")] = 10.0,
+    folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Where to write them; they are removed.")] = None,
+) -> Results:
     """Make sparse sessions in a folder that is removed again, and read them in processes of their own."""
     rows = []
     with tempfile.TemporaryDirectory(prefix="flowrec-large-", dir=folder) as made:
@@ -126,7 +131,7 @@ def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> It
     counts: dict[int, int] = {}
     ticks = int(seconds_long * load.rate_hz)
     with path.open("wb") as file:
-        file.write(MAGIC + record(HEADER, text("flowrec") + text("flowrec bench large")))
+        file.write(MAGIC + record(HEADER, text("flowrec") + text("flowrec perf large")))
         for opcode, body in draft.head:
             listed += listing_of(opcode, body, file.tell())
             file.write(record(opcode, body))
@@ -211,13 +216,17 @@ def _finish(file: BinaryIO, draft: Draft, listed: list[tuple[int, bytes]], count
 
 def _measured(path: Path, what: str) -> dict[str, float]:
     """Figures of one reading, in a fresh process."""
-    command = [sys.executable, "-m", "flowrec.bench.poses", what, str(path)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603 - our own words
+    command = [sys.executable, "-m", "tests.perf.poses", what, str(path)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
     row: dict[str, float] = json.loads(done.stdout)
     return row
 
 
 def _verb_s(verb: str, path: Path) -> float:
     began = time.perf_counter()
-    subprocess.run([sys.executable, "-m", "flowrec", verb, str(path)], check=True, capture_output=True)  # noqa: S603
+    subprocess.run([sys.executable, "-m", "flowrec", verb, str(path)], check=True, capture_output=True)
     return time.perf_counter() - began
+
+
+if __name__ == "__main__":
+    run(measure, show)

@@ -1,7 +1,7 @@
-"""`flowrec bench clocks`: how well a camera's frames are dated from its own clock, by five ways to fit it.
+"""`python -m tests.perf.clocks`: errors of frame stamps by five ways to fit a camera's clock to the host's.
 
-Made-up series, whose truth is known: a camera at 100 Hz for some minutes, its clock 50 ppm fast, frames that arrive
-late by a fifth of a millisecond and more, and one thing after the other that goes wrong.
+The series are simulated, so the truth is known: a camera at 100 Hz for some minutes, its clock 50 ppm fast, frames that
+arrive at least 0.2 ms late, and one fault per series.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
+from flowrec.bench.harness import Results, Seed, run
 from flowrec.clocks import DeviceClock, Fit
 from flowrec.clocks.device_clock import envelope
 from flowrec.terminal import table
@@ -92,9 +94,12 @@ CASES = (
 
 
 def measure(
-    seconds: float = 300.0, seed: int = 0, cases: Sequence[str] = CASES, methods: Sequence[str] | None = None
-) -> dict[str, Any]:
-    """Errors of the dates by case and method, s."""
+    seconds: Annotated[float, typer.Option(min=60.0, help="Length of each series.")] = 300.0,
+    seed: Seed = 0,
+    cases: Sequence[str] = CASES,
+    methods: Sequence[str] | None = None,
+) -> Results:
+    """Errors of the stamps by case and method, s."""
     rows = []
     for case in cases:
         one = series(case, seconds, seed)
@@ -222,3 +227,7 @@ def show(figures: dict[str, Any]) -> None:
 
 def _told(error_s: float) -> str:
     return f"{1e6 * error_s:.0f}" if abs(error_s) < 10.0 else f"{error_s:.0f} s"
+
+
+if __name__ == "__main__":
+    run(measure, show)

@@ -1,13 +1,11 @@
-"""Each way to end a run, many times, in real processes: how long until the field is off, and until the process is gone.
+"""`python -m tests.perf.stops`: each way to end a run, in real processes, until the field is off and the process ends.
 
-`python -m tests.campaigns.stops --trials 20 [--only KIND]` prints a row for each kind: the worst time from its cause
-to the field being off (by the driver log of trial.py, seen from the loop: no command with a field follows), its timer,
-the worst time from the cause to the end of the process, and what became of the files.
+A row per kind: the worst time from its cause to the field being off (by the driver log of stop_trial.py: no command
+with a field follows), its timer, the worst time from the cause to the end of the process, and the state of the files.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import signal
@@ -17,9 +15,14 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import typer
+
+from flowrec.bench.harness import Results, run
 from flowrec.errors import FlowrecError
 from flowrec.store import SessionReader, recover
+from flowrec.terminal import progress, table
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGUSR1, signal.SIGUSR2]
 _RAMP_S, _HANG_S, _SIGHT_S = 0.9, 0.5, 1.4
@@ -29,7 +32,7 @@ _START_S, _END_S = 120.0, 30.0
 
 @dataclass(frozen=True)
 class Kind:
-    """What is done to a run: the fault of trial.py, then signals, 10 ms from one to the next."""
+    """What is done to a run: the fault of stop_trial.py, then signals, 10 ms from one to the next."""
 
     fault: str = "none"
     sent: tuple[signal.Signals, ...] = ()
@@ -106,7 +109,7 @@ def stop(kind: Kind, folder: Path, *sets: str) -> Ended:
     path, log = folder / "run.mcap", folder / "driver.log"
     with (folder / "stderr").open("wb") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", "tests.campaigns.trial", kind.fault, str(path), str(log), *sets],
+            [sys.executable, "-m", "tests.perf.stop_trial", kind.fault, str(path), str(log), *sets],
             cwd=Path(__file__).parents[2],
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             stdout=subprocess.DEVNULL,
@@ -177,31 +180,51 @@ def _read(path: Path) -> str:
         return ""
 
 
-def main() -> None:
+def measure(
+    trials: Annotated[int, typer.Option(min=1, help="Runs of each kind.")] = 20,
+    only: Annotated[list[str] | None, typer.Option(metavar="KIND", help="Only this kind; may be repeated.")] = None,
+) -> Results:
+    """Worst times by kind, exit statuses, and how many runs left which files."""
+    rows = {}
+    kinds = only or list(KINDS)
+    with progress("stopping runs", trials * len(kinds)) as done:
+        for place, name in enumerate(kinds):
+            ended: list[Ended] = []
+            files: dict[str, int] = {}
+            for trial in range(trials):
+                with tempfile.TemporaryDirectory(prefix="flowrec-stops-") as folder:
+                    ended.append(stop(KINDS[name], Path(folder)))
+                    files[ended[-1].file()] = files.get(ended[-1].file(), 0) + 1
+                done(place * trials + trial + 1)
+            offs = [one.off_s - one.cause_s if one.off_s is not None else float("inf") for one in ended]
+            rows[name] = {
+                "field_off_s": max(offs),
+                "timer_s": KINDS[name].timer_s,
+                "process_gone_s": max(one.end_s - one.cause_s for one in ended),
+                "statuses": sorted({one.status for one in ended}),
+                "files": files,
+            }
+    return {"trials": trials, "rows": rows}
+
+
+def show(results: Results) -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--trials", type=int, default=20)
-    parser.add_argument("--only", action="append", help="a kind; may be given several times")
-    asked = parser.parse_args()
-    heads = ("kind", "trials", "field off", "timer", "process gone", "statuses", "files")
-    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads))
-    for name in asked.only or KINDS:
-        ended: list[Ended] = []
-        files: dict[str, int] = {}
-        for _ in range(asked.trials):
-            with tempfile.TemporaryDirectory(prefix="flowrec-stops-") as folder:
-                ended.append(stop(KINDS[name], Path(folder)))
-                files[ended[-1].file()] = files.get(ended[-1].file(), 0) + 1
-        offs = [one.off_s - one.cause_s if one.off_s is not None else float("inf") for one in ended]
-        gone_s = max(one.end_s - one.cause_s for one in ended)
-        statuses = ", ".join(str(status) for status in sorted({one.status for one in ended}))
-        told = ", ".join(f"{count} {what}" for what, count in files.items())
-        timer_s = KINDS[name].timer_s
-        print(
-            f"| {name} | {asked.trials} | {max(offs):.3f} s | {timer_s:g} s | {gone_s:.2f} s | {statuses} | {told} |",
-            flush=True,
-        )
+    table(
+        f"{results['trials']} runs of each kind, worst times from the cause on",
+        ("kind", "field off, s", "timer, s", "process gone, s", "statuses", "files"),
+        [
+            (
+                name,
+                f"{row['field_off_s']:.3f}",
+                f"{row['timer_s']:g}",
+                f"{row['process_gone_s']:.2f}",
+                ", ".join(map(str, row["statuses"])),
+                ", ".join(f"{count} {state}" for state, count in row["files"].items()),
+            )
+            for name, row in results["rows"].items()
+        ],
+    )
 
 
 if __name__ == "__main__":
-    main()
+    run(measure, show)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-import re
+import queue
 import tempfile
+import threading
 import time
+import zlib
 from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import get_context
+from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
 
+from flowrec.bench.harness import memory_mb
 from flowrec.bench.loop import PacedRig, TimingsOnly, prepare_inputs
-from flowrec.bench.store_rivals import BareProcess, BareThread
-from flowrec.bench.store_writers import made_up_header, pictures, ticks_of
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.declarations import Image
@@ -23,6 +27,7 @@ from flowrec.run.loop import LockstepWorker, Sink, run
 from flowrec.store import SessionWriter, Snapshot
 from flowrec.system.realtime_priority import first_of_all
 from flowrec.terminal import progress
+from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 2448, 2048
@@ -30,6 +35,7 @@ _QUEUE_BYTES = round(2.0 * RATE_HZ * _WIDTH * _HEIGHT)  # as `flowrec record` ha
 _RING = 140  # images, more than the queue holds
 _SOAK_RATE_HZ = 100.0
 _RING_S = 30.0
+_SLOTS = 16  # images in shared memory
 _WARM_S = 5.0  # until the queue, the pools and the caches have their size
 
 
@@ -171,8 +177,68 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
     }
 
 
-def memory_mb() -> float:
-    """Memory of this process now, in MB, of Linux; NaN elsewhere."""
-    status = Path("/proc/self/status")
-    found = re.search(r"VmRSS:\s+(\d+)", status.read_text(encoding="ascii")) if status.exists() else None
-    return float(found[1]) / 1024.0 if found else float("nan")
+def _pack(compressor: zstandard.ZstdCompressor, content: memoryview) -> None:
+    packed = compressor.compress(content)
+    zlib.crc32(content)
+    zlib.crc32(packed)
+
+
+class BareThread:
+    """A thread beside the loop."""
+
+    def __init__(self) -> None:
+        self._images: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def write(self, tick: Tick) -> None:
+        if tick.frame is not None:
+            self._images.put(tick.frame.image)
+
+    def close(self) -> None:
+        self._images.put(None)
+        self._thread.join()
+
+    def _work(self) -> None:
+        compressor = zstandard.ZstdCompressor(level=1)
+        while (image := self._images.get()) is not None:
+            _pack(compressor, image.data)
+
+
+class BareProcess:
+    """A process beside the loop; what it costs the loop is one more copy of every image, and a message."""
+
+    def __init__(self, nbytes: int) -> None:
+        context = get_context("spawn")
+        self._nbytes = nbytes
+        self._memory: Any = SharedMemory(create=True, size=_SLOTS * nbytes)
+        self._slots, far = context.Pipe()
+        self._process = context.Process(target=_work_in_process, args=(self._memory.name, nbytes, far), daemon=True)
+        self._process.start()
+        self._slots.recv()  # it is there
+        self._next = 0
+
+    def write(self, tick: Tick) -> None:
+        if tick.frame is not None:
+            at = self._next * self._nbytes
+            slot = np.frombuffer(self._memory.buf, np.uint8, self._nbytes, at)
+            np.copyto(slot, tick.frame.image.reshape(-1))
+            self._slots.send(self._next)
+            self._next = (self._next + 1) % _SLOTS
+
+    def close(self) -> None:
+        self._slots.send(None)
+        self._process.join()
+        self._memory.close()
+        self._memory.unlink()
+
+
+def _work_in_process(name: str, nbytes: int, slots: Any) -> None:
+    memory: Any = SharedMemory(name)
+    compressor = zstandard.ZstdCompressor(level=1)
+    slots.send(True)
+    while (slot := slots.recv()) is not None:
+        content = memory.buf[slot * nbytes : (slot + 1) * nbytes]
+        _pack(compressor, content)
+        content.release()
+    memory.close()

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from flowrec.bench.clocks import CASES, measure, series
 from flowrec.clocks import DeviceClock
+from tests.perf.clocks import CASES, measure, series
 
 FRAMES_PER_S = 100
 

@@ -1,10 +1,9 @@
-"""Spoiled sessions. `flowrec bench fuzz` reads as many as one likes; here are the first of them, and those that once
-did what may not happen."""
+"""The first corrupted sessions of `python -m tests.perf.fuzz`, and those that once were a fault."""
 
 import pytest
 
-from flowrec.bench.fuzz import Campaign
 from flowrec.store import SessionReader
+from tests.perf.fuzz import Campaign
 
 # Seeds of files that were once a fault: what recovery passed for whole could not be read; a check that saw less than
 # the reader.
@@ -40,8 +39,8 @@ def test_the_campaign_notices_what_may_not_happen(tmp_path, monkeypatch):
 
 
 def test_the_session_that_is_spoiled_holds_every_topic(tmp_path):
-    from flowrec.bench.draft import TICKS, small_draft
     from flowrec.topics import TOPICS
+    from tests.store.drafts import TICKS, small_draft
 
     path = tmp_path / "whole.mcap"
     path.write_bytes(small_draft().build())

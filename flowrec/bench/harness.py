@@ -1,0 +1,197 @@
+"""What the benches share: command-line options, output files, the choice of methods, statistics and memory.
+
+A bench is a module with `measure`, which returns its results as a dictionary for JSON, and `show`, which prints them.
+The parameters of `measure` that are annotated as options are the options of its command.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+import math
+import os
+import platform
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_origin
+
+import typer
+
+from flowrec.errors import FlowrecError, UsageError
+from flowrec.system.outputs import FIGURE, JSON, new_file
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Results = dict[str, Any]
+
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb."),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+JsonFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the results as JSON.")]
+FigureFile = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the results (PNG, PDF or SVG).")]
+Cases = Annotated[Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz); random ones by default.")]
+Names = Annotated[str | None, typer.Option(metavar="A,B", help="Only these methods; by default all.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Smaller cases only.")]
+
+_Z = 1.959963984540054  # of a two-sided interval of 95 %
+_BOOTSTRAP_DRAWS = 10_000
+
+
+def run(
+    measure: Callable[..., Results],
+    show: Callable[[Any], None],
+    words: Sequence[str] | None = None,
+    program: str | None = None,
+    summary: str | None = None,
+) -> None:
+    """Run a bench as a command of its own; `words` are its arguments, by default those of the process.
+
+    Ends with SystemExit: the exit status is 1 if the results count faults (`fault_count`).
+    """
+    app = typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.command(help=summary or inspect.getdoc(sys.modules[measure.__module__]))(_command(measure, show))
+    try:
+        app(args=words, prog_name=program)
+    except FlowrecError as error:
+        sys.stderr.write(f"flowrec: {error}\n")
+        sys.exit(error.exit_status)
+
+
+def _command(measure: Callable[..., Results], show: Callable[[Any], None]) -> Callable[..., None]:
+    """A function with the options of `measure` and those of every bench, for typer."""
+
+    def command(as_json: bool, out: Path | None, overwrite: bool, **options: Any) -> None:
+        inputs = [value for name, value in options.items() if isinstance(value, Path) and name != "figure"]
+        with ExitStack() as stack:
+            file = out and stack.enter_context(new_file(out, JSON, inputs=inputs, overwrite=overwrite))
+            if figure := options.get("figure"):
+                need_matplotlib()
+                options["figure"] = stack.enter_context(new_file(figure, FIGURE, inputs=inputs, overwrite=overwrite))
+            results = {"machine": machine(), **measure(**options)}
+            if as_json:
+                typer.echo(json.dumps(results))
+            else:
+                show(results)
+            if file is not None:
+                file.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        if results.get("fault_count"):
+            raise typer.Exit(1)
+
+    own = inspect.signature(measure, eval_str=True).parameters.values()
+    common = inspect.signature(_common, eval_str=True).parameters.values()
+    parameters = [one for one in (*own, *common) if get_origin(one.annotation) is Annotated]
+    parameters = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in parameters]
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {one.name: one.annotation for one in parameters}
+    return command
+
+
+def _common(as_json: AsJson = False, out: JsonFile = None, overwrite: Overwrite = False) -> None:
+    """Declares the options of every bench."""
+
+
+def need_matplotlib() -> None:
+    """Raise UsageError if matplotlib is not installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise UsageError("--figure needs matplotlib, which is not installed: pip install 'flowrec[notebook]'")
+
+
+def machine() -> dict[str, Any]:
+    """The computer and the versions that a result depends on."""
+    return {
+        "cores": os.cpu_count(),
+        "threads": os.environ.get("OMP_NUM_THREADS", "default"),
+        "platform": platform.platform(),
+        "python": platform.python_version(),
+        **{package: version(package) for package in ("numpy", "scipy")},
+    }
+
+
+def chosen(what: str, names: str | None, known: Iterable[str]) -> tuple[str, ...]:
+    """The names in "A,B", all known ones if there are none given.
+
+    Raises
+    ------
+    UsageError
+        If a name is not known; `what` is the kind of name, as in "bench flow: no method".
+    """
+    known = tuple(known)
+    wanted = known if names is None else tuple(dict.fromkeys(names.split(",")))
+    if unknown := [name for name in wanted if name not in known]:
+        raise UsageError(f"{what} {', '.join(map(repr, unknown))}; there are {', '.join(known)}")
+    return wanted
+
+
+def vessel_cases(folder: Path) -> list[Path]:
+    """The vessel cases in a folder; UsageError if there are none."""
+    cases = sorted(folder.glob("*.npz"))
+    if not cases:
+        raise UsageError(f"{folder}: no vessel case (*.npz) in it")
+    return cases
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """The 95 % score interval of a proportion; (0, 1) without a trial. Source: Wilson (1927)."""
+    if count == 0:
+        return 0.0, 1.0
+    ratio, zz = successes / count, _Z * _Z
+    middle = (ratio + zz / (2 * count)) / (1 + zz / count)
+    half = _Z * math.sqrt(ratio * (1 - ratio) / count + zz / (4 * count * count)) / (1 + zz / count)
+    # The ends are exact if all or none succeeded: rounding must not take them out of [0, 1].
+    return (0.0 if successes == 0 else middle - half), (1.0 if successes == count else middle + half)
+
+
+def paired(ratios: NDArray[np.float64]) -> Results:
+    """Geometric mean of paired ratios (n,), its bootstrap 95 % interval, and tests of the hypothesis that it is 1.
+
+    The sign test and Wilcoxon's signed-rank test are two-sided; ties (ratio 1) count for neither side.
+    """
+    import numpy as np
+    from scipy.stats import binomtest, wilcoxon
+
+    if len(ratios) == 0:
+        return {"count": 0}
+    logs = np.log(ratios)
+    rng = np.random.default_rng(0)
+    means = rng.choice(logs, (_BOOTSTRAP_DRAWS, len(logs))).mean(axis=1)
+    less, more = int((logs < 0).sum()), int((logs > 0).sum())
+    return {
+        "count": len(ratios),
+        "mean": float(np.exp(logs.mean())),
+        "interval_95": tuple(float(np.exp(end)) for end in np.percentile(means, (2.5, 97.5))),
+        "less": less,
+        "more": more,
+        "sign_p": float(binomtest(less, less + more).pvalue) if less + more else 1.0,
+        "wilcoxon_p": float(wilcoxon(logs).pvalue) if less + more else 1.0,
+    }
+
+
+def peak_mb() -> float:
+    """Largest memory of this process so far, in MB (Linux); NaN elsewhere. getrusage would count the parent's."""
+    return _status_mb("VmHWM")
+
+
+def memory_mb() -> float:
+    """Memory of this process now, in MB (Linux); NaN elsewhere."""
+    return _status_mb("VmRSS")
+
+
+def _status_mb(key: str) -> float:
+    status = Path("/proc/self/status")
+    found = re.search(rf"{key}:\s+(\d+)", status.read_text(encoding="ascii")) if status.exists() else None
+    return float(found[1]) / 1024.0 if found else float("nan")

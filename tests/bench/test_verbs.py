@@ -1,0 +1,67 @@
+"""The command line of the benches: options are those of `measure`, and moved benches say where they are."""
+
+import inspect
+import json
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, get_origin
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from flowrec.bench import harness
+from flowrec.bench.verbs import BENCHES, MOVED, bench
+from flowrec.errors import UsageError
+
+PERF = sorted(path.stem for path in (Path(__file__).parents[1] / "perf").glob("*.py"))
+
+
+def options_of(measure):
+    parameters = inspect.signature(measure, eval_str=True).parameters.values()
+    return {one.name.replace("_", "-") for one in parameters if get_origin(one.annotation) is Annotated}
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_the_help_of_a_bench_has_its_summary_and_the_options_of_its_measure(name):
+    done = CliRunner().invoke(bench, [name, "--help"], env={"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"})
+    assert done.exit_code == 0, done.output
+    shown = " ".join(done.output.split())
+    assert BENCHES[name].split(":")[0] in shown and "--json" in shown and "--overwrite" in shown
+    module = import_module(f"flowrec.bench.{name}")
+    renamed = {"k", "tree-channels", "tree-iterations", "sets"}  # declared with names of their own
+    assert all(f"--{option}" in shown for option in options_of(module.measure) - renamed)
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_a_bench_that_has_moved_says_where_to(name):
+    with pytest.raises(UsageError, match=rf"has moved: run 'python -m {MOVED[name]} ") as refused:
+        CliRunner().invoke(bench, [name, "--quick", "word"], catch_exceptions=False)
+    assert "\n" not in str(refused.value)
+    assert import_module(MOVED[name])
+
+
+def test_results_that_count_faults_end_with_status_1_after_they_are_written(tmp_path):
+    out = tmp_path / "a.json"
+
+    def measure(count: Annotated[int, typer.Option()] = 3, hidden: int = 7):
+        return {"fault_count": count, "hidden": hidden}
+
+    for count, status in ((0, 0), (2, 1)):
+        with pytest.raises(SystemExit) as ended:
+            harness.run(measure, print, ["--count", str(count), "--out", str(out), "--overwrite", "--json"], "a", "b")
+        assert ended.value.code == status
+        assert json.loads(out.read_text())["fault_count"] == count
+    with pytest.raises(SystemExit) as ended:
+        harness.run(measure, print, ["--hidden", "3"], "a", "b")
+    assert ended.value.code == 2
+
+
+@pytest.mark.parametrize("name", ["clocks", "fuzz", "grid", "large", "stops", "store"])
+def test_an_engineering_measurement_runs_as_a_module(name):
+    done = subprocess.run(
+        [sys.executable, "-m", f"tests.perf.{name}", "--help"], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "--json" in done.stdout and name in PERF, done.stderr
