@@ -10,32 +10,28 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-import numpy as np
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
-from scipy.ndimage import label
 
-from flowrec.chip import ChipSettings, check_point, median_width_um
+from flowrec.chip import ChipSettings
 from flowrec.chip.chip import Chip
 from flowrec.chip.io import CHIP_KEYS
-from flowrec.chip.places import named_opening, opening_point_um
 from flowrec.chip.registration import Calibration
 from flowrec.control import Coils, Controller
-from flowrec.control.mission import MissionStateMachine
-from flowrec.errors import UnreachableError, UsageError
+from flowrec.control.mission import MissionStateMachine, PlacedMission
+from flowrec.errors import UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.methods import Methods
 from flowrec.planning import Planner, SurveyPlanner
-from flowrec.planning.free_space import Swift, swept_out, too_swift
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
-from flowrec.rig_settings import CameraSettings, Safety, Simulated
-from flowrec.robot import USUAL_DELAY_S, Robot
+from flowrec.rig_settings import Camera, CameraSettings, Safety, Simulated
+from flowrec.robot import Robot, RobotSettings
 from flowrec.system.toml_file import parse_toml, read_toml
 from flowrec.vision import Tracker
 
@@ -97,7 +93,7 @@ class Config:
     rig: Literal["simulated"] = "simulated"
     duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None  # None: until the mission is finished
     chip: ChipSettings = field(default_factory=ChipSettings)
-    robot: Robot = field(default_factory=Robot)
+    robot: RobotSettings = field(default_factory=RobotSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     simulated: Simulated = field(default_factory=Simulated)
     start: Start = field(default_factory=Start)
@@ -117,10 +113,17 @@ class Config:
     recording: Recording = field(default_factory=Recording)
 
 
-_ADAPTER = TypeAdapter(Config)
-SIMULATED = "simulated"
-_FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
-_OUTLET_START_RADII = (5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResolvedConfig(Config):
+    """A run on its chip: robot, camera, start and goal are known."""
+
+    robot: Robot
+    camera: Camera
+    mission: PlacedMission
+
+
+_AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
+_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,19 +153,19 @@ def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mappi
     """
     tree = _read_config(path) if path is not None else {}
     origin = Origin(str(path) if path is not None else "--set", _apply_sets(tree, sets) | dict(flags or {}))
-    config = _config_from(tree, origin)
+    config = _config_from(Config, tree, origin)
     check_config(config, origin)
     return config
 
 
-def config_from_toml(text: str, where: str) -> Config:
-    """The Config that `to_toml` wrote; `where` names its origin in errors.
+def config_from_toml(text: str, where: str) -> ResolvedConfig:
+    """The configuration of a session, as `to_toml` wrote it; `where` names its origin in errors.
 
     A recording is readable whatever it was made with: ranges are checked only where sizes and scales depend on them.
     """
     origin = Origin(where)
     try:
-        config = _config_from(parse_toml(text), origin)
+        config = _config_from(ResolvedConfig, parse_toml(text), origin)
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
     for fault in faults(config):
@@ -177,162 +180,26 @@ def to_toml(config: Config) -> str:
     return tomli_w.dumps(_without_none(asdict(config)))
 
 
-def with_sets(config: Config, sets: Iterable[str], flags: Mapping[str, str] | None = None) -> Config:
+def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] | None = None) -> _AnyConfig:
     """The configuration with some `key=value` changed; `flags` as in `load_config`.
 
     A recorded configuration may hold settings outside of their ranges; only what is changed is checked.
     """
     tree = _without_none(asdict(config))
     origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
-    changed = _config_from(tree, origin)
+    changed = _config_from(type(config), tree, origin)
     check_config(changed, origin, frozenset(faults(config)))
     return changed
 
 
-def resolve(config: Config, chip: Chip) -> Config:
-    """Fill in what was left to fit the chip, place the camera, and turn named places into points.
-
-    A robot that nobody described is made to suit the chip: radius 50 um, or a fifth of the median channel width
-    where that is narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow;
-    40 ms from command to motion, or as long as it takes at v_max through a fifth of a channel. All that is for the
-    simulated rig only; `derived` lists it.
-
-    Raises
-    ------
-    UsageError : settings outside of their ranges; on a real rig also what has to be measured and was not given.
-    UnreachableError : start and goal lie in channels that do not meet.
-    """
-    check_config(config)
-    _refuse_unmeasured(config)
-    camera, robot = config.camera, config.robot
-    channel_um = median_width_um(chip)
-    width_um, height_um = chip.size_um
-    if camera.um_per_px is None:
-        fit = max(width_um / camera.width_px, height_um / camera.height_px)
-        camera = replace(camera, um_per_px=fit)
-    assert camera.um_per_px is not None
-    if robot.radius_um is None:
-        radius = min(max(min(50.0, 0.2 * channel_um), 3.0 * camera.um_per_px), 0.25 * channel_um)
-        robot = replace(robot, radius_um=round(radius, 2))
-    if robot.max_speed_um_s is None:
-        peak = float(np.linalg.norm(config.flow.solve(chip).velocity_um_s, axis=-1).max())
-        robot = replace(robot, max_speed_um_s=max(600.0, round(1.3 * peak, 1)))
-    assert robot.max_speed_um_s is not None
-    if robot.delay_s is None:
-        crossing_s = 0.2 * channel_um / robot.max_speed_um_s
-        robot = replace(robot, delay_s=round(min(USUAL_DELAY_S, crossing_s), 5))
-    assert robot.max_speed_um_s is not None
-    if robot.step_out_hz is None:
-        robot = replace(robot, step_out_hz=1.2 * robot.max_speed_um_s / robot.um_per_rev)
-    assert robot.max_speed_um_s is not None
-    # Coils that can not make the full field can not make the robot as fast either; plans must know.
-    if config.coils.full_mt(robot) < config.coils.amplitude_mt:
-        robot = replace(robot, max_speed_um_s=min(robot.max_speed_um_s, round(config.coils.fastest_um_s(robot), 1)))
-    assert robot.max_speed_um_s is not None
-    if camera.rate_hz is None:
-        rate = min(max(30.0, robot.max_speed_um_s / (0.5 * robot.radius)), _FASTEST_CAMERA_HZ)
-        camera = replace(camera, rate_hz=round(rate, 1))
-    assert camera.rate_hz is not None
-    plan = replace(config.plan, swift=_timed(config.plan.swift, robot, camera.rate_hz))
-    survey = replace(config.survey, swift=_timed(config.survey.swift, robot, camera.rate_hz))
-    resolved = replace(config, camera=camera, robot=robot, plan=plan, survey=survey)
-    mission = config.mission
-    mission = replace(
-        mission,
-        start=_start(resolved, chip),
-        goal=_point(chip, mission.goal, "goal", robot),
-    )
-    _refuse_apart(chip, mission)
-    return replace(resolved, mission=mission)
-
-
-def derived(asked: Config, resolved: Config) -> dict[str, float]:
-    """The numbers that nobody gave or that were changed while a configuration was resolved, by key."""
-    was, now = _flat(asdict(asked), ""), _flat(asdict(resolved), "")
-    return {key: value for key, value in now.items() if isinstance(value, (int, float)) and value != was[key]}
-
-
-def _flat(tree: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in tree.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return flat
-
-
-def _refuse_unmeasured(config: Config) -> None:
-    """Only a simulated robot and camera can be made to fit the chip."""
-    rig: str = config.rig
-    given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
-    missing = [key for key, value in given.items() if value is None]
-    if rig != SIMULATED and missing:
-        raise UsageError(
-            f"rig = {rig!r}: {', '.join(missing)} not given; measure them and set each: only the simulated rig's robot "
-            "and camera are made to fit the chip"
-        )
-
-
-def _timed(swift: Swift, robot: Robot, rate_hz: float) -> Swift:
-    return replace(
-        swift,
-        frame_s=round(1.0 / rate_hz, 6) if swift.frame_s is None else swift.frame_s,
-        latency_s=robot.delay if swift.latency_s is None else swift.latency_s,
-    )
-
-
-def calibration_of(config: Config, chip: Chip) -> Calibration:
+def calibration_of(config: ResolvedConfig, chip: Chip) -> Calibration:
     """Camera pixels to chip coordinates: the chip is centred in the image."""
     camera = config.camera
-    assert camera.um_per_px is not None, "resolve() first"
     width_um, height_um = chip.size_um
     half = 0.5 * chip.um_per_px
     x = width_um / 2 - half - camera.um_per_px * (camera.width_px - 1) / 2
     y = height_um / 2 - half - camera.um_per_px * (camera.height_px - 1) / 2
     return Calibration(camera.um_per_px, (x, y))
-
-
-def _start(config: Config, chip: Chip) -> tuple[float, float]:
-    """The start; that called `outlet` is the nearest to the opening at which the robot can be held.
-
-    Five radii inside, as elsewhere, or farther where the assumed flow carries the robot out before the coils are up. No
-    such place: the first one, which is refused with the reason before anything is driven.
-    """
-    place, robot = config.mission.start, config.robot
-    if not isinstance(place, str) or named_opening(chip, place).kind != "outlet":
-        return _point(chip, place, "start", robot)
-    field, drift = config.flow.solve(chip), config.plan.swift.drift(robot, robot.speed_limit_um_s)
-    for radii in _OUTLET_START_RADII:
-        point = opening_point_um(chip, place, radii * robot.radius)
-        start_um = np.array(point)
-        if not (
-            swept_out(chip, field, start_um, drift, config.coils.ramp_s)
-            or too_swift(chip, field, start_um, start_um, robot.radius, drift)
-        ):
-            return point
-    return _point(chip, place, "start", robot)
-
-
-def _point(chip: Chip, place: tuple[float, float] | str, what: str, robot: Robot) -> tuple[float, float]:
-    if isinstance(place, str):
-        return opening_point_um(chip, place, 5.0 * robot.radius)
-    check_point(chip, place, what, robot.radius)
-    return place
-
-
-def _refuse_apart(chip: Chip, mission: MissionStateMachine) -> None:
-    """Start and goal must lie in one connected channel."""
-    channels, count = label(chip.mask)
-    rows, columns = chip.mask.shape
-    ends = []
-    for place in (mission.start, mission.goal):
-        assert not isinstance(place, str)
-        x, y = place
-        row, column = round(y / chip.um_per_px), round(x / chip.um_per_px)
-        ends.append(channels[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)])
-    if ends[0] != ends[1]:
-        raise UnreachableError(
-            f"unreachable: mission.goal = {mission.goal} lies in another channel than the start {mission.start}; the "
-            f"mask of {chip.name} has {count} channels that do not meet; choose a goal in the same one"
-        )
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -371,18 +238,23 @@ def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
     tree[keys[-1]] = value
 
 
-def _config_from(tree: dict[str, Any], origin: Origin) -> Config:
+def _config_from(kind: type[_AnyConfig], tree: dict[str, Any], origin: Origin) -> _AnyConfig:
     """The settings of a tree, each of its type; ranges are not looked at."""
     phases = tree.get("mission", {}).get("phases") if isinstance(tree.get("mission", {}), dict) else None
     if isinstance(phases, str):
         tree["mission"]["phases"] = [phase.strip() for phase in phases.split(",") if phase.strip()]
     _refuse_unknown(tree, Config, "", origin)
+    if kind not in _ADAPTERS:
+        _ADAPTERS[kind] = TypeAdapter(kind)
     try:
-        return _ADAPTER.validate_python(tree)
+        config: _AnyConfig = _ADAPTERS[kind].validate_python(tree)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(part for part in map(str, first["loc"]) if not part.startswith(("tuple", "str", "function")))
+        if first["type"] == "missing":
+            raise UsageError(f"{origin(key)}: {key} is missing; a session states it") from error
         raise UsageError(f"{origin(key)}: {_not_of_its_type(key, first['input'], first['msg'].lower())}") from error
+    return config
 
 
 def _not_of_its_type(key: str, value: Any, complaint: str) -> str:

@@ -15,7 +15,7 @@ from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
 from flowrec.clocks import Fit
-from flowrec.config import Config, calibration_of
+from flowrec.config import ResolvedConfig, calibration_of
 from flowrec.control import Coils, Controller
 from flowrec.control.events import event_of
 from flowrec.control.mission import MissionStateMachine
@@ -80,7 +80,7 @@ class Pipeline:
     hindsight: Callable[[int], Observations] | None = None
 
 
-def assemble(config: Config, chip: Chip) -> Pipeline:
+def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
     """The stages of a resolved configuration on its chip."""
     return Pipeline(
         chip=chip,

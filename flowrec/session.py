@@ -20,7 +20,7 @@ from flowrec.units import nanoseconds, seconds
 if TYPE_CHECKING:
     from flowrec.chip.chip import Chip
     from flowrec.chip.registration import Calibration
-    from flowrec.config import Config
+    from flowrec.config import ResolvedConfig
     from flowrec.messages import Event, FlowField, Frame, Tick
     from flowrec.store.reader import SessionReader
 
@@ -84,7 +84,7 @@ class Session:
         return self.run.counts()
 
     @cached_property
-    def config(self) -> Config:
+    def config(self) -> ResolvedConfig:
         """The resolved configuration of the run; UsageError where it is not valid."""
         from flowrec.config import config_from_toml
 

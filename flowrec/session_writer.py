@@ -9,7 +9,7 @@ from pathlib import Path
 
 from flowrec.chip import chip_files
 from flowrec.chip.chip import Chip
-from flowrec.config import Config, calibration_of, to_toml
+from flowrec.config import ResolvedConfig, calibration_of, to_toml
 from flowrec.provenance import provenance
 from flowrec.session import files_behind, session_sha256
 from flowrec.store import Region, SessionHeader, SessionWriter, Snapshot, Split, encoding_for, files_of
@@ -21,7 +21,7 @@ _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
 
 def session_writer(
     path: Path,
-    config: Config,
+    config: ResolvedConfig,
     chip: Chip,
     *,
     parent: Path | None = None,
@@ -61,10 +61,10 @@ def session_writer(
     )
 
 
-def _durability(config: Config, *, live: bool) -> dict[str, str]:
+def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
     """How much of a run a kill takes at most, in s of stamps; of a ring, from its event on."""
     camera, flush_s = config.camera, config.recording.flush_s
-    pixels_s = camera.width_px * camera.height_px * (camera.rate_hz or 0.0)
+    pixels_s = camera.width_px * camera.height_px * camera.rate_hz
     waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only where the disk is too slow
     return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
 
@@ -74,14 +74,14 @@ def _start_unix_ns(file: Path) -> int:
         return head.source.start_unix_ns
 
 
-def _pieces_of(config: Config) -> Split | Snapshot:
+def _pieces_of(config: ResolvedConfig) -> Split | Snapshot:
     recording = config.recording
     if recording.snapshot_before_s:
         return Snapshot(recording.snapshot_before_s, recording.snapshot_after_s, recording.snapshot_mb)
     return Split(recording.split_mb, recording.split_s)
 
 
-def region_of(config: Config, chip: Chip, again: bool = False) -> Region | None:
+def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region | None:
     """Which part of most images is kept, as settings and tracker will have it; None: all.
 
     `again`: the images were cut when they were recorded, and are kept as they are.
@@ -94,26 +94,26 @@ def region_of(config: Config, chip: Chip, again: bool = False) -> Region | None:
     return Region(sight.pad_px + recording.region_pad_px, sight.everywhere_px, recording.full_every_s, cut=not again)
 
 
-def queue_bytes_of(config: Config) -> int:
+def queue_bytes_of(config: ResolvedConfig) -> int:
     """How much may wait for the disk, in bytes."""
     camera, chosen_mb = config.camera, config.recording.queue_mb
     if chosen_mb is not None:
         return int(chosen_mb * 1e6)
-    images = int(_QUEUE_S * camera.width_px * camera.height_px * (camera.rate_hz or 0.0))
+    images = int(_QUEUE_S * camera.width_px * camera.height_px * camera.rate_hz)
     return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
 
 
-def frames_of(config: Config) -> str:
+def frames_of(config: ResolvedConfig) -> str:
     """How the images of a run travel, a name of store/frames.py."""
     camera, chosen = config.camera, config.recording.frames
     if chosen != "auto":
         return chosen
     if config.recording.region == "robot":
         return "zstd"  # makes less of the black than delta in a fifth of its time (flowrec bench store)
-    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz or 0.0)
+    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz)
 
 
-def session_header(config: Config, chip: Chip) -> SessionHeader:
+def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:
     """Everything that must be in a file before its first frame; the session clock starts now."""
     png, toml = chip_files(chip)
     facts = provenance(config.recording.anonymous) | {

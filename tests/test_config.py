@@ -6,7 +6,7 @@ import ast
 import json
 import re
 import sys
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -15,8 +15,9 @@ import flowrec
 from flowrec.chip import load_chip
 from flowrec.cli import main
 from flowrec.commands.record import Recorded, prepare
-from flowrec.config import Config, config_from_toml, load_config, resolve, to_toml, with_sets
+from flowrec.config import Config, config_from_toml, load_config, to_toml, with_sets
 from flowrec.errors import FlowrecError, UnreachableError, UsageError
+from flowrec.resolve import resolve
 from flowrec.store import SessionReader
 
 
@@ -54,7 +55,7 @@ def test_every_example_configuration_resolves() -> None:
     for path in examples:
         config = load_config(path)
         resolved = resolve(config, load_chip(config.chip))
-        assert resolved.robot.radius > 0
+        assert resolved.robot.radius_um > 0
         assert isinstance(resolved.mission.goal, tuple)
 
 
@@ -100,8 +101,8 @@ def test_every_key_that_a_message_names_exists() -> None:
     known = keys(Config())
     named = {key: text for source in SOURCES for text in messages(source) for key in KEY.findall(text)}
     assert len(named) > 20
-    unknown = {key: text for key, text in named.items() if key not in known and not key.endswith(".py")}
-    assert unknown == {}
+    settings = {key: text for key, text in named.items() if not (key.startswith("flowrec.") or key.endswith(".py"))}
+    assert {key: text for key, text in settings.items() if key not in known} == {}
 
 
 def test_every_key_that_the_readme_names_exists() -> None:
@@ -151,7 +152,7 @@ def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> No
         assert key in str(caught.value)
     robot = replace(config.robot, radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, delay_s=0.04)
     camera = replace(config.camera, um_per_px=10.0, rate_hz=30.0)
-    assert resolve(replace(config, robot=robot, camera=camera), chip).robot == robot
+    assert asdict(resolve(replace(config, robot=robot, camera=camera), chip).robot) == asdict(robot)
 
 
 def test_what_was_derived_is_said_and_kept_in_the_file(
@@ -174,7 +175,7 @@ def test_a_start_called_outlet_is_where_the_robot_can_be_held_while_the_field_co
     def start_of(*sets):
         config, chip, _ = prepare(load_config(None, ["mission.start=outlet", "mission.goal=inlet", *sets]))
         end_um = (chip.mask.shape[1] - 0.5) * chip.um_per_px
-        return (end_um - config.mission.start[0]) / config.robot.radius
+        return (end_um - config.mission.start[0]) / config.robot.radius_um
 
     slow, swift = start_of("chip.name=straight"), start_of("chip.name=straight", "chip.inlet_speed_um_s=3000")
     assert slow < 6.0 < swift

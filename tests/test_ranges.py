@@ -14,8 +14,9 @@ import pytest
 from flowrec.chip import load_chip
 from flowrec.cli import main
 from flowrec.commands import replay
-from flowrec.config import Config, load_config, resolve, with_sets
+from flowrec.config import Config, load_config, with_sets
 from flowrec.errors import UsageError
+from flowrec.resolve import resolve
 from flowrec.session import Session
 
 GOLDEN = Path(__file__).parents[1] / "sessions" / "golden.mcap"

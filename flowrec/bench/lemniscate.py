@@ -42,7 +42,14 @@ class World:
         rev_um = 25.0
         top = v_max_um_s if self.step_out_um_s is None else self.step_out_um_s
         margin = 1.0 if self.step_out_um_s is None else 0.95
-        return Robot(50.0, rev_um, v_max_um_s, top / rev_um, margin, self.delay_s)
+        return Robot(
+            radius_um=50.0,
+            um_per_rev=rev_um,
+            max_speed_um_s=v_max_um_s,
+            step_out_hz=top / rev_um,
+            step_out_margin=margin,
+            delay_s=self.delay_s,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,7 @@ from flowrec.chip.chip import Chip
 from flowrec.commands.export import scene_of
 from flowrec.commands.record import prepare
 from flowrec.commands.replay import Change, replay
-from flowrec.config import Config, load_config
+from flowrec.config import ResolvedConfig, load_config
 from flowrec.messages import Currents, Tick
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
@@ -75,9 +75,9 @@ class Keep:
         self.ticks.append(tick)
 
 
-def prepare_inputs(config: Config, pipeline: Pipeline, ticks: int) -> list[Inputs]:
+def prepare_inputs(config: ResolvedConfig, pipeline: Pipeline, ticks: int) -> list[Inputs]:
     """Fly a mission in the simulator and keep what its rig yielded, worker results included."""
-    rig = SimulatedRig.of(pipeline, config, ticks / (config.camera.rate_hz or RATE_HZ))
+    rig = SimulatedRig.of(pipeline, config, ticks / config.camera.rate_hz)
     kept = Keep()
     with progress("preparing frames", ticks) as done:
         run(
@@ -140,7 +140,7 @@ def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] 
 
 
 def _run_once(
-    kind: str, prepared: list[Inputs], config: Config, chip: Chip, pipeline: Pipeline, path: Path
+    kind: str, prepared: list[Inputs], config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path
 ) -> list[Tick]:
     """One paced run with the sinks of its kind; the timings are in the ticks."""
     timings = TimingsOnly()

@@ -23,12 +23,13 @@ from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, ves
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.commands.record import refuse_adrift
-from flowrec.config import Config, load_config, resolve
+from flowrec.config import ResolvedConfig, load_config
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import assemble
 from flowrec.planning import Planner
+from flowrec.resolve import resolve
 from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run.loop import LockstepWorker, run
@@ -252,7 +253,7 @@ def fly(
     taken_s = best_s = None
     if log.began is not None:
         began_ns, place_um, _route = log.began
-        tolerance_um = config.mission.goal_tolerance_um or config.robot.radius
+        tolerance_um = config.mission.goal_tolerance_um or config.robot.radius_um
         best_s = optimum_s(truth, place_um, mission.goal_um, tolerance_um, chip, config.robot)
         if outcome == "reached":
             taken_s = seconds(mission.since_ns - began_ns)
@@ -274,13 +275,13 @@ def fly(
         planned_s=float(log.began[2].arrival_s[-1]) if log.began is not None else None,
         rms_um=math.sqrt(float(np.mean(log.square_um2))) if log.square_um2 else None,
         replans=log.replans,
-        latency_ms=1e3 * config.robot.delay,
-        radius_um=config.robot.radius,
+        latency_ms=1e3 * config.robot.delay_s,
+        radius_um=config.robot.radius_um,
         speed_limit_um_s=config.robot.speed_limit_um_s,
     )
 
 
-def true_field(chip: Chip, config: Config, world: World) -> FlowField:
+def true_field(chip: Chip, config: ResolvedConfig, world: World) -> FlowField:
     """The flow that really is: every inlet off by exactly the world's share, outlets and viscosity as the rig draws."""
     solver = FlowSolver(k=config.simulated.k)
     drawn = true_chip(chip, config.simulated, solver)

@@ -288,7 +288,7 @@ def _policy(
                     "flow": scale,
                     "time_s": took,
                     "optimum_s": best,
-                    "touches": bool(lowest < world.robot.radius - 0.5 * flow.um_per_px),
+                    "touches": bool(lowest < world.robot.radius_um - 0.5 * flow.um_per_px),
                 }
             )
     return made
@@ -341,7 +341,7 @@ def _speed_on(world: World, trip: Trip, repeats: int = 7) -> dict[str, Any]:
     field = world.field(0.9)
     planner = Planner()
     start, goal = trip.ends("up")
-    space = open_space(world.chip, field, world.robot.radius, 0.5 * world.robot.radius)
+    space = open_space(world.chip, field, world.robot.radius_um, 0.5 * world.robot.radius_um)
     speed = 0.85 * SPEED_UM_S / space.um_per_px
 
     def cpu(action: Callable[[], object]) -> float:

@@ -106,12 +106,13 @@ def _world(chip: Chip, k: int) -> World | None:
         return None
     peak = float(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]).max())
     flow = replace(field, velocity_um_s=field.velocity_um_s / np.float32(peak))
-    return World(chip.name, chip, flow, Robot(chip.um_per_px, 25.0, SPEED_UM_S, 1e6, 1.0))
+    robot = Robot(radius_um=chip.um_per_px, max_speed_um_s=SPEED_UM_S, step_out_hz=1e6, step_out_margin=1.0)
+    return World(chip.name, chip, flow, robot)
 
 
 def draw_trip(world: World, rng: np.random.Generator, least_share: float = 0.4) -> Trip | None:
     """Two places with room for the robot, at least a share of the chip's size apart; None where none is found."""
-    space = open_space(world.chip, world.flow, world.robot.radius, 0.5 * world.robot.radius)
+    space = open_space(world.chip, world.flow, world.robot.radius_um, 0.5 * world.robot.radius_um)
     parts = label(space.free, _EIGHT)[0]
     rows, columns = np.nonzero(space.free)
     for _ in range(400 if len(rows) else 0):
@@ -134,7 +135,7 @@ def best_time(
 
     Flow and clearance are the same bilinear ones, looked at more closely. inf where there is no way.
     """
-    space = open_space(world.chip, field, world.robot.radius, 0.5 * world.robot.radius)
+    space = open_space(world.chip, field, world.robot.radius_um, 0.5 * world.robot.radius_um)
     px = space.um_per_px
     even = np.full_like(space.clearance, speed_um_s / px)
     terrain = Terrain(space.free, space.clearance, space.need, space.vx, space.vy, even).finer(finer)

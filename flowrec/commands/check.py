@@ -12,7 +12,7 @@ from flowrec.chip import chip_from_files
 from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_told, faults_of, skew_ppm
 from flowrec.commands.check_tally import GAP_PERIODS, Tally
 from flowrec.commands.verdict import Finding, Gap, Verdict
-from flowrec.config import Config, config_from_toml
+from flowrec.config import ResolvedConfig, config_from_toml
 from flowrec.declarations import Role
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
@@ -86,7 +86,7 @@ class _FileCheck:
         self._clocks()
         self._replay()
 
-    def _header(self) -> Config | None:
+    def _header(self) -> ResolvedConfig | None:
         verdict, found = self.verdict, self.found
         written = f"by flowrec {found.flowrec_version}"
         if found.flowrec_version != __version__:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flowrec.chip.chip import Chip
-from flowrec.config import Config
+from flowrec.config import ResolvedConfig
 from flowrec.errors import SessionError
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.session import Session, content_blamed, files_behind
@@ -17,7 +17,7 @@ from flowrec.terminal import progress, say
 from flowrec.view import Scene, is_made_from, write_rrd
 
 
-def scene_of(config: Config, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:
+def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:
     """What the viewer needs to know besides the ticks."""
     properties = {
         "chip": chip.name,

@@ -19,12 +19,13 @@ from flowrec.chip.chip import Chip
 from flowrec.clocks import ClockWatch
 from flowrec.commands.auto_recovery import look_after
 from flowrec.commands.interactive import Unattended
-from flowrec.config import Config, derived, resolve
+from flowrec.config import Config, ResolvedConfig
 from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.free_space import no_room, swept_out, too_swift
+from flowrec.resolve import derived, resolve
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.disk_monitor import DiskWatch, refuse_below
 from flowrec.run.loop import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
@@ -106,20 +107,19 @@ class Witness:
         return math.sqrt(self._square_um2 / self._count) if self._count else math.nan
 
 
-def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
+def prepare(asked: Config) -> tuple[ResolvedConfig, Chip, Pipeline]:
     """The resolved configuration, its chip and its pipeline. Warns where the plan will have to be honest."""
-    if config.sampler.method == "smoothed":
+    if asked.sampler.method == "smoothed":
         raise UsageError(
             "sampler.method = 'smoothed' looks at what came later: use it in flowrec replay --refine; a run takes "
             "'filter' or 'trimmed'"
         )
-    chip = load_chip(config.chip)
-    asked, config = config, resolve(config, chip)
+    chip = load_chip(asked.chip)
+    config = resolve(asked, chip)
     made = derived(asked, config)
     if made:
         say(f"derived for the simulated rig: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
     refuse_adrift(config, chip)
-    assert config.robot.max_speed_um_s is not None
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:
         warn(
@@ -132,17 +132,17 @@ def prepare(config: Config) -> tuple[Config, Chip, Pipeline]:
                 f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
                 f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
             )
-    blind_um = config.robot.delay * config.robot.max_speed_um_s
+    blind_um = config.robot.delay_s * config.robot.max_speed_um_s
     if blind_um > 0.5 * median_width_um(chip):
         warn(
-            f"in the {1e3 * config.robot.delay:.0f} ms from command to motion a robot at "
+            f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at "
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return config, chip, assemble(config, chip)
 
 
-def refuse_adrift(config: Config, chip: Chip) -> None:
+def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
     """Raise UnreachableError where the assumed flow leaves no way to the goal, before anything is driven.
 
     So it is where it can not be held at the start, or is out of an outlet before the coils are up: their field, and
@@ -152,12 +152,12 @@ def refuse_adrift(config: Config, chip: Chip) -> None:
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
     drift = config.plan.swift.drift(robot, robot.speed_limit_um_s)
-    reason = too_swift(chip, field, start, start, robot.radius, drift)
+    reason = too_swift(chip, field, start, start, robot.radius_um, drift)
     if reason:
         raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
     if {"plan", "navigate"} & set(config.mission.phases):
         goal = np.asarray(config.mission.goal, np.float64)
-        reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius, drift)
+        reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius_um, drift)
         if reason:
             raise UnreachableError(f"unreachable: {reason}")
     reason = swept_out(chip, field, start, drift, config.coils.ramp_s)
@@ -214,19 +214,18 @@ def record(
     ------
     FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
     """
-    asked = config
     inputs = (*inputs, *_named_by(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
-    config, chip, pipeline = prepare(config)
-    made = derived(asked, config)
-    timeout_s = _guard_timeout_s(config) if realtime else None
-    path = _place(config, out, overwrite)
+    resolved, chip, pipeline = prepare(config)
+    made = derived(config, resolved)
+    timeout_s = _guard_timeout_s(resolved) if realtime else None
+    path = _place(resolved, out, overwrite)
     if view == "rrd":
         check_output(path.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
-    fields = field_of_session(Path(config.start.field), chip) if config.start.field else {}
-    rig = SimulatedRig.of(pipeline, config, config.duration_s, realtime)
-    folder, floor_gb = path.resolve().parent, config.recording.disk_floor_gb
+    fields = field_of_session(Path(resolved.start.field), chip) if resolved.start.field else {}
+    rig = SimulatedRig.of(pipeline, resolved, resolved.duration_s, realtime)
+    folder, floor_gb = path.resolve().parent, resolved.recording.disk_floor_gb
     control = control if control is not None else Unattended()
     desk = control.desk
     guard = Guard(rig, timeout_s, partial(desk.stop, zero=True), warn)
@@ -244,7 +243,7 @@ def record(
         stack.enter_context(control.armed(guard, lambda: _closed_beside(opened, desk.reason)))
         writer = stack.enter_context(
             session_writer(
-                path, config, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
+                path, resolved, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
             )
         )
         opened.append(writer)
@@ -256,10 +255,10 @@ def record(
             from flowrec.commands.export import scene_of
             from flowrec.view import LiveView
 
-            live = stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), view))
+            live = stack.enter_context(LiveView(scene_of(resolved, chip, pipeline, path), view))
             say(live.message)
             sinks.append(live)
-        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, config.worker.adopt_after_s)
+        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, resolved.worker.adopt_after_s)
         stack.callback(worker.close)
         if fields:
             worker = Preloaded(worker, fields)
@@ -284,7 +283,7 @@ def record(
                 guard=guard,
             )
         facts = facts_of(chip, report, witness.true_field)
-        if config.control.method != "policy":  # which has no reference to be off
+        if resolved.control.method != "policy":  # which has no reference to be off
             facts["tracking_error_um"] = finite(witness.rms_um)
         facts["frames_dropped"] = writer.dropped_frames
         if control.note:
@@ -310,10 +309,10 @@ def record(
     return recorded
 
 
-def _guard_timeout_s(config: Config) -> float:
+def _guard_timeout_s(config: ResolvedConfig) -> float:
     """The guard's time, which must suffice for the camera's frames."""
     timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
-    if rate_hz is not None and timeout_s * rate_hz < _LEAST_FRAMES:
+    if timeout_s * rate_hz < _LEAST_FRAMES:
         raise UsageError(
             f"safety.guard_timeout_s = {timeout_s:g}: shorter than {_LEAST_FRAMES:g} frames at camera.rate_hz = "
             f"{rate_hz:g}; the nearest that works is {_LEAST_FRAMES / rate_hz:.3g}"

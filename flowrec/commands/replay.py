@@ -16,7 +16,7 @@ from flowrec import topics
 from flowrec.chip.chip import Chip
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
-from flowrec.config import Config, with_sets
+from flowrec.config import ResolvedConfig, with_sets
 from flowrec.enums import WorkOrder
 from flowrec.errors import FlowrecError, SessionError, UsageError, printable
 from flowrec.estimation.smoother import observe, smooth
@@ -49,7 +49,7 @@ class Change:
     controller: str | None = None
     sets: tuple[str, ...] = ()
 
-    def apply(self, config: Config) -> Config:
+    def apply(self, config: ResolvedConfig) -> ResolvedConfig:
         """The recorded configuration with the changes; a what-if never replans on a robot that can not follow."""
         plan, controller = _that_go_together(self.plan, self.controller, config)
         typed = {
@@ -70,7 +70,9 @@ class Change:
         return replace(changed, mission=mission)
 
 
-def _that_go_together(plan: str | None, controller: str | None, config: Config) -> tuple[str | None, str | None]:
+def _that_go_together(
+    plan: str | None, controller: str | None, config: ResolvedConfig
+) -> tuple[str | None, str | None]:
     """Planner and controller asked for; where only one is and the recorded other does not suit it, one that does."""
     if controller == "policy" and plan is None and config.plan.method != "time_field":
         return "time_field", controller
@@ -110,8 +112,8 @@ class Replayed:
     """What a replay found."""
 
     source: Path
-    recorded_config: Config
-    config: Config
+    recorded_config: ResolvedConfig
+    config: ResolvedConfig
     chip: Chip
     report: RunReport
     recorded: Tick
@@ -124,9 +126,11 @@ class Replayed:
     digest: tuple[bool, list[str]] | None  # likewise: whether the file is as it was recorded, and lines that say so
 
 
-def stale_results(recorded: Config, changed: Config) -> frozenset[str]:
+def stale_results(recorded: ResolvedConfig, changed: ResolvedConfig) -> frozenset[str]:
     """The worker results that must be made anew; changing what a recording has settled is a UsageError."""
-    sections = [each.name for each in fields(Config) if getattr(recorded, each.name) != getattr(changed, each.name)]
+    sections = [
+        each.name for each in fields(ResolvedConfig) if getattr(recorded, each.name) != getattr(changed, each.name)
+    ]
     for section in sections:
         if section in FIXED:
             raise UsageError(
@@ -251,7 +255,7 @@ def replay(
 
 
 @contextmanager
-def _settings_blamed(path: Path, config: Config) -> Iterator[None]:
+def _settings_blamed(path: Path, config: ResolvedConfig) -> Iterator[None]:
     """A replay runs with recorded settings that are outside of their ranges; where it fails, the first one is named."""
     fault = next(range_faults(config), None)
     try:
@@ -267,7 +271,7 @@ def _settings_blamed(path: Path, config: Config) -> Iterator[None]:
         ) from error
 
 
-def _warned_of_windows(reader: SessionReader, recorded: Config, config: Config) -> Config:
+def _warned_of_windows(reader: SessionReader, recorded: ResolvedConfig, config: ResolvedConfig) -> ResolvedConfig:
     """Where images are windows another tracker may look outside of them, and what is written are windows again."""
     if reader.region is None:
         return config
@@ -386,7 +390,9 @@ def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
     return reader.tick_before(max(mission.requested_ns, reader.first_ns))
 
 
-def _closing_work(pipeline: Pipeline, config: Config, last: Tick, recorded: Tick, stale: frozenset[str]) -> Tick:
+def _closing_work(
+    pipeline: Pipeline, config: ResolvedConfig, last: Tick, recorded: Tick, stale: frozenset[str]
+) -> Tick:
     """Refine and plan after the last frame what the recording ended too early to adopt, or never asked for."""
     mission = last.mission
     if mission is None or last.assumed is None:

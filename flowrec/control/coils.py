@@ -174,7 +174,6 @@ class Coils:
 
 def _follow_hz(robot: Robot) -> float:
     """Frequency up to which the robot follows the nominal amplitude, with the step-out margin."""
-    assert robot.step_out_hz is not None, "robot is resolved with the chip"
     return robot.step_out_margin * robot.step_out_hz
 
 

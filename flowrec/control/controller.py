@@ -122,7 +122,7 @@ class Controller:
             field=field,
             flow=flow,
             robot=robot,
-            predicted_um=predict_position(estimate.position_um, sent, dt_s, robot.delay, flow),
+            predicted_um=predict_position(estimate.position_um, sent, dt_s, robot.delay_s, flow),
             limit_um_s=robot.speed_limit_at(strength),
             dt_s=dt_s,
             um_per_px=um_per_px,
@@ -132,7 +132,7 @@ class Controller:
         if not mission.finished and math.isfinite(reference.error_um):
             demand, saturated = law.velocity(now, reference)
             if clearance_um is not None and self.guard_radii > 0.0:
-                keep_um, per_s = self.guard_radii * robot.radius, now.scaled_rate(self.guard_per_s)
+                keep_um, per_s = self.guard_radii * robot.radius_um, now.scaled_rate(self.guard_per_s)
                 demand, limited = wall_barrier(demand, now, clearance_um, keep_um, per_s)
                 saturated = saturated or limited
             if not estimate.seen:
@@ -144,7 +144,7 @@ class Controller:
             progress_s=reference.progress_s,
             error_um=reference.error_um,
             saturated=saturated,
-            sent_um_s=append_demand(sent, demand, dt_s, robot.delay),
+            sent_um_s=append_demand(sent, demand, dt_s, robot.delay_s),
         )
 
     def _reference(self, now: Situation, law: TrackingLaw) -> Reference:
@@ -158,7 +158,7 @@ class Controller:
         own = law.reference(now)
         if own is not None:
             return own
-        radius_um = now.robot.radius
+        radius_um = now.robot.radius_um
         lag_free_um, lag_full_um = self.lag_free_radii * radius_um, self.lag_full_radii * radius_um
         return follow(now, route, lag_free_um, lag_full_um, self.pace_share)
 

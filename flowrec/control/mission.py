@@ -19,7 +19,8 @@ from flowrec.units import seconds
 Phase = Literal["survey", "refine", "plan", "navigate"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
-Place = tuple[Coordinate, Coordinate] | str
+Point = tuple[Coordinate, Coordinate]
+Place = Point | str
 _SWEPT_RADII, _RETURNED_RADII = 2.0, 1.0  # from its position, of a held robot
 _EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
 
@@ -231,14 +232,14 @@ class MissionStateMachine:
 
     def _navigate(self, previous: Mission, now: _Frame, route: Route) -> Mission:
         """At the goal, too late, too far off the route, or still on the way."""
-        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius
+        tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius_um
         if math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
             return _finish(previous, now, "reached")
         limit_s = self._time_limit_s(self.navigate_limit_s, route)
         if _elapsed_s(previous, now) > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
             return _finish(previous, now, "timeout", note)
-        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius
+        limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
         if now.demand is None or not now.demand.error_um > limit_um:
             return previous
         if previous.request >= self.orders_limit:
@@ -263,7 +264,7 @@ def _held(previous: Mission, now: _Frame) -> Mission:
     if not now.track.seen or now.demand is None or not math.isfinite(now.demand.error_um):
         return previous
     limit_radii = _RETURNED_RADII if previous.swept else _SWEPT_RADII
-    swept = now.demand.error_um > limit_radii * now.robot.radius
+    swept = now.demand.error_um > limit_radii * now.robot.radius_um
     return previous if swept == previous.swept else replace(previous, stamp_ns=now.now_ns, swept=swept)
 
 
@@ -277,10 +278,12 @@ def _elapsed_s(mission: Mission, now: _Frame) -> float:
 
 def _at_end(now: _Frame, route: Route) -> bool:
     """Whether the robot is at the end of a route, or the reference is and the robot as near as it comes."""
-    if math.dist(now.estimate.position_um, route.waypoints_um[-1]) <= now.robot.radius:
+    if math.dist(now.estimate.position_um, route.waypoints_um[-1]) <= now.robot.radius_um:
         return True
     demand = now.demand
-    return demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * now.robot.radius
+    return (
+        demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * now.robot.radius_um
+    )
 
 
 def _transition(
@@ -321,3 +324,11 @@ def _finish(previous: Mission, now: _Frame, outcome: str, note: str = "") -> Mis
         blind="",
         field_off=False,
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedMission(MissionStateMachine):
+    """A mission whose start and goal are points on the chip."""
+
+    start: Point
+    goal: Point

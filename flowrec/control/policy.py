@@ -50,10 +50,10 @@ class Policy(VectorLaw):
         drift = now.flow_um_s / robot.speed_limit_um_s
         fastest = 1.0 + math.hypot(drift[0], drift[1])  # over ground, in units of the robot's own speed
         frame_um = robot.speed_limit_um_s * now.dt_s
-        hold = left_um <= max(self.hold_radii * robot.radius, um_per_px, fastest * frame_um)
+        hold = left_um <= max(self.hold_radii * robot.radius_um, um_per_px, fastest * frame_um)
         progress_s = float(route.arrival_s[-1]) if hold else nearest_time(route, now.estimate.position_um)
         # A gradient on pixels needs two of them; beyond the goal there is none.
-        distance_um = min(max(robot.radius, 2.0 * um_per_px, frame_um), left_um / fastest)
+        distance_um = min(max(robot.radius_um, 2.0 * um_per_px, frame_um), left_um / fastest)
         return Reference(
             position_um=goal if hold else position_at(route, progress_s),
             future_um=goal,

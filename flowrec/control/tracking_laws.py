@@ -188,5 +188,4 @@ def limit_length(vector: Vector, limit: float) -> tuple[Vector, bool]:
 
 def speed_ratio(robot: Robot) -> float:
     """How many times faster, in radii per second, than the robot that the settings are meant for; at least 1."""
-    assert robot.max_speed_um_s is not None
-    return max(1.0, robot.max_speed_um_s / robot.radius / _NOMINAL_RADII_PER_S)
+    return max(1.0, robot.max_speed_um_s / robot.radius_um / _NOMINAL_RADII_PER_S)

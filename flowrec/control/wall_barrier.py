@@ -33,12 +33,12 @@ def wall_barrier(
     if now.route is not None:
         waypoints = now.route.waypoints_um
         distance = np.hypot(waypoints[:, 0] - now.predicted_um[0], waypoints[:, 1] - now.predicted_um[1])
-        near_um = waypoints[distance < _NEAR_RADII * now.robot.radius]
+        near_um = waypoints[distance < _NEAR_RADII * now.robot.radius_um]
         some_um = near_um[:: len(near_um) // _MOST_WAYPOINTS + 1]
         gap_um = min(
             (clearance_and_slope(clearance_um, point / now.um_per_px)[0] for point in some_um), default=math.inf
         )
-        keep_um = min(keep_um, max(gap_um, now.robot.radius))
+        keep_um = min(keep_um, max(gap_um, now.robot.radius_um))
     clearance, slope = clearance_and_slope(clearance_um, now.predicted_um / now.um_per_px)
     steepness = math.hypot(slope[0], slope[1]) / now.um_per_px
     if math.isfinite(clearance) and steepness > _LEAST_SLOPE:

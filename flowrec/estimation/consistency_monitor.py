@@ -66,7 +66,6 @@ class HealthMonitor:
 
         Without `applied` step-out is not looked for. `wall_um` is from the robot's centre to the nearest wall.
         """
-        assert robot.max_speed_um_s is not None
         if previous is None or before is None:
             bank = np.zeros(len(_BANK_HZ))
             return Health(estimate.stamp_ns, "", 2.0, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0)

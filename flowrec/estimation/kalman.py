@@ -78,11 +78,10 @@ class Kalman:
         `estimate_gain` the filter needs headings that vary within the memory of the flow; on a straight way its
         variance stays what it was and the belief with it.
         """
-        assert robot.max_speed_um_s is not None
         if previous is not None and math.hypot(*previous.flow_um_s) > _FASTEST_SHARE * robot.max_speed_um_s:
             previous = None  # begin anew
         state, covariance, layout, _ = self.predict(previous, track, applied, robot, field)
-        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius
+        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.02 * robot.radius_um
         # State and covariance are set anew for every step: all that the filter knows is in the messages.
         kalman = copy.copy(_filter(layout.size, sigma_um))  # several threads may replay at a time
         kalman.x, kalman.P = state, covariance
@@ -142,7 +141,6 @@ class Kalman:
     def _noise(
         self, previous: Estimate, layout: Layout, change: Floats, dt: float, robot: Robot, field: FlowField | None
     ) -> Floats:
-        assert robot.max_speed_um_s is not None
         gain = (_GAIN_WANDERS * robot.um_per_rev) ** 2 * dt
         if self.flow_noise_um2_s3 is not None:
             q = self.flow_noise_um2_s3 * (1.0 if field is None else self.map_share**2)
@@ -150,16 +148,15 @@ class Kalman:
         way = math.hypot(change[0], change[1]) + _STILL_SHARE * robot.max_speed_um_s * dt
         flow = previous.flow_um_s
         speed = math.hypot(flow[0], flow[1], _SLOWEST_SHARE * robot.max_speed_um_s)
-        unit = self.agility * self._scale(previous, robot, dt) * way / robot.radius * speed**2
+        unit = self.agility * self._scale(previous, robot, dt) * way / robot.radius_um * speed**2
         if field is not None:
             unit *= self.map_share**2
-        slope = self.slope_change * unit / robot.radius**2
+        slope = self.slope_change * unit / robot.radius_um**2
         return noise(layout, dt, self.flow_change * unit, slope, gain, self.drift_um2_s)
 
     def _watch_share(self, robot: Robot, dt: float) -> float:
         """Weight of the newest innovation in their sliding mean."""
-        assert robot.max_speed_um_s is not None
-        return min(max(dt, 0.0) * robot.max_speed_um_s / (self.watch_radii * robot.radius), 0.5)
+        return min(max(dt, 0.0) * robot.max_speed_um_s / (self.watch_radii * robot.radius_um), 0.5)
 
     def _scale(self, previous: Estimate, robot: Robot, dt: float) -> float:
         """By how much the noise is scaled: 1 where the mean innovation is as large as that of white ones."""
@@ -207,12 +204,11 @@ def _first(layout: Layout, track: Track, robot: Robot, field: FlowField | None) 
 
 def _usual(layout: Layout, robot: Robot) -> tuple[Floats, Floats]:
     """State and covariance before anything was measured."""
-    assert robot.max_speed_um_s is not None
     state = np.zeros(layout.size)
     variance = np.full(layout.size, _UNKNOWN_UM**2)
     variance[2:4] = (0.5 * robot.max_speed_um_s) ** 2
     if layout.slopes:
-        variance[4:7] = (_SLOPE_SHARE * robot.max_speed_um_s / robot.radius) ** 2 * ISOTROPIC
+        variance[4:7] = (_SLOPE_SHARE * robot.max_speed_um_s / robot.radius_um) ** 2 * ISOTROPIC
     if layout.gain:
         state[-1] = robot.um_per_rev
         variance[-1] = (_GAIN_SHARE * robot.um_per_rev) ** 2

@@ -31,7 +31,7 @@ class Luenberger:
         field: FlowField | None = None,
     ) -> Estimate:
         """The position is the measured one; the covariance is nominal: noise through the low pass, no dynamics."""
-        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius
+        sigma_um = self.position_noise_um if self.position_noise_um is not None else 0.04 * robot.radius_um
         moved = robot.um_per_rev * applied.turns
         flow = np.zeros(2) if previous is None else previous.flow_um_s
         position = track.position_um

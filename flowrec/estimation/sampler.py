@@ -45,7 +45,6 @@ class Sampler:
         self, previous: Observations | None, before: Estimate | None, estimate: Estimate, robot: Robot
     ) -> Observations | None:
         """The observations after this frame; the previous object itself when none is due."""
-        assert robot.max_speed_um_s is not None
         variance = 0.5 * (estimate.covariance[2, 2] + estimate.covariance[3, 3])
         if before is None or not estimate.seen or not before.seen:
             return previous
@@ -62,7 +61,7 @@ class Sampler:
         if previous is not None and len(previous.position_um):
             way = math.dist(position, previous.position_um[-1])
             soon = estimate.stamp_ns < previous.stamp_ns + nanoseconds(self.memories * lag_s)
-            if soon or way < self.spacing_radii * robot.radius:
+            if soon or way < self.spacing_radii * robot.radius_um:
                 return previous
             wait_s = seconds(estimate.stamp_ns - previous.stamp_ns)
         else:

@@ -60,7 +60,6 @@ def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, 
 
 def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settled_share: float = 0.1) -> Observations:
     """Observations so far apart, in way and in time, that each has noise of its own; std as the smoother has it."""
-    assert robot.max_speed_um_s is not None
     chosen: list[int] = []
     std = np.sqrt(0.5 * (smoothed.covariance[:, 2, 2] + smoothed.covariance[:, 3, 3]))
     for index, position in enumerate(smoothed.position_um):
@@ -70,7 +69,7 @@ def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settle
             way = math.dist(position, smoothed.position_um[chosen[-1]])
             passed_s = seconds(smoothed.stamps_ns[index] - smoothed.stamps_ns[chosen[-1]])
             # Both sides of a smoothed flow remember.
-            if way < spacing_radii * robot.radius or passed_s < 2.0 * smoothed.memory_s[index]:
+            if way < spacing_radii * robot.radius_um or passed_s < 2.0 * smoothed.memory_s[index]:
                 continue
         chosen.append(index)
     stamp_ns = smoothed.stamps_ns[-1] if smoothed.stamps_ns else 0

@@ -59,7 +59,6 @@ class StepOut:
         `previous` and `before` are health and estimate of the frame before, `robot` is as the settings say.
         `wall_um` is from the robot's centre to the nearest wall: a robot at a wall may be stopped by it.
         """
-        assert robot.step_out_hz is not None
         own_hz = robot.step_out_margin * robot.step_out_hz
         dt, turns = seconds(estimate.stamp_ns - before.stamp_ns), math.hypot(applied.turns[0], applied.turns[1])
         was_ns, was_before = previous.limited_ns, previous.rolled_before_um_s
@@ -74,7 +73,7 @@ class StepOut:
             return replace(now, rolled_sums=_NONE)
         if field is None or dt <= 0.0 or turns <= 0.0 or not before.seen:
             return now
-        if wall_um < _FREE_RADII * robot.radius:
+        if wall_um < _FREE_RADII * robot.radius_um:
             return now
         heading = applied.turns / turns
         carried = dt * sample(field, 0.5 * (before.measured_um + estimate.measured_um))

@@ -109,7 +109,7 @@ class Swift:
         """Of a robot that swims at a speed."""
         frame_s, latency_s = self.frame_s or 0.0, self.latency_s or 0.0
         blind_s = frame_s + latency_s
-        return Drift(self.map_error, self.heading_error_rad, blind_s, frame_s, speed_um_s, robot.radius)
+        return Drift(self.map_error, self.heading_error_rad, blind_s, frame_s, speed_um_s, robot.radius_um)
 
 
 def open_space(chip: Chip, field: FlowField, radius_um: float, margin_um: float, drift: Drift = Drift()) -> Space:
@@ -253,7 +253,7 @@ def swept_out(chip: Chip, field: FlowField, start_um: Points, drift: Drift, ramp
 
 def no_room(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, robot: Robot) -> str:
     """Why a robot does not fit through from start to goal (2,), however near to the walls; '' when it does."""
-    space = open_space(chip, field, robot.radius, 0.0)
+    space = open_space(chip, field, robot.radius_um, 0.0)
     start, goal = attach_start(space, start_um), attach_goal(space, goal_um)
     return start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
 
@@ -351,7 +351,7 @@ def _narrowest_place(clearance: Raster, widest: float, a: int, b: int) -> tuple[
 
 def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
     """Clearances beside the robot's radius, to be tried in turn: what was asked for, else half of it, less, none."""
-    return (0.5 * robot.radius, 0.25 * robot.radius, 0.0) if wanted_um is None else (wanted_um,)
+    return (0.5 * robot.radius_um, 0.25 * robot.radius_um, 0.0) if wanted_um is None else (wanted_um,)
 
 
 def margin_remark(margin_um: float, tried_um: tuple[float, ...]) -> str:

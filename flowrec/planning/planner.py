@@ -110,7 +110,7 @@ class Planner:
         drift = self.swift.drift(robot, robot.speed_limit_um_s)
         trouble = ""
         for margin_um in margins:
-            space = open_space(chip, field, robot.radius, margin_um, drift)
+            space = open_space(chip, field, robot.radius_um, margin_um, drift)
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             trouble = start.trouble or goal.trouble or why_apart(space, start.node, goal.node)
             if not trouble:
@@ -126,7 +126,7 @@ class Planner:
                 return replace(route, reason="; ".join(remark for remark in remarks if remark))
         if self.clearance_margin_um is not None:
             trouble = narrowest(space, start_at, goal_at) or trouble
-        swift = too_swift(chip, field, start_at, goal_at, robot.radius, drift)
+        swift = too_swift(chip, field, start_at, goal_at, robot.radius_um, drift)
         return no_route(self.method, swift or trouble)
 
     def _check(self) -> None:

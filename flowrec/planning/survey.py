@@ -61,7 +61,7 @@ class SurveyPlanner:
         drift = self.swift.drift(robot, speed_um_s)
         route = no_route(_METHOD, "")
         for margin_um in margins:
-            space = open_space(chip, field, robot.radius, margin_um, drift)
+            space = open_space(chip, field, robot.radius_um, margin_um, drift)
             route = self._downstream(space, field, at, chip, speed_um_s, limit_um)
             if route.reachable:
                 lean = margin_remark(margin_um, margins)

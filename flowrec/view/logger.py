@@ -82,7 +82,7 @@ class TickLogger:
         self._trail: deque[tuple[int, NDArray[np.float64]]] = deque()
         left, _, right, _ = scene.image_bounds()
         self._unit_px = (right - left) / 640.0  # sizes that suit a 640 pixel image, whatever the camera
-        self._robot_px = scene.length_px(scene.robot.radius)
+        self._robot_px = scene.length_px(scene.robot.radius_um)
         turn = np.linspace(0.0, 2.0 * np.pi, 33)
         self._ring = np.stack([np.cos(turn), np.sin(turn)], 1)
         self._log_static()

@@ -120,7 +120,7 @@ class Tracker:
 
     def sight(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Sight:
         """How far around the searched region pixels of an image of `shape` have a say, whatever is in them."""
-        nominal = robot.radius / calibration.um_per_px
+        nominal = robot.radius_um / calibration.um_per_px
         coarse = _coarse_step(nominal)
         # Squares of the shrunk image that a template on the outermost square of the region covers; the last of them
         # may reach out of the region by all but a pixel.
@@ -134,7 +134,7 @@ class Tracker:
         self, previous: Track | None, frame: Frame, walls: Walls, calibration: Calibration, robot: Robot
     ) -> _Search:
         """Where to look, from the previous message."""
-        nominal = robot.radius / calibration.um_per_px
+        nominal = robot.radius_um / calibration.um_per_px
         margin = min(max(self.wall_margin_um / calibration.um_per_px, 1.0), 0.5 * nominal)
         # A score of 0 says that it was never seen.
         if previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after:

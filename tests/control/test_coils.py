@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 from flowrec.chip import load_chip
-from flowrec.config import load_config, resolve
+from flowrec.config import load_config
 from flowrec.control import Coils
 from flowrec.control.amplifier import Amplifier
 from flowrec.control.coils import field_limits
 from flowrec.errors import UsageError
 from flowrec.messages import Currents, Demand
+from flowrec.resolve import resolve
 from flowrec.robot import Robot
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=20.0, step_out_margin=0.9)

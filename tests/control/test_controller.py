@@ -61,7 +61,7 @@ def test_the_reference_waits_for_a_robot_that_can_not_follow_and_never_runs_away
     slow = replace(ROBOT, max_speed_um_s=200.0)
     route = straight(speed_um_s=300.0)
     run = fly(Controller(), route, lambda x, y: (0.0, 0.0), 25.0, (500.0, 2500.0), STILL, robot=slow)
-    assert max(demand.error_um for demand in run.demands) < 3.0 * slow.radius
+    assert max(demand.error_um for demand in run.demands) < 3.0 * slow.radius_um
     assert all(np.hypot(*demand.velocity_um_s) <= 200.0 + 1e-9 for demand in run.demands)
     progress = [demand.progress_s for demand in run.demands]
     assert (np.diff(progress) >= 0.0).all()
@@ -161,7 +161,7 @@ def test_the_wall_guard_keeps_the_robot_off_the_wall_that_its_route_leads_into()
         for c in (guard, careless)
     ]
     nearest = [run.position_um[:, 1].min() - wall_um for run in runs]
-    assert nearest[0] > 0.9 * ROBOT.radius and nearest[1] < 0.0
+    assert nearest[0] > 0.9 * ROBOT.radius_um and nearest[1] < 0.0
 
 
 @pytest.mark.parametrize("method", ["vector", "ff_fb"])

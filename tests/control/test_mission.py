@@ -176,7 +176,7 @@ def test_a_held_robot_that_is_carried_off_is_swept_until_it_is_back() -> None:
     world.tick()
     world.tick(route=route(1))
     world.tick(operator="pause")
-    radius_um = ROBOT.radius
+    radius_um = ROBOT.radius_um
     assert not world.tick(error_um=1.9 * radius_um).swept
     assert world.tick(error_um=2.1 * radius_um).swept
     assert world.tick(error_um=1.1 * radius_um).swept

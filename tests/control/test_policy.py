@@ -100,13 +100,13 @@ def test_from_wherever_a_way_is_known_the_goal_is_reached_in_about_that_time_and
     walls = clearance_um(chip.mask, px)
     k = round(px / route.time_to_go_um_per_px)
     times = route.time_to_go_s[::k, ::k]  # at the pixels
-    roomy = np.argwhere(np.isfinite(times) & (walls > 1.6 * robot.radius))
+    roomy = np.argwhere(np.isfinite(times) & (walls > 1.6 * robot.radius_um))
     for row, column in np.random.default_rng(way).choice(roomy, 4, replace=False):
         start, planned = np.array([column, row]) * px, float(times[row, column])
         options = {"robot": robot, "clearance": (walls, px)}
         run = fly(POLICY, route, lambda x, y: sample(field, (x, y)), 1.1 * planned + 0.5, start, field, **options)
-        assert arrival_s(run, goal, robot.radius) < 1.03 * planned + 0.1
-        assert min(clearance_at(walls, point / px) for point in run.position_um[::10]) > robot.radius
+        assert arrival_s(run, goal, robot.radius_um) < 1.03 * planned + 0.1
+        assert min(clearance_at(walls, point / px) for point in run.position_um[::10]) > robot.radius_um
 
 
 def test_between_two_ways_that_are_equally_fast_it_takes_one_of_them():
@@ -138,7 +138,7 @@ def test_blown_off_the_route_it_plans_nothing_anew_unless_no_way_is_known_there(
     route, field = homeward_route(times), field_of(lambda x, y: (0.0 * x, 0.0 * x))
     for place, strayed in (((2500.0, 4500.0), False), ((2500.0, 500.0), True)):
         demand = POLICY.control(None, mission(), route, seen_at(place), field, SWIMMER, None, PX_UM)
-        assert (demand.error_um > 6.0 * SWIMMER.radius) == strayed
+        assert (demand.error_um > 6.0 * SWIMMER.radius_um) == strayed
         assert demand.velocity_um_s @ (GOAL_UM - place) > 0.9 * V * np.hypot(*(GOAL_UM - place))
 
 

@@ -99,7 +99,7 @@ def test_a_slow_field_says_nothing_of_step_out() -> None:
 
 
 def test_a_robot_that_a_wall_may_stop_says_nothing_of_step_out() -> None:
-    assert limits(swum(5.0, 400.0, 0.0, step_out_hz=28.8, wall_um=1.2 * ROBOT.radius)) == [None]
+    assert limits(swum(5.0, 400.0, 0.0, step_out_hz=28.8, wall_um=1.2 * ROBOT.radius_um)) == [None]
 
 
 def test_upstream_a_robot_that_steps_out_below_what_was_stated_is_slowed_down_and_arrives(
@@ -108,7 +108,6 @@ def test_upstream_a_robot_that_steps_out_below_what_was_stated_is_slowed_down_an
     class Made:
         @staticmethod
         def of(pipeline: Pipeline, config: Config, *more: object) -> SimulatedRig:
-            assert config.robot.step_out_hz is not None
             weak = replace(config.robot, step_out_hz=0.7 * config.robot.max_speed_um_s / config.robot.um_per_rev)  # type: ignore[operator]
             return SimulatedRig.of(pipeline, replace(config, robot=weak), *more)  # type: ignore[arg-type]
 

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from flowrec.chip import load_chip
-from flowrec.config import load_config, resolve
+from flowrec.config import load_config
+from flowrec.resolve import resolve
 from flowrec.session_writer import region_of
 from flowrec.store import Region, SessionWriter
 from flowrec.terminal import progress
@@ -67,9 +68,8 @@ def _window(width: int, height: int, rate_hz: float) -> tuple[Region, Any]:
     config = resolve(config, chip)
     region = region_of(config, chip)
     assert region is not None
-    assert config.camera.um_per_px is not None
     tracker, px = config.tracker, config.camera.um_per_px
     drift_px = tracker.reach_speed * config.robot.speed_limit_um_s / rate_hz / px
-    reach_px = max(tracker.search_radii * config.robot.radius / px + drift_px, tracker.search_px)
+    reach_px = max(tracker.search_radii * config.robot.radius_um / px + drift_px, tracker.search_px)
     middle = np.array([width / 2, height / 2, width / 2, height / 2])
     return region, np.rint(middle + reach_px * np.array([-1.0, -1.0, 1.0, 1.0]))

@@ -32,14 +32,14 @@ def test_in_a_solved_flow_the_survey_runs_downstream_all_the_way_clear_of_walls(
     chip = load_chip(ChipSettings(name=name))
     field = FlowSolver().solve(chip)
     swimmer = robot(600.0, radius_um=2.4 * chip.um_per_px)
-    start = opening_point_um(chip, "inlet", 5 * swimmer.radius)
+    start = opening_point_um(chip, "inlet", 5 * swimmer.radius_um)
     route = SurveyPlanner(distance_um=1e6).plan(field, start, chip, swimmer)
     assert route.reachable, route.reason
     points = route.waypoints_um[::4]
     with_flow = np.einsum("ij,ij->i", np.diff(points, axis=0), sample(field, 0.5 * (points[1:] + points[:-1])))
     assert (with_flow > 0).mean() > 0.97
     clearance = clearance_um(chip.mask, chip.um_per_px).astype(float)
-    assert min(bilinear(clearance, *(p / chip.um_per_px)) for p in route.waypoints_um) >= swimmer.radius
+    assert min(bilinear(clearance, *(p / chip.um_per_px)) for p in route.waypoints_um) >= swimmer.radius_um
     assert length_um(route) > 1.5 * chip.mask.shape[1] * chip.um_per_px / 2
 
 

@@ -12,14 +12,14 @@ from flowrec.control import Coils
 from flowrec.errors import ChipError, RigError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Currents, FlowField
-from flowrec.rig_settings import CameraSettings, Simulated
+from flowrec.rig_settings import Camera, Simulated
 from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
 from flowrec.robot import Robot
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
-CAMERA = CameraSettings(width_px=256, height_px=64, rate_hz=30.0, debris=0)
 EXACT = Simulated(position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
 STRAIGHT = load_chip(ChipSettings("straight"))  # rows 22 to 41 of 64, 20 um a pixel: y from 430 to 830 um
+CAMERA = Camera(width_px=256, height_px=64, rate_hz=30.0, um_per_px=STRAIGHT.size_um[0] / 256, debris=0)
 MIDDLE = 31.5 * 20.0
 
 

@@ -17,8 +17,9 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 
 from flowrec.chip import load_chip
-from flowrec.config import Config, load_config, resolve
+from flowrec.config import ResolvedConfig, load_config
 from flowrec.declarations import Message, array_fields, message_fields
+from flowrec.resolve import resolve
 from flowrec.session_writer import session_header
 from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations
 from flowrec.store.codec import encode_record
@@ -184,7 +185,7 @@ def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Gene
     return kind(**{**values, "stamp_ns": stamp_ns})
 
 
-def _plain(config: Config) -> Config:
+def _plain(config: ResolvedConfig) -> ResolvedConfig:
     return replace(config, recording=replace(config.recording, anonymous=True))
 
 

@@ -16,9 +16,10 @@ from flowrec.commands.check import check
 from flowrec.commands.compare import compare
 from flowrec.commands.info import info, list_sessions
 from flowrec.commands.replay import Change
-from flowrec.config import load_config, resolve
+from flowrec.config import load_config
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
+from flowrec.resolve import resolve
 from flowrec.session import Session, session_sha256
 from flowrec.session_writer import session_header
 from flowrec.store import SessionReader, SessionWriter, recover_run

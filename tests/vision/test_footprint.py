@@ -32,7 +32,7 @@ class Watched:
 def test_no_pixel_is_read_beyond_the_sight_and_some_are_at_its_end(width_px: int) -> None:
     scene = Scene(width_px)
     sight = TRACKER.sight(CHIP, scene.calibration, ROBOT, (round(0.8 * width_px), width_px))
-    nominal = ROBOT.radius / scene.um_per_px
+    nominal = ROBOT.radius_um / scene.um_per_px
     step, largest = max(1, int(nominal / 2.5)), 1.35 * nominal
     open_water = np.full((400, 400), 1e3, np.float32)
     farthest = 0
@@ -55,10 +55,10 @@ def test_no_pixel_is_read_beyond_the_sight_and_some_are_at_its_end(width_px: int
 def test_another_world_outside_of_the_sight_changes_nothing_of_a_track(width_px: int) -> None:
     scene, rng = Scene(width_px), np.random.default_rng(5)
     sight = TRACKER.sight(CHIP, scene.calibration, ROBOT, (round(0.8 * width_px), width_px))
-    found = scene.track(None, scene.frame(scene.places(1, ROBOT.radius + 5.0)[0]))
+    found = scene.track(None, scene.frame(scene.places(1, ROBOT.radius_um + 5.0)[0]))
     assert tuple(found.roi_px) == sight.everywhere_px
     near = 0
-    for place in scene.places(25, ROBOT.radius + 5.0):
+    for place in scene.places(25, ROBOT.radius_um + 5.0):
         before = scene.track(None, scene.frame(place))
         frame = scene.frame(place + rng.uniform(-40.0, 40.0, 2), 1, debris=80)
         lost = replace(before, seen=False, lost_frames=int(rng.integers(1, 10)))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from flowrec.chip import ChipSettings, clearance_um, load_chip
 from flowrec.chip.registration import Calibration
 from flowrec.messages import Frame, Track
-from flowrec.rig_settings import CameraSettings
+from flowrec.rig_settings import Camera
 from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.robot import Robot
 from flowrec.vision import Tracker
@@ -28,7 +28,7 @@ class Scene:
         self.um_per_px = 6400.0 / width_px
         corner = (3190.0 - self.um_per_px * (width_px - 1) / 2, 2550.0 - self.um_per_px * (height_px - 1) / 2)
         self.calibration = Calibration(self.um_per_px, corner)
-        camera = CameraSettings(width_px=width_px, height_px=height_px, um_per_px=self.um_per_px, rate_hz=30.0)
+        camera = Camera(width_px=width_px, height_px=height_px, um_per_px=self.um_per_px, rate_hz=30.0)
         self.microscope = Microscope(CHIP.mask, CHIP.um_per_px, self.calibration, camera, seed)
         self.rng = np.random.default_rng(seed)
 
@@ -38,9 +38,9 @@ class Scene:
         return np.column_stack((columns[picked], rows[picked])) * CHIP.um_per_px + self.rng.uniform(-9, 9, (count, 2))
 
     def frame(self, robot_um: NDArray[np.float64] | None, index: int = 0, debris: int = 24) -> Frame:
-        radii = self.rng.uniform(0.3, 0.7, debris) * ROBOT.radius
+        radii = self.rng.uniform(0.3, 0.7, debris) * ROBOT.radius_um
         image = self.microscope.image(
-            robot_um, ROBOT.radius, np.zeros(2), self.places(debris, 20.0), radii, np.full(debris, 0.3)
+            robot_um, ROBOT.radius_um, np.zeros(2), self.places(debris, 20.0), radii, np.full(debris, 0.3)
         )
         return Frame(index * 33_000_000, index, image)
 
@@ -54,7 +54,7 @@ def test_the_robot_is_found_anywhere_among_debris_and_located_to_a_tenth_of_a_pi
 ) -> None:
     scene = Scene(width_px)
     errors = []
-    for place in scene.places(25, ROBOT.radius + 5.0):
+    for place in scene.places(25, ROBOT.radius_um + 5.0):
         found = scene.track(None, scene.frame(place))
         assert found.seen
         moved = place + scene.rng.uniform(-8.0, 8.0, 2)
@@ -65,7 +65,7 @@ def test_the_robot_is_found_anywhere_among_debris_and_located_to_a_tenth_of_a_pi
 def test_beside_a_wall_the_robot_is_located_to_a_third_of_a_pixel() -> None:
     scene = Scene(640)
     errors = []
-    for place in scene.places(40, ROBOT.radius + 1.0, ROBOT.radius + 12.0):
+    for place in scene.places(40, ROBOT.radius_um + 1.0, ROBOT.radius_um + 12.0):
         found = scene.track(None, scene.frame(place))
         assert found.seen
         errors.append(found.position_um - place)

@@ -19,7 +19,7 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import check_point, clearance_um
 from flowrec.chip.registration import Calibration
 from flowrec.clocks import DeviceClock
-from flowrec.config import Config
+from flowrec.config import ResolvedConfig
 from flowrec.control.coils import Coils
 from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.errors import RigError
@@ -27,7 +27,7 @@ from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.ranges import check_ranges
-from flowrec.rig_settings import CameraSettings, Simulated
+from flowrec.rig_settings import Camera, Simulated
 from flowrec.rigs.simulated.camera_clock import CameraClock
 from flowrec.rigs.simulated.debris import Debris
 from flowrec.rigs.simulated.microscope import Microscope
@@ -36,7 +36,6 @@ from flowrec.robot import Robot
 from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _COILS = 3
-_DEFAULT_RATE_HZ = 30.0
 
 
 def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
@@ -83,7 +82,7 @@ class SimulatedRig:
     def of(
         cls,
         pipeline: Pipeline,
-        config: Config,
+        config: ResolvedConfig,
         duration_s: float | None = None,
         realtime: bool = False,
         true_field: FlowField | None = None,
@@ -107,7 +106,7 @@ class SimulatedRig:
         chip: Chip,
         robot: Robot,
         calibration: Calibration,
-        camera: CameraSettings,
+        camera: Camera,
         simulated: Simulated,
         start_um: ArrayLike,
         duration_s: float | None = None,
@@ -117,7 +116,7 @@ class SimulatedRig:
     ) -> None:
         check_ranges(camera, "camera")
         check_ranges(simulated, "simulated")
-        check_point(chip, start_um, "start", robot.radius)
+        check_point(chip, start_um, "start", robot.radius_um)
         self._chip = chip
         self._robot = robot
         self._calibration = calibration
@@ -125,11 +124,11 @@ class SimulatedRig:
         self._simulated = simulated
         x, y = (float(value) for value in np.asarray(start_um, np.float64))
         self._start_um = (x, y)
-        self._rate_hz = _DEFAULT_RATE_HZ if camera.rate_hz is None else camera.rate_hz
+        self._rate_hz = camera.rate_hz
         self._frames = math.inf if duration_s is None else max(1.0, math.floor(duration_s * self._rate_hz) + 1)
         self._realtime = realtime
         self._field = true_field
-        self._delay_ns = nanoseconds(robot.delay if simulated.delay_s is None else simulated.delay_s)
+        self._delay_ns = nanoseconds(robot.delay_s if simulated.delay_s is None else simulated.delay_s)
         self._now_ns = 0
         self._coils = coils
         # What the coils were told last and where their field is; what is on its way: (stamp of its effect, command).
@@ -163,7 +162,7 @@ class SimulatedRig:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
         field = self._true_field()
         walls = clearance_um(self._chip.mask, self._chip.um_per_px)
-        radius, seed, px = self._robot.radius, self._simulated.seed, self._chip.um_per_px
+        radius, seed, px = self._robot.radius_um, self._simulated.seed, self._chip.um_per_px
         swimmer = Swimmer(self._start_um, self._robot, self._simulated, field.velocity_um_s, walls, px)
         debris = Debris(self._chip, self._camera.debris, radius, field.velocity_um_s, walls, seed)
         microscope = Microscope(self._chip.mask, px, self._calibration, self._camera, seed)

@@ -94,7 +94,6 @@ class Swimmer:
         self.gone = False
         self._touching = False
         self._time_s = 0.0
-        assert robot.step_out_hz is not None
         self._robot = replace(robot, step_out_hz=simulated.step_out_share * robot.step_out_hz)
         self._simulated = simulated
         self._vx = np.ascontiguousarray(velocity_um_s[..., 0])
@@ -124,7 +123,7 @@ class Swimmer:
         if self.gone:
             return math.nan
         x, y = self.position_um / self._um_per_px
-        return float(bilinear(self._clearance, x, y)) - self._robot.radius
+        return float(bilinear(self._clearance, x, y)) - self._robot.radius_um
 
     def advance(self, duration_s: float, frequency_hz: float, heading_rad: float, strength: float) -> None:
         """Move on for a while under a constant field, as strong as the full one or a share of it.
@@ -147,7 +146,7 @@ class Swimmer:
         # One contact lasts until the robot has come off the wall by a twentieth of its radius.
         if touched and not self._touching:
             self.contacts += 1
-        self._touching = bool(touched) or (self._touching and free < 1.05 * self._robot.radius)
+        self._touching = bool(touched) or (self._touching and free < 1.05 * self._robot.radius_um)
         height, width = self._clearance.shape
         column, row = self.position_um / self._um_per_px
         self.gone = not (-0.5 <= column <= width - 0.5 and -0.5 <= row <= height - 0.5)
@@ -165,7 +164,7 @@ class Swimmer:
             self._strength(self._time_s - 0.5 * dt * len(noise)),
             self._clearance,
             self._um_per_px,
-            self._robot.radius,
+            self._robot.radius_um,
         )
         self.position_um = np.array([x, y])
         return touched, free

@@ -1,0 +1,163 @@
+"""Resolve the settings of a run on its chip: fill in what was left open, turn named places into points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.ndimage import label
+
+from flowrec.chip import check_point, median_width_um
+from flowrec.chip.chip import Chip
+from flowrec.chip.places import named_opening, opening_point_um
+from flowrec.config import Config, ResolvedConfig, check_config
+from flowrec.control import Coils
+from flowrec.control.mission import Place, PlacedMission, Point
+from flowrec.errors import UnreachableError, UsageError
+from flowrec.flow import FlowSolver
+from flowrec.planning.free_space import Drift, Swift, swept_out, too_swift
+from flowrec.rig_settings import Camera
+from flowrec.robot import USUAL_DELAY_S, Robot
+
+SIMULATED = "simulated"
+_FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
+_PLACE_RADII = 5.0  # from a named opening into the chip
+_OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
+
+_Section = TypeVar("_Section")
+
+
+def resolve(config: Config, chip: Chip) -> ResolvedConfig:
+    """Choose what was left open so that it fits the chip, place the camera, and turn named places into points.
+
+    A robot that is not described fits the chip: radius 50 um, or a fifth of the median channel width if that is
+    narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; a delay of 40 ms,
+    or the time through a fifth of a channel at v_max if that is shorter. This holds for the simulated rig only;
+    `derived` lists the numbers.
+
+    Raises
+    ------
+    UsageError : settings outside of their ranges; on a real rig also a missing setting that has to be measured.
+    UnreachableError : start and goal lie in channels that do not meet.
+    """
+    check_config(config)
+    _refuse_unmeasured(config)
+    robot, camera = _fitted(config, chip)
+    swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
+    plan = replace(config.plan, swift=_timed(config.plan.swift, swift))
+    survey = replace(config.survey, swift=_timed(config.survey.swift, swift))
+    drift = plan.swift.drift(robot, robot.speed_limit_um_s)
+    mission = _narrowed(
+        PlacedMission,
+        config.mission,
+        start=_start(config.mission.start, chip, robot, drift, config.flow, config.coils),
+        goal=_point(chip, config.mission.goal, "goal", robot),
+    )
+    _refuse_apart(chip, mission)
+    return _narrowed(ResolvedConfig, config, robot=robot, camera=camera, plan=plan, survey=survey, mission=mission)
+
+
+def derived(asked: Config, resolved: ResolvedConfig) -> dict[str, float]:
+    """The numbers that nobody gave or that were changed while a configuration was resolved, by key."""
+    was, now = _flat(asdict(asked), ""), _flat(asdict(resolved), "")
+    return {key: value for key, value in now.items() if isinstance(value, (int, float)) and value != was[key]}
+
+
+def _flat(tree: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+def _narrowed(kind: type[_Section], settings: Any, **changed: Any) -> _Section:
+    """The settings as the type that excludes None, with some of them changed."""
+    return kind(**{each.name: getattr(settings, each.name) for each in fields(settings)} | changed)
+
+
+def _refuse_unmeasured(config: Config) -> None:
+    """Only a simulated robot and camera can be made to fit the chip."""
+    rig: str = config.rig
+    given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
+    missing = [key for key, value in given.items() if value is None]
+    if rig != SIMULATED and missing:
+        raise UsageError(
+            f"rig = {rig!r}: {', '.join(missing)} not given; measure them and set each: only the simulated rig's robot "
+            "and camera are made to fit the chip"
+        )
+
+
+def _fitted(config: Config, chip: Chip) -> tuple[Robot, Camera]:
+    """The robot and the camera with what was left open chosen to fit the chip."""
+    asked, camera, coils = config.robot, config.camera, config.coils
+    channel_um = median_width_um(chip)
+    width_um, height_um = chip.size_um
+    um_per_px, radius_um, speed_um_s = camera.um_per_px, asked.radius_um, asked.max_speed_um_s
+    delay_s, step_out_hz, rate_hz = asked.delay_s, asked.step_out_hz, camera.rate_hz
+    if um_per_px is None:
+        um_per_px = max(width_um / camera.width_px, height_um / camera.height_px)
+    if radius_um is None:
+        radius_um = round(min(max(min(50.0, 0.2 * channel_um), 3.0 * um_per_px), 0.25 * channel_um), 2)
+    if speed_um_s is None:
+        peak = float(np.linalg.norm(config.flow.solve(chip).velocity_um_s, axis=-1).max())
+        speed_um_s = max(600.0, round(1.3 * peak, 1))
+    if delay_s is None:
+        delay_s = round(min(USUAL_DELAY_S, 0.2 * channel_um / speed_um_s), 5)
+    if step_out_hz is None:
+        step_out_hz = 1.2 * speed_um_s / asked.um_per_rev
+    known = {"radius_um": radius_um, "step_out_hz": step_out_hz, "delay_s": delay_s}
+    robot = _narrowed(Robot, asked, **known, max_speed_um_s=speed_um_s)
+    # Coils that can not generate the full field can not make the robot as fast either; plans must know.
+    if coils.full_mt(robot) < coils.amplitude_mt:
+        robot = replace(robot, max_speed_um_s=min(speed_um_s, round(coils.fastest_um_s(robot), 1)))
+    if rate_hz is None:
+        rate_hz = round(min(max(30.0, robot.max_speed_um_s / (0.5 * radius_um)), _FASTEST_CAMERA_HZ), 1)
+    return robot, _narrowed(Camera, camera, um_per_px=um_per_px, rate_hz=rate_hz)
+
+
+def _timed(swift: Swift, times: Mapping[str, float]) -> Swift:
+    return replace(swift, **{key: value for key, value in times.items() if getattr(swift, key) is None})
+
+
+def _start(place: Place, chip: Chip, robot: Robot, drift: Drift, solver: FlowSolver, coils: Coils) -> Point:
+    """The start; for a named outlet the place nearest to it where the robot can be held.
+
+    That is five radii inside, as elsewhere, or farther if the assumed flow carries the robot out before the coils have
+    ramped up. Without such a place: the first one, which is refused with the reason before anything is driven.
+    """
+    if not isinstance(place, str) or named_opening(chip, place).kind != "outlet":
+        return _point(chip, place, "start", robot)
+    field = solver.solve(chip)
+    for radii in _OUTLET_START_RADII:
+        point = opening_point_um(chip, place, radii * robot.radius_um)
+        start_um = np.array(point)
+        if not (
+            swept_out(chip, field, start_um, drift, coils.ramp_s)
+            or too_swift(chip, field, start_um, start_um, robot.radius_um, drift)
+        ):
+            return point
+    return _point(chip, place, "start", robot)
+
+
+def _point(chip: Chip, place: Place, what: str, robot: Robot) -> Point:
+    if isinstance(place, str):
+        return opening_point_um(chip, place, _PLACE_RADII * robot.radius_um)
+    check_point(chip, place, what, robot.radius_um)
+    return place
+
+
+def _refuse_apart(chip: Chip, mission: PlacedMission) -> None:
+    """Start and goal must lie in one connected channel."""
+    channels, count = label(chip.mask)
+    rows, columns = chip.mask.shape
+    ends = []
+    for x, y in (mission.start, mission.goal):
+        row, column = round(y / chip.um_per_px), round(x / chip.um_per_px)
+        ends.append(channels[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)])
+    if ends[0] != ends[1]:
+        raise UnreachableError(
+            f"unreachable: mission.goal = {mission.goal} lies in another channel than the start {mission.start}; the "
+            f"mask of {chip.name} has {count} channels that do not meet; choose a goal in the same one"
+        )
