@@ -25,6 +25,7 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.commands.record import record as record
     from flowrec.commands.replay import Change as Change
     from flowrec.commands.replay import replay as replay
+    from flowrec.commands.replay_report import report as report
     from flowrec.config import Config as Config
     from flowrec.config import load_config as load_config
     from flowrec.errors import FlowrecError as FlowrecError
@@ -44,6 +45,7 @@ _MODULES = {
     "open": "session",
     "record": "commands.record",
     "replay": "commands.replay",
+    "report": "commands.replay_report",
 }
 __all__ = list(_MODULES)
 

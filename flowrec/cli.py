@@ -142,56 +142,35 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
-    from flowrec.commands import replay as verb
     from flowrec.commands.interactive import AtTerminal
-    from flowrec.commands.replay_report import before_and_after, refinement_told
+    from flowrec.commands.replay_report import Outputs, refinement_remarks, replay_and_report
     from flowrec.summary import comparison_for_people
     from flowrec.terminal import say, table
 
-    change = verb.Change(refine, plan, observer, controller, tuple(sets or ()))
-    if verify and refly:
-        raise typer.BadParameter("--verify only compares; it goes without --refly")
-    target = out if out is not None or verify else verb.default_out(session)
-    if target is not None:
-        verb.check_outputs(session, target, refly=refly, rrd=view == "rrd", overwrite=overwrite)
-    done = verb.replay(session, change, from_s, verify, target, overwrite, frames, AtTerminal())
+    change = flowrec.Change(refine, plan, observer, controller, tuple(sets or ()))
     if verify:
-        same, lines = verb.verdict(done)
+        if refly:
+            raise typer.BadParameter("--verify only compares; it goes without --refly")
+        done = flowrec.replay(session, change, from_s, True, out, overwrite, frames, AtTerminal())
         if as_json:
-            typer.echo(json.dumps({"session": str(session), **verb.verdict_json(done)}))
+            typer.echo(json.dumps({"session": str(session), **done.as_json()}))
         else:
-            for line in lines:
+            for line in done.lines():
                 typer.echo(printable(line))
-        raise typer.Exit(0 if same else 3)
-    rows = before_and_after(done)
-    if refly:
-        from flowrec.commands.refly import refly as fly_both
-
-        rows += fly_both(done, verb.refly_path(target) if target is not None else None, overwrite)
+        raise typer.Exit(0 if done.same else 3)
+    outputs = Outputs.of(session, out, overwrite, refly=refly, rrd=view == "rrd")
+    done, rows = replay_and_report(session, change, outputs, from_s, frames, AtTerminal())
+    report, remarks = done.report, refinement_remarks(done)
     if as_json:
-        typer.echo(
-            json.dumps(
-                {
-                    "session": str(session),
-                    "out": str(target),
-                    "wall_s": done.report.wall_s,
-                    "duration_s": done.report.duration_s,
-                    "ticks": done.report.ticks,
-                    "refinement": refinement_told(done),
-                    "rows": [{"quantity": a, "recorded": b, "replayed": c} for a, b, c in rows],
-                }
-            )
-        )
-    else:
-        table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
-        report = done.report
-        say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {target}")
-        for line in refinement_told(done):
-            say(line)
-    if view == "rrd" and target is not None:
-        from flowrec.commands.export import export as write
-
-        write(target, overwrite=overwrite)
+        figures = {"wall_s": report.wall_s, "duration_s": report.duration_s, "ticks": report.ticks}
+        named = [dict(zip(("quantity", "recorded", "replayed"), row, strict=True)) for row in rows]
+        result = {"session": str(session), "out": str(outputs.session), "refinement": remarks, "rows": named}
+        typer.echo(json.dumps(result | figures))
+        return
+    table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
+    say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {outputs.session}")
+    for line in remarks:
+        say(line)
 
 
 @app.command()

@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from flowrec.clocks import read_clocks
-from flowrec.version import __version__
+from flowrec.version import NUMERICS_VERSION, __version__
 
 PACKAGES = (
     "numpy",
@@ -36,7 +36,11 @@ _DIFF_LIMIT = 200_000  # characters; a larger change is cut and says so
 
 def provenance(anonymous: bool = False) -> dict[str, str]:
     """Facts about code, machine and moment as text, for the head of a session; `anonymous` leaves the machine out."""
-    facts = {"flowrec": __version__, "python": platform.python_version()}
+    facts = {
+        "flowrec": __version__,
+        "numerics_version": str(NUMERICS_VERSION),
+        "python": platform.python_version(),
+    }
     if not anonymous:
         facts |= {"platform": platform.platform(), "host": platform.node(), "user": _user()}
     monotonic_ns, wall_ns = read_clocks()

@@ -68,6 +68,11 @@ class Session:
         """Where the session comes from: version, commit, packages, host, time, operator, seed; all text."""
         return self.header.provenance
 
+    @property
+    def numerics(self) -> str:
+        """Version of the numerics that the session was computed with; the first release, "1", did not state it."""
+        return self.provenance.get("numerics_version", "1")
+
     @cached_property
     def outcome(self) -> Figures:
         """How the run ended and what it came to; keys carry the unit, as in `duration_s`."""
@@ -209,23 +214,32 @@ def files_behind(path: Path) -> list[Path]:
 
 
 @contextlib.contextmanager
-def content_blamed(session: Session, done: str) -> Iterator[None]:
-    """Turn a failure over absurd numbers in a session into a SessionError; any other failure stays what it is.
+def input_blamed(session: Session, config: ResolvedConfig, done: str) -> Iterator[None]:
+    """Turn a failure over absurd numbers in a session, or settings outside of their ranges, into a SessionError.
 
-    `done` says what can not be done with the session, such as "replayed".
+    A replay runs with recorded settings as they are. Any other failure stays what it is.
+
+    Parameters
+    ----------
+    config : the settings in use.
+    done : what can not be done with the session, such as "replayed".
     """
     try:
         yield
     except FlowrecError:
         raise
     except Exception as error:
-        fault = next(_absurd_numbers(session), None)
-        if fault is None:
+        from flowrec.ranges import faults
+
+        number, fault = next(_absurd_numbers(session), None), next(faults(config), None)
+        if number is not None:
+            reason, advice = number, f"`flowrec check {session.path}` says more"
+        elif fault is not None:
+            reason, advice = f"it was recorded with {fault}", f"replay it with --set {fault.key}=..."
+        else:
             raise
-        raise SessionError(
-            f"{session.path}: {fault}, so it can not be {done} ({type(error).__name__}: {error}); "
-            f"`flowrec check {session.path}` says more"
-        ) from error
+        failure = f"{type(error).__name__}: {error}"
+        raise SessionError(f"{session.path}: {reason}, so it can not be {done} ({failure}); {advice}") from error
 
 
 def _absurd_numbers(session: Session) -> Iterator[str]:

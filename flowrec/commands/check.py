@@ -24,7 +24,7 @@ from flowrec.summary import finite
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import NS_PER_S, seconds
-from flowrec.version import __version__
+from flowrec.version import NUMERICS_VERSION, __version__
 
 _LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
 _RATE_TOLERANCE = 0.05
@@ -91,6 +91,9 @@ class _FileCheck:
         written = f"by flowrec {found.flowrec_version}"
         if found.flowrec_version != __version__:
             written += f" (this is {__version__}: flowrec replay --verify tells whether it still does the same)"
+        numerics = found.header.provenance.get("numerics_version", "1") if found.header is not None else None
+        if numerics not in (None, str(NUMERICS_VERSION)):
+            written += f", made by other numerics (version {numerics}; this is {NUMERICS_VERSION})"
         verdict.fact("written", written)
         header = found.header
         if header is None:

@@ -18,6 +18,7 @@ from flowrec.session import Session
 from flowrec.store.topic_filter import is_left_out
 from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import seconds
+from flowrec.version import NUMERICS_VERSION
 
 Fields = Mapping[str, frozenset[str]]  # names of message fields, by field of Tick
 _Apart = tuple[float, tuple[int, ...] | None, object, object]  # excess over the tolerance, index, both values
@@ -34,12 +35,14 @@ class Side:
     name : what it is called as a whole.
     recorded : the fields that it records.
     copy : it is a replay, into which images are copied on request only.
+    numerics : version of the numerics that computed it.
     """
 
     word: str
     name: str
     recorded: Fields = field(default_factory=lambda: _ALL)
     copy: bool = False
+    numerics: str = str(NUMERICS_VERSION)
 
     @classmethod
     def of(cls, word: str, session: Session) -> Side:
@@ -53,7 +56,7 @@ class Side:
         for name in recorded.keys() - session.reader.counts.keys():
             if (copy and name == "frame") or is_left_out(BY_FIELD[name].path, left_out):
                 del recorded[name]
-        return cls(word, session.path.name, recorded, copy)
+        return cls(word, session.path.name, recorded, copy, session.numerics)
 
     def lacks(self, topic: Topic) -> dict[str, str]:
         """What it does not record of a topic, `/topic` or `/topic field`, each with the words for it."""
@@ -158,6 +161,19 @@ class Comparison:
                 self.not_recorded |= lacking
 
     @property
+    def other_numerics(self) -> str:
+        """That the two sides were computed by different numerics, so that they may differ; '' if by the same."""
+        if self.sides[0].numerics == self.sides[1].numerics:
+            return ""
+        versions = ", ".join(f"{side.word}: version {side.numerics}" for side in self.sides)
+        return printable(f"made by other numerics ({versions})")
+
+    @property
+    def different_word(self) -> str:
+        """What messages beyond their tolerance are called."""
+        return "by other numerics" if self.other_numerics else "DIFFERENT"
+
+    @property
     def words(self) -> tuple[str, str]:
         """What the values of the two sides are called."""
         return self.sides[0].word, self.sides[1].word
@@ -223,7 +239,7 @@ class Comparison:
             lines.append(
                 f"{topic:20s} {count.identical} of {total} identical"
                 + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
-                + (f", {count.different} DIFFERENT" if count.different else "")
+                + (f", {count.different} {self.different_word}" if count.different else "")
             )
         return lines + [printable(f"{what:20s} {why}") for what, why in self.not_recorded.items()]
 
@@ -234,6 +250,7 @@ class Comparison:
             "identical": self.identical,
             "ticks": self.ticks,
             "different_ticks": self.different_ticks,
+            "other_numerics": self.other_numerics,
             "topics": {topic: count.as_json() for topic, count in self.topics.items()},
             "not_recorded": self.not_recorded,
             "first": self.first.as_json() if self.first is not None else None,

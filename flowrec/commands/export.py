@@ -10,7 +10,7 @@ from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig
 from flowrec.errors import SessionError
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.session import Session, content_blamed, files_behind
+from flowrec.session import Session, files_behind, input_blamed
 from flowrec.store import files_of
 from flowrec.system.outputs import RRD, check_output
 from flowrec.terminal import progress, say
@@ -59,7 +59,7 @@ def export(session: Session | Path | str, out: Path | None = None, overwrite: bo
             ticks, replayed = Session(parent).ticks(), session.ticks(with_frames=False)
         else:
             ticks, replayed = session.ticks(), None
-        with content_blamed(session, "drawn"):
+        with input_blamed(session, session.config, "drawn"):
             write_rrd(target, scene, ticks, replayed, done, inputs=inputs, overwrite=overwrite)
     say(f"{target} written in {time.perf_counter() - began:.1f} s; open it with: rerun {target}")
     return target

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,35 +13,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec import topics
-from flowrec.chip.chip import Chip
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
+from flowrec.commands.verification import WorkerCheck, digest_lines
 from flowrec.config import ResolvedConfig, with_sets
-from flowrec.enums import WorkOrder
-from flowrec.errors import FlowrecError, SessionError, UsageError, printable
+from flowrec.enums import Outcome, Phase, WorkOrder
+from flowrec.errors import SessionError, UsageError
 from flowrec.estimation.smoother import observe, smooth
-from flowrec.messages import Applied, Demand, FlowField, Observations, Route, Tick, Track
+from flowrec.messages import Applied, Demand, Mission, Observations, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.ranges import faults as range_faults
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run.jobs import work
 from flowrec.run.loop import LockstepWorker, RunReport, Sink, run
-from flowrec.session import Session, content_blamed, files_behind
+from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
-from flowrec.store import SessionReader, SessionWriter, digest_faults
-from flowrec.summary import as_text
-from flowrec.system.outputs import MCAP, RRD, check_output
+from flowrec.store import SessionReader, SessionWriter
+from flowrec.summary import Figures, as_text
+from flowrec.system.outputs import MCAP, check_output
 from flowrec.terminal import warn
-from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS
+from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
 from flowrec.units import seconds
 
-# What a recording has settled once and for all.
+# Sections that a recording has fixed.
 FIXED = ("chip", "camera", "rig", "simulated")
+_SAME_COMMAND_UM_S = 1.0  # smaller differences of the demanded velocity are not visible
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a replay does differently: the verbs of the command line."""
+    """What a replay does differently from the recording: the options of the verb; None keeps what was recorded.
+
+    Attributes
+    ----------
+    refine, plan, observer, controller : names of methods.
+    sets : settings as `key=value`.
+    """
 
     refine: str | None = None
     plan: str | None = None
@@ -50,40 +56,59 @@ class Change:
     sets: tuple[str, ...] = ()
 
     def apply(self, config: ResolvedConfig) -> ResolvedConfig:
-        """The recorded configuration with the changes; a what-if never replans on a robot that can not follow."""
-        plan, controller = _that_go_together(self.plan, self.controller, config)
-        typed = {
+        """The recorded configuration with the changes. A changed run does not plan again because of tracking errors:
+        the recorded robot can not follow the replayed commands.
+        """
+        plan, controller = self.plan, self.controller
+        # The control law "policy" needs the planner "time_field": where one of them is asked for, the other follows.
+        if controller == "policy" and plan is None:
+            plan = "time_field"
+        elif plan not in (None, "time_field") and controller is None and config.control.method == "policy":
+            controller = "vector"
+        given = {
             "refine.method": ("--refine", self.refine),
             "plan.method": ("--plan", plan),
             "observer.method": ("--observer", self.observer),
             "control.method": ("--controller", controller),
         }
-        given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
-        sets = [*(f"{key}={value}" for key, (_, value) in given.items()), *self.sets]
-        if not sets:
+        sets = [f"{key}={value}" for key, (_, value) in given.items() if value is not None]
+        if not sets and not self.sets:
             return config
-        changed = with_sets(config, sets, {key: flag for key, (flag, _) in given.items()})
-        phases = changed.mission.phases
-        if self.refine is not None and "refine" not in phases:
-            phases = tuple(dict.fromkeys((*phases, "refine", "plan")))
-        mission = replace(changed.mission, phases=phases, replan_error_um=math.inf)
+        flags = {key: flag for key, (flag, value) in given.items() if value is not None}
+        changed = with_sets(config, [*sets, *self.sets], flags)
+        mission = replace(changed.mission, replan_error_um=math.inf)
+        if self.refine is not None and Phase.REFINE not in mission.phases:
+            phases = tuple(dict.fromkeys((*mission.phases, Phase.REFINE.value, Phase.PLAN.value)))
+            mission = replace(mission, phases=phases)
         return replace(changed, mission=mission)
 
+    def stale_results(self, recorded: ResolvedConfig, changed: ResolvedConfig) -> frozenset[str]:
+        """Fields of Tick with results of the worker that must be computed again.
 
-def _that_go_together(
-    plan: str | None, controller: str | None, config: ResolvedConfig
-) -> tuple[str | None, str | None]:
-    """Planner and controller asked for; where only one is and the recorded other does not suit it, one that does."""
-    if controller == "policy" and plan is None and config.plan.method != "time_field":
-        return "time_field", controller
-    if plan not in (None, "time_field") and controller is None and config.control.method == "policy":
-        return plan, "vector"
-    return plan, controller
+        Raises
+        ------
+        UsageError : a section is changed that the recording has fixed.
+        """
+        sections = [each.name for each in fields(ResolvedConfig) if getattr(recorded, each.name) != getattr(changed, each.name)]
+        for section in sections:
+            if section in FIXED:
+                raise UsageError(
+                    f"--set {section}...: a replay can not change the {section} of a recording; "
+                    "record again, or use --refly"
+                )
+        return topics.stale_results([*sections, *(["refine"] if self.refine is not None else [])])
 
 
 @dataclass(slots=True)
 class CommandDifference:
-    """A sink's tally of how far the replayed demand is from the recorded one."""
+    """How far the replayed demand is from the recorded one.
+
+    Attributes
+    ----------
+    compared, changed : number of ticks.
+    first_ns : stamp of the first changed demand.
+    rms_um_s : root mean square difference of the demanded velocity, um/s.
+    """
 
     compared: int = 0
     changed: int = 0
@@ -97,7 +122,7 @@ class CommandDifference:
         self.compared += 1
         difference = math.dist(was.velocity_um_s, now.velocity_um_s)
         self._square += difference**2
-        if difference > 1.0:  # um/s: below that nobody would see it
+        if difference > _SAME_COMMAND_UM_S:
             self.changed += 1
             self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
 
@@ -109,50 +134,73 @@ class CommandDifference:
 
 @dataclass(slots=True)
 class Replayed:
-    """What a replay found."""
+    """The result of a replay.
 
-    source: Path
-    recorded_config: ResolvedConfig
+    Attributes
+    ----------
+    session : what was replayed, with the recorded configuration.
+    config : the configuration of the replay.
+    report : how the loop went.
+    recorded, replayed : the last tick, as recorded and as replayed.
+    comparison : of the outputs of both, tick by tick.
+    commands : of the demands of both.
+    frames_missing : images that are not in the file.
+    worker_check : of --verify: the results of the worker.
+    digest : of --verify: whether the files hold what was recorded, and lines of text about it.
+    """
+
+    session: Session
     config: ResolvedConfig
-    chip: Chip
     report: RunReport
     recorded: Tick
     replayed: Tick
-    true_field: FlowField | None
     comparison: Comparison
-    frames_missing: int
     commands: CommandDifference
-    worker_check: WorkerCheck | None  # of --verify
-    digest: tuple[bool, list[str]] | None  # likewise: whether the file is as it was recorded, and lines that say so
+    frames_missing: int
+    worker_check: WorkerCheck | None = None
+    digest: tuple[bool, list[str]] = (True, [])
 
+    @property
+    def same(self) -> bool:
+        """Whether everything that was compared is the same within its tolerance, and the files are unchanged."""
+        return self.digest[0] and all(comparison.same for comparison in self._comparisons)
 
-def stale_results(recorded: ResolvedConfig, changed: ResolvedConfig) -> frozenset[str]:
-    """The worker results that must be made anew; changing what a recording has settled is a UsageError."""
-    sections = [
-        each.name for each in fields(ResolvedConfig) if getattr(recorded, each.name) != getattr(changed, each.name)
-    ]
-    for section in sections:
-        if section in FIXED:
-            raise UsageError(
-                f"--set {section}...: a replay can not change the {section} of a recording; "
-                "record again, or use --refly"
-            )
-    return topics.stale_results(sections)
+    @property
+    def identical(self) -> bool:
+        """The same bit for bit."""
+        return self.digest[0] and all(comparison.identical for comparison in self._comparisons)
 
+    @property
+    def _comparisons(self) -> list[Comparison]:
+        return [self.comparison, *([self.worker_check.comparison] if self.worker_check is not None else [])]
 
-def check_outputs(path: Path, out: Path, *, refly: bool, rrd: bool, overwrite: bool) -> None:
-    """Refuse what a replay of `path` may not write, before it begins: `out` and what is made beside it."""
-    inputs = files_behind(path)
-    check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
-    if refly:
-        check_output(refly_path(out), MCAP, inputs=inputs, overwrite=overwrite)
-    if rrd:
-        check_output(out.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
+    def lines(self) -> list[str]:
+        """How the replay compares with the recording, the conclusion last."""
+        lines = self.comparison.lines()
+        if self.worker_check is not None:
+            lines += self.worker_check.results
+        lines += self.digest[1]
+        if self.frames_missing:
+            lines.append(f"{self.frames_missing} frames are not in the file; their recorded tracks stood in")
+        first = next((each.first for each in self._comparisons if each.first is not None), None)
+        if first is not None:
+            lines.append(f"first difference: {first}")
+        differs = self.comparison.other_numerics if self.digest[0] else ""
+        conclusion = "every tick identical" if self.identical else "the same within tolerance"
+        lines.append(f"{self.comparison.ticks} ticks: {conclusion if self.same else differs or 'NOT the same'}")
+        return lines
 
-
-def refly_path(out: Path) -> Path:
-    """Where the flight of the replayed plan goes, beside the replay."""
-    return out.with_name(f"{out.stem}_refly{MCAP[0]}")
+    def as_json(self) -> dict[str, Any]:
+        """The same in numbers, with the lines."""
+        found = [comparison.as_json() for comparison in self._comparisons]
+        return found[0] | {
+            "same": self.same,
+            "identical": self.identical,
+            "topics": {name: count for each in found for name, count in each["topics"].items()},
+            "first": next((each["first"] for each in found if each["first"] is not None), None),
+            "digest_faults": [] if self.digest[0] else self.digest[1],
+            "lines": self.lines(),
+        }
 
 
 def replay(
@@ -165,30 +213,41 @@ def replay(
     frames: bool = False,
     control: Unattended | None = None,
 ) -> Replayed:
-    """Replay a session with `change`, in any thread; write the result to `out` when given.
+    """Replay a session, in any thread; write the result to a new session if `out` is given.
 
     Parameters
     ----------
-    from_s : resume at this second.
-    verify : do the worker's orders again as well, and compare.
+    change : other methods and settings; None: as recorded.
+    from_s : session time in s to start at.
+    verify : compute the results of the worker again, too, and compare the files with their digests.
+    out : session file of the replay.
+    overwrite : `out` may replace an existing file.
     frames : copy the camera's images to `out`.
-    control : who attends it; None: nobody, it takes no signals and shows no progress.
+    control : who attends the replay; None: nobody, it takes no signals and shows no progress.
+
+    Raises
+    ------
+    UsageError : a change that is not possible, or a time outside of the session.
+    SessionError : the session can not be read or replayed, or `out` not be written.
     """
-    session, change = Session.of(session), change if change is not None else Change()
-    path, reader, recorded_config, chip = session.path, session.reader, session.config, session.chip
-    config = change.apply(recorded_config)
-    stale = stale_results(recorded_config, config)
-    if change.refine is not None:
-        stale |= topics.stale_results(["refine"])
-    if verify and (stale or config != recorded_config):
+    if out is not None:
+        out = Path(out)
+        source = session.path if isinstance(session, Session) else Path(session)
+        check_output(out, MCAP, inputs=files_behind(source), overwrite=overwrite)
+    session, change = Session.of(session), change or Change()
+    control = control or Unattended()
+    config = change.apply(session.config)
+    stale = change.stale_results(session.config, config)
+    if verify and (stale or config != session.config):
         raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
-    config = _warned_of_windows(reader, recorded_config, config)
-    pipeline = assemble(config, chip)
+    config = _with_recorded_region(session, config)
+    pipeline = assemble(config, session.chip)
     if config.sampler.method == "smoothed":
-        pipeline = replace(pipeline, hindsight=hindsight(reader, pipeline))
+        pipeline = replace(pipeline, hindsight=hindsight(session, pipeline))
+    path, reader = session.path, session.reader
     start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
     if reader.carried_ns is not None:
-        # A piece of a run begins with what was known, not with a frame to work on.
+        # A part of a run begins with a keyframe, whose inputs the part before holds.
         start_ns = max(start_ns or 0, reader.carried_ns + 1)
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
@@ -197,130 +256,99 @@ def replay(
     if order is not None:
         worker.submit(order)
     sides = Side.of("recorded", session), Side("replayed", "the replay")
-    checker = WorkerCheck(pipeline, start, order, Comparison(sides=sides)) if verify else None
+    check = WorkerCheck(pipeline, start, order, Comparison(sides=sides)) if verify else None
     comparison, commands = Comparison(sides=sides), CommandDifference()
-    truth: list[FlowField] = [] if start.true_field is None else [start.true_field]
+    first_ns = start_ns if start_ns is not None else reader.first_ns
 
     def on_tick(tick: Tick) -> None:
         comparison.add(rig.recorded, tick)
         commands.add(rig.recorded.demand, tick.demand)
-        if tick.true_field is not None:
-            truth.append(tick.true_field)
-        if checker is not None:
-            checker.see(tick)
-        done(seconds(tick.stamp_ns - first_ns))
+        if check is not None:
+            check.add(tick)
+        progress(seconds(tick.stamp_ns - first_ns))
 
-    control = control if control is not None else Unattended()
-    desk = control.desk
-    first_ns = start_ns if start_ns is not None else reader.first_ns
     with ExitStack() as stack:
-        stack.enter_context(_settings_blamed(path, config))
-        stack.enter_context(content_blamed(session, "replayed"))
+        stack.enter_context(input_blamed(session, config, "replayed"))
         sinks: list[Sink] = []
         writer = None
         if out is not None:
-            writer = stack.enter_context(session_writer(out, config, chip, parent=path, overwrite=overwrite))
+            writer = stack.enter_context(session_writer(out, config, session.chip, parent=path, overwrite=overwrite))
             sinks.append(writer if frames else WithoutFrames(writer))
         length_s = max(seconds(reader.last_ns - first_ns), 1e-3)
-        done = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
+        progress = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
         with control.armed():
-            report = run(pipeline, rig, worker, sinks, start=start, desk=desk, on_tick=on_tick, end_when_finished=False)
+            report = run(
+                pipeline, rig, worker, sinks, start=start, desk=control.desk, on_tick=on_tick, end_when_finished=False
+            )
         if report.ticks == 0:
             raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
-        last = report.last
-        if stale and not desk.reason:
-            last = _closing_work(pipeline, config, report.last, rig.recorded, stale)
+        stopped, last = control.desk.reason, report.last
+        if stale and not stopped:
+            last = _closing_work(pipeline, config, last, rig.recorded, stale)
             if last is not report.last and sinks:
                 sinks[0].write(last)
         if writer is not None:
-            ended = "stopped" if desk.reason else "replayed"
-            note = f"replay of {path.name}" + (f", {desk.reason}" if desk.reason else "")
-            figures = {"duration_s": report.duration_s, "wall_s": report.wall_s, "ticks": report.ticks}
-            writer.close(as_text({"outcome": ended, "note": note, **figures}))
-    return Replayed(
-        source=path,
-        recorded_config=recorded_config,
-        config=config,
-        chip=chip,
-        report=report,
-        recorded=rig.recorded,
-        replayed=last,
-        true_field=truth[-1] if truth else None,
-        comparison=comparison,
-        frames_missing=rig.frames_missing,
-        commands=commands,
-        worker_check=checker,
-        digest=intact(reader) if verify else None,
-    )
+            figures: Figures = {
+                "outcome": Outcome.STOPPED if stopped else Outcome.REPLAYED,
+                "note": f"replay of {path.name}" + (f", {stopped}" if stopped else ""),
+                "duration_s": report.duration_s,
+                "wall_s": report.wall_s,
+                "ticks": report.ticks,
+            }
+            writer.close(as_text(figures))
+    result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing)
+    if verify:
+        result.worker_check, result.digest = check, digest_lines(path)
+    return result
 
 
-@contextmanager
-def _settings_blamed(path: Path, config: ResolvedConfig) -> Iterator[None]:
-    """A replay runs with recorded settings that are outside of their ranges; where it fails, the first one is named."""
-    fault = next(range_faults(config), None)
-    try:
-        yield
-    except FlowrecError:
-        raise
-    except Exception as error:
-        if fault is None:
-            raise
-        raise SessionError(
-            f"{path}: the replay failed ({type(error).__name__}) with what was recorded: {fault}; replay it with "
-            f"--set {fault.key}=..."
-        ) from error
+def _with_recorded_region(session: Session, config: ResolvedConfig) -> ResolvedConfig:
+    """The configuration of a replay whose images are cropped, if the recorded ones are.
 
-
-def _warned_of_windows(reader: SessionReader, recorded: ResolvedConfig, config: ResolvedConfig) -> ResolvedConfig:
-    """Where images are windows another tracker may look outside of them, and what is written are windows again."""
-    if reader.region is None:
+    Warns if tracker or robot differ from the recorded ones: they may need pixels that were not stored.
+    """
+    if session.reader.region is None:
         return config
-    if (config.tracker, config.robot) != (recorded.tracker, recorded.robot):
+    if (config.tracker, config.robot) != (session.config.tracker, session.config.robot):
         warn(
-            f"{reader.path.name}: most images are black but for what the recorded tracker read; with another tracker or"
-            " robot the replay is not what it would be on whole images"
+            f"{session.path.name}: most images are black outside of what the recorded tracker read; with another "
+            "tracker or robot the replay is not what it would be on whole images"
         )
     return replace(config, recording=replace(config.recording, region="robot"))
 
 
-def hindsight(reader: SessionReader, pipeline: Pipeline) -> Callable[[int], Observations]:
-    """The recorded way up to a stamp as the RTS smoother sees it, for `sampler.method = "smoothed"`.
+def hindsight(session: Session, pipeline: Pipeline) -> Callable[[int], Observations]:
+    """The flow observations up to a stamp by the RTS smoother, for `sampler.method = "smoothed"`.
 
     Raises
     ------
-    UsageError
-        If the observer is not the Kalman filter, whose model the smoother shares.
+    UsageError : the observer is not the Kalman filter, whose model the smoother shares.
     """
     if pipeline.observer.method == "luenberger":
         raise UsageError("sampler.method = 'smoothed' needs observer.method = 'kalman', whose model it shares")
     tracks: list[Track] = []
     applied: list[Applied] = []
-    for tick in reader.ticks(with_frames=False):
+    for tick in session.ticks(with_frames=False):
         if tick.track is not None and tick.applied is not None and (not tracks or tick.track is not tracks[-1]):
             tracks.append(tick.track)
             applied.append(tick.applied)
     robot, sampler = pipeline.robot, pipeline.sampler
 
-    def upto(stamp_ns: int) -> Observations:
-        known = sum(track.stamp_ns <= stamp_ns for track in tracks)
-        smoothed = smooth(tracks[:known], applied[:known], pipeline.observer.kalman, robot)
+    def observations(stamp_ns: int) -> Observations:
+        count = sum(track.stamp_ns <= stamp_ns for track in tracks)
+        smoothed = smooth(tracks[:count], applied[:count], pipeline.observer.kalman, robot)
         return observe(smoothed, robot, sampler.spacing_radii, sampler.settled_share)
 
-    return upto
+    return observations
 
 
 def adoption_stamps(reader: SessionReader) -> dict[int, int]:
-    """For each work order of a recording, by number, the tick that adopted its result."""
-    stamps: dict[int, int] = {}
-    for name in WORKER_FIELDS:
-        for message in reader.messages(name):
-            assert isinstance(message, FlowField | Route)
-            stamps[message.request] = message.stamp_ns
-    return stamps
+    """For each work order of a recording, by number, the stamp of the tick that adopted its result."""
+    return {message.request: message.stamp_ns for name in WORKER_FIELDS for message in reader.messages(name)}
 
 
 class WithoutFrames:
-    """A sink that leaves the camera images in the parent session, which the replay names by hash."""
+    """A sink that leaves the camera images out: they stay in the parent session, which the replay names by hash."""
 
     def __init__(self, writer: SessionWriter) -> None:
         self._writer = writer
@@ -329,57 +357,10 @@ class WithoutFrames:
         self._writer.write(replace(tick, frame=None))
 
 
-class WorkerCheck:
-    """Does each recorded work order again and compares the adopted result with its topic's tolerance."""
-
-    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None, comparison: Comparison) -> None:
-        self._pipeline = pipeline
-        self._made: dict[int, FlowField | Route] = {}
-        self._asked = start.mission.request if start.mission is not None else 0
-        self._last = start
-        self._taken = {0}  # results that can not be made again; 0: fields of an earlier session
-        self.comparison = comparison
-        self.results: list[str] = []
-        if order is None or order.mission is None:
-            return
-        wanted, seen = order.mission.wanted, order.observations
-        if wanted == WorkOrder.REFINE and seen is not None and seen.stamp_ns > order.mission.requested_ns:
-            # Ordered before this piece of a run begins, from fewer observations than are repeated in it.
-            self._taken.add(order.mission.request)
-            self.results.append(
-                f"{BY_FIELD[ANSWERED_BY[WorkOrder.REFINE]].path}: ordered in the part before, taken as recorded"
-            )
-        else:
-            self._made[order.mission.request] = work(pipeline, order)
-
-    def see(self, tick: Tick) -> None:
-        """Take note of one tick: new orders are worked on, adopted results compared."""
-        for name in WORKER_FIELDS:
-            adopted = getattr(tick, name)
-            if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._taken:
-                continue
-            made = self._made.pop(adopted.request, None)
-            made = replace(made, stamp_ns=tick.stamp_ns) if made is not None else None
-            topic = BY_FIELD[name]
-            found = self.comparison.add_pair(topic, adopted, made, tick.stamp_ns)
-            how = "identical" if found is None else f"{'DIFFERENT' if found.beyond else 'within tolerance'}: {found}"
-            self.results.append(printable(f"{topic.path} {adopted.method}: {how}"))
-        mission = tick.mission
-        if mission is not None and mission.wanted and mission.request > self._asked:
-            self._asked = mission.request
-            self._made[mission.request] = work(self._pipeline, tick)
-        self._last = tick
-
-    @property
-    def same(self) -> bool:
-        """Whether every result could be made again."""
-        return self.comparison.same
-
-
 def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
-    """The tick of an order that was on its way at the starting tick, with what was known when it was given.
+    """The tick that gave a work order whose result is not yet adopted at the start, with what was known then.
 
-    Where a piece of a run begins after that, with what it repeats: the same but for observations made meanwhile.
+    Where a part of a run begins after that: its keyframe, in which only later observations differ.
     """
     mission = start.mission
     if mission is None or not mission.wanted:
@@ -390,105 +371,36 @@ def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
     return reader.tick_before(max(mission.requested_ns, reader.first_ns))
 
 
-def _closing_work(
-    pipeline: Pipeline, config: ResolvedConfig, last: Tick, recorded: Tick, stale: frozenset[str]
-) -> Tick:
-    """Refine and plan after the last frame what the recording ended too early to adopt, or never asked for."""
+def _closing_work(pipeline: Pipeline, config: ResolvedConfig, last: Tick, recorded: Tick, stale: frozenset[str]) -> Tick:
+    """Refine and plan after the last frame what the recording ended too early to adopt, or never ordered."""
     mission = last.mission
     if mission is None or last.assumed is None:
         return last
-    stamp_ns = last.stamp_ns + 1
+    stamp_ns, number = last.stamp_ns + 1, mission.request
     tick = replace(last, stamp_ns=stamp_ns, event=None)
-    number = mission.request
-    if "refined" in stale and "refine" in config.mission.phases and last.refined is None:
+
+    def result_of(order: WorkOrder, **more: Any) -> Any:
+        nonlocal number
         number += 1
-        order = replace(mission, stamp_ns=stamp_ns, wanted="refine", request=number, requested_ns=stamp_ns)
-        refined = work(pipeline, replace(tick, mission=order))
-        assert isinstance(refined, FlowField)
-        tick = replace(tick, refined=refined)
-    wants_route = "plan" in config.mission.phases or "navigate" in config.mission.phases
-    planned = last.route is not None and last.route is not recorded.route and mission.phase in ("navigate", "done")
-    if "route" in stale and wants_route and (tick.refined is not last.refined or not planned):
-        assert last.estimate is not None
-        order = replace(
-            mission,
-            stamp_ns=stamp_ns,
-            wanted="route",
-            request=number + 1,
-            requested_ns=stamp_ns,
-            start_um=planned_from(recorded, last),
+        ordered: Mission = replace(
+            mission, stamp_ns=stamp_ns, wanted=order, request=number, requested_ns=stamp_ns, **more
         )
-        route = work(pipeline, replace(tick, mission=order))
-        assert isinstance(route, Route)
-        tick = replace(tick, route=route)
+        return work(pipeline, replace(tick, mission=ordered))
+
+    phases = config.mission.phases
+    if "refined" in stale and Phase.REFINE in phases and last.refined is None:
+        tick = replace(tick, refined=result_of(WorkOrder.REFINE))
+    navigated = mission.phase in (Phase.NAVIGATE, Phase.DONE)
+    planned = last.route is not None and last.route is not recorded.route and navigated
+    wants_route = "route" in stale and {Phase.PLAN, Phase.NAVIGATE} & set(phases)
+    if wants_route and (tick.refined is not last.refined or not planned):
+        tick = replace(tick, route=result_of(WorkOrder.ROUTE, start_um=planned_from(recorded, last)))
     return tick if tick.refined is not last.refined or tick.route is not last.route else last
 
 
 def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
-    """Where the recorded route began, else where the robot is."""
+    """Where the recorded route begins, else where the robot is: a point (2,) in um."""
     if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
         return np.array(recorded.route.waypoints_um[0], np.float64)
     assert last.estimate is not None
     return last.estimate.position_um
-
-
-def intact(reader: SessionReader) -> tuple[bool, list[str]]:
-    """Whether the session's files hold what was recorded, by their digests, and lines that say so."""
-    lines = []
-    same = True
-    for file, faults in digest_faults(reader.path).items():
-        if faults is None:
-            lines.append(printable(f"{file.name}: no digest, recorded by an older flowrec"))
-        elif faults:
-            same = False
-            lines += [printable(f"{file.name}: DIFFERENT from its digest: {fault}") for fault in faults]
-    return same, lines or ["all messages and the head are as the digest says"]
-
-
-def verdict(done: Replayed) -> tuple[bool, list[str]]:
-    """Lines that say how the replay compares with the recording, and whether it is the same."""
-    comparison = done.comparison
-    lines = comparison.lines()
-    same, first = comparison.same, comparison.first
-    identical = comparison.identical
-    if done.worker_check is not None:
-        results = done.worker_check.comparison
-        lines.extend(done.worker_check.results)
-        same, identical, first = same and results.same, identical and results.identical, first or results.first
-    if done.digest is not None:
-        same = same and done.digest[0]
-        lines.extend(done.digest[1])
-    if done.frames_missing:
-        lines.append(f"{done.frames_missing} frames are not in the file; their recorded tracks stood in")
-    if first is not None:
-        lines.append(f"first difference: {first}")
-    lines.append(
-        f"{comparison.ticks} ticks: "
-        + ("NOT the same" if not same else "every tick identical" if identical else "the same within tolerance")
-    )
-    return same, lines
-
-
-def verdict_json(done: Replayed) -> dict[str, Any]:
-    """What `verdict` says, in numbers too."""
-    same, lines = verdict(done)
-    found = done.comparison.as_json()
-    if done.worker_check is not None:
-        results = done.worker_check.comparison.as_json()
-        found["topics"] |= results["topics"]
-        found["first"] = found["first"] or results["first"]
-        found["identical"] = found["identical"] and results["identical"]
-    return (
-        found
-        | {"same": same, "digest_faults": [] if done.digest is None or done.digest[0] else done.digest[1]}
-        | {"lines": lines}
-    )
-
-
-def default_out(path: Path) -> Path:
-    """SESSION_replay_001.mcap beside the session, the first number that is free."""
-    for number in range(1, 1000):
-        out = path.with_name(f"{path.stem}_replay_{number:03d}.mcap")
-        if not out.exists():
-            return out
-    raise SessionError(f"{path.parent}: 999 replays of {path.name} are here; name one with --out")

@@ -1,70 +1,79 @@
-"""What a replay is worth: recorded and replayed beside each other, both judged on the replay's map."""
+"""What a replay is worth: recorded and replayed side by side, on paper and flown again in a simulator."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
+from flowrec.commands.interactive import Unattended
 from flowrec.commands.record import length_um
-from flowrec.commands.replay import Replayed
+from flowrec.commands.replay import Change, Replayed, planned_from, replay
+from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import FlowField, Observations, Route, Tick
+from flowrec.pipeline import assemble
 from flowrec.planning import travel_time
+from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.jobs import no_observations
-from flowrec.summary import Row, finite
+from flowrec.run.loop import LockstepWorker, Preloaded, RunReport, Sink, run
+from flowrec.session import files_behind
+from flowrec.session_writer import session_writer
+from flowrec.summary import Row, Value, finite
+from flowrec.system.outputs import MCAP, RRD, check_output
+from flowrec.terminal import say
 from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
 _SAME_MAP = 1e-3  # of the largest speed: no table shows less
 
 
-def residual_um_s(flow: FlowField, observations: Observations) -> float:
-    """Root mean square of observed minus mapped flow, um/s, both components together."""
-    miss = observations.flow_um_s - sample(flow, observations.position_um)
-    return float(np.sqrt((miss**2).sum(axis=1).mean())) if len(miss) else math.nan
+def report(done: Replayed) -> list[Row]:
+    """Key, recorded and replayed value of every figure that a replay may change; both judged on the replay's map.
 
-
-def before_and_after(done: Replayed) -> list[Row]:
-    """Key, recorded, replayed: what the change is worth. Both are judged on the replay's map.
-
-    Flow errors are shares of the true flow; a route that can not be followed on that map has no travel time.
+    Flow errors are relative to the true flow, where it is known. A route that can not be followed on that map has no
+    travel time.
     """
     was, now = done.recorded, done.replayed
+    rows: list[Row] = []
+
+    def add(key: str, value: Callable[[Tick], Value]) -> None:
+        rows.append((key, value(was), value(now)))
+
+    add("map", lambda tick: tick.field.method if tick.field is not None else "none")
+    if was.true_field is not None:
+        add("assumed_flow_error", lambda tick: _flow_error(done, tick.assumed))
+        add("refined_flow_error", lambda tick: _flow_error(done, tick.refined))
     observations = now.observations or was.observations or no_observations(0)
-    rows: list[Row] = [("map", _map_name(was), _map_name(now))]
-    if done.true_field is not None:
-        for name in FLOW_FIELDS:
-            key = f"{name}_flow_error"
-            rows.append((key, _flow_error(done, getattr(was, name)), _flow_error(done, getattr(now, name))))
-    count = len(observations.position_um)
-    if count and was.field is not None and now.field is not None:
-        was_um_s, now_um_s = (residual_um_s(field, observations) for field in (was.field, now.field))
-        rows.append(("observations", count, count))
-        rows.append(("residual_um_s", finite(was_um_s), finite(now_um_s)))
+    if len(observations.position_um) and was.field is not None and now.field is not None:
+        add("observations", lambda _: len(observations.position_um))
+        add("residual_um_s", lambda tick: _residual_um_s(tick.field, observations))
     if was.route is not None or now.route is not None:
-        rows.append(("planner", _planner(was.route), _planner(now.route)))
-        rows.append(("route_length_um", _length(was.route), _length(now.route)))
+        add("planner", lambda tick: _planner(tick.route))
+        add("route_length_um", lambda tick: _length_um(tick.route))
+        limit_um_s = done.config.plan.speed_share * done.config.robot.speed_limit_um_s
         if now.field is not None:
-            limit = done.config.plan.speed_share * done.config.robot.speed_limit_um_s
-            was_s, now_s = (_time_on(route, now.field, limit) for route in (was.route, now.route))
-            rows.append(("travel_time_on_replayed_map_s", was_s, now_s))
-    was_control, now_control = done.recorded_config.control.method, done.config.control.method
-    if was_control != now_control:
-        rows.append(("controller", was_control, now_control))
+            add("travel_time_on_replayed_map_s", lambda tick: _travel_time_s(tick.route, now.field, limit_um_s))
+    controllers = done.session.config.control.method, done.config.control.method
+    if controllers[0] != controllers[1]:
+        rows.append(("controller", *controllers))
     commands = done.commands
     rows.append(("commands_compared", None, commands.compared))
     rows.append(("commands_changed", None, commands.changed))
-    if commands.changed:
+    if commands.first_ns is not None:
         rows.append(("commands_difference_rms_um_s", None, commands.rms_um_s))
-        first_ns = commands.first_ns
-        rows.append(("first_changed_command_s", None, seconds(first_ns) if first_ns is not None else None))
+        rows.append(("first_changed_command_s", None, seconds(commands.first_ns)))
     return rows
 
 
-def refinement_told(done: Replayed) -> list[str]:
-    """What the refinement of a replay did, in lines; where it left the recorded map as it was, why."""
+def refinement_remarks(done: Replayed) -> list[str]:
+    """What the refinement of a replay did, in lines; why, if it left the recorded map as it was."""
     was, now = done.recorded.refined, done.replayed.refined
     if now is None:
         return []
@@ -80,33 +89,160 @@ def refinement_told(done: Replayed) -> list[str]:
     return [*lines, f"the refined map is the recorded one, unchanged{why}"]
 
 
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """The files that a replay writes.
+
+    Attributes
+    ----------
+    session : of the replay.
+    refly : of the flight of the replayed plan; None: it is not flown.
+    rrd : for Rerun; None: it is not made.
+    overwrite : existing files may be replaced, but none that is read.
+    """
+
+    session: Path
+    refly: Path | None
+    rrd: Path | None
+    overwrite: bool
+
+    @classmethod
+    def of(cls, path: Path, out: Path | None, overwrite: bool, *, refly: bool, rrd: bool) -> Self:
+        """Those of a replay of `path` to `out`, by default SESSION_replay_NNN.mcap with the first free number.
+
+        Raises
+        ------
+        OutputError : one of them may not be written.
+        """
+        numbered = (path.with_name(f"{path.stem}_replay_{number:03d}{MCAP[0]}") for number in range(1, 1000))
+        out = out or next((name for name in numbered if not name.exists()), None)
+        if out is None:
+            raise SessionError(f"{path.parent}: 999 replays of {path.name} are here; name one with --out")
+        flight = out.with_name(f"{out.stem}_refly{MCAP[0]}") if refly else None
+        outputs = cls(out, flight, out.with_suffix(RRD[0]) if rrd else None, overwrite)
+        inputs = files_behind(path)
+        for file, suffixes in ((out, MCAP), (flight, MCAP), (outputs.rrd, RRD)):
+            if file is not None:
+                check_output(file, suffixes, inputs=inputs, overwrite=overwrite)
+        return outputs
+
+
+def replay_and_report(
+    path: Path,
+    change: Change,
+    outputs: Outputs,
+    from_s: float | None = None,
+    frames: bool = False,
+    control: Unattended | None = None,
+) -> tuple[Replayed, list[Row]]:
+    """Replay a session, report on it, and write all outputs; arguments and errors as of `replay` and `refly`."""
+    overwrite = outputs.overwrite
+    done = replay(path, change, from_s, False, outputs.session, overwrite, frames, control)
+    rows = report(done)
+    if outputs.refly is not None:
+        rows += refly(done, outputs.refly, overwrite)
+    if outputs.rrd is not None:
+        from flowrec.commands.export import export  # late: it imports Rerun
+
+        export(outputs.session, overwrite=overwrite)
+    return done, rows
+
+
+def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[Row]:
+    """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
+
+    Both flights begin where the recorded route does and have the same seed; rows as of `report`.
+
+    Parameters
+    ----------
+    out : session file of the flight of the replayed plan.
+
+    Raises
+    ------
+    UsageError : there is no map or no route to fly.
+    """
+    flow = done.replayed.field
+    if flow is None or done.recorded.mission is None or done.recorded.route is None:
+        raise UsageError(
+            "--refly: the session has no map or no route to fly; replay it with --refine --plan astar_time"
+        )
+    session = done.session
+    x_um, y_um = (float(value) for value in planned_from(done.recorded, done.replayed))
+    reports = []
+    for name, config, tick, target in (
+        ("recorded", session.config, done.recorded, None),
+        ("replayed", done.config, done.replayed, out),
+    ):
+        mission = replace(config.mission, phases=("plan", "navigate"), start=(x_um, y_um), replan_error_um=None)
+        flown = replace(config, mission=mission)
+        pipeline = assemble(flown, session.chip)
+        rig = SimulatedRig.of(pipeline, flown, true_field=flow)
+        known = {key: field for key in FLOW_FIELDS if (field := getattr(tick, key)) is not None}
+        worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
+        sinks: list[Sink] = []
+        with ExitStack() as stack:
+            if target is not None:
+                writer = session_writer(target, flown, session.chip, parent=session.path, overwrite=overwrite)
+                sinks.append(stack.enter_context(writer))
+            say(f"reflying as {name} ...")
+            flight = run(pipeline, rig, worker, sinks)
+            if target is not None:
+                writer.close({"outcome": flight.outcome, "note": f"refly of {session.path.name}"})
+        reports.append(flight)
+    was, now = reports
+    return [
+        ("reflown_outcome", was.outcome, now.outcome),
+        ("reflown_navigation_s", _navigation_s(was), _navigation_s(now)),
+        ("reflown_planned_s", _planned_s(was), _planned_s(now)),
+        ("reflown_contacts", was.contacts, now.contacts),
+    ]
+
+
 def _largest_change(was: FlowField, now: FlowField) -> float:
-    """Of the velocity, as a share of its largest component."""
+    """Largest change of a velocity component relative to the largest component."""
     largest = float(np.abs(was.velocity_um_s).max())
     return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
 
 
 def _flow_error(done: Replayed, flow: FlowField | None) -> float | None:
-    if flow is None or done.true_field is None:
+    truth = done.recorded.true_field
+    if flow is None or truth is None:
         return None
-    return finite(float(relative_rmse(flow, done.true_field, done.chip.mask).v))
+    return finite(float(relative_rmse(flow, truth, done.session.chip.mask).v))
 
 
-def _map_name(tick: Tick) -> str:
-    return tick.field.method if tick.field is not None else "none"
+def _residual_um_s(flow: FlowField | None, observations: Observations) -> float | None:
+    """Root mean square of observed minus mapped flow, um/s, both components together."""
+    if flow is None:
+        return None
+    miss = observations.flow_um_s - sample(flow, observations.position_um)
+    return finite(float(np.sqrt((miss**2).sum(axis=1).mean())))
 
 
 def _planner(route: Route | None) -> str:
     return "none" if route is None else route.method if route.reachable else f"{route.method}: unreachable"
 
 
-def _length(route: Route | None) -> float | None:
+def _length_um(route: Route | None) -> float | None:
     return length_um(route) if route is not None and route.reachable else None
 
 
-def _time_on(route: Route | None, flow: FlowField, limit_um_s: float) -> float | None:
-    """None where there is no route, or it can not be followed."""
-    if route is None or not route.reachable:
+def _travel_time_s(route: Route | None, flow: FlowField | None, limit_um_s: float) -> float | None:
+    """None where there is no map or route, or it can not be followed."""
+    if flow is None or route is None or not route.reachable:
         return None
     arrival_s, feasible = travel_time(flow, route.waypoints_um, limit_um_s)
     return float(arrival_s[-1]) if feasible else None
+
+
+def _navigation_s(flight: RunReport) -> float | None:
+    """Time from the adopted route to the end."""
+    mission, route = flight.last.mission, flight.last.route
+    if mission is None or route is None or not mission.finished or not len(route.arrival_s):
+        return None
+    return seconds(mission.since_ns - route.stamp_ns)
+
+
+def _planned_s(flight: RunReport) -> float | None:
+    route = flight.last.route
+    return float(route.arrival_s[-1]) if route is not None and len(route.arrival_s) else None

@@ -18,7 +18,7 @@ _JUDGEMENTS = {
 _MARKS = {"bad": "!!", "odd": "! "}
 
 
-class Level(StrEnum):
+class Severity(StrEnum):
     """How serious a finding is."""
 
     BAD = "bad"  # the session can not be used as it is
@@ -37,7 +37,7 @@ class Gap:
 class Finding:
     """Something that is not as it should be."""
 
-    level: Level
+    level: Severity
     about: str
     text: str
 
@@ -70,7 +70,7 @@ class Verdict:
     def word(self) -> Literal["good", "usable", "bad"]:
         """The judgement."""
         levels = {finding.level for finding in self.findings}
-        return "bad" if Level.BAD in levels else "usable" if levels else "good"
+        return "bad" if Severity.BAD in levels else "usable" if levels else "good"
 
     @property
     def exit_status(self) -> int:
@@ -79,11 +79,11 @@ class Verdict:
 
     def odd(self, about: str, text: str) -> None:
         """Add a finding: something was lost or is unusual."""
-        self.findings.append(Finding(Level.ODD, about, printable(text)))
+        self.findings.append(Finding(Severity.ODD, about, printable(text)))
 
     def bad(self, about: str, text: str) -> None:
         """Add a finding: the session can not be replayed as it is."""
-        self.findings.append(Finding(Level.BAD, about, printable(text)))
+        self.findings.append(Finding(Severity.BAD, about, printable(text)))
 
     def fact(self, about: str, text: str) -> None:
         """Add a fact."""

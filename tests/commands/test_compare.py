@@ -187,5 +187,5 @@ def test_fields_that_an_older_file_does_not_have_are_not_compared() -> None:
 def test_a_field_of_tick_without_a_row_in_the_table_is_an_error_at_import(monkeypatch: pytest.MonkeyPatch) -> None:
     wider = make_dataclass("Tick", [("extra", FlowField | None, None)], bases=(Tick,), frozen=True)
     monkeypatch.setattr(flowrec.messages, "Tick", wider)
-    with pytest.raises(TypeError, match=r"topics\.py: .*extra"):
+    with pytest.raises(TypeError, match=r"Tick\.extra"):
         runpy.run_path(topics.__file__)

@@ -22,7 +22,7 @@ def test_the_golden_session_is_small_and_says_nothing_of_the_machine_it_was_made
 @pytest.mark.parametrize("from_s", [None, 3.0])
 def test_the_golden_session_replays_the_same(from_s: float | None) -> None:
     done = verb.replay(GOLDEN, Change(), from_s=from_s, verify=True)
-    same, lines = verb.verdict(done)
+    same, lines = done.same, done.lines()
     assert same, lines
     assert done.recorded.mission is not None
     assert done.recorded.mission.outcome == "reached"

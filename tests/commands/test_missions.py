@@ -10,8 +10,7 @@ import pytest
 
 from flowrec.commands import replay as verb
 from flowrec.commands.record import GOOD_ENDS, Recorded, record
-from flowrec.commands.refly import refly
-from flowrec.commands.replay_report import before_and_after
+from flowrec.commands.replay_report import refly, report
 from flowrec.config import load_config
 from flowrec.store import SessionReader
 from tests.conftest import SMALL
@@ -71,7 +70,7 @@ def test_what_time_field_would_have_gained_over_the_paper_planner_is_gained_when
     recorded = record(load_config(SESSIONS / "upstream.toml", sets), tmp_path / "paper.mcap")
     assert recorded.report.outcome == "reached"
     done = verb.replay(recorded.path, verb.Change(plan="time_field"))
-    rows = {row[0]: row[1:] for row in [*before_and_after(done), *refly(done, None)]}
+    rows = {row[0]: row[1:] for row in [*report(done), *refly(done, None)]}
     was_s, now_s = rows["travel_time_on_replayed_map_s"]
     assert now_s < 0.995 * was_s
     flown_was_s, flown_now_s = rows["reflown_navigation_s"]

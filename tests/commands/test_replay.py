@@ -36,7 +36,7 @@ def test_the_same_seed_gives_the_same_messages(session: Path, tmp_path: Path) ->
 
 def test_a_replay_is_identical_tick_by_tick_and_its_worker_results_can_be_made_again(session: Path) -> None:
     done = verb.replay(session, Change(), verify=True)
-    same, lines = verb.verdict(done)
+    same, lines = done.same, done.lines()
     assert same, lines
     assert done.comparison.identical, str(done.comparison.first)
     assert done.worker_check is not None
@@ -63,7 +63,7 @@ def test_a_recording_in_real_time_verifies_from_any_time(realtime_session: Path,
     }[where]
     from_s = start_ns / 1e9 if start_ns is not None else None
     done = verb.replay(realtime_session, Change(), from_s=from_s, verify=True)
-    same, lines = verb.verdict(done)
+    same, lines = done.same, done.lines()
     assert same and done.comparison.identical, lines
     assert done.worker_check is not None
     made = sum(stamp_ns >= (start_ns or 0) for stamp_ns in adopted)
@@ -116,11 +116,11 @@ def test_planted_hidden_state_passes_from_the_start_and_is_caught_from_the_middl
 
 def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp_path: Path) -> None:
     done = verb.replay(session, Change(refine="assimilate"), out=tmp_path / "refined.mcap")
-    assert done.true_field is not None
+    assert done.recorded.true_field is not None
     assert done.replayed.assumed is not None
     assert done.replayed.refined is not None
-    before = relative_rmse(done.replayed.assumed, done.true_field, done.chip.mask).v
-    after = relative_rmse(done.replayed.refined, done.true_field, done.chip.mask).v
+    before = relative_rmse(done.replayed.assumed, done.recorded.true_field, done.session.chip.mask).v
+    after = relative_rmse(done.replayed.refined, done.recorded.true_field, done.session.chip.mask).v
     assert after < 0.5 * before
     written = SessionReader(tmp_path / "refined.mcap")
     assert written.header.parent["file"] == session.name
@@ -131,9 +131,11 @@ def test_refining_again_by_assimilation_halves_the_flow_error(session: Path, tmp
 def test_a_replay_can_refine_with_what_the_smoother_sees_in_hindsight(session: Path) -> None:
     smoothed = Change(refine="assimilate", sets=("sampler.method=smoothed",))
     done = verb.replay(session, smoothed)
-    assert done.true_field is not None and done.replayed.assumed is not None and done.replayed.refined is not None
-    before = relative_rmse(done.replayed.assumed, done.true_field, done.chip.mask).v
-    assert relative_rmse(done.replayed.refined, done.true_field, done.chip.mask).v < 0.3 * before
+    assert (
+        done.recorded.true_field is not None and done.replayed.assumed is not None and done.replayed.refined is not None
+    )
+    before = relative_rmse(done.replayed.assumed, done.recorded.true_field, done.session.chip.mask).v
+    assert relative_rmse(done.replayed.refined, done.recorded.true_field, done.session.chip.mask).v < 0.3 * before
     # No later than the work order itself, and other observations than the filter's.
     filtered = verb.replay(session, Change(refine="assimilate"))
     assert filtered.replayed.refined is not None

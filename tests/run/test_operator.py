@@ -98,7 +98,7 @@ def test_a_held_robot_stays_goes_on_and_arrives_and_a_replay_is_identical(
     for words in ("held by the operator", "goes on after", "operator: mark: 1", "operator: note: look"):
         assert words in events
     done = again.replay(recorded.path, again.Change(), verify=True)
-    assert again.verdict(done)[0]
+    assert done.same
     assert done.comparison.identical, str(done.comparison.first)
     middle = again.replay(recorded.path, again.Change(), from_s=2.5)  # under the second hold
     assert middle.comparison.identical, str(middle.comparison.first)

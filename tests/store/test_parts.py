@@ -282,7 +282,7 @@ def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut
     files = in_parts(path, {order + 2 for order in orders}, ticks, header)  # in the middle of each order
     for file in (path, *files):
         done = verb.replay(file, Change(), verify=True)
-        same_again, lines = verb.verdict(done)
+        same_again, lines = done.same, done.lines()
         assert same_again and done.comparison.identical, lines
         assert (done.worker_check is not None and done.worker_check.results) or file == files[0]
     # What is planned or refined anew from a part alone goes out from what the part knows.

@@ -88,7 +88,7 @@ def test_a_real_recording_cut_anywhere_is_replayed_exactly_after_recovery(sessio
         assert reader.header == SessionReader(session).header
         assert reader.outcome["ticks"] == str(done.ticks)
         replayed = verb.replay(done.path, Change(), verify=True)
-        same, lines = verb.verdict(replayed)
+        same, lines = replayed.same, replayed.lines()
         assert same, lines
         assert replayed.report.ticks == done.ticks > 0
         assert ("all but the image" in done.lost) == (reader.counts["frame"] > done.ticks)

@@ -48,7 +48,7 @@ def package(tmp_path: Path) -> Path:
     """A small copy of flowrec, with a kernel that calls one of another file."""
     copy = tmp_path / "installed" / "flowrec"
     (copy / "system").mkdir(parents=True)
-    for name in ("__init__.py", "system/__init__.py", "system/numba_setup.py"):
+    for name in ("__init__.py", "version.py", "system/__init__.py", "system/numba_setup.py"):
         (copy / name).write_bytes((PACKAGE / name).read_bytes())
     (copy / "inner.py").write_text(INNER.format(value=3))
     (copy / "outer.py").write_text(OUTER)
