@@ -89,7 +89,9 @@ class Change:
         ------
         UsageError : a section is changed that the recording has fixed.
         """
-        sections = [each.name for each in fields(ResolvedConfig) if getattr(recorded, each.name) != getattr(changed, each.name)]
+        sections = [
+            each.name for each in fields(ResolvedConfig) if getattr(recorded, each.name) != getattr(changed, each.name)
+        ]
         for section in sections:
             if section in FIXED:
                 raise UsageError(
@@ -371,7 +373,9 @@ def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
     return reader.tick_before(max(mission.requested_ns, reader.first_ns))
 
 
-def _closing_work(pipeline: Pipeline, config: ResolvedConfig, last: Tick, recorded: Tick, stale: frozenset[str]) -> Tick:
+def _closing_work(
+    pipeline: Pipeline, config: ResolvedConfig, last: Tick, recorded: Tick, stale: frozenset[str]
+) -> Tick:
     """Refine and plan after the last frame what the recording ended too early to adopt, or never ordered."""
     mission = last.mission
     if mission is None or last.assumed is None:
