@@ -15,6 +15,7 @@ from flowrec.store.part_continuity import Run, files_of
 from flowrec.store.paths import pieces
 from flowrec.store.session_metadata import Head
 from flowrec.summary import Figures, of_text
+from flowrec.system.toml_file import parse_toml
 from flowrec.units import nanoseconds, seconds
 
 if TYPE_CHECKING:
@@ -87,6 +88,17 @@ class Session:
     def topics(self) -> dict[str, int]:
         """Number of messages by topic."""
         return self.run.counts()
+
+    @cached_property
+    def _settings(self) -> dict[str, Any]:
+        return toml_table(self.header.config_toml, f"{self.path}: config.toml inside")
+
+    def setting(self, *keys: str) -> Any:
+        """A setting as the file holds it, not validated, such as `setting("camera", "rate_hz")`; None if absent."""
+        tree: Any = self._settings
+        for key in keys:
+            tree = tree.get(key) if isinstance(tree, dict) else None
+        return tree
 
     @cached_property
     def config(self) -> ResolvedConfig:
@@ -198,6 +210,14 @@ def open(path: Path | str) -> Session:  # noqa: A001 - flowrec.open
     SessionError : one line that says what the file is, and what to do.
     """
     return Session(path)
+
+
+def toml_table(text: str, where: str) -> dict[str, Any]:
+    """The tables of a TOML text in a session; SessionError, which begins with `where`, if it is damaged."""
+    try:
+        return parse_toml(text)
+    except (ValueError, RecursionError) as error:  # also numbers and nesting that no flowrec has written
+        raise SessionError(f"{where}: is not valid TOML ({error}); the file is damaged or was edited") from error
 
 
 def files_behind(path: Path) -> list[Path]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.declarations import Message, Role, Topic
-from flowrec.errors import UsageError, printable
+from flowrec.errors import printable
 from flowrec.messages import Tick
 from flowrec.session import Session
 from flowrec.store.topic_filter import is_left_out
@@ -47,10 +47,8 @@ class Side:
     @classmethod
     def of(cls, word: str, session: Session) -> Side:
         """A session: without the topics that it leaves out, and the fields that its own schemas do not have."""
-        try:
-            left_out = session.config.recording.leave_out
-        except UsageError:  # the configuration of another flowrec: then every topic that it declares counts
-            left_out = ()
+        patterns = session.setting("recording", "leave_out")
+        left_out = list(map(str, patterns)) if isinstance(patterns, list) else []
         copy = bool(session.header.parent)
         recorded = dict(session.reader.recorded_fields)
         for name in recorded.keys() - session.reader.counts.keys():

@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import SessionError
-from flowrec.session import Session
+from flowrec.session import Session, toml_table
 from flowrec.store.metadata import Part
 from flowrec.store.part_continuity import Run
 from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
 from flowrec.summary import name_of, of_text, shown
 from flowrec.system.locks import is_growing
-from flowrec.system.toml_file import parse_toml
 from flowrec.units import seconds
 
 _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
@@ -37,8 +36,7 @@ def info(session: Session | Path | str) -> dict[str, Any]:
     """
     session = Session.of(session)
     path, run, header = session.path, session.run, session.header
-    outcome = run.outcome
-    config = _table(header.config_toml, f"{path}: config.toml inside")
+    outcome, phases = run.outcome, session.setting("mission", "phases")
     said = header.provenance
     facts: dict[str, Any] = {
         "outcome": outcome.get("outcome", "unknown"),
@@ -46,10 +44,10 @@ def info(session: Session | Path | str) -> dict[str, Any]:
         "duration_s": session.duration_s,
         "size_bytes": _size(run),
         "parts": len(run.pieces) if run.in_parts else None,
-        **_chip(_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
-        "rig": _at(config, "rig"),
-        "phases": list(map(str, _listed_at(config, "mission", "phases"))),
-        **{stage: _at(config, stage, "method") for stage in ("observer", "refine", "plan", "control")},
+        **_chip(toml_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
+        "rig": _name(session.setting("rig")),
+        "phases": [str(phase) for phase in phases] if isinstance(phases, list) else [],
+        **{stage: _name(session.setting(stage, "method")) for stage in ("observer", "refine", "plan", "control")},
         "recorded": said.get("wall_time", "unknown"),
         "flowrec": said.get("flowrec", "?"),
         "commit": said.get("git_commit"),
@@ -62,7 +60,7 @@ def info(session: Session | Path | str) -> dict[str, Any]:
     for key, code in said.items():
         if key.startswith("weights."):
             facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
-    if _at(config, "recording", "region") == "robot" and "frames_windows" not in outcome:
+    if session.setting("recording", "region") == "robot" and "frames_windows" not in outcome:
         facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
     told = of_text(outcome)
     return facts | {key: value for key, value in told.items() if key not in (*facts, *_SAID_ELSE)}
@@ -144,7 +142,7 @@ def _listed(path: Path, files: list[Path]) -> Listed:
         session = Session(path)
         head, said = session.header, session.run.outcome
         outcome = said.get("outcome", "unknown"), _why(said)
-        chip = str(_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
+        chip = str(toml_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
         recorded = head.provenance.get("wall_time", "")
         return Listed(path.name, *outcome, size, session.duration_s, chip, recorded, parts)
     except SessionError as error:
@@ -160,13 +158,6 @@ def _size(run: Run) -> int:
 def _piece(part: Part, path: Path) -> str:
     said = f"{part.kind} {part.number} of the run {run_path(path).stem}" + _bracketed(part.why)
     return said if part.carried_ns is None else f"{said}, goes on from {seconds(part.carried_ns):.2f} s"
-
-
-def _table(text: str, where: str) -> dict[str, Any]:
-    try:
-        return parse_toml(text)
-    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
-        raise SessionError(f"{where}: is not valid TOML ({error}); the file is damaged or was edited") from error
 
 
 def _chip(said: Mapping[str, Any], png: bytes) -> dict[str, Any]:
@@ -188,16 +179,8 @@ def _derived(text: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _at(tree: object, *keys: str) -> str:
-    for key in keys:
-        tree = tree.get(key) if isinstance(tree, dict) else None
-    return str(tree) if tree is not None else "?"
-
-
-def _listed_at(tree: object, *keys: str) -> list[Any]:
-    for key in keys:
-        tree = tree.get(key) if isinstance(tree, dict) else None
-    return tree if isinstance(tree, list) else []
+def _name(setting: Any) -> str:
+    return "?" if setting is None else str(setting)
 
 
 def _bracketed(text: str) -> str:
