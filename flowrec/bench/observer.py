@@ -1,12 +1,11 @@
-"""`flowrec bench observer`: error of the flow that each observer tells, on the paper's lemniscate in its swirling flow.
+"""`flowrec bench observer`: error of the flow that each observer estimates, on the paper's lemniscate in a vortex.
 
-The robot is driven along the lemniscate exactly; what differs is the noise of its measured positions, whether the flow
-pulsates, and whether it rolls as far per revolution as is thought. RMSE is of the vector, over the second lap.
+The robot moves along the lemniscate exactly. The cases differ in the noise of the measured positions, in pulsation of
+the flow and in the error of the displacement per revolution. RMSE is that of the vector over the second lap.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,10 +14,11 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from flowrec.bench.figure_observer import draw
+from flowrec.bench.figures import draw_observer
 from flowrec.bench.harness import FigureFile, Results, Seed
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, RATE_HZ, SPIN_PER_S, place_um, vortex_map
 from flowrec.estimation import HealthMonitor, Kalman, Luenberger, Observer, smooth
+from flowrec.estimation.observer import OBSERVERS
 from flowrec.estimation.tuning import tune
 from flowrec.flow import sample
 from flowrec.messages import Applied, Estimate, FlowField, Health, Track
@@ -29,22 +29,23 @@ from flowrec.units import seconds
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 LAPS = 2
-GAINS_PER_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)
-MAP_SHARE = 1.1  # the map is that much too strong
+GAINS_PER_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # tried of the Luenberger observer; that of the paper is 1
+MAP_SCALE = 1.1
+DRAWN = "10 um"
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """What the observers have to cope with."""
+    """Conditions of one run."""
 
     name: str
     noise_um: float = 10.0
-    pulsation: float = 0.0  # share of the flow
+    pulsation: float = 0.0  # amplitude, relative to the flow
     pulsation_hz: float = 1.0
-    gain: float = 1.0  # true um per revolution over the nominal
-    map_share: float = MAP_SHARE
+    gain: float = 1.0  # true um per revolution over the nominal value
+    map_scale: float = MAP_SCALE  # of the map over the true flow
 
 
 CASES = (
@@ -53,22 +54,22 @@ CASES = (
     Case("15 um", 15.0),
     Case("10 um, pulsating", pulsation=0.5),
     Case("10 um, gain +10 %", gain=1.1),
-    Case("10 um, gain +10 %, true map", gain=1.1, map_share=1.0),
+    Case("10 um, gain +10 %, true map", gain=1.1, map_scale=1.0),
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Run:
-    """A driven lap: what is known and what is true. Rows are frames."""
+    """Inputs of the observer and the truth, frame by frame."""
 
     tracks: list[Track]
     applied: list[Applied]
-    time_s: Floats
-    flow_um_s: Floats
+    time_s: Floats  # (n,)
+    flow_um_s: Floats  # (n, 2) true
 
 
 def drive(case: Case, seed: int = 0, laps: int = LAPS) -> Run:
-    """The robot on its lemniscate: its own displacement is what the flow (Simpson's rule) leaves of the way."""
+    """The robot on the lemniscate. Its own displacement is the path less that by the flow (Simpson's rule)."""
     rng = np.random.default_rng(seed)
     count = round(laps * PERIOD_S * RATE_HZ)
     time = np.arange(count) / RATE_HZ
@@ -98,16 +99,40 @@ def observe(observer: Observer, run: Run, field: FlowField | None = None) -> lis
 
 
 def rmse(run: Run, flow_um_s: Floats) -> float:
-    """Of the vector over the second half, um/s."""
+    """RMSE of the vector over the second half of the run, um/s."""
     half = len(run.time_s) // 2
     return float(np.sqrt(np.square(flow_um_s - run.flow_um_s)[half:].sum(axis=1).mean()))
+
+
+def estimates_of(case: Case, run: Run) -> tuple[dict[str, tuple[Floats, list[Estimate]]], float]:
+    """Estimated flow (n, 2) in um/s by observer, with the estimates if it makes one per frame; the best gain, 1/s.
+
+    Beside the rows of OBSERVERS: the Luenberger observer with its best gain, the smoother, the map alone, the Kalman
+    filters that also estimate the displacement per revolution (if that is wrong), and a flow of zero.
+    """
+    field, kalman = vortex_map(case.map_scale - 1.0), Kalman(position_noise_um=case.noise_um)
+    observers = {name: Observer(name, kalman=kalman) for name in OBSERVERS}
+    if case.gain != 1.0:
+        adapting = replace(kalman, estimate_gain=True)
+        observers |= {f"{name}, gain estimated": Observer(name, kalman=adapting) for name in ("kalman", "kalman_map")}
+    gains = [Observer("luenberger", luenberger=Luenberger(gain)) for gain in GAINS_PER_S]
+    best = min(gains, key=lambda observer: rmse(run, _flows(observe(observer, run))))
+    found = {name: observe(observer, run, field) for name, observer in observers.items()}
+    found["luenberger, best gain"] = observe(best, run)
+    flows = {name: (_flows(estimates), estimates) for name, estimates in found.items()}
+    flows |= {
+        "smoother": (smooth(run.tracks, run.applied, kalman, ROBOT).flow_um_s, []),
+        "map alone": (sample(field, place_um(run.time_s)), []),
+        "no observer": (np.zeros_like(run.flow_um_s), []),
+    }
+    return flows, best.luenberger.gain_per_s
 
 
 def _flows(estimates: list[Estimate]) -> Floats:
     return np.array([estimate.flow_um_s for estimate in estimates])
 
 
-def _alarm(estimates: list[Estimate]) -> tuple[str, float | None]:
+def _alarms(estimates: list[Estimate]) -> tuple[str, float | None]:
     """The alarms of a run and when the first began, s."""
     monitor = HealthMonitor()
     health: Health | None = None
@@ -130,79 +155,57 @@ def measure(
     figure: FigureFile = None,
     seed: Seed = 0,
 ) -> Results:
-    """Error per case and observer. With a recorded session also what settings it recommends.
+    """Error by case and observer; with a recorded session also the settings that it recommends.
 
     Raises
     ------
     UsageError
-        If a figure is wanted and matplotlib is not installed, or the session is too short.
+        If the session is too short.
     """
     rows: list[dict[str, Any]] = []
-    curves: dict[str, Floats] = {}
-    truth: Floats | None = None
-    time: Floats | None = None
+    drawn: tuple[Floats, Floats, dict[str, Floats]] | None = None
     with progress("observing", len(CASES)) as done:
         for number, case in enumerate(CASES):
             run = drive(case, seed)
-            field = vortex_map(case.map_share - 1.0)
-            kalman = Kalman(position_noise_um=case.noise_um)
-            tried = {
-                gain: _flows(observe(Observer("luenberger", luenberger=Luenberger(gain)), run)) for gain in GAINS_PER_S
-            }
-            best = min(tried, key=lambda gain: rmse(run, tried[gain]))
-
-            def by(observer: Observer, known: FlowField | None = None, run: Run = run) -> tuple[Floats, list[Estimate]]:
-                estimates = observe(observer, run, known)
-                return _flows(estimates), estimates
-
-            found: dict[str, tuple[Floats, list[Estimate]]] = {
-                "luenberger": (tried[1.0], []),
-                "luenberger, best gain": (tried[best], []),
-                "kalman": by(Observer(kalman=kalman)),
-                "kalman_map": by(Observer("kalman_map", kalman=kalman), field),
-                "map alone": (sample(field, place_um(run.time_s)), []),
-                "smoother": (smooth(run.tracks, run.applied, kalman, ROBOT).flow_um_s, []),
-            }
-            if case.gain != 1.0:
-                felt = replace(kalman, estimate_gain=True)
-                found["kalman, gain felt"] = by(Observer(kalman=felt))
-                found["kalman_map, gain felt"] = by(Observer("kalman_map", kalman=felt), field)
+            found, best_gain = estimates_of(case, run)
             for name, (flow, estimates) in found.items():
-                half = len(estimates) // 2
-                alarm, after_s = _alarm(estimates) if estimates else ("", None)
-                gain = estimates[-1].um_per_rev if estimates else None
+                nis = np.array([one.nis for one in estimates[len(estimates) // 2 :]])
+                has_nis = bool(np.isfinite(nis).any())
+                alarm, after_s = _alarms(estimates) if has_nis else ("", None)
                 rows.append(
                     {
                         "case": case.name,
                         "observer": name,
                         "rmse_um_s": rmse(run, flow),
-                        "nis": float(np.nanmean([one.nis for one in estimates[half:]])) if estimates else None,
+                        "nis": float(np.nanmean(nis)) if has_nis else None,
                         "alarm": alarm,
                         "alarm_after_s": after_s,
-                        "um_per_rev": gain,
-                        "gain_per_s": {"luenberger": 1.0, "luenberger, best gain": best}.get(name),
+                        "um_per_rev": estimates[-1].um_per_rev if estimates else None,
+                        "gain_per_s": {"luenberger": 1.0, "luenberger, best gain": best_gain}.get(name),
                     }
                 )
-            if case.name == "10 um":
-                curves = {name: flow for name, (flow, _) in found.items()}
-                truth, time = run.flow_um_s, run.time_s
+            if case.name == DRAWN:
+                drawn = run.time_s, run.flow_um_s, {name: flow for name, (flow, _) in found.items()}
             done(number + 1)
     if figure is not None:
-        assert time is not None and truth is not None
-        draw(figure, time, truth, curves, rows)
-    figures: dict[str, Any] = {"seed": seed, "map_share": MAP_SHARE, "rows": rows}
+        assert drawn is not None
+        noises = {case.name: case.noise_um for case in CASES[:3]}
+        of = {(row["case"], row["observer"]): row["rmse_um_s"] for row in rows}
+        by_noise = {name: {um: of[case, name] for case, um in noises.items()} for name in drawn[2]}
+        draw_observer(figure, *drawn, by_noise)
+    results: Results = {"seed": seed, "map_share": MAP_SCALE, "rows": rows}
     if session is not None:
-        figures["session"] = recommend(session)
-    return figures
+        results["session"] = recommend(session)
+    return results
 
 
 def recommend(path: Path) -> dict[str, Any]:
-    """Settings of the Kalman filter that suit a recording, and the alarms that its observer would have raised."""
+    """Settings of the Kalman filter that suit a recording."""
     session = Session(path)
     config = session.config
     ticks = [tick for tick in session.ticks(with_frames=False) if tick.track is not None and tick.applied is not None]
     tracks, applied = [tick.track for tick in ticks], [tick.applied for tick in ticks]
-    fields = [tick.field for tick in ticks] if config.observer.method == "kalman_map" else None
+    fields = [tick.field for tick in ticks] if config.observer.uses_map else None
     tuned = tune(tracks, applied, config.robot, config.observer.kalman, fields)  # type: ignore[arg-type]
     return {
         "path": str(path),
@@ -216,28 +219,28 @@ def recommend(path: Path) -> dict[str, Any]:
     }
 
 
-def show(figures: dict[str, Any]) -> None:
-    """Print the table, and what a session recommends."""
-    names = list(dict.fromkeys(row["observer"] for row in figures["rows"]))
-    cases = list(dict.fromkeys(row["case"] for row in figures["rows"]))
-    lines = []
-    for name in names:
-        cells = []
-        for case in cases:
-            row = next((one for one in figures["rows"] if (one["case"], one["observer"]) == (case, name)), None)
-            said = "" if row is None else f"{row['rmse_um_s']:.1f}"
-            if row is not None and row["nis"] is not None and math.isfinite(row["nis"]):
-                said += f" ({row['nis']:.2f})"
-            cells.append(said)
-        lines.append((name, *cells))
-    table("RMSE of the flow in um/s (and mean NIS)", ("observer", *cases), lines)
-    for row in figures["rows"]:
+def show(results: Results) -> None:
+    """Print the table, the alarms, and what a session recommends."""
+    rows = {(row["observer"], row["case"]): row for row in results["rows"]}
+    cases = list(dict.fromkeys(case for _, case in rows))
+
+    def cell(row: dict[str, Any] | None) -> str:
+        if row is None:
+            return ""
+        return f"{row['rmse_um_s']:.1f}" + ("" if row["nis"] is None else f" ({row['nis']:.2f})")
+
+    table(
+        "RMSE of the flow in um/s (and mean NIS)",
+        ("observer", *cases),
+        [(name, *(cell(rows.get((name, case))) for case in cases)) for name in dict.fromkeys(name for name, _ in rows)],
+    )
+    for (name, case), row in rows.items():
         if row["alarm"]:
-            say(f"alarm in {row['case']} by {row['observer']}: {row['alarm']} after {row['alarm_after_s']:.1f} s")
+            say(f"alarm in {case} by {name}: {row['alarm']} after {row['alarm_after_s']:.1f} s")
         if row["um_per_rev"] is not None:
-            say(f"{row['case']}: {row['observer']} finds {row['um_per_rev']:.2f} um per revolution")
-    if "session" in figures:
-        found = figures["session"]
+            say(f"{case}: {name} estimates {row['um_per_rev']:.2f} um per revolution")
+    if "session" in results:
+        found = results["session"]
         say(
             f"{found['path']}: position noise {found['position_noise_um']:.2f} um from a {found['position_noise_from']}"
             f" robot; NIS {found['nis_before']:.2f} as recorded, {found['nis']:.2f} with"

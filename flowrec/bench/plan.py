@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from flowrec.bench.drive import drive
+from flowrec.bench.figures import draw_plan
 from flowrec.bench.harness import Cases, FigureFile, Names, Quick, Results, Seed, chosen
 from flowrec.bench.trips import SPEED_UM_S, Trip, World, best_time, draw_trip, magnified, worlds, worlds_of
 from flowrec.chip import clearance_um
@@ -135,9 +136,7 @@ def measure(
         "speed": None if quick else _speed(),
     }
     if figure is not None:
-        from flowrec.bench.figure_plan import draw
-
-        draw(figure, shown[:2], [asdict(row) for row in rows])
+        draw_plan(figure, shown[:2], [asdict(row) for row in rows])
     return figures
 
 
