@@ -108,7 +108,7 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
         mean, std = float(values.mean()), float(values.std())
         low = max(mean - std, 0.3 * mean, 1e-4)  # above zero: the axis is logarithmic
         ax.errorbar(at + 0.2, mean, [[max(mean - low, 0.0)], [std]], fmt="o", ms=5, color="#2f6f8f", capsize=3, lw=1.4)
-        beside = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        beside: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
         ax.annotate(f"{mean:.3f}\n±{std:.3f}", (at + 0.26, mean), fontsize=7.5, color=INK, **beside)
     count = len({row["case"] for row in rows})
     style(ax, f"{count} cases, a dot each, the case above circled; mean ± standard deviation")
@@ -143,8 +143,8 @@ def _show(ax: Axes, image: NDArray[np.floating], mask: NDArray[np.bool_], colour
 def _arrows(ax: Axes, velocity: NDArray[np.floating], places: NDArray[np.intp], top: float) -> None:
     """Arrows at places (n, 2) of row and column where the flow is not slow; an arrow at speed `top` fills a block."""
     rows, columns = places[_length(velocity[places[:, 0], places[:, 1]]) > SHORTEST * top].T
-    shape = {"width": 0.009, "headwidth": 3.6, "headlength": 4.0, "headaxislength": 3.6, "pivot": "mid"}
-    scale = {"angles": "xy", "scale_units": "xy", "scale": top / BLOCK_PX}
+    shape: dict[str, Any] = {"width": 0.009, "headwidth": 3.6, "headlength": 4.0, "headaxislength": 3.6, "pivot": "mid"}
+    scale: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": top / BLOCK_PX}
     ax.quiver(columns, rows, *velocity[rows, columns].T, color="white", **scale, **shape)
 
 

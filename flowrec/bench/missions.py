@@ -1,7 +1,8 @@
-"""`flowrec bench missions`: whole missions in the simulated rig, the same worlds under several policies.
+"""`flowrec bench missions`: whole missions in the simulated rig, several policies in the same worlds.
 
-A seed is a world: a chip, a flow that is wrong, noise. Every policy flies every trip in it: with the flow and against
-it, after a survey and on the assumed map alone. Only the bench looks at the truth; the stages see camera images.
+A seed determines a world: the chip, the error of the assumed flow, the noise. Every policy flies every trip in it, with
+the flow and against it, after a survey and on the assumed map alone. Only the bench reads the truth; the stages get
+camera images.
 """
 
 from __future__ import annotations
@@ -19,11 +20,13 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, vessel_cases, wilson
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.commands.record import refuse_adrift
 from flowrec.config import ResolvedConfig, load_config
+from flowrec.control.controller import CONTROLLERS
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Route, Tick
@@ -36,7 +39,7 @@ from flowrec.run.loop import LockstepWorker, run
 from flowrec.terminal import progress, say, table
 from flowrec.units import seconds
 
-# Name: what is set, beside what all have.
+# The settings of a policy. `plain` is the null model: the shortest path, planned without the flow.
 POLICIES: dict[str, tuple[str, ...]] = {
     "policy": ("plan.method=time_field", "control.method=policy"),
     "vector": ("plan.method=time_field", "control.method=vector"),
@@ -44,64 +47,69 @@ POLICIES: dict[str, tuple[str, ...]] = {
     "plain": ("plan.method=astar_length", "control.method=vector"),
     "paper": ("plan.method=astar_paper", "control.method=ff_fb", "observer.method=luenberger"),
 }
-# Which way and how much is known when the robot sets out. Upstream with a survey: it rides down, then swims back.
+POLICIES |= {
+    name: ("plan.method=time_field", f"control.method={name}")
+    for name in CONTROLLERS
+    if not any(f"control.method={name}" in sets for sets in POLICIES.values())
+}
+# By direction and map. Upstream after a survey, the robot drifts down first and then swims back.
 TRIPS: dict[tuple[str, str], tuple[str, ...]] = {
     ("down", "surveyed"): (),
     ("up", "surveyed"): ("survey.share=1.0", "mission.goal=inlet"),
     ("down", "assumed"): ("mission.phases=plan,navigate",),
     ("up", "assumed"): ("mission.phases=plan,navigate", "mission.start=outlet", "mission.goal=inlet"),
 }
-# Everything that a planner may want to know about the truth, and nothing kept back for the controller.
-_BEST = Planner(method="time_field", clearance_margin_um=0.0, speed_share=1.0)
+_AS_PREDICTED = ("reached", "unreachable", "refused")  # outcomes that are no failure
+_BEST = Planner(method="time_field", clearance_margin_um=0.0, speed_share=1.0)  # no reserves
 
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """How wrong the assumptions are. The rest (noise, latency) is as in any simulated run."""
+    """Errors of the assumptions; noise and latency are those of any simulated run."""
 
-    flow_error: float = 0.1  # every true inlet flow is the assumed one times 1 +- this; which, the seed says
+    flow_error: float = 0.1  # relative error of each true inlet flow; the seed chooses its sign
     outlet_error: float = 0.0  # simulated.outlet_pressure_error
-    latency_s: float | None = None  # of the robot, known to it; None: as `resolve` has it
+    latency_s: float | None = None  # of the robot, known to it; None: the default
     sets: tuple[str, ...] = ()  # further settings of all policies
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One mission."""
+    """One mission. None or NaN if it was refused, or if there is no such value."""
 
     seed: int
     chip: str
     way: str  # down, up
     map: str  # surveyed, assumed
     policy: str
-    outcome: str  # reached, unreachable (said before leaving), or what went wrong
+    outcome: str  # reached, unreachable or refused (both before the start), or the failure
     note: str
-    survey_contacts: int
-    contacts: int  # while navigating, planning anew included
-    seconds: float | None  # from the adopted route until the goal is reached
-    optimum_s: float | None  # the fastest possible from there in the true flow
-    ratio: float | None
-    planned_s: float | None
-    rms_um: float | None  # distance to the reference while navigating
-    replans: int
-    latency_ms: float
-    radius_um: float
-    speed_limit_um_s: float
+    survey_contacts: int = 0
+    contacts: int = 0  # while navigating, planning again included
+    seconds: float | None = None  # from the adoption of the route to the goal
+    optimum_s: float | None = None  # the least time for the same in the true flow
+    ratio: float | None = None
+    planned_s: float | None = None
+    rms_um: float | None = None  # distance to the reference while navigating
+    replans: int = 0
+    latency_ms: float = math.nan
+    radius_um: float = math.nan
+    speed_limit_um_s: float = math.nan
 
     @property
     def trip(self) -> tuple[int, str, str]:
-        """What is the same for all policies."""
+        """What all policies have in common."""
         return self.seed, self.way, self.map
 
 
-class Logbook:
-    """A sink that keeps what a row tells."""
+class MissionLog:
+    """A sink that collects what a row needs."""
 
     def __init__(self) -> None:
-        self.began: tuple[int, NDArray[np.float64], Route] | None = None  # stamp, true place, route
+        self.began: tuple[int, NDArray[np.float64], Route] | None = None  # stamp, true position, route
         self.contacts = {"survey": 0, "navigate": 0}
         self.replans = 0
-        self.square_um2: list[float] = []
+        self.squared_um2: list[float] = []  # distances to the reference
         self._last = Tick()
 
     def write(self, tick: Tick) -> None:
@@ -116,7 +124,7 @@ class Logbook:
             self.replans += mission.request != before.mission.request
         demand = tick.demand
         if mission.phase == "navigate" and demand is not None and math.isfinite(demand.error_um):
-            self.square_um2.append(demand.error_um**2)
+            self.squared_um2.append(demand.error_um**2)
         self._last = tick
 
 
@@ -125,48 +133,47 @@ def measure(
     cases: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz), besides the built-in chips.")
     ] = None,
-    policies: Annotated[str, typer.Option(metavar="A,B", help=f"Of {', '.join(POLICIES)}.")] = "policy,vector,paper",
+    policies: Annotated[
+        str, typer.Option(metavar="A,B", help=f"Of {', '.join(POLICIES)}.")
+    ] = "policy,vector,paper,plain",
     flow_error: Annotated[float, typer.Option(help="Relative error of each inlet flow.")] = 0.1,
     outlet_error: Annotated[float, typer.Option(help="Same of outlet pressures, of the drop across the chip.")] = 0.0,
     latency: Annotated[
-        float | None, typer.Option(metavar="S", help="From command to motion; 0.04, less in swift channels.")
+        float | None, typer.Option(metavar="S", help="From command to motion; 0.04, less in fast channels.")
     ] = None,
     sets: Sets = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     figure: FigureFile = None,
     maps: Sequence[str] = ("surveyed", "assumed"),
 ) -> Results:
-    """Rows per mission, a summary per policy, and the policies compared on the trips that both arrived from.
+    """Rows by mission, a summary by policy, and pairs of policies compared on the trips on which both arrived.
 
-    Seeds take the bifurcation, the vessels and each of the `cases` (*.npz), as it is and slowed down, in turn.
+    Seeds take the bifurcation, the random vessels and each of the `cases`, as it is and slowed down, in turn.
 
     Raises
     ------
     UsageError
-        If there is no such policy or no case, or a figure is wanted and matplotlib is not installed.
+        If there is no such policy, or no case in `cases`.
     """
     names = chosen("bench missions: no policy", policies, POLICIES)
     world = World(flow_error, outlet_error, latency, tuple(sets or ()))
     paths = [] if cases is None else vessel_cases(cases)
-    orders = [
-        (seed, chip_of(seed, paths), way, how, policy, world)
+    jobs_left = [
+        (seed, chip_of(seed, paths), way, known, policy, world)
         for seed in range(1, seeds + 1)
-        for way, how in TRIPS
-        if how in maps
+        for way, known in TRIPS
+        if known in maps
         for policy in names
     ]
     rows: list[Row] = []
-    with progress("flying", len(orders)) as done:
-        if jobs == 1:
-            for order in orders:
-                rows.append(fly(*order))
-                done(len(rows))
-        else:
-            with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as workers:
-                for row in workers.map(_fly, orders, chunksize=4):
-                    rows.append(row)
-                    done(len(rows))
-    figures = {
+    with (
+        progress("flying", len(jobs_left)) as done,
+        ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as workers,
+    ):
+        for row in workers.map(_fly, jobs_left, chunksize=4) if jobs > 1 else map(_fly, jobs_left):
+            rows.append(row)
+            done(len(rows))
+    results = {
         "world": asdict(world),
         "seeds": seeds,
         "rows": [asdict(row) for row in rows],
@@ -174,14 +181,12 @@ def measure(
         "pairs": {f"{a} / {b}": compared(rows, a, b) for a, b in combinations(names, 2)},
     }
     if figure is not None:
-        from flowrec.bench.figure_missions import draw
-
-        draw(figure, figures)
-    return figures
+        draw_missions(figure, results)
+    return results
 
 
 def chip_of(seed: int, paths: Sequence[Path]) -> tuple[str, ...]:
-    """The settings of a seed's chip: bifurcation, vessels, and each case as it is and slowed down, in turn."""
+    """The settings of a seed's chip: bifurcation, random vessels, and each case as it is and slowed down, in turn."""
     turn, kind = divmod(seed - 1, 4 if paths else 2)
     if kind == 0:
         return ("chip.name=bifurcation",)
@@ -192,15 +197,15 @@ def chip_of(seed: int, paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def slowed(path: Path) -> tuple[str, ...]:
-    """A vessel case with a flow, and a robot to match, that 40 ms of latency and 30 frames a second can master.
+    """A vessel case with a slower flow and robot, which 40 ms of latency and 30 frames a second can control.
 
-    In that time the robot, 1.3 times as fast as the flow, swims a fifth of the median channel. Many cases as they are
-    run a thousand times faster: there the right answer is that nobody can steer in them.
+    In that time the robot, 1.3 times as fast as the flow, swims a fifth of the median channel width. The flow in many
+    cases is a thousand times faster; no robot can be controlled in them.
     """
-    plain = load_config(None, [f"chip.path={path}"])
-    chip = load_chip(plain.chip)
+    original = load_config(None, [f"chip.path={path}"])
+    chip = load_chip(original.chip)
     speed_um_s = 0.2 * median_width_um(chip) / (USUAL_DELAY_S + 1.0 / 30.0)
-    peak_um_s = float(np.linalg.norm(plain.flow.solve(chip).velocity_um_s, axis=-1).max())
+    peak_um_s = float(np.linalg.norm(original.flow.solve(chip).velocity_um_s, axis=-1).max())
     inlet_um_s = max(opening.value for opening in chip.openings if opening.kind == "inlet")
     return (
         f"chip.path={path}",
@@ -209,71 +214,64 @@ def slowed(path: Path) -> tuple[str, ...]:
     )
 
 
-def _fly(order: tuple[int, tuple[str, ...], str, str, str, World]) -> Row:
-    return fly(*order)
+def _fly(job: tuple[int, tuple[str, ...], str, str, str, World]) -> Row:
+    return fly(*job)
 
 
 def fly(
     seed: int,
     chip_sets: tuple[str, ...],
     way: str,
-    how: str,
+    known: str,
     policy: str,
     world: World,
     watch: Callable[[Tick], None] | None = None,
 ) -> Row:
-    """One mission, from the first frame to coils at zero."""
+    """One mission; `known` is the map, surveyed or assumed. `watch` gets every tick."""
     sets = [
         *chip_sets,
         f"simulated.seed={seed}",
         f"simulated.outlet_pressure_error={world.outlet_error}",
         *([] if world.latency_s is None else [f"robot.delay_s={world.latency_s}"]),
-        *TRIPS[way, how],
+        *TRIPS[way, known],
         *POLICIES[policy],
         *world.sets,
     ]
-    config = load_config(None, sets)
-    name = Path(config.chip.path).stem or config.chip.name
-    name += " slowed" if config.chip.path and config.chip.inlet_speed_um_s is not None else ""
+    asked = load_config(None, sets)
+    name = Path(asked.chip.path).stem or asked.chip.name
+    name += " slowed" if asked.chip.path and asked.chip.inlet_speed_um_s is not None else ""
     try:
-        chip = load_chip(config.chip)
-        config = resolve(config, chip)
+        chip = load_chip(asked.chip)
+        config = resolve(asked, chip)
         refuse_adrift(config, chip)
         truth = true_field(chip, config, world)
-    except FlowrecError as error:  # said in one line before anything is switched on
-        nothing = (0, 0, None, None, None, None, None, 0, math.nan, math.nan, math.nan)
-        return Row(seed, name, way, how, policy, "refused", str(error), *nothing)
+    except FlowrecError as error:  # before anything is switched on
+        return Row(seed, name, way, known, policy, "refused", str(error))
     pipeline = assemble(config, chip)
     rig = SimulatedRig.of(pipeline, config, true_field=truth)
-    log = Logbook()
+    log = MissionLog()
     report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], on_tick=watch)
     mission = report.last.mission
     assert mission is not None
     outcome = report.outcome
     taken_s = best_s = None
     if log.began is not None:
-        began_ns, place_um, _route = log.began
+        began_ns, start_um, _ = log.began
         tolerance_um = config.mission.goal_tolerance_um or config.robot.radius_um
-        best_s = optimum_s(truth, place_um, mission.goal_um, tolerance_um, chip, config.robot)
+        best_s = optimum_s(truth, start_um, mission.goal_um, tolerance_um, chip, config.robot)
         if outcome == "reached":
             taken_s = seconds(mission.since_ns - began_ns)
         elif outcome == "unreachable":
             outcome = "unreachable too late"
     return Row(
-        seed=seed,
-        chip=name,
-        way=way,
-        map=how,
-        policy=policy,
-        outcome=outcome,
-        note=report.note,
+        *(seed, name, way, known, policy, outcome, report.note),
         survey_contacts=log.contacts["survey"],
         contacts=log.contacts["navigate"],
         seconds=taken_s,
         optimum_s=best_s,
         ratio=taken_s / best_s if taken_s is not None and best_s else None,
         planned_s=float(log.began[2].arrival_s[-1]) if log.began is not None else None,
-        rms_um=math.sqrt(float(np.mean(log.square_um2))) if log.square_um2 else None,
+        rms_um=math.sqrt(float(np.mean(log.squared_um2))) if log.squared_um2 else None,
         replans=log.replans,
         latency_ms=1e3 * config.robot.delay_s,
         radius_um=config.robot.radius_um,
@@ -282,7 +280,7 @@ def fly(
 
 
 def true_field(chip: Chip, config: ResolvedConfig, world: World) -> FlowField:
-    """The flow that really is: every inlet off by exactly the world's share, outlets and viscosity as the rig draws."""
+    """The true flow: inlets off by exactly the flow error of the world, outlets and viscosity as drawn by the rig."""
     solver = FlowSolver(k=config.simulated.k)
     drawn = true_chip(chip, config.simulated, solver)
     rng = np.random.default_rng([config.simulated.seed, 0xF10])
@@ -301,46 +299,45 @@ def optimum_s(
     chip: Chip,
     robot: Robot,
 ) -> float | None:
-    """The least time in the true flow at the robot's speed limit until the goal is within the tolerance.
+    """The least time in the true flow, at the robot's speed limit, until the goal is within the tolerance.
 
-    No margin but the robot's radius, no latency, no noise: nothing can be faster. None where there is no way.
+    Without margin, latency and noise: a lower bound of every policy. None if there is no route.
     """
     route = _BEST.plan(truth, start_um, goal_um, chip, robot)
     if not route.reachable:
         return None
-    far = np.hypot(*(route.waypoints_um - goal_um).T)
-    after = int(np.argmax(far <= tolerance_um)) if (far <= tolerance_um).any() else len(far) - 1
+    distance_um = np.hypot(*(route.waypoints_um - goal_um).T)
+    near = distance_um <= tolerance_um
+    after = int(np.argmax(near)) if near.any() else len(near) - 1
     if after == 0:
         return 0.0
-    share = min(max((far[after - 1] - tolerance_um) / max(far[after - 1] - far[after], 1e-9), 0.0), 1.0)
-    return float(route.arrival_s[after - 1] + share * (route.arrival_s[after] - route.arrival_s[after - 1]))
+    before_um, after_um = distance_um[after - 1 : after + 1]
+    ratio = min(max((before_um - tolerance_um) / max(before_um - after_um, 1e-9), 0.0), 1.0)
+    return float(route.arrival_s[after - 1] + ratio * (route.arrival_s[after] - route.arrival_s[after - 1]))
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Shares with their Wilson 95 % intervals, and how the arrivals compare with the optimum."""
-    count = len(rows)
+    """Proportions with their Wilson 95 % intervals, and the arrival times over the least times."""
     ratios = np.array([row.ratio for row in rows if row.ratio is not None])
     errors = [row.rms_um / row.radius_um for row in rows if row.rms_um is not None]
-    kept = {
+    failed = [row for row in rows if row.outcome not in _AS_PREDICTED]
+    counts = {
         "reached": sum(row.outcome == "reached" for row in rows),
         "unreachable": sum(row.outcome in ("unreachable", "refused") for row in rows),
         "without_contact": sum(row.contacts == 0 for row in rows),
         "survey_without_contact": sum(row.survey_contacts == 0 for row in rows),
+        "honest": len(rows) - len(failed),
     }
-    kept["honest"] = kept["reached"] + kept["unreachable"]
-    shares = {name: {"count": k, "share": k / count, "wilson_95": wilson(k, count)} for name, k in kept.items()}
+    fast = int((ratios <= 1.1).sum())
     return {
-        "missions": count,
-        **shares,
-        "failed": [f"{row.chip} {row.seed} {row.way} {row.map}: {row.outcome}" for row in rows if not _honest(row)],
+        "missions": len(rows),
+        **{name: _proportion(k, len(rows)) | {"count": k} for name, k in counts.items()},
+        "failed": [f"{row.chip} {row.seed} {row.way} {row.map}: {row.outcome}" for row in failed],
         "ratio": {
             "median": float(np.median(ratios)),
             "mean": float(ratios.mean()),
             "worst": float(ratios.max()),
-            "within_10_percent": {
-                "share": float((ratios <= 1.1).mean()),
-                "wilson_95": wilson(int((ratios <= 1.1).sum()), len(ratios)),
-            },
+            "within_10_percent": _proportion(fast, len(ratios)),
         }
         if len(ratios)
         else None,
@@ -349,42 +346,46 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     }
 
 
-def _honest(row: Row) -> bool:
-    return row.outcome in ("reached", "unreachable", "refused")
+def _proportion(successes: int, count: int) -> dict[str, Any]:
+    return {"share": successes / count, "wilson_95": wilson(successes, count)}
 
 
 def compared(rows: Sequence[Row], a: str, b: str) -> dict[str, Any]:
     """Times of `a` over those of `b` on the trips on which both arrived."""
     times = {(row.policy, row.trip): row.seconds for row in rows if row.seconds}
     trips = sorted({row.trip for row in rows})
-    ratios = np.array([times[a, trip] / times[b, trip] for trip in trips if (a, trip) in times and (b, trip) in times])
-    return paired(ratios)
-
-
-def show(figures: dict[str, Any]) -> None:
-    """Print the summary per policy and the comparisons."""
-    rows = []
-    for name, line in figures["summary"].items():
-        ratio = line["ratio"]
-        rows.append(
-            (
-                name,
-                str(line["missions"]),
-                *(_share(line[key]) for key in ("reached", "honest", "without_contact", "survey_without_contact")),
-                *((f"{ratio[key]:.2f}" for key in ("median", "mean", "worst")) if ratio else ("-", "-", "-")),
-                f"{100 * ratio['within_10_percent']['share']:.0f} %" if ratio else "-",
-            )
-        )
-    error = 100 * figures["world"]["flow_error"]
-    table(
-        f"Missions over {figures['seeds']} worlds, inlet flows {error:g} % off, Wilson 95 % intervals in brackets",
-        ("policy", "n", "reached", "honest", "no contact", "survey", "median", "mean", "worst", "< 1.1"),
-        rows,
+    return paired(
+        np.array([times[a, trip] / times[b, trip] for trip in trips if (a, trip) in times and (b, trip) in times])
     )
-    for name, line in figures["summary"].items():
-        for trouble in line["failed"]:
-            say(f"{name}: {trouble}")
-    if figures["pairs"]:
+
+
+def show(results: Results) -> None:
+    """Print the summary by policy and the comparisons."""
+
+    def cell(proportion: dict[str, Any]) -> str:
+        low, high = proportion["wilson_95"]
+        return f"{proportion['count']} ({100 * low:.0f}-{100 * high:.0f} %)"
+
+    def ratios(ratio: dict[str, Any] | None) -> tuple[str, ...]:
+        if ratio is None:
+            return ("-",) * 4
+        within = f"{100 * ratio['within_10_percent']['share']:.0f} %"
+        return (*(f"{ratio[key]:.2f}" for key in ("median", "mean", "worst")), within)
+
+    counts = ("reached", "honest", "without_contact", "survey_without_contact")
+    table(
+        f"Missions over {results['seeds']} worlds, inlet flows {100 * results['world']['flow_error']:g} % off, Wilson "
+        "95 % intervals in brackets; predicted: reached, or refused in advance",
+        ("policy", "n", "reached", "predicted", "no contact", "survey", "median", "mean", "worst", "< 1.1"),
+        [
+            (name, str(line["missions"]), *(cell(line[key]) for key in counts), *ratios(line["ratio"]))
+            for name, line in results["summary"].items()
+        ],
+    )
+    for name, line in results["summary"].items():
+        for failure in line["failed"]:
+            say(f"{name}: {failure}")
+    if results["pairs"]:
         table(
             "Time of one over time of the other on the same trips",
             ("policies", "n", "mean ratio (95 %)", "faster", "sign test p", "Wilcoxon p"),
@@ -397,12 +398,7 @@ def show(figures: dict[str, Any]) -> None:
                     f"{pair['sign_p']:.1g}",
                     f"{pair['wilcoxon_p']:.1g}",
                 )
-                for name, pair in figures["pairs"].items()
+                for name, pair in results["pairs"].items()
                 if pair["count"]
             ],
         )
-
-
-def _share(share: dict[str, Any]) -> str:
-    low, high = share["wilson_95"]
-    return f"{share['count']} ({100 * low:.0f}-{100 * high:.0f} %)"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flowrec.bench import missions
-from flowrec.bench.figure_missions import draw
+from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import paired, wilson
 from flowrec.bench.missions import World, chip_of, compared, fly, optimum_s, summary
 from flowrec.chip import load_chip
@@ -113,7 +113,7 @@ def test_a_summary_counts_and_pairs_what_arrived(flown, tmp_path, capsys):
     json.dumps(figures)
     missions.show(figures)
     assert "vector" in capsys.readouterr().out
-    draw(tmp_path / "a.png", figures)
+    draw_missions(tmp_path / "a.png", figures)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -18,18 +18,17 @@ import numpy as np
 import zstandard
 
 from flowrec.bench.harness import memory_mb
-from flowrec.bench.loop import PacedRig, TimingsOnly, prepare_inputs
+from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.declarations import Image
 from flowrec.messages import Frame, OperatorEvent, Tick
-from flowrec.run.loop import LockstepWorker, Sink, run
+from flowrec.run.loop import Sink
 from flowrec.store import SessionWriter, Snapshot
 from flowrec.system.realtime_priority import first_of_all
 from flowrec.terminal import progress
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
-RATE_HZ = 60.0
 _WIDTH, _HEIGHT = 2448, 2048
 _QUEUE_BYTES = round(2.0 * RATE_HZ * _WIDTH * _HEIGHT)  # as `flowrec record` has it for this camera
 _RING = 140  # images, more than the queue holds
@@ -79,24 +78,14 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
         for number in range(rounds * len(kinds)):
             kind = kinds[number % len(kinds)]
             writer = _writer(kind, path)
-            timings = TimingsOnly()
-            sinks: list[Sink] = [timings, LargeCamera(images, ring, writer)]
-            worker = LockstepWorker(pipeline, config.worker.adopt_after_s, fills=())
+            sinks: list[Sink] = [LargeCamera(images, ring, writer)]
             cpu_s = time.process_time()
             with first_of_all() as first:
-                run(
-                    pipeline,
-                    PacedRig(prepared, RATE_HZ),
-                    worker,
-                    sinks,
-                    queue_state=partial(_queue_of, writer),
-                    end_when_finished=False,
-                )
+                timings = paced_run(prepared, config, pipeline, sinks, partial(_queue_of, writer))
             cpu_s = time.process_time() - cpu_s
             if writer is not None:
                 writer.close()
-            skip = len(timings.ticks) // 10  # the robot is found and caches are filled in the first frames
-            rows[kind].append(([t.timing for t in timings.ticks[skip:] if t.timing is not None], cpu_s))
+            rows[kind].append((timings, cpu_s))
             done(number + 1)
     return {
         "ticks": len(prepared) * rounds,
