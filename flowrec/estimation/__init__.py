@@ -4,8 +4,7 @@ from flowrec.estimation.consistency_monitor import HealthMonitor
 from flowrec.estimation.kalman import Kalman
 from flowrec.estimation.luenberger import Luenberger
 from flowrec.estimation.observer import Observer
-from flowrec.estimation.sampler import Sampler
+from flowrec.estimation.sampler import Sampler, Trimmed
 from flowrec.estimation.smoother import Smoothed, observe, smooth
-from flowrec.estimation.trimmed import Trimmed
 
 __all__ = ["HealthMonitor", "Kalman", "Luenberger", "Observer", "Sampler", "Smoothed", "Trimmed", "observe", "smooth"]

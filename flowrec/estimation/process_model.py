@@ -1,15 +1,15 @@
-"""How robot and flow go on from one frame to the next, in the Kalman filter's state.
+"""Process model of the Kalman filter: how robot and flow change from one frame to the next.
 
-State [x, y, vx, vy], then where they are estimated the slopes of the flow [dvx/dx, dvx/dy, dvy/dx] and the robot's
-um per revolution k. With turns n of the field, x' = x + v dt + k n. The flow itself goes on in one of three ways:
+State [x, y, vx, vy], then, where they are estimated, the gradient of the flow [dvx/dx, dvx/dy, dvy/dx] and the robot's
+um per revolution k. With turns n of the field, x' = x + v dt + k n. There are three models of the flow:
 
-- walk: v' = v, all change is noise;
-- slopes: v' = v + S (x' - x) with S = [[sxx, sxy], [syx, -sxx]], which has no divergence: the flow is steady and
-  smooth, so what changes along the way is told by where the robot goes;
-- map: v' = v + m(x') - m(x) with a known map m, whatever constant the map misses. The state stays the whole flow, so
-  nothing jumps when another map is adopted.
+- random walk: v' = v, all change is noise;
+- gradient: v' = v + S (x' - x) with S = [[sxx, sxy], [syx, -sxx]], which is free of divergence: the flow is steady and
+  smooth, so its change along the way follows from the displacement;
+- map: v' = v + m(x') - m(x) with a known map m that may be wrong by a constant. The state is the whole flow, so it does
+  not jump when another map is adopted.
 
-The last two are not linear: an extended filter, with the midpoint rule for the way.
+The last two are not linear: the filter is an extended one, with the midpoint rule for the displacement.
 """
 
 from __future__ import annotations
@@ -24,77 +24,90 @@ from flowrec.messages import FlowField
 
 Floats = NDArray[np.float64]
 
-ISOTROPIC = np.array([0.5, 1.0, 1.0])  # variances of [sxx, sxy, syx] that are the same along any axes
+ISOTROPIC = np.array([0.5, 1.0, 1.0])  # relative variances of [sxx, sxy, syx] that do not depend on the axes
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class StateLayout:
     """What a state holds besides position and flow."""
 
-    slopes: bool
-    gain: bool
+    gradient: bool
+    gain: bool  # um per revolution
 
     @property
     def size(self) -> int:
         """Length of the state."""
-        return 4 + 3 * self.slopes + self.gain
+        return 4 + 3 * self.gradient + self.gain
 
 
-def onward(
-    state: Floats, layout: Layout, turns: Floats, um_per_rev: float, dt: float, field: FlowField | None, held: bool
+def propagate(
+    state: Floats,
+    layout: StateLayout,
+    turns: Floats,
+    um_per_rev: float,
+    dt: float,
+    field: FlowField | None,
+    constant_flow: bool,
 ) -> tuple[Floats, Floats]:
-    """The state (n,) after dt and its derivative (n, n) by the state before.
+    """The state (n,) after dt and its Jacobian (n, n).
 
-    `um_per_rev` counts where the state has no gain of its own. `held` keeps the flow as it is: an extrapolation by
-    slopes is worth something over a frame, not while the robot is out of sight.
+    Parameters
+    ----------
+    um_per_rev : used where the state has no gain of its own.
+    constant_flow : ignore the gradient: it is valid over a frame, but not while the robot is out of sight.
     """
     position, flow = state[:2], state[2:4]
     moved = (float(state[-1]) if layout.gain else um_per_rev) * turns
-    way = moved + dt * flow
-    slope = np.zeros((2, 2))
+    displacement = moved + dt * flow
+    gradient = np.zeros((2, 2))
     ahead = state.copy()
     if field is not None:
         here = sample(field, position)
-        middle = flow + sample(field, position + 0.5 * way) - here
+        middle = flow + sample(field, position + 0.5 * displacement) - here
         ahead[:2] = position + moved + dt * middle
         ahead[2:4] = flow + sample(field, ahead[:2]) - here
-        slope = slope_of(field, ahead[:2])
+        gradient = gradient_at(field, ahead[:2])
     else:
-        if layout.slopes and not held:
-            slope = np.array([[state[4], state[5]], [state[6], -state[4]]])
-        change = slope @ way
-        ahead[:2] = position + way + 0.5 * dt * change
+        if layout.gradient and not constant_flow:
+            gradient = np.array([[state[4], state[5]], [state[6], -state[4]]])
+        change = gradient @ displacement
+        ahead[:2] = position + displacement + 0.5 * dt * change
         ahead[2:4] = flow + change
-    step = np.eye(layout.size)
-    step[0, 2] = step[1, 3] = dt
-    step[2:4, 2:4] += dt * slope
-    if layout.slopes:
-        step[2, 4], step[2, 5], step[3, 6], step[3, 4] = way[0], way[1], way[0], -way[1]
+    jacobian = np.eye(layout.size)
+    jacobian[0, 2] = jacobian[1, 3] = dt
+    jacobian[2:4, 2:4] += dt * gradient
+    if layout.gradient:
+        dx, dy = displacement
+        jacobian[2, 4], jacobian[2, 5], jacobian[3, 6], jacobian[3, 4] = dx, dy, dx, -dy
     if layout.gain:
-        step[:2, -1] = turns
-        step[2:4, -1] = slope @ turns
-    return ahead, step
+        jacobian[:2, -1] = turns
+        jacobian[2:4, -1] = gradient @ turns
+    return ahead, jacobian
 
 
-def noise(layout: Layout, dt: float, flow: float, slope: float, gain: float, drift: float) -> Floats:
-    """(n, n) covariance of what one step adds: variances of flow (um2/s2), slopes (1/s2) and gain, and um2/s of drift.
+def process_noise(layout: StateLayout, dt: float, flow: float, gradient: float, gain: float, drift: float) -> Floats:
+    """(n, n) covariance that one step adds.
 
-    The flow's is a white acceleration over dt, which also moves the robot.
+    Parameters
+    ----------
+    flow : variance, um2/s2, of a white acceleration over dt, which also displaces the robot.
+    gradient, gain : variances, 1/s2 and um2.
+    drift : variance of the position per time, um2/s.
     """
     matrix = np.zeros((layout.size, layout.size))
     for axis in (0, 1):
         matrix[axis, axis] = flow * dt**2 / 3.0 + drift * dt
         matrix[axis, axis + 2] = matrix[axis + 2, axis] = flow * dt / 2.0
         matrix[axis + 2, axis + 2] = flow
-    if layout.slopes:
-        matrix[4, 4], matrix[5, 5], matrix[6, 6] = slope * ISOTROPIC
+    if layout.gradient:
+        matrix[4, 4], matrix[5, 5], matrix[6, 6] = gradient * ISOTROPIC
     if layout.gain:
         matrix[-1, -1] = gain
     return matrix
 
 
-def slope_of(field: FlowField, point_um: Floats) -> Floats:
-    """(2, 2) 1/s: dv_i/dx_j of a map over one of its pixels."""
+def gradient_at(field: FlowField, point_um: Floats) -> Floats:
+    """(2, 2) 1/s: dv_i/dx_j of a map, central differences over one of its pixels."""
     right, down = np.array([[0.5, 0.0], [0.0, 0.5]]) * field.um_per_px
     by_x = sample(field, point_um + right) - sample(field, point_um - right)
     by_y = sample(field, point_um + down) - sample(field, point_um - down)

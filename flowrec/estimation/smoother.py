@@ -1,7 +1,7 @@
 """`smoothed`: position and flow at every frame from the frames before and after it (Rauch, Tung and Striebel, 1965).
 
-The model is the Kalman filter's own prediction at every frame, with the robot's displacement in it (filterpy's
-rts_smoother leaves that input out): x_s = x + C (x_s' - x'), C = P F^T P'^-1, where primes are of the next frame.
+The model is the Kalman filter's own prediction at every frame, which includes the robot's displacement (filterpy's
+rts_smoother omits that input): x_s = x + C (x_s' - x'), C = P F^T P'^-1, where primes are of the next frame.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.declarations import Matrix
-from flowrec.estimation.kalman import Kalman, carried, memory_s
+from flowrec.estimation.kalman import Kalman, memory_s, state_of
+from flowrec.estimation.process_model import Floats
 from flowrec.messages import Applied, Estimate, Observations, Track
 from flowrec.robot import Robot
 from flowrec.units import seconds
@@ -24,17 +24,17 @@ class Smoothed:
     """One row per frame."""
 
     stamps_ns: tuple[int, ...]
-    position_um: Matrix  # (n, 2)
-    flow_um_s: Matrix  # (n, 2)
-    covariance: Matrix  # (n, 4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
-    memory_s: Matrix  # (n,) K_x / K_v of the filter: how far apart two flows share their noise
+    position_um: Floats  # (n, 2)
+    flow_um_s: Floats  # (n, 2)
+    covariance: Floats  # (n, 4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
+    memory_s: Floats  # (n,) K_x / K_v of the filter: time over which the errors of the flow are correlated
 
 
 def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, robot: Robot) -> Smoothed:
-    """Run the filter forward over a recorded sequence and the smoother back."""
+    """Run the filter forward over a recorded sequence and the smoother backward."""
     estimates: list[Estimate] = []
-    for track, done in zip(tracks, applied, strict=True):
-        estimates.append(kalman.estimate(estimates[-1] if estimates else None, track, done, robot))
+    for track, one_applied in zip(tracks, applied, strict=True):
+        estimates.append(kalman.estimate(estimates[-1] if estimates else None, track, one_applied, robot))
     count = len(estimates)
     states = np.zeros((count, 4))
     covariances = np.zeros((count, 4, 4))
@@ -42,15 +42,14 @@ def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, 
     state, covariance = np.zeros(0), np.zeros((0, 0))
     for index in range(count - 1, -1, -1):
         if index == count - 1:
-            layout = kalman.layout()
-            state, covariance = carried(estimates[index], layout, robot)
+            state, covariance = state_of(estimates[index], kalman.layout(), robot)
         else:
-            ahead, expected, layout, step = kalman.predict(
+            ahead, expected, layout, jacobian = kalman.predict(
                 estimates[index], tracks[index + 1], applied[index + 1], robot
             )
-            known, spread = carried(estimates[index], layout, robot)
-            gain = np.linalg.solve(expected, step @ spread).T
-            state = known + gain @ (state - ahead)
+            filtered, spread = state_of(estimates[index], layout, robot)
+            gain = np.linalg.solve(expected, jacobian @ spread).T
+            state = filtered + gain @ (state - ahead)
             covariance = spread + gain @ (covariance - expected) @ gain.T
             covariance = 0.5 * (covariance + covariance.T)
         states[index], covariances[index] = state[:4], covariance[:4, :4]
@@ -59,17 +58,22 @@ def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, 
 
 
 def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settled_share: float = 0.1) -> Observations:
-    """Observations so far apart, in way and in time, that each has noise of its own; std as the smoother has it."""
+    """Observations so far apart, in distance and time, that their errors are independent; std is the smoother's.
+
+    Parameters
+    ----------
+    spacing_radii, settled_share : as of Sampler.
+    """
     chosen: list[int] = []
     std = np.sqrt(0.5 * (smoothed.covariance[:, 2, 2] + smoothed.covariance[:, 3, 3]))
     for index, position in enumerate(smoothed.position_um):
         if std[index] > settled_share * robot.max_speed_um_s:
             continue
         if chosen:
-            way = math.dist(position, smoothed.position_um[chosen[-1]])
-            passed_s = seconds(smoothed.stamps_ns[index] - smoothed.stamps_ns[chosen[-1]])
-            # Both sides of a smoothed flow remember.
-            if way < spacing_radii * robot.radius_um or passed_s < 2.0 * smoothed.memory_s[index]:
+            distance = math.dist(position, smoothed.position_um[chosen[-1]])
+            elapsed_s = seconds(smoothed.stamps_ns[index] - smoothed.stamps_ns[chosen[-1]])
+            # Smoothing correlates in both directions, hence the factor 2.
+            if distance < spacing_radii * robot.radius_um or elapsed_s < 2.0 * smoothed.memory_s[index]:
                 continue
         chosen.append(index)
     stamp_ns = smoothed.stamps_ns[-1] if smoothed.stamps_ns else 0
