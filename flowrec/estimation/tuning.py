@@ -51,8 +51,8 @@ def parked_noise(tracks: Sequence[Track], applied: Sequence[Applied]) -> tuple[f
     """One sigma in um of the measured position while the robot is not driven, and the duration in s.
 
     In intervals of half a second, a quadratic drift is subtracted and the scatter is measured by its median, so that a
-    jump of the tracker does not count. NaN for fewer than three intervals. An error of the camera that is constant while
-    the robot rests is subtracted with the drift, so this is what a filter calls noise.
+    jump of the tracker does not count. NaN for fewer than three intervals. An error of the camera that is constant
+    while the robot rests is subtracted with the drift, so this is what a filter calls noise.
     """
     sigmas: list[float] = []
     rest_s = 0.0
@@ -62,8 +62,8 @@ def parked_noise(tracks: Sequence[Track], applied: Sequence[Applied]) -> tuple[f
             interval = []
             continue
         interval.append(track)
-        time = np.array([seconds(each.stamp_ns - interval[0].stamp_ns) for each in interval])
-        if time[-1] >= _INTERVAL_S and len(interval) >= _LEAST_SAMPLES:
+        if seconds(track.stamp_ns - interval[0].stamp_ns) >= _INTERVAL_S and len(interval) >= _LEAST_SAMPLES:
+            time = np.array([seconds(each.stamp_ns - interval[0].stamp_ns) for each in interval])
             rest_s += float(time[-1])
             powers = np.vander(time, 3)
             position = np.array([each.position_um for each in interval])
