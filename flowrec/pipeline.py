@@ -28,7 +28,7 @@ from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
 from flowrec.topics import BY_FIELD, TOPICS
-from flowrec.vision import Tracker, missed
+from flowrec.vision import Tracker, unseen
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ def _strength(coils: Coils, last: Tick) -> float:
 def _seen(p: Pipeline, previous: Track | None, inputs: Inputs) -> Track:
     """Where the robot is, and when it was last seen. An image that repeats the one before tells neither."""
     if inputs.applied.repeats_image and previous is not None:
-        return missed(previous, inputs.stamp_ns)
+        return unseen(previous, inputs.stamp_ns)
     if inputs.frame is None:
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
         return inputs.track

@@ -90,8 +90,9 @@ def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region
     if recording.region == "whole":
         return None
     shape = (camera.height_px, camera.width_px)
-    sight = config.tracker.sight(chip, calibration_of(config, chip), config.robot, shape)
-    return Region(sight.pad_px + recording.region_pad_px, sight.everywhere_px, recording.full_every_s, cut=not again)
+    footprint = config.tracker.footprint(chip, calibration_of(config, chip), config.robot, shape)
+    pad_px = footprint.pad_px + recording.region_pad_px
+    return Region(pad_px, footprint.everywhere_px, recording.full_every_s, cut=not again)
 
 
 def queue_bytes_of(config: ResolvedConfig) -> int:

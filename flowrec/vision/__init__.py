@@ -1,5 +1,5 @@
 """Frame to Track."""
 
-from flowrec.vision.tracker import Sight, Tracker, missed
+from flowrec.vision.tracker import Footprint, Tracker, unseen
 
-__all__ = ["Sight", "Tracker", "missed"]
+__all__ = ["Footprint", "Tracker", "unseen"]

@@ -1,23 +1,45 @@
-"""How much each place of an image looks like the robot: normalised correlation that leaves out the walls.
+"""Masked normalised cross-correlation of an image with the robot's template; walls are left out.
 
-With weights M (1 where a pixel counts) the correlation of image I with template T at each place is that of the
-weighted samples, after taking off their weighted means:
+With weights M (1 where a pixel counts) the correlation of image I with template T at each position is that of the
+weighted samples, after subtraction of their weighted means:
     cov = T*(MI) - (T*M)(1*MI) / (1*M),  var_I = 1*(MI^2) - (1*MI)^2 / (1*M),  var_T likewise.
-Compiled, because the region is small on most frames and calls of numpy would cost more than the work.
+The kernel is compiled: the region is small on most frames, and the overhead of NumPy would exceed the work.
 """
 
 from __future__ import annotations
+
+import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.system.numba_setup import compiled
+from flowrec.vision.disc_fit import RIM_RATIO, initial_edge_px, profile
 
-_LEAST_SHARE = 0.5  # of the template that must lie on pixels that count
+_LEAST_OVERLAP = 0.5  # fraction of the template that must lie on pixels that count
+
+
+@lru_cache(maxsize=16)
+def template(radius_px: float, step: int) -> NDArray[np.float32]:
+    """The robot (n, n), n odd, in an image reduced by `step`: disc -1, rim positive, background 0; mean subtracted."""
+    radius, edge = radius_px / step, initial_edge_px(radius_px) / step + 0.3 * (step > 1)
+    half = math.ceil(1.15 * radius + 2.5 * edge)
+    fine = 4
+    axis = (np.arange((2 * half + 1) * fine) + 0.5) / fine - 0.5 - half
+    shape = np.empty((len(axis), len(axis)))
+    for row, y in enumerate(axis.tolist()):
+        for column, x in enumerate(axis.tolist()):
+            disc, rim, _, _ = profile((math.hypot(x, y) - radius) / edge)
+            shape[row, column] = RIM_RATIO * rim - disc
+    binned = shape.reshape(2 * half + 1, fine, 2 * half + 1, fine).mean(axis=(1, 3))
+    pattern = np.ascontiguousarray(binned - binned.mean(), np.float32)
+    pattern.flags.writeable = False
+    return pattern
 
 
 @compiled
-def likeness(
+def masked_ncc(
     image: NDArray[np.uint8],
     distance_px: NDArray[np.float32],
     box: tuple[int, int, int, int],
@@ -26,24 +48,24 @@ def likeness(
     clearance_px: float,
     pattern: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Correlation -1 to 1 (rows, columns) with the robot centred on each square of step x step pixels of a box.
+    """Correlation -1 to 1 (rows, columns) with the robot centred on each block of step x step pixels of a box.
 
-    Pixels nearer to a wall than the margin do not count, nor those outside the image. Squares that are no place for
-    the centre, being nearer to a wall than the clearance, are -1.
+    Pixels nearer to a wall than the margin do not count, nor do those outside the image. Blocks nearer to a wall than
+    the clearance can not hold the centre and are -1.
 
     Parameters
     ----------
-    pattern : (n, n) of mean 0, at the scale of the shrunk image
+    pattern : (n, n) of mean 0, at the scale of the reduced image; see `template`.
     """
     height, width = image.shape
     x0, y0 = box[0], box[1]
     columns, rows = (box[2] - x0 + step - 1) // step, (box[3] - y0 + step - 1) // step
     size = pattern.shape[0]
     half = size // 2
-    grey = np.zeros((rows + 2 * half, columns + 2 * half), np.float32)  # M I, grey levels about their middle
+    grey = np.zeros((rows + 2 * half, columns + 2 * half), np.float32)  # M I, grey levels minus 128
     square = np.zeros(grey.shape, np.float32)  # M I^2
     weight = np.zeros(grey.shape, np.float32)  # M
-    whole = np.ones(grey.shape[0], np.bool_)  # M is 1 all along the row
+    whole = np.ones(grey.shape[0], np.bool_)  # whether M is 1 in the entire row
     for j in range(grey.shape[0]):
         for i in range(grey.shape[1]):
             left, top = x0 + (i - half) * step, y0 + (j - half) * step
@@ -53,13 +75,13 @@ def likeness(
                     for x in range(left, left + step):
                         total += image[y, x]
                         count += distance_px[y, x] > margin_px
-            share = count / (step * step)
-            weight[j, i] = share
+            covered = count / (step * step)
+            weight[j, i] = covered
             level = total / (step * step) - 128.0
-            grey[j, i], square[j, i] = share * level, share * level * level
-            if share < 1.0:
+            grey[j, i], square[j, i] = covered * level, covered * level * level
+            if covered < 1.0:
                 whole[j] = False
-    found = np.full((rows, columns), -1.0, np.float32)
+    correlation = np.full((rows, columns), -1.0, np.float32)
     middle = (step - 1) // 2
     area = np.float32(size * size)
     one = np.float32(1.0)
@@ -74,7 +96,7 @@ def likeness(
         if last < 0:
             continue
         span, wide = last + 1 - first, last - first + size
-        # Sums over the window: down the columns first, then along the row.
+        # Sums over the window: along the columns first, then along the row.
         line, line2 = np.zeros(wide, np.float32), np.zeros(wide, np.float32)
         sum_i, sum_i2 = np.zeros(span, np.float32), np.zeros(span, np.float32)
         cov, sum_m = np.zeros(span, np.float32), np.full(span, area)
@@ -88,8 +110,8 @@ def likeness(
         for j in range(size):
             for k in range(size):
                 _add(cov, pattern[j, k], grey[row + j, first + k :])
-        open_water = whole[row : row + size].all()
-        if not open_water:
+        open_fluid = whole[row : row + size].all()
+        if not open_fluid:
             sum_m[:] = 0.0
             for j in range(size):
                 for k in range(size):
@@ -98,21 +120,21 @@ def likeness(
                     _add(sum_t, pattern[j, k], part)
                     _add(sum_t2, squared[j, k], part)
         for i in range(span):
-            if sum_m[i] < _LEAST_SHARE * area:
+            if sum_m[i] < _LEAST_OVERLAP * area:
                 continue
             if distance_px[y, min(x0 + (first + i) * step + middle, width - 1)] < clearance_px:
                 continue
             var_t, joint = spread, cov[i]
-            if not open_water:
+            if not open_fluid:
                 var_t = sum_t2[i] - sum_t[i] * sum_t[i] / sum_m[i]
                 joint = cov[i] - sum_t[i] * sum_i[i] / sum_m[i]
             var_i = sum_i2[i] - sum_i[i] * sum_i[i] / sum_m[i]
-            found[row, first + i] = joint / np.sqrt(max(var_i * var_t, np.float32(1e-3)))
-    return found
+            correlation[row, first + i] = joint / np.sqrt(max(var_i * var_t, np.float32(1e-3)))
+    return correlation
 
 
 @compiled
 def _add(to: NDArray[np.float32], factor: np.float32, what: NDArray[np.float32]) -> None:
-    """Add a multiple of the first part of an array to another: a loop that runs several numbers at a time."""
+    """Add a multiple of the first part of an array to another, in a loop that is vectorised."""
     for i in range(len(to)):
         to[i] += factor * what[i]
