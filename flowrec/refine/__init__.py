@@ -1,19 +1,17 @@
 """Flow field and observations to a better flow field: assimilation, the paper's PI-UNet and its baselines.
 
-Secrets: which pixels an observation sees (sight), the prior and its posterior (assimilate), the correction and when
-to believe it (pi_unet, judge), how it is found (descend; balance and stencil directly), its units (case), what
-networks see and how their output becomes a field (scene), what an observation says along a channel (spread), the
-network (network), its weights on disk (weights), the discrete equations (physics). Of the baselines: a field from
-observations alone (ni), what other vessels teach (unet), a flow as a network of coordinates (pinn), where that is
-asked (collocation), that network and its derivatives (coordinate_net). For all: what part of an image a network sees
-(crop), the same bytes every time (torch_run). torch is imported when a method that needs it runs.
+refiner: the table of methods. method, observation_operator: what all methods are given. prior, mixture_regression,
+discretisation_error, assimilate, report: assimilation. case, residuals, gauss_newton: a case without dimensions, its
+equations and their direct solution. network, network_inputs, network_fit, weights: what pi_unet, ni and unet share.
+pinn, collocation, coordinate_net: the network of the coordinates. training: makes the shipped weights. torch is
+imported when a method that needs it runs.
 """
 
 from flowrec.refine.assimilate import Assimilate
 from flowrec.refine.ni import Ni
 from flowrec.refine.pi_unet import PiUnet
 from flowrec.refine.pinn import Pinn
-from flowrec.refine.refiner import Refiner
+from flowrec.refine.refiner import REFINERS, Refiner
 from flowrec.refine.unet import Unet
 
-__all__ = ["Assimilate", "Ni", "PiUnet", "Pinn", "Refiner", "Unet"]
+__all__ = ["REFINERS", "Assimilate", "Ni", "PiUnet", "Pinn", "Refiner", "Unet"]

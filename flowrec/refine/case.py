@@ -1,11 +1,13 @@
-"""One case without dimensions: what the PI-UNet works on, cropped to the fluid and padded to what it can halve.
+"""One case without dimensions, on the pixels that the networks and Gauss-Newton work on.
 
-Lengths are in pixels, velocities in units of the fastest initial component V, pressures in mu V / px.
+The image is cropped to the fluid and padded to sides that a U-Net can halve. Lengths are in pixels, velocities in
+units of a speed V, pressures in units of mu V / px.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,98 +16,142 @@ from scipy.ndimage import binary_dilation
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import border
 from flowrec.messages import FlowField
-from flowrec.refine.crop import Crop
-from flowrec.refine.data_misfit import noise_of
-from flowrec.refine.observation_operator import Floats, Sight
+from flowrec.refine.observation_operator import Floats, ObservationOperator
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
 CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], bool)
-MULTIPLE = 16  # sides of what the network sees must divide by this
+MULTIPLE = 16  # a U-Net of four levels needs sides that are multiples of this
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """A box of an image of `shape`, padded at the right and bottom to multiples of MULTIPLE."""
+
+    rows: slice
+    columns: slice
+    shape: tuple[int, int]
+
+    @classmethod
+    def around(cls, mask: NDArray[np.bool_]) -> Crop:
+        """The box around the fluid of a mask (h, w); all of a mask without fluid."""
+        lines = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
+        rows, columns = (
+            slice(int(line[0]), int(line[-1]) + 1) if len(line) else slice(0, size)
+            for line, size in zip(lines, mask.shape, strict=True)
+        )
+        return cls(rows, columns, (mask.shape[0], mask.shape[1]))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of the box without padding."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def part(self, image: NDArray[Any]) -> NDArray[Any]:
+        """The padded part of an image (h, w, ...); zeros beyond the box."""
+        padding = [(0, -length % MULTIPLE) for length in self.size]
+        return np.pad(image[self.rows, self.columns], padding + [(0, 0)] * (image.ndim - 2))
+
+    def whole(self, part: NDArray[Any]) -> Floats:
+        """An image (h, w, ...) from the padded part (rows, columns, ...); zeros beyond the box."""
+        image = np.zeros((*self.shape, *part.shape[2:]))
+        image[self.rows, self.columns] = part[: self.size[0], : self.size[1]]
+        return image
+
+    def operator(self, operator: ObservationOperator) -> ObservationOperator:
+        """An observation operator of the image on the padded part."""
+        number = np.full(self.shape, -1, np.intp)
+        h, w = self.size
+        number[self.rows, self.columns] = np.add.outer(np.arange(h) * (w + -w % MULTIPLE), np.arange(w))
+        return operator.renumbered(number)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """An initial field and what was observed, on (h, w) pixels of the padded crop."""
+    """An initial field and observations, on the (h, w) pixels of the padded crop."""
 
     fluid: NDArray[np.bool_]  # (h, w)
-    inside: NDArray[np.bool_]  # (h, w) not on the border of the image, where a residual would reach outside
-    walled: NDArray[np.bool_]  # (h, w) a wall on one of the four sides, and a free pixel close by
-    openings: Floats  # (h, w) 1 on the border pixels of inlets, -1 on those of outlets
-    door: NDArray[np.intp]  # (h, w) number of the opening that a border pixel belongs to, from 1; 0 elsewhere
-    doors: tuple[Opening, ...]
-    velocity: Floats  # (h, w, 2) in units of `speed`
-    pressure: Floats  # (h, w) in units of `unit_pressure`
-    rows: NDArray[np.intp]  # (n, 4) as in Sight
-    columns: NDArray[np.intp]
-    weights: Floats
-    flow: Floats  # (n, 2) in units of `speed`
-    noise: Floats  # (n,)
+    inside: NDArray[np.bool_]  # (h, w) not on the border of the image, where a residual would need pixels outside
+    walled: NDArray[np.bool_]  # (h, w) a wall on one of the four sides, and a pixel without walls next to it
+    inflow: Floats  # (h, w) 1 on the border pixels of inlets, -1 on those of outlets
+    opening: NDArray[np.intp]  # (h, w) number of the opening that a border pixel belongs to, from 1; 0 elsewhere
+    openings: tuple[Opening, ...]
+    velocity: Floats  # (h, w, 2) initial, in units of `speed`
+    pressure: Floats  # (h, w) initial, in units of `unit_pressure`
+    pixels: NDArray[np.intp]  # (n, 4) as in ObservationOperator
+    weights: Floats  # (n, 4)
+    flow: Floats  # (n, 2) observed, in units of `speed`
+    noise: Floats  # (n,) its standard deviation, in units of `speed`
     speed: float  # V, um/s
     unit_pressure: float  # mu V / px, Pa
-    reynolds: float
-    friction: float
-    box: Crop
+    reynolds: float  # rho V px / mu
+    friction: float  # 12 px^2 / H^2, 0 without a depth
+    crop: Crop
 
     @classmethod
-    def of(cls, initial: FlowField, sight: Sight, chip: Chip, cropped: bool = True) -> Case:
-        """Scale, and crop unless a batch needs all cases of one size."""
-        box = Crop.around(chip.mask if cropped else np.ones_like(chip.mask), MULTIPLE)
-        crop = box.part
-        inside = np.zeros(chip.mask.shape, bool)
+    def of(
+        cls,
+        initial: FlowField,
+        operator: ObservationOperator,
+        chip: Chip,
+        cropped: bool = True,
+        speed: float | None = None,
+    ) -> Case:
+        """Case of an initial field. V is `speed`, or else the largest component of its velocity.
+
+        A batch of cases needs one size: it is not cropped.
+        """
+        crop = Crop.around(chip.mask if cropped else np.ones_like(chip.mask))
+        part, shape = crop.part, chip.mask.shape
+        inside = np.zeros(shape, bool)
         inside[1:-1, 1:-1] = True
-        # Beyond the image is not a wall: openings keep their freedom.
+        # The border of the image is not a wall, so openings keep their freedom.
         walled = chip.mask & binary_dilation(~chip.mask, CROSS)
         walled &= binary_dilation(chip.mask & ~walled, np.ones((3, 3), bool))
-        openings, door = np.zeros(chip.mask.shape), np.zeros(chip.mask.shape, np.intp)
-        for number, opening in enumerate(chip.openings):
+        inflow, number = np.zeros(shape), np.zeros(shape, np.intp)
+        for index, opening in enumerate(chip.openings):
             along = slice(opening.first, opening.last + 1)
-            sign = 1.0 if opening.kind == "inlet" else -1.0
-            border(openings, opening.side)[along] = sign
-            border(door, opening.side)[along] = number + 1
+            border(inflow, opening.side)[along] = 1.0 if opening.kind == "inlet" else -1.0
+            border(number, opening.side)[along] = index + 1
         px_m, mu = chip.um_per_px * M_PER_UM, initial.viscosity_mpa_s * PA_S_PER_MPA_S
-        speed = float(np.abs(initial.velocity_um_s).max())
+        speed = float(np.abs(initial.velocity_um_s).max()) if speed is None else speed
         unit_pressure = mu * speed * M_PER_UM / px_m
+        observed = crop.operator(operator)
         return cls(
-            crop(chip.mask),
-            crop(inside),
-            crop(walled),
-            crop(openings),
-            crop(door),
+            part(chip.mask),
+            part(inside),
+            part(walled),
+            part(inflow),
+            part(number),
             chip.openings,
-            crop(initial.velocity_um_s.astype(np.float64) / speed),
-            crop(initial.pressure_pa.astype(np.float64) / unit_pressure),
-            sight.rows - box.corner[0],
-            sight.columns - box.corner[1],
-            sight.weights,
-            sight.flow_um_s / speed,
-            noise_of(sight) / speed,
+            part(initial.velocity_um_s.astype(np.float64) / speed),
+            part(initial.pressure_pa.astype(np.float64) / unit_pressure),
+            observed.pixels,
+            observed.weights,
+            observed.flow_um_s / speed,
+            observed.noise_um_s / speed,
             speed,
             unit_pressure,
             initial.density_kg_m3 * speed * M_PER_UM * px_m / mu,
             0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / chip.depth_um) ** 2,
-            box,
+            crop,
         )
 
-    def gaps(self, used: NDArray[np.bool_] | None = None) -> Floats:
-        """(h, w, 4) on the pixel nearest to each observation: 1, observed minus initial velocity, std; 0 elsewhere.
+    def only(self, used: NDArray[np.bool_]) -> Case:
+        """The same with some of the observations, `used` (n,)."""
+        names = ("pixels", "weights", "flow", "noise")
+        return replace(self, **{name: getattr(self, name)[used] for name in names})
 
-        Of two observations on one pixel the later one counts. `used` (n,) leaves some out.
-        """
-        nearest = self.weights.argmax(axis=1)
-        each = np.arange(len(nearest))
-        row, column = self.rows[each, nearest], self.columns[each, nearest]
-        initial = (self.velocity[self.rows, self.columns] * self.weights[..., None]).sum(axis=1)
-        told = np.column_stack([np.ones(len(each)), self.flow - initial, self.noise])
-        made = np.zeros((*self.fluid.shape, 4))
-        chosen = each if used is None else each[used]
-        made[row[chosen], column[chosen]] = told[chosen]
-        return made
+    def at_nearest(self, values: Floats) -> Floats:
+        """(h, w, c) values (n, c) on the pixel nearest to each observation, 0 elsewhere; of two the later counts."""
+        image = np.zeros((self.fluid.size, values.shape[1]))
+        image[np.take_along_axis(self.pixels, self.weights.argmax(axis=1)[:, None], axis=1)[:, 0]] = values
+        return image.reshape(*self.fluid.shape, -1)
 
-    @property
-    def pixels(self) -> int:
-        """Size of the network's input."""
-        return self.fluid.size
+    def innovations(self) -> Floats:
+        """(h, w, 4) on the pixel nearest to each observation: 1, observed minus initial velocity, std; 0 elsewhere."""
+        initial = (self.velocity.reshape(-1, 2)[self.pixels] * self.weights[..., None]).sum(axis=1)
+        return self.at_nearest(np.column_stack([np.ones(len(self.flow)), self.flow - initial, self.noise]))
 
-    def whole(self, channels: Floats) -> Floats:
-        """(h, w, c) on the image of channels (c, h, w) on the padded crop."""
-        return self.box.whole(channels)
+    def dimensional(self, velocity: Floats, pressure: Floats) -> tuple[Floats, Floats]:
+        """Velocity (h, w, 2) in um/s and pressure (h, w) in Pa on the image, from those of the case."""
+        return self.crop.whole(velocity) * self.speed, self.crop.whole(pressure) * self.unit_pressure

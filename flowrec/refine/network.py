@@ -1,12 +1,19 @@
-"""The network of the paper: a four-level U-Net whose bottleneck alone is a Transformer."""
+"""The networks: the paper's U-Net with a Transformer in its bottleneck, and the PINN's network of coordinates.
+
+The U-Net has four levels of convolutions, group norm and GELU, with resolutions halved by max pooling; its skip
+connections are concatenated.
+"""
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+from flowrec.refine.network_inputs import INPUTS, OUTPUTS
 
 LEVELS = 4
 
@@ -22,15 +29,15 @@ class Block(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply."""
+        """(n, b, h, w) of x (n, a, h, w)."""
         return self.layers(x)  # type: ignore[no-any-return]
 
 
 class UNet(nn.Module):
-    """(n, in, h, w) to (n, out, h, w), zero before training; skips by concatenation; h and w multiples of 16.
+    """(n, in, h, w) to (n, out, h, w), zero before training; h and w are multiples of 16.
 
-    As printed it sees [mask, vx, vy, p] and has four levels of convolutions. `folded`, the finest level is 2 x 2
-    pixels folded into channels, without convolutions of its own: a fifth of the time, for corrections that are smooth.
+    As in the paper the input is [mask, vx, vy, p] and all four levels have convolutions. With `folded`, 2 x 2 pixels
+    are folded into channels in place of the finest level: a fifth of the time, for corrections that are smooth.
     """
 
     def __init__(
@@ -53,13 +60,13 @@ class UNet(nn.Module):
         self.lift = nn.ModuleList(nn.ConvTranspose2d(2 * b, b, 2, 2) for b in widths[::-1])
         self.up = nn.ModuleList(Block(2 * b, b) for b in widths[::-1])
         self.last = nn.Conv2d(base_channels, channels_out, 1)
-        # Start exactly at the initial field: the network predicts what is to be added to it.
+        # The output is a correction: without training it is zero.
         nn.init.zeros_(self.last.weight)
         assert self.last.bias is not None
         nn.init.zeros_(self.last.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply."""
+        """(n, out, h, w) of x (n, in, h, w)."""
         if self.folded:
             x = functional.pixel_unshuffle(x, 2)
         skips = []
@@ -78,7 +85,7 @@ class UNet(nn.Module):
 
 
 def positions(h: int, w: int, channels: int) -> Tensor:
-    """(1, h w, channels) sines and cosines of row and column: attention alone does not know where a token is."""
+    """(1, h w, channels) position encoding by sines and cosines of row and column, for the attention."""
     quarter = channels // 4
     rate = torch.exp(-math.log(1000.0) * torch.arange(quarter) / quarter)
     row, column = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
@@ -87,7 +94,59 @@ def positions(h: int, w: int, channels: int) -> Tensor:
 
 
 def trained_network() -> UNet:
-    """The network that shipped weights fit: it sees and gives what a `Scene` says."""
-    from flowrec.refine.network_inputs import OUTPUTS, TOLD
+    """The network of the shipped weights, from `NetworkInputs.with_observations` to `NetworkInputs.correct`."""
+    return UNet(16, INPUTS, OUTPUTS, folded=True, depth=3)
 
-    return UNet(16, TOLD, OUTPUTS, folded=True, depth=3)
+
+class CoordinateNet(nn.Module):
+    """Points (n, 2) to (n, 3); tanh layers after Fourier features of the coordinates (Tancik et al., 2020).
+
+    `jet` computes derivatives in forward mode: value, both slopes and the Laplacian go through the layers together.
+    For h = tanh(z)
+
+        h_x = (1 - h^2) z_x,   lap h = (1 - h^2) lap z - 2 h (1 - h^2) |grad z|^2,
+
+    and a linear layer acts on all four alike. The result is that of differentiating twice, in a third of the time.
+    """
+
+    def __init__(self, width: int, depth: int, features: int, wavenumber: float) -> None:
+        super().__init__()
+        self.waves: Tensor
+        self.register_buffer("waves", wavenumber * torch.randn(2, features))
+        sizes = [2 * features, *[width] * depth, 3]
+        self.weights = nn.ParameterList(torch.empty(b, a) for a, b in pairwise(sizes))
+        self.biases = nn.ParameterList(torch.zeros(b) for b in sizes[1:])
+        for weight in self.weights:
+            nn.init.xavier_normal_(weight)
+
+    def forward(self, points: Tensor) -> Tensor:
+        """Value (n, 3) of points (n, 2)."""
+        phase = points @ self.waves
+        h = math.sqrt(2.0) * torch.cat([phase.sin(), phase.cos()], dim=1)
+        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for w, b in hidden:
+            h = torch.tanh(h @ w.T + b)
+        return h @ weight.T + bias  # type: ignore[no-any-return]
+
+    def jet(self, points: Tensor) -> Tensor:
+        """(4, n, 3) of points (n, 2): value, slope along x, slope along y, Laplacian."""
+        phase = points @ self.waves
+        sine, cosine = math.sqrt(2.0) * phase.sin(), math.sqrt(2.0) * phase.cos()
+        square = (self.waves**2).sum(dim=0)
+        h = torch.stack(
+            [
+                torch.cat([sine, cosine], dim=1),
+                torch.cat([cosine * self.waves[0], -sine * self.waves[0]], dim=1),
+                torch.cat([cosine * self.waves[1], -sine * self.waves[1]], dim=1),
+                torch.cat([-sine * square, -cosine * square], dim=1),
+            ]
+        )
+        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for w, b in hidden:
+            z = h @ w.T
+            t = torch.tanh(z[0] + b)
+            slope = 1.0 - t**2
+            bend = slope * (z[3] - 2.0 * t * (z[1] ** 2 + z[2] ** 2))
+            h = torch.stack([t, slope * z[1], slope * z[2], bend])
+        z = h @ weight.T
+        return torch.cat([z[:1] + bias, z[1:]])

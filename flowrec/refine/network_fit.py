@@ -1,135 +1,188 @@
-"""The network's part of a PI-UNet: from random weights it descends on physics and observations, trained ones know more.
+"""Fit of a U-Net to one case: physics and observations as its loss, Adam, and a reproducible run of torch.
 
-The loss is the mean squared residual of the field minus that of the initial field, and the likelihood of the
-observations.
+The loss is the mean squared residual of the field minus that of the initial field, and the negative log-likelihood of
+the observations under Student-t noise. torch is imported when a function runs.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from flowrec.errors import FlowError
 from flowrec.refine.case import Case
-from flowrec.refine.data_misfit import TAIL
-from flowrec.refine.network import UNet, trained_network
-from flowrec.refine.network_inputs import Scene
-from flowrec.refine.observation_operator import Floats
-from flowrec.refine.residuals import Physics
-from flowrec.refine.weights import SHIPPED, read_weights
+from flowrec.refine.observation_operator import TAIL, Floats
 
 if TYPE_CHECKING:
-    from flowrec.refine.pi_unet import PiUnet
+    from torch import Tensor, nn
+    from torch.optim import Optimizer
+    from torch.optim.lr_scheduler import LambdaLR
 
-COLD_ITERATIONS = 80
-TRAINED_RATE = 0.1  # of the learning rate of random weights
+    from flowrec.refine.network_inputs import NetworkInputs
+
+Device = Literal["cpu", "cuda"]
 
 
-def descend(case: Case, used: NDArray[np.bool_], settings: PiUnet) -> tuple[int, Floats, Floats]:
-    """Iterations done, velocity (h, w, 2) and pressure (h, w) of the lowest loss, on the pixels of the case.
-
-    Within `torch_run`, which seeds the random weights.
+@contextlib.contextmanager
+def torch_run(device: Device, threads: int, seed: int, setting: str) -> Iterator[None]:
+    """Seeded, deterministic run of torch that restores torch's global state; `setting` names the device's setting.
 
     Raises
     ------
     FlowError
-        If the weights can not be read.
+        If the device is not available.
     """
-    trained = settings.weights == "vessels"
-    wanted = (0 if trained else COLD_ITERATIONS) if settings.iterations is None else settings.iterations
-    steps = min(wanted, max(1, int(settings.largest_work_mpx * 1e6 / case.pixels)))
-    loss_of = _Loss(case, used, settings)
-    net = trained_network() if trained else UNet(settings.base_channels)
-    if trained:
-        read_weights(SHIPPED["vessels"], net)
-    # Channels last: a fifth faster on a CPU.
-    net = net.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-    seen = loss_of.scene.told() if trained else loss_of.scene.printed()
-    seen = seen.contiguous(memory_format=torch.channels_last)
-    with torch.no_grad():
-        best = loss_of(net(seen))[1] if trained else loss_of.start
-    rate = settings.learning_rate * (TRAINED_RATE if trained else 1.0)
-    done, _, lowest = lowest_of(net, seen, loss_of, steps, rate, settings.patience)
-    best = best if lowest is None else lowest
-    result = np.moveaxis(best.cpu().numpy()[0].astype(np.float64), 0, -1)
-    return done, result[..., :2], result[..., 2]
+    import torch
+
+    if device == "cuda":
+        if not torch.cuda.is_available():
+            raise FlowError(f"{setting} = 'cuda', but torch sees no GPU: set it to 'cpu'")
+        # Without it cuBLAS refuses to be deterministic; cuBLAS reads it when it starts.
+        os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    before, strict = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
+    torch.set_num_threads(threads)
+    try:
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            torch.use_deterministic_algorithms(True)
+            yield
+    finally:
+        torch.use_deterministic_algorithms(strict)
+        torch.set_num_threads(before)
 
 
-def lowest_of(
-    net: UNet,
-    seen: Tensor,
-    loss_of: Callable[[Tensor], tuple[Tensor, Tensor]],
-    steps: int,
-    rate: float,
-    patience: int,
-) -> tuple[int, int, Tensor | None]:
-    """Iterations done, the one of the lowest loss from 0, and the field of that; None where no loss was finite.
+def adam(
+    parameters: Iterator[nn.Parameter], rate: float, steps: int, warm_up: float, lowest: float = 0.0
+) -> tuple[Optimizer, LambdaLR]:
+    """Adam whose rate rises over `warm_up` steps and falls as half a cosine to `lowest` of it."""
+    import torch
 
-    `loss_of` gives loss and field for the network's output; after `patience` iterations without a better loss it ends.
-    """
-    optimiser = torch.optim.Adam(net.parameters(), lr=rate)
-    # A short start, then half a cosine down to zero.
+    optimiser = torch.optim.Adam(parameters, lr=rate)
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimiser,
-        lambda i: min(1.0, (i + 1) / (0.1 * steps + 1e-9)) * 0.5 * (1.0 + math.cos(math.pi * i / max(steps, 1))),
+        lambda i: min(1.0, (i + 1) / warm_up) * max(lowest, 0.5 * (1.0 + math.cos(math.pi * i / max(steps, 1)))),
     )
-    best: Tensor | None = None
-    lowest, since, done, kept = float("inf"), 0, 0, 0
+    return optimiser, schedule
+
+
+class FitSettings(Protocol):
+    """Settings that the methods with a U-Net share."""
+
+    @property
+    def observations(self) -> Literal["soft", "hard"]: ...
+    @property
+    def largest_work_mpx(self) -> float: ...
+    @property
+    def patience(self) -> int: ...
+    @property
+    def observation_weight(self) -> float: ...
+    @property
+    def device(self) -> Device: ...
+
+
+class FieldLoss:
+    """From a network's output to a constrained field and its loss; holds all tensors of one case on the device."""
+
+    def __init__(
+        self,
+        inputs: NetworkInputs,
+        case: Case,
+        settings: FitSettings,
+        correct: Callable[[Tensor], tuple[Tensor, Tensor]],
+    ) -> None:
+        """`correct` gives velocity (1, 2, h, w) and pressure (1, 1, h, w) for an output (1, 3 or 5, h, w)."""
+        import torch
+
+        from flowrec.refine.residuals import Physics
+
+        def tensor(array: NDArray[Any]) -> Tensor:
+            return torch.from_numpy(np.array(array, np.float32)).to(settings.device)
+
+        self.correct, self.settings = correct, settings
+        self.physics = Physics.of(inputs.fluid, inputs.inside, case.reynolds, case.friction)
+        self.truncation = self.physics.residuals(inputs.velocity, inputs.pressure)
+        # Residuals are relative to the square of the initial field, so that weights mean the same in any case.
+        size = float((inputs.velocity**2).sum() / inputs.fluid.sum()) or 1.0
+        self.norm = size * float(self.physics.where.sum().clamp(min=1.0))
+        self.pixels = torch.from_numpy(case.pixels.astype(np.int64)).to(settings.device)
+        self.weights, self.flow, self.noise = tensor(case.weights), tensor(case.flow), tensor(case.noise)[:, None]
+        self.observed = inputs.observed
+        self.measured = tensor(np.moveaxis(case.at_nearest(case.flow), -1, 0))[None]
+
+    def __call__(self, output: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Loss, mean squared misfit of the observations in variances, and the field (1, 3, h, w)."""
+        import torch
+
+        velocity, pressure = self.correct(output)
+        if self.settings.observations == "hard":
+            velocity = velocity * (1.0 - self.observed) + self.measured * self.observed
+        residual = self.physics.residuals(velocity, pressure) - self.truncation
+        loss = (residual**2).sum() / self.norm
+        predicted = (velocity[0].flatten(1)[:, self.pixels] * self.weights).sum(dim=-1).T
+        misfit = (((predicted - self.flow) / self.noise) ** 2).sum(dim=1)
+        likelihood = 0.5 * (TAIL + 2.0) * torch.log1p(misfit / TAIL).mean()
+        total = loss + 2.0 * self.settings.observation_weight * likelihood
+        return total, misfit.mean(), torch.cat([velocity, pressure], dim=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """The field of the lowest loss, on the pixels of the case and in its units."""
+
+    iterations: int
+    velocity: Floats  # (h, w, 2)
+    pressure: Floats  # (h, w)
+    first_misfit: float  # chi squared per component of the observations in the first iteration
+    misfit: float  # in the iteration of the lowest loss
+
+
+def fit_network(
+    net: nn.Module,
+    image: Tensor,
+    loss_of: FieldLoss,
+    iterations: int,
+    rate: float,
+    start: Tensor | None = None,
+) -> Fitted:
+    """Minimise the loss over the parameters of a network for its input image (1, c, h, w). Runs within `torch_run`.
+
+    Large images get fewer iterations. Without an iteration with a finite loss the field is `start` (1, 3, h, w), or
+    that of the network as it is.
+    """
+    import torch
+
+    settings = loss_of.settings
+    steps = min(iterations, max(1, int(settings.largest_work_mpx * 1e6 / image[0, 0].numel())))
+    # Channels last: a fifth faster on a CPU.
+    net = net.to(settings.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    image = image.contiguous(memory_format=torch.channels_last)
+    if start is None:
+        with torch.no_grad():
+            start = loss_of(net(image))[2]
+    optimiser, schedule = adam(net.parameters(), rate, steps, 0.1 * steps + 1e-9)
+    best, lowest, since = start, float("inf"), 0
+    misfits: list[float] = []
+    lowest_misfit = float("nan")
     for _ in range(steps):
-        loss, field = loss_of(net(seen))
-        value, since, done = float(loss.detach()), since + 1, done + 1
+        loss, misfit, field = loss_of(net(image))
+        misfits.append(float(misfit.detach()) / 2.0)
+        value, since = float(loss.detach()), since + 1
         if value < lowest:
             since = since if value > 0.995 * lowest else 0
-            lowest, best, kept = value, field.detach(), done - 1
-        if since > patience:
+            lowest, best, lowest_misfit = value, field.detach(), misfits[-1]
+        if since > settings.patience:
             break
         optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         optimiser.step()
         schedule.step()
-    return done, kept, best
-
-
-class _Loss:
-    """From the network's output to a constrained field and its loss; all tensors of a case on the device."""
-
-    def __init__(self, case: Case, used: NDArray[np.bool_], settings: PiUnet) -> None:
-        def tensor(array: NDArray[np.generic]) -> Tensor:
-            return torch.from_numpy(np.array(array, np.float32)).to(settings.device)
-
-        self.settings = settings
-        self.scene = Scene.of([case], used, settings.device)
-        self.start = torch.cat([self.scene.velocity, self.scene.pressure], dim=1)
-        self.physics = Physics.of(self.scene.fluid, self.scene.inside, case.reynolds, case.friction)
-        self.truncation = self.physics.residuals(self.scene.velocity, self.scene.pressure)
-        # Residuals are shares of the field's own size, so that weights mean the same in any case.
-        size = float((self.scene.velocity**2).sum() / self.scene.fluid.sum())
-        self.norm = size * float(self.physics.where.sum().clamp(min=1.0))
-        self.rows, self.columns = (
-            torch.from_numpy(np.array(index[used], np.int64)).to(settings.device) for index in (case.rows, case.columns)
-        )
-        self.weights, self.flow = tensor(case.weights[used]), tensor(case.flow[used])
-        self.noise = tensor(case.noise[used])[:, None]
-        if settings.observations == "hard":
-            nearest = case.weights[used].argmax(axis=1)[:, None]
-            row, column = (np.take_along_axis(at[used], nearest, axis=1)[:, 0] for at in (case.rows, case.columns))
-            pinned, given = np.zeros(case.fluid.shape), np.zeros((2, *case.fluid.shape))
-            pinned[row, column], given[:, row, column] = 1.0, case.flow[used].T
-            self.pinned, self.given = tensor(pinned)[None, None], tensor(given)[None]
-
-    def __call__(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """Loss, and the field (1, 3, h, w) that it is of, for the network's output (1, 3, h, w)."""
-        velocity, pressure = self.scene.correct(output, self.settings.near_wall)
-        if self.settings.observations == "hard":
-            velocity = velocity * (1.0 - self.pinned) + self.given * self.pinned
-        residual = self.physics.residuals(velocity, pressure) - self.truncation
-        loss = (residual**2).sum() / self.norm
-        field = velocity[0][:, self.rows, self.columns]  # (2, n, 4)
-        misfits = ((((field * self.weights).sum(dim=-1).T - self.flow) / self.noise) ** 2).sum(dim=1)
-        likelihood = 0.5 * (TAIL + 2.0) * torch.log1p(misfits / TAIL).mean()
-        return loss + 2.0 * self.settings.observation_weight * likelihood, torch.cat([velocity, pressure], dim=1)
+    image_of = np.moveaxis(best.cpu().numpy()[0].astype(np.float64), 0, -1)
+    first = misfits[0] if misfits else float("nan")
+    return Fitted(len(misfits), image_of[..., :2], image_of[..., 2], first, lowest_misfit)

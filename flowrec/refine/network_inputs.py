@@ -1,9 +1,9 @@
-"""Cases as tensors: what the networks see of them, and how their output becomes a field. One case or a batch of a size.
+"""Cases as tensors: inputs of the networks, and the field for their output. One case, or a batch of one size.
 
-A free part of the output would have to learn the profile of every channel. What is wrong with an initial field is
-mostly the amount that flows in each branch, so the trained network gives a gain of the initial velocity, which is
-smooth, and a free part relative to the speed around. Near-wall pixels keep the initial profile; their amplitude is that
-of the corrected flow beside them.
+A network that adds a free field would have to learn the profile of every channel. An initial field is mostly wrong in
+the flow rate of each branch, so the trained network gives a gain of the initial velocity, which is smooth, and a free
+part relative to the speed around. Pixels at walls keep the initial profile; their amplitude is that of the corrected
+flow beside them.
 """
 
 from __future__ import annotations
@@ -19,109 +19,117 @@ from torch import Tensor
 from torch.nn import functional
 
 from flowrec.refine.case import Case
-from flowrec.refine.geodesic_features import spread
+from flowrec.refine.observation_operator import Floats
 
-PRINTED = 4  # channels of `Scene.printed`
-TOLD = 12  # channels of `Scene.told`
-GAIN, FREE, PRESSURE, DOUBT = 0, slice(1, 3), slice(3, 4), slice(4, 5)  # of a trained network's output
+INPUTS = 12  # channels of `NetworkInputs.with_observations`
+GAIN, FREE, PRESSURE, LOG_STD = slice(0, 1), slice(1, 3), slice(3, 4), slice(4, 5)  # of a trained network's output
 OUTPUTS = 5
-WINDOW = 5  # pixels over which near-wall pixels take their amplitude
-LEAST = 0.05  # of V: a branch where nothing was assumed to flow may still be given a flow
+WINDOW = 5  # pixels around, for the amplitude of pixels at walls
+LEAST_SPEED = 0.05  # of V: a branch without assumed flow can still be given a flow
+
+SMOOTHINGS = 4  # passes of averaging over neighbours of double size
+FARTHEST = 64  # pixels of double size along the channels to the nearest observation
+LARGEST_GAIN = 1.5  # limits outliers: boundary values hardly cause a larger gain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class NetworkInputs:
     """The images of n cases; units as in `Case`."""
 
     fluid: Tensor  # (n, 1, h, w)
     inside: Tensor  # (n, 1, h, w)
     walled: Tensor  # (n, 1, h, w)
-    openings: Tensor  # (n, 1, h, w)
+    inflow: Tensor  # (n, 1, h, w)
     velocity: Tensor  # (n, 2, h, w) initial
     pressure: Tensor  # (n, 1, h, w) initial
     observed: Tensor  # (n, 1, h, w) 1 where there is an observation
-    gap: Tensor  # (n, 2, h, w) observed minus initial velocity
-    near: Tensor  # (n, 3, h, w) what observations say along the channels, as in `spread`
+    innovation: Tensor  # (n, 2, h, w) observed minus initial velocity
+    geodesic: Tensor  # (n, 3, h, w) observations along the channels, as in `geodesic_features`
     reynolds: Tensor  # (n, 1, 1, 1)
     friction: Tensor  # (n, 1, 1, 1)
 
     @classmethod
-    def of(cls, cases: Sequence[Case], used: NDArray[np.bool_] | None = None, device: str = "cpu") -> Scene:
-        """Cases of one size; `used` (observations,) leaves out some of an only case."""
+    def of(cls, cases: Sequence[Case], device: str = "cpu") -> NetworkInputs:
+        """Cases of one size."""
 
         def stack(arrays: list[NDArray[Any]]) -> Tensor:
             image = np.stack([np.asarray(a, np.float32).reshape(*a.shape[:2], -1) for a in arrays])
             return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 1))).to(device)
 
-        told = [case.gaps(used) for case in cases]
-        gaps = stack(told)
-        near = stack([spread(case.fluid, case.velocity, each) for case, each in zip(cases, told, strict=True)])
-
         def number(values: list[float]) -> Tensor:
             return torch.tensor(values, dtype=torch.float32, device=device)[:, None, None, None]
 
-        names = ("fluid", "inside", "walled", "openings", "velocity", "pressure")
-        images = {name: stack([getattr(case, name) for case in cases]) for name in names}
+        innovations = [case.innovations() for case in cases]
+        observed = stack(innovations)
+        names = ("fluid", "inside", "walled", "inflow", "velocity", "pressure")
         return cls(
-            **images,
-            observed=gaps[:, :1],
-            gap=gaps[:, 1:3],
-            near=near,
-            reynolds=number([c.reynolds for c in cases]),
-            friction=number([c.friction for c in cases]),
+            **{name: stack([getattr(case, name) for case in cases]) for name in names},
+            observed=observed[:, :1],
+            innovation=observed[:, 1:3],
+            geodesic=stack(
+                [
+                    geodesic_features(case.fluid, case.velocity, each)
+                    for case, each in zip(cases, innovations, strict=True)
+                ]
+            ),
+            reynolds=number([case.reynolds for case in cases]),
+            friction=number([case.friction for case in cases]),
         )
 
-    def turned(self, quarters: int, mirrored: bool) -> Scene:
-        """The same cases seen from another of the eight sides of a square."""
-        return Scene(**{f.name: turn(getattr(self, f.name), quarters, mirrored) for f in fields(self)})
+    def turned(self, quarters: int, mirrored: bool) -> NetworkInputs:
+        """The same cases under one of the eight symmetries of a square."""
+        return NetworkInputs(**{f.name: turn(getattr(self, f.name), quarters, mirrored) for f in fields(self)})
 
     @property
     def largest(self) -> Tensor:
-        """(n, 1, 1, 1) largest initial pressure: they reach hundreds of mu V / px."""
+        """(n, 1, 1, 1) largest initial pressure: pressures reach hundreds of mu V / px."""
         return self.pressure.abs().amax(dim=(1, 2, 3), keepdim=True).clamp(min=1.0)
 
     @property
-    def around(self) -> Tensor:
-        """(n, 1, h, w) root mean square of the initial speed around each pixel, off the walls."""
-        free = self.fluid * (1.0 - self.walled)
-        square = mean_around((self.velocity**2).sum(dim=1, keepdim=True) * free)
-        return (square / mean_around(free).clamp(min=0.04)).sqrt()
+    def free(self) -> Tensor:
+        """(n, 1, h, w) 1 on fluid pixels that are not at a wall."""
+        return self.fluid * (1.0 - self.walled)
 
-    def printed(self) -> Tensor:
+    @property
+    def local_rms(self) -> Tensor:
+        """(n, 1, h, w) root mean square of the initial speed around each pixel, without pixels at walls."""
+        square = mean_around((self.velocity**2).sum(dim=1, keepdim=True) * self.free)
+        return (square / mean_around(self.free).clamp(min=0.04)).sqrt()
+
+    def of_paper(self) -> Tensor:
         """(n, 4, h, w) input of the paper's network: mask, vx, vy, p."""
         return torch.cat([self.fluid, self.velocity, self.pressure / self.largest], dim=1)
 
-    def told(self) -> Tensor:
-        """(n, 12, h, w) input of a network that uses observations at once.
+    def with_observations(self) -> Tensor:
+        """(n, 12, h, w) input of a network that uses the observations at once.
 
-        The printed four, the logarithm of the speed, openings; where was observed, what differs there; the gain that
-        the nearest observations along the channels speak for, how surely, and how far they are.
+        The paper's four, the logarithm of the speed, and the openings; where observations are, and the innovation
+        there; the gain that the nearest observations along the channels imply, its precision, and their distance.
         """
         speed = torch.linalg.vector_norm(self.velocity, dim=1, keepdim=True)
         level = (1.0 + torch.log(speed + 1e-3) / 6.9) * self.fluid
-        gap = 3.0 * self.gap.clamp(-1.0, 1.0)
-        return torch.cat([self.printed(), level, self.openings, self.observed, gap, self.near], dim=1)
+        innovation = 3.0 * self.innovation.clamp(-1.0, 1.0)
+        return torch.cat([self.of_paper(), level, self.inflow, self.observed, innovation, self.geodesic], dim=1)
 
     def correct(self, output: Tensor, near_wall: Literal["scaled", "hard", "free"] = "scaled") -> tuple[Tensor, Tensor]:
         """Velocity (n, 2, h, w) and pressure (n, 1, h, w) for a network's output (n, 3 or 5, h, w)."""
         if output.shape[1] == OUTPUTS:
-            moved = output[:, GAIN : GAIN + 1] * self.velocity + output[:, FREE] * (self.around + LEAST)
-            pushed = output[:, PRESSURE]
-        else:  # as printed: vx, vy, p
-            moved, pushed = output[:, :2], output[:, 2:]
-        moved = moved * self.fluid
+            change = output[:, GAIN] * self.velocity + output[:, FREE] * (self.local_rms + LEAST_SPEED)
+            pressure = output[:, PRESSURE]
+        else:  # as in the paper: vx, vy, p
+            change, pressure = output[:, :2], output[:, 2:]
+        change = change * self.fluid
         if near_wall != "free":
-            moved = moved * (1.0 - self.walled)
+            change = change * (1.0 - self.walled)
         if near_wall == "scaled":
-            free = self.fluid * (1.0 - self.walled)
-            amplitude = mean_around((self.velocity**2).sum(dim=1, keepdim=True) * free) + 1e-6
-            gain = mean_around((moved * self.velocity).sum(dim=1, keepdim=True) * free) / amplitude
-            moved = moved + self.walled * gain * self.velocity
-        return self.velocity + moved, self.pressure + pushed * self.largest * self.fluid
+            amplitude = mean_around((self.velocity**2).sum(dim=1, keepdim=True) * self.free) + 1e-6
+            gain = mean_around((change * self.velocity).sum(dim=1, keepdim=True) * self.free) / amplitude
+            change = change + self.walled * gain * self.velocity
+        return self.velocity + change, self.pressure + pressure * self.largest * self.fluid
 
     def std(self, output: Tensor) -> Tensor:
-        """(n, 1, h, w) standard deviation of a component that a trained network's output (n, 5, h, w) admits."""
-        return (output[:, DOUBT].clamp(-6.0, 2.0) - 2.0).exp() * (self.around + LEAST) * self.fluid
+        """(n, 1, h, w) standard deviation of each component, from a trained network's output (n, 5, h, w)."""
+        return (output[:, LOG_STD].clamp(-6.0, 2.0) - 2.0).exp() * (self.local_rms + LEAST_SPEED) * self.fluid
 
 
 def mean_around(image: Tensor) -> Tensor:
@@ -135,7 +143,7 @@ def turn(image: Tensor, quarters: int, mirrored: bool) -> Tensor:
         return image
     vector = image.shape[1] == 2
     for _ in range(quarters % 4):
-        image = torch.rot90(image, 1, (2, 3))  # what pointed right (x) now points up (-y)
+        image = torch.rot90(image, 1, (2, 3))  # a vector to the right (x) now points up (-y)
         if vector:
             image = torch.stack([image[:, 1], -image[:, 0]], dim=1)
     if mirrored:
@@ -143,3 +151,54 @@ def turn(image: Tensor, quarters: int, mirrored: bool) -> Tensor:
         if vector:
             image = image * torch.tensor([-1.0, 1.0]).to(image)[None, :, None, None]
     return image
+
+
+def geodesic_features(fluid: NDArray[np.bool_], velocity: Floats, innovations: Floats) -> Floats:
+    """(h, w, 3): relative gain of the nearest observations, the logarithm of its precision, their distance (0 to 1).
+
+    Observations are carried along the channels and not through walls, as a convolution would.
+
+    Parameters
+    ----------
+    fluid
+        (h, w) with even sides.
+    velocity
+        (h, w, 2) initial.
+    innovations
+        (h, w, 4) as in `Case.innovations`.
+    """
+    h, w = fluid.shape[0] // 2, fluid.shape[1] // 2
+    channels = np.asarray(fluid.reshape(h, 2, w, 2).any(axis=(1, 3)))  # pixels of double size
+    # The 3 x 3 neighbours of each such pixel; the number after the last stands for solid.
+    count = int(channels.sum())
+    number = np.full((h + 2, w + 2), count)
+    number[1:-1, 1:-1][channels] = np.arange(count)
+    rows, columns = np.nonzero(channels)
+    around = np.stack([number[rows + dy, columns + dx] for dy in range(3) for dx in range(3)], axis=1)
+
+    def mean(values: Floats) -> Floats:
+        """(pixels, c) sum of values (pixels, c) over the neighbours, over 9."""
+        return np.asarray(np.concatenate([values, np.zeros((1, values.shape[1]))])[around].mean(axis=1))
+
+    observed, noise = innovations[..., 0] > 0.0, np.maximum(innovations[..., 3], 1e-3)
+    square = (velocity**2).sum(axis=-1)
+    gain = (innovations[..., 1:3] * velocity).sum(axis=-1) / np.maximum(square, 1e-9)
+    precision = np.where(observed, square / noise**2, 0.0)
+    weighted = np.stack([np.clip(gain, -LARGEST_GAIN, LARGEST_GAIN) * precision, precision], axis=-1)
+    values = weighted.reshape(h, 2, w, 2, 2).sum(axis=(1, 3))[channels]
+    for _ in range(SMOOTHINGS):
+        values = mean(values)
+    known = values[:, 1] > 1e-12
+    state = np.column_stack([values[:, 0] / np.maximum(values[:, 1], 1e-12), np.log1p(values[:, 1]) / 7.0, known])
+    state[~known] = 0.0
+    distance = np.where(known, 0.0, 1.0)
+    for step in range(1, FARTHEST):
+        total = mean(state)
+        new = (state[:, 2] == 0.0) & (total[:, 2] > 0.0)
+        if not new.any():
+            break
+        state[new] = total[new] / total[new, 2:]
+        distance[new] = step / FARTHEST
+    features = np.zeros((h, w, 3))
+    features[channels] = np.column_stack([state[:, :2], distance])
+    return np.asarray(np.repeat(np.repeat(features, 2, axis=0), 2, axis=1) * fluid[..., None])

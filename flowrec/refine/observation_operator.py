@@ -1,68 +1,90 @@
-"""Which pixels an observation sees: bilinear weights, so that a field can be compared with what was measured."""
+"""Observation operator: what would be measured in a flow field, and how well a field predicts the observations."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.interpolation import cells_at, nearest_pixels
 from flowrec.messages import Observations
 
 Floats = NDArray[np.float64]
 
+TAIL = 4.0  # degrees of freedom of the observations' Student-t noise
+RELATIVE_NOISE = 0.03  # of the measured speed, in addition to its std: what pixels can not represent
+
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """The usable observations of a mask: each is a weighted mean of four pixels."""
+class ObservationOperator:
+    """The usable observations of a mask. Each is a weighted mean of four pixels (bilinear interpolation)."""
 
-    rows: NDArray[np.intp]  # (n, 4)
-    columns: NDArray[np.intp]  # (n, 4)
-    weights: Floats  # (n, 4) summing to 1
+    pixels: NDArray[np.intp]  # (n, 4) indices into the raster, row by row
+    weights: Floats  # (n, 4) whose sum is 1, less where pixels are left out
+    width: int  # columns of the raster
     flow_um_s: Floats  # (n, 2)
     std_um_s: Floats  # (n,)
-    ignored: str = ""  # how many others there were, and why they are of no use; for people
+    ignored: str = ""  # number of unusable observations and why; for people
 
     @property
     def count(self) -> int:
         """Number of usable observations."""
         return len(self.std_um_s)
 
-    def of(self, velocity: NDArray[np.floating]) -> Floats:
-        """What would be measured in fields (..., h, w, 2): (..., n, 2)."""
-        seen = velocity[..., self.rows, self.columns, :]
-        return np.asarray(np.einsum("...nkc,nk->...nc", seen, self.weights), np.float64)
+    def predict(self, values: NDArray[np.floating]) -> Floats:
+        """What would be measured (..., n, 2) in velocities (..., pixels, 2)."""
+        return np.asarray(np.einsum("...nkc,nk->...nc", values[..., self.pixels, :], self.weights), np.float64)
+
+    def renumbered(self, number: NDArray[np.intp]) -> ObservationOperator:
+        """The operator on the pixels with a number (h, w) >= 0; the velocity of all others is 0."""
+        pixels = number.ravel()[self.pixels]
+        return replace(self, pixels=np.maximum(pixels, 0), weights=np.where(pixels >= 0, self.weights, 0.0))
+
+    def on_fluid(self, mask: NDArray[np.bool_]) -> ObservationOperator:
+        """The operator on the fluid pixels of a mask (h, w) in raster order."""
+        number = np.full(mask.shape, -1, np.intp)
+        number[mask] = np.arange(np.count_nonzero(mask))
+        return self.renumbered(number)
+
+    def misfit(self, velocity: NDArray[np.floating]) -> Floats:
+        """(n,) squared distance of the prediction of a field (h, w, 2), in standard deviations.
+
+        Its mean is 2 if the field is right.
+        """
+        error = self.predict(velocity.reshape(-1, 2)) - self.flow_um_s
+        return np.asarray(((error / self.noise_um_s[:, None]) ** 2).sum(axis=1))
+
+    @property
+    def noise_um_s(self) -> Floats:
+        """(n,) standard deviation of the observations, with what pixels can not represent."""
+        speed = np.linalg.norm(self.flow_um_s, axis=1)
+        return np.asarray(np.hypot(self.std_um_s, RELATIVE_NOISE * np.maximum(speed, 0.1 * speed.max()) + 1e-9))
 
 
-def sight(observations: Observations, mask: NDArray[np.bool_], um_per_px: float) -> Sight:
-    """The observations that are finite, have a std and lie in a fluid pixel."""
-    h, w = mask.shape
+def observation_operator(observations: Observations, mask: NDArray[np.bool_], um_per_px: float) -> ObservationOperator:
+    """Operator of the observations that are finite, have a standard deviation and lie in a fluid pixel of a mask."""
     points = observations.position_um / um_per_px
-    numbers = (
+    finite = (
         np.isfinite(points).all(axis=1)
         & np.isfinite(observations.flow_um_s).all(axis=1)
         & np.isfinite(observations.std_um_s)
         & (observations.std_um_s >= 0.0)
     )
-    with np.errstate(invalid="ignore"):
-        usable = numbers & (points >= -0.5).all(axis=1) & (points <= np.array([w, h]) - 0.5).all(axis=1)
-    usable[usable] = mask[tuple(np.clip(np.rint(points[usable]).astype(np.intp), 0, [w - 1, h - 1]).T[::-1])]
-    x, y = np.clip(points[usable], 0.0, [w - 1.0, h - 1.0]).T
-    column, row = np.minimum(x.astype(np.intp), max(w - 2, 0)), np.minimum(y.astype(np.intp), max(h - 2, 0))
-    right, below = np.minimum(column + 1, w - 1), np.minimum(row + 1, h - 1)
-    a, b = x - column, y - row
-    return Sight(
-        np.stack([row, row, below, below], axis=1),
-        np.stack([column, right, column, right], axis=1),
-        np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1),
+    usable = finite & cells_at(points, mask.shape).inside
+    usable[usable] = mask[nearest_pixels(points[usable], mask.shape)]
+    cells = cells_at(points[usable], mask.shape)
+    unusable = ((~finite, "without finite numbers"), (finite & ~usable, "outside the fluid"))
+    return ObservationOperator(
+        cells.rows * mask.shape[1] + cells.columns,
+        cells.weights,
+        mask.shape[1],
         observations.flow_um_s[usable],
         observations.std_um_s[usable],
-        _ignored(int((~numbers).sum()), int((numbers & ~usable).sum())),
+        " and ".join(f"{which.sum()} {why}" for which, why in unusable if which.any()),
     )
 
 
-def _ignored(broken: int, outside: int) -> str:
-    parts = [
-        f"{count} {why}" for count, why in ((broken, "without finite numbers"), (outside, "outside the fluid")) if count
-    ]
-    return " and ".join(parts)
+def student_t_loss(misfits: Floats) -> float:
+    """Mean negative log-likelihood of Student-t noise, bounded in its effect by outliers, but for a constant."""
+    return float(0.5 * (TAIL + 2.0) * np.log1p(misfits / TAIL).mean()) if len(misfits) else float("inf")

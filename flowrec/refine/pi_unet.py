@@ -1,13 +1,14 @@
 """PI-UNet (the paper): a U-Net corrects an initial field so that physics and observations hold.
 
-What differs from the print, and why (science.md, section 2): true operators in dimensionless form; the loss is the
-residual of the field minus that of the initial field, since a field from the solver obeys finer equations and its
-residual on pixels is truncation error; near-wall pixels keep the initial profile but not its amplitude, because a
-wrong inlet makes them wrong in proportion. Weights trained on drawn vessels give a correction without iterations.
-The last step balances physics, observations and boundary values directly (`balance`) and brings nearly all of the
-gain: on 24 crops of real vessels the mean relative RMSE falls from 0.198 to 0.063 in 2 s a case. On eight of them, of
-0.169, the trained network alone leaves 0.125 in 0.1 s, 80 iterations from random weights as printed 0.125 in 13 s, and
-balancing 0.083 after the one and 0.084 after the other. With weights "none" and finish "none" it is the paper's.
+Differences from the paper, and why (science.md, section 2): the operators are the true ones in dimensionless form. The
+loss is the residual of the field minus that of the initial field, because a field from the solver satisfies finer
+equations and its residual on pixels is truncation error. Pixels at walls keep the initial profile but not its
+amplitude, because a wrong inlet makes them wrong in proportion. Weights trained on drawn vessels give a correction
+without iterations. The last step balances physics, observations and boundary values directly (gauss_newton) and gives
+nearly all of the improvement: on 24 crops of real vessels the mean relative RMSE falls from 0.198 to 0.063 in 2 s a
+case. On eight of them, with 0.169 before, the trained network alone leaves 0.125 in 0.1 s, 80 iterations from random
+weights as in the paper 0.125 in 13 s, and balancing 0.083 after the one and 0.084 after the other. With weights "none"
+and finish "none" it is the paper's method.
 """
 
 from __future__ import annotations
@@ -16,22 +17,22 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowrec.chip.chip import Chip
 from flowrec.messages import FlowField
 from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.case import Case
-from flowrec.refine.data_misfit import doubt, misfit
-from flowrec.refine.observation_operator import Floats, Sight
-from flowrec.refine.torch_run import Device, torch_run
-from flowrec.refine.weights import SHIPPED, sha256
+from flowrec.refine.method import Problem
+from flowrec.refine.network_fit import Device, FieldLoss, Fitted, fit_network, torch_run
+from flowrec.refine.observation_operator import Floats, student_t_loss
+from flowrec.refine.weights import SHIPPED, read_weights, sha256
 
-HELD_OUT = 4  # every fourth observation judges whether a correction gained anything
+HELD_OUT = 4  # every fourth observation tests whether a correction is an improvement
 FEWEST = 8  # observations of which some can be held out
-WORTH_TAKING = 0.9  # of the start's misfit on what was held out, for a network's correction
-# Share of a correction that is taken, up to so many standard deviations of chi2 above what noise alone gives.
-TAKEN = ((1.0, 0.5), (2.0, 0.75))
+WORTH_TAKING = 0.9  # of the initial loss of the held-out observations, for a network's correction
+# Fraction of a correction that is taken where chi2 is at most this many standard deviations above that of noise alone.
+DAMPED = ((1.0, 0.5), (2.0, 0.75))
+COLD_ITERATIONS = 80  # from random weights
+TRAINED_RATE = 0.1  # learning rate from trained weights, of that from random ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +40,12 @@ class PiUnet:
     """Settings of the PI-UNet."""
 
     start: Literal["assimilate", "fvm"] = "assimilate"  # the initial field
-    # Both of the next two are for the start "fvm": what remains of an assimilated field's misfit is no matter of
-    # boundary values, which is what the weights have learned and the balance assumes.
-    weights: Literal["vessels", "none"] = "vessels"  # trained on drawn vessels, or random ones as printed
+    # The next two apply to the start "fvm". What remains of an assimilated field's misfit is not explained by boundary
+    # values, which is what the weights have learned and the balance assumes.
+    weights: Literal["vessels", "none"] = "vessels"  # trained on drawn vessels, or random ones as in the paper
     finish: Literal["balance", "none"] = "balance"  # with soft observations
-    observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value, noise and all
-    near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as printed, the initial values stay
+    observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value with its noise
+    near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as in the paper, the initial values stay
     # None: 80 with random weights, none with trained ones
     iterations: Annotated[int, Range(0, 1_000_000)] | None = None
     # iterations times pixels in millions: larger fields get fewer iterations
@@ -54,7 +55,7 @@ class PiUnet:
     observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
     base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
     device: Device = "cpu"
-    # More than one only on idle cores: torch spins at its barriers, and on two shared cores two are ten times slower.
+    # More than one only on idle cores: torch's threads wait actively, and on two shared cores two are ten times slower.
     threads: Threads = 1
     seed: Seed = 0
 
@@ -63,92 +64,105 @@ class PiUnet:
         """Hash of the trained weights that are used, '' where they are random."""
         return sha256(SHIPPED[self.weights]) if self.weights != "none" and self.start == "fvm" else ""
 
-    def fit(self, initial: FlowField, sight: Sight, chip: Chip) -> FlowField:
-        """The corrected field, or `initial` with a note where a correction would not be an improvement.
+    def fit(self, problem: Problem) -> FlowField:
+        """The corrected field, or the initial one with a note where a correction would not be an improvement.
 
-        A correction is found without every fourth observation first and must predict those better than `initial`;
-        from the unrefined start it is then found anew with all. A start that has error bars has already used the
-        observations: it is kept when they lie within their noise around it.
+        A correction is first computed without every fourth observation and must predict those better than the initial
+        field does; from the unrefined start it is then computed again with all. A start with error bars has used the
+        observations already: it is kept when they lie within their noise around it.
 
         Raises
         ------
         FlowError
-            If the device is not there, or the weights can not be read.
+            If the device is not available, or the weights can not be read.
         """
+        initial = problem.assimilated() if self.start == "assimilate" else problem.assumed
         assimilated = initial.std_um_s is not None
-        if assimilated and (self.weights, self.finish) != ("none", "none"):
-            # What remains of its misfit is no matter of boundary values.
-            return replace(self, weights="none", finish="none").fit(initial, sight, chip)
-        fastest = float(np.abs(initial.velocity_um_s).max())
-        if fastest == 0.0:
-            return self._kept(initial, "the initial field stands still")
-        before = misfit(initial.velocity_um_s, sight)
-        if assimilated and float(before.mean()) <= 2.0 + 4.0 / np.sqrt(sight.count):  # two standard deviations of chi2
-            return self._kept(initial, f"the observations lie within their noise (chi2 {before.mean() / 2:.2f})")
-        case = Case.of(initial, sight, chip)
-        every = np.ones(sight.count, bool)
-        used = np.arange(sight.count) % HELD_OUT != HELD_OUT // 2 if sight.count >= FEWEST else every
-        judges = every if used.all() else ~used
-        start = doubt(before[judges])
-        found = self._corrections(case, used)
-        scores = [doubt(misfit(velocity, sight)[judges]) for _, velocity, _ in found]
-        # The balanced field where it predicts what it has not seen; the network's alone must do so clearly.
-        bars = [WORTH_TAKING * start] + [(WORTH_TAKING if used.all() else 1.0) * start] * (len(scores) - 1)
-        best = max((i for i in range(len(scores)) if scores[i] < bars[i]), default=-1)
-        if best < 0:
-            return self._kept(initial, "a correction did not predict the observations better")
-        # An assimilated start has used all observations already; descending once more is not worth its time.
-        said, velocity, pressure = (found if assimilated else self._corrections(case, every))[best]
+        if not initial.velocity_um_s.any():
+            return _kept(initial, "the initial field stands still")
+        operator = problem.operator
+        before = operator.misfit(initial.velocity_um_s)
+        chi2 = float(before.mean()) / 2.0
+        # Two standard deviations of chi2.
+        if assimilated and float(before.mean()) <= 2.0 + 4.0 / np.sqrt(operator.count):
+            return _kept(initial, f"the observations lie within their noise (chi2 {chi2:.2f})")
+        settings = replace(self, weights="none", finish="none") if assimilated else self
+        case = Case.of(initial, operator, problem.chip)
+        used = np.ones(operator.count, bool)
+        if operator.count >= FEWEST:
+            used[HELD_OUT // 2 :: HELD_OUT] = False
+        test = used if used.all() else ~used
+        before_loss = student_t_loss(before[test])
+        found = settings.corrections(case.only(used))
+        losses = [student_t_loss(operator.misfit(velocity)[test]) for _, velocity, _ in found]
+        # The balanced field must predict the held-out observations better, the network's alone clearly better.
+        limits = [WORTH_TAKING * before_loss, (WORTH_TAKING if used.all() else 1.0) * before_loss]
+        better = [index for index, loss in enumerate(losses) if loss < limits[index]]
+        if not better:
+            return _kept(initial, "a correction did not predict the observations better")
+        # An assimilated start has used all observations already; a second fit is not worth its time.
+        words, velocity, pressure = (found if assimilated else settings.corrections(case))[better[-1]]
         if not np.isfinite(velocity).all():
-            return self._kept(initial, "a correction is not finite")
+            return _kept(initial, "a correction is not finite")
+        # Where the start nearly explains the observations, much of what the correction follows is their noise.
+        excess = (chi2 - 1.0) * np.sqrt(operator.count)
+        fraction = 1.0 if assimilated else next((part for most, part in DAMPED if excess <= most), 1.0)
+        velocity = initial.velocity_um_s + fraction * (velocity - initial.velocity_um_s)
+        pressure = initial.pressure_pa + fraction * (pressure - initial.pressure_pa)
         std = initial.std_um_s
-        # Where the start nearly explains the observations, much of what they ask for is their noise.
-        over = (0.5 * float(before.mean()) - 1.0) * np.sqrt(sight.count)
-        share = 1.0 if assimilated else next((part for most, part in TAKEN if over <= most), 1.0)
-        velocity = initial.velocity_um_s + share * (velocity - initial.velocity_um_s)
-        pressure = initial.pressure_pa + share * (pressure - initial.pressure_pa)
         if std is not None:
-            # Where the correction moves the field, the start stays within the error bar.
+            # Where the correction changes the field, the start stays within the error bar.
             std = np.hypot(std, velocity - initial.velocity_um_s).astype(np.float32)
-        after = misfit(velocity, sight)
-        said += "" if share == 1.0 else f", {share:.0%} of it"
+        after = float(operator.misfit(velocity).mean()) / 2.0
+        words += "" if fraction == 1.0 else f", {fraction:.0%} of it"
         return replace(
             initial,
             method="pi_unet",
             velocity_um_s=velocity.astype(np.float32),
             pressure_pa=pressure.astype(np.float32),
             std_um_s=std,
-            note=f"{said}; misfit of the observations (chi2) {before.mean() / 2:.2f} to "
-            f"{after.mean() / 2:.2f}" + f"; start: {_said(initial)}",
+            note=f"{words}; misfit of the observations (chi2) {chi2:.2f} to {after:.2f}; start: {_origin(initial)}",
         )
 
-    @staticmethod
-    def _kept(initial: FlowField, why: str) -> FlowField:
-        """The start as it is, and why."""
-        return replace(initial, method="pi_unet", note=f"start kept, {why}; start: {_said(initial)}")
+    def corrections(self, case: Case) -> list[tuple[str, Floats, Floats]]:
+        """Description, velocity (h, w, 2) in um/s and pressure (h, w) in Pa: the network's field, and the balanced one.
 
-    def _corrections(self, case: Case, used: NDArray[np.bool_]) -> list[tuple[str, Floats, Floats]]:
-        """What was done, velocity (h, w, 2) in um/s and pressure (h, w) in Pa: the network's field, and its finish."""
+        The second is left out where it is not requested, or the case is too large.
+        """
         from flowrec.refine.gauss_newton import LARGEST_PX, balance
-        from flowrec.refine.network_fit import descend
 
         weights = f"weights {self.weights_sha256[:8]}" if self.weights_sha256 else "random weights"
         with torch_run(self.device, self.threads, self.seed, "refine.pi_unet.device"):
-            steps, velocity, pressure = descend(case, used, self)
-            said = f"corrected by {weights}" + (f" in {steps} iterations" if steps else "")
-            found = [(said, velocity, pressure)]
+            fitted = self._fit_network(case)
+            words = f"corrected by {weights}" + (f" in {fitted.iterations} iterations" if fitted.iterations else "")
+            found = [(words, *case.dimensional(fitted.velocity, fitted.pressure))]
             if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
-                found.append((f"{said} and balanced", *balance(case, used, velocity)))
-        return [
-            (
-                said,
-                case.whole(np.moveaxis(velocity, -1, 0) * case.speed),
-                case.whole(pressure[None] * case.unit_pressure)[..., 0],
-            )
-            for said, velocity, pressure in found
-        ]
+                found.append((f"{words} and balanced", *case.dimensional(*balance(case, fitted.velocity))))
+        return found
+
+    def _fit_network(self, case: Case) -> Fitted:
+        import torch
+
+        from flowrec.refine.network import UNet, trained_network
+        from flowrec.refine.network_inputs import NetworkInputs
+
+        inputs = NetworkInputs.of([case], self.device)
+        loss_of = FieldLoss(inputs, case, self, lambda output: inputs.correct(output, self.near_wall))
+        if self.weights == "vessels":
+            net = trained_network()
+            read_weights(SHIPPED["vessels"], net)
+            rate = self.learning_rate * TRAINED_RATE
+            return fit_network(net, inputs.with_observations(), loss_of, self.iterations or 0, rate)
+        start = torch.cat([inputs.velocity, inputs.pressure], dim=1)
+        steps = COLD_ITERATIONS if self.iterations is None else self.iterations
+        return fit_network(UNet(self.base_channels), inputs.of_paper(), loss_of, steps, self.learning_rate, start)
 
 
-def _said(initial: FlowField) -> str:
-    """What is known of the initial field; an assimilation says itself what it is."""
+def _kept(initial: FlowField, why: str) -> FlowField:
+    """The initial field as it is, and why."""
+    return replace(initial, method="pi_unet", note=f"start kept, {why}; start: {_origin(initial)}")
+
+
+def _origin(initial: FlowField) -> str:
+    """Method and note of the initial field; the note of an assimilation names its method."""
     return initial.note if initial.method in initial.note else f"{initial.method}, {initial.note}".rstrip(", ")

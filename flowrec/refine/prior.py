@@ -1,93 +1,89 @@
-"""What is believed before anything was observed: Gaussians around the assumed boundary values and fluid."""
+"""Prior of the assimilation: Gaussians around the assumed boundary values and fluid."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
+from flowrec.ranges import Range
 from flowrec.refine.observation_operator import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Widths:
-    """One standard deviation of each belief."""
+class PriorSettings:
+    """Widths of the prior, each one standard deviation."""
 
-    inlet_share: float  # of the assumed inlet speed, each inlet for itself
-    pump_share: float  # the same, one factor for all inlets
-    outlet_share: float  # of the assumed difference of pressure
-    viscosity_share: float  # of the assumed viscosity
-    density_share: float  # of the assumed density
-    depth_share: float  # of the assumed depth
-    shape_share: float  # skew and flatness of an inlet's profile, of its speed
+    inlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.25  # of the assumed inlet speed
+    pump_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0  # the same, common to all inlets
+    outlet_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10  # of the largest assumed |pressure|
+    viscosity_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.30  # of the assumed viscosity
+    density_std_share: Annotated[float, Range(1e-4, 10.0)] = 0.10  # of the assumed density
+    depth_std_share: Annotated[float, Range(0.0, 10.0)] = 0.0  # of the chip's depth, where it has one
+    # skew and flatness of the inlets' profiles, of the inlet speed
+    inlet_shape_std: Annotated[float, Range(0.0, 10.0)] = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """z ~ N(0, 1), the beliefs in standard deviations, and what they mean for the P parameters of a FlowResponse.
+    """z ~ N(0, 1), the unknowns in prior standard deviations, and their effect on the P parameters of Sensitivities.
 
-    z holds first one belief per opening, then ln mu and ln rho, then the optional ones.
+    z holds one unknown per opening, then ln mu and ln rho, then the optional ones: ln of the depth friction, the shapes
+    of the inlets, and a factor common to all inlets.
     """
 
-    spread: Floats  # (beliefs, P): offset = z spread
+    effect: Floats  # (unknowns, P): offset = z effect
     viscosity_std: float  # of ln mu
     density_std: float  # of ln rho
 
     @classmethod
-    def of(cls, widths: Widths, chip: Chip, drop_pa: float) -> Prior:
-        """Of a chip in whose assumed flow the pressure differs by `drop_pa`.
+    def of(cls, settings: PriorSettings, chip: Chip, drop_pa: float) -> Prior:
+        """Prior of a chip in whose assumed flow the pressure varies by `drop_pa`.
 
         Raises
         ------
         FlowError
-            If nothing moves in the assumed flow.
+            If the assumed flow is at rest.
         """
         inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
         values, count = chip.boundary_values, len(inlet)
-        speeds = np.abs(values[inlet])
         # A closed inlet is no more certain than an open one.
-        speed = np.where(values != 0.0, np.abs(values), speeds.max(initial=0.0))
-        with_depth = widths.depth_share > 0.0 and chip.depth_um is not None
-        own = np.where(inlet, widths.inlet_share * speed, widths.outlet_share * drop_pa)
-        if min(own) <= 0.0:
+        speed = np.where(values != 0.0, np.abs(values), np.abs(values[inlet]).max(initial=0.0))
+        std = np.where(inlet, settings.inlet_std_share * speed, settings.outlet_std_share * drop_pa)
+        if min(std) <= 0.0:
             raise FlowError(
                 f"chip '{chip.name}' is assumed to stand still, so nothing says how wrong that may be: "
                 "give an inlet speed or an outlet pressure of the right size"
             )
-        inlets = np.flatnonzero(inlet)
-        shapes = 2 * len(inlets) if widths.shape_share > 0.0 else 0
+        with_depth = settings.depth_std_share > 0.0 and chip.depth_um is not None
+        shapes = 2 * int(inlet.sum()) if settings.inlet_shape_std > 0.0 else 0
         parameters = count + 1 + with_depth + shapes
-        rows = [*np.eye(count, parameters) * own[:, None]]
-        viscosity, density = np.zeros((2, parameters))
-        viscosity[count], density[count] = widths.viscosity_share, -widths.density_share
-        # Flow goes with p / mu: what is assumed of a pressure is as uncertain as the viscosity.
-        viscosity[:count] = np.where(inlet, 0.0, -values * widths.viscosity_share)
+        rows = [*np.eye(count, parameters) * std[:, None]]
+        viscosity, density, depth, pump = np.zeros((4, parameters))
+        viscosity[count], density[count] = settings.viscosity_std_share, -settings.density_std_share
+        # The flow depends on p / mu: a pressure is as uncertain as the viscosity.
+        viscosity[:count] = np.where(inlet, 0.0, -values * settings.viscosity_std_share)
         rows += [viscosity, density]
         if with_depth:
-            depth = np.zeros(parameters)
-            depth[count + 1] = 2.0 * widths.depth_share  # friction goes as 1 / depth^2
+            depth[count + 1] = 2.0 * settings.depth_std_share  # friction is proportional to 1 / depth^2
             rows.append(depth)
         if shapes:
-            rows += [
-                *np.eye(shapes, parameters, parameters - shapes)
-                * np.repeat(widths.shape_share * speed[inlet], 2)[:, None]
-            ]
-        if widths.pump_share > 0.0:
-            rows.append(
-                np.where(np.arange(parameters) < count, 1.0, 0.0)
-                * np.pad(np.where(inlet, values, 0.0), (0, parameters - count))
-                * widths.pump_share
-            )
-        return cls(np.stack(rows), widths.viscosity_share, widths.density_share)
+            widths = np.repeat(settings.inlet_shape_std * speed[inlet], 2)
+            rows += [*np.eye(shapes, parameters, parameters - shapes) * widths[:, None]]
+        if settings.pump_std_share > 0.0:
+            pump[:count] = np.where(inlet, values, 0.0) * settings.pump_std_share
+            rows.append(pump)
+        return cls(np.stack(rows), settings.viscosity_std_share, settings.density_std_share)
 
     def offset(self, z: Floats) -> Floats:
-        """(P,) parameters of the FlowResponse, from its own."""
-        return np.asarray(z[: len(self.spread)] @ self.spread)
+        """(P,) change of the parameters of Sensitivities."""
+        return np.asarray(z[: len(self.effect)] @ self.effect)
 
     def chip(self, chip: Chip, z: Floats) -> Chip:
-        """The chip with boundary values, viscosity and density as believed in z."""
+        """The chip with the boundary values, viscosity and density of z."""
         count = len(chip.openings)
         thicker = float(np.exp(self.viscosity_std * z[count]))
         values = chip.boundary_values + self.offset(z)[:count]

@@ -17,7 +17,7 @@ from flowrec.bench.harness import Results, run, vessel_cases
 from flowrec.chip.vessel_case import read_true_chip, read_true_velocity, read_vessel_case
 from flowrec.errors import UsageError
 from flowrec.flow import FlowSolver
-from flowrec.refine.discretisation_error import around
+from flowrec.refine.discretisation_error import local_rms
 from flowrec.terminal import table
 
 WITHIN_TWO = 0.9545  # of a Gaussian
@@ -43,7 +43,7 @@ def measure(
         share = float((beyond * difference).sum() / (difference**2).sum())
         size = float(np.linalg.norm(truth))
         left = beyond - share * difference
-        scale = np.repeat(around(chip.mask, difference), 2)
+        scale = np.repeat(local_rms(chip.mask, difference), 2)
         moving = scale > 1e-6 * scale.max()  # stagnant corners have no error to speak of
         local.append(np.abs(left).ravel()[moving] / scale[moving])
         rows.append(

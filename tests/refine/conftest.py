@@ -9,6 +9,7 @@ import pytest
 from flowrec.chip.chip import Chip, Opening
 from flowrec.flow import FlowSolver, sample
 from flowrec.messages import FlowField, Observations
+from flowrec.refine import REFINERS, Ni, Pinn, PiUnet, Refiner
 
 
 @dataclass
@@ -54,3 +55,17 @@ def twin():
         return Twin(chip, solver, true, solver.solve(chip), Observations(0, points, flow, np.full(len(points), std)))
 
     return make
+
+
+# Settings with which a method of the table takes about a second; a method that is not named here has its own defaults.
+QUICK = {
+    "pi_unet": PiUnet(start="fvm"),
+    "ni": Ni(iterations=6, base_channels=8),
+    "pinn": Pinn(iterations=20, points=128, width=24, depth=3, features=24),
+}
+
+
+@pytest.fixture(params=REFINERS)
+def any_refiner(request):
+    """Every method of the table, one after the other."""
+    return Refiner(request.param, **QUICK)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flowrec.refine.mixture_regression import SHARE, fit
+from flowrec.refine.mixture_regression import OUTLIERS, fit
 
 WIDE = 1e6  # outliers would lie far beyond everything here
 
@@ -30,8 +30,10 @@ def least_squares(design, misfit, variance, share):
 def test_the_fit_is_that_of_least_squares_with_one_row_per_prior(seed):
     design, misfit, variance = case(seed)
     found = fit(design, misfit, variance, WIDE)
-    assert found.trust.min() > 0.9
-    mean, covariance = least_squares(design, misfit, found.copies * found.noise_factor**2 * variance, found.trust)
+    assert found.inlier.min() > 0.9
+    mean, covariance = least_squares(
+        design, misfit, found.correlation_length * found.noise_factor**2 * variance, found.inlier
+    )
     assert 0.2 < np.diag(covariance).mean() < 0.9, "neither the prior nor the observations rule"
     np.testing.assert_allclose(found.mean, mean, atol=2e-3)
     np.testing.assert_allclose(found.covariance, covariance, rtol=2e-3, atol=1e-4)
@@ -48,8 +50,10 @@ def test_what_no_observation_reaches_keeps_its_prior():
 def test_moved_misfits_move_the_mean_as_least_squares_says():
     design, misfit, variance = case(2)
     found = fit(design, misfit, variance, WIDE)
-    moved = found.moved(design, 2.0 * misfit, variance)
-    mean, covariance = least_squares(design, 2.0 * misfit, found.copies * found.noise_factor**2 * variance, found.trust)
+    moved = found.with_misfit(design, 2.0 * misfit, variance)
+    mean, covariance = least_squares(
+        design, 2.0 * misfit, found.correlation_length * found.noise_factor**2 * variance, found.inlier
+    )
     np.testing.assert_allclose(moved.mean, mean, rtol=1e-9)
     np.testing.assert_allclose(moved.covariance, covariance, rtol=1e-9)
 
@@ -57,9 +61,9 @@ def test_moved_misfits_move_the_mean_as_least_squares_says():
 def test_the_energy_is_minus_the_ln_of_prior_times_likelihood():
     def posterior(found, design, misfit, variance):
         left = ((misfit - np.tensordot(found.mean, design, axes=1)) ** 2).sum(axis=1)
-        right = (1.0 - SHARE) / (2.0 * np.pi * variance) * np.exp(-0.5 * left / variance)
+        right = (1.0 - OUTLIERS) / (2.0 * np.pi * variance) * np.exp(-0.5 * left / variance)
         # Student's with two degrees of freedom in two dimensions.
-        wrong = SHARE / (2.0 * np.pi * WIDE) * (1.0 + 0.5 * left / WIDE) ** -2.0
+        wrong = OUTLIERS / (2.0 * np.pi * WIDE) * (1.0 + 0.5 * left / WIDE) ** -2.0
         return -np.log(right + wrong).sum() + 0.5 * (found.mean**2).sum() - len(variance) * np.log(2.0 * np.pi)
 
     cases = [case(seed, std=0.1) for seed in (3, 4)]

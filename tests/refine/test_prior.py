@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flowrec.flow import FlowSolver
-from flowrec.refine.prior import Prior, Widths
+from flowrec.refine.prior import Prior, PriorSettings
 
-WIDTHS = Widths(0.25, 0.0, 0.10, 0.30, 0.10, 0.0, 0.0)
+SETTINGS = PriorSettings()
 
 
 def seen(field, chip):
@@ -22,9 +22,9 @@ def driven(twin):
 def test_a_thicker_fluid_moves_the_flow_as_the_solver_says_at_the_same_pressures(driven):
     solver = FlowSolver(convection=False)
     response = solver.sensitivities(driven)
-    prior = Prior.of(WIDTHS, driven, 0.01)
+    prior = Prior.of(SETTINGS, driven, 0.01)
     count = len(driven.openings)
-    z = np.zeros(len(prior.spread))
+    z = np.zeros(len(prior.effect))
     z[count] = 1.0
     predicted = np.tensordot(prior.offset(z), response.modes, axes=1)
     step = 0.02
@@ -40,10 +40,10 @@ def test_a_thicker_fluid_moves_the_flow_as_the_solver_says_at_the_same_pressures
 def test_the_chip_of_a_belief_has_the_flow_that_the_linear_model_predicts(driven):
     solver = FlowSolver(convection=False)
     response = solver.sensitivities(driven)
-    prior = Prior.of(WIDTHS, driven, 0.01)
+    prior = Prior.of(SETTINGS, driven, 0.01)
     rng = np.random.default_rng(4)
     for _ in range(4):
-        z = 0.5 * rng.standard_normal(len(prior.spread))
+        z = 0.5 * rng.standard_normal(len(prior.effect))
         believed = prior.chip(driven, z)
         np.testing.assert_allclose(believed.viscosity_mpa_s, np.exp(0.30 * z[len(driven.openings)]))
         predicted = response.base + np.tensordot(prior.offset(z), response.modes, axes=1)
@@ -52,8 +52,8 @@ def test_the_chip_of_a_belief_has_the_flow_that_the_linear_model_predicts(driven
 
 
 def test_a_belief_in_the_viscosity_alone_leaves_a_pressure_where_it_is(driven):
-    prior = Prior.of(WIDTHS, driven, 0.01)
-    z = np.zeros(len(prior.spread))
+    prior = Prior.of(SETTINGS, driven, 0.01)
+    z = np.zeros(len(prior.effect))
     z[len(driven.openings)] = 0.01
     believed = prior.chip(driven, z)
     # The product of two changes is left, of second order.

@@ -18,8 +18,8 @@ import numpy as np
 
 from flowrec.errors import UsageError
 from flowrec.refine.case import Case
-from flowrec.refine.observation_operator import sight
-from flowrec.refine.torch_run import Device, torch_run
+from flowrec.refine.network_fit import Device, torch_run
+from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.training.lessons import Lesson, prepare, read_lesson
 from flowrec.system.outputs import WEIGHTS, check_output
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from flowrec.refine.network import UNet
-    from flowrec.refine.network_inputs import Scene
+    from flowrec.refine.network_inputs import NetworkInputs
 
 SIDES = (4, 16)  # of the blocks in which mass must balance, px
 VALIDATION_LESSONS = 64  # at most a fourth of all lessons
@@ -129,23 +129,23 @@ def _optimise(
     return figures | {"best": best, "cpu_s": time.process_time() - began}
 
 
-def _batch(lessons: list[Lesson], rng: np.random.Generator, training: Training) -> tuple[Scene, Tensor]:
+def _batch(lessons: list[Lesson], rng: np.random.Generator, training: Training) -> tuple[NetworkInputs, Tensor]:
     """The inputs of some lessons, and their true velocity and pressure (n, 3, h, w) in the units of the inputs."""
     import torch
 
-    from flowrec.refine.network_inputs import Scene
+    from flowrec.refine.network_inputs import NetworkInputs
 
     cases, truths = [], []
     for lesson in lessons:
-        seen = sight(lesson.observe(rng), lesson.chip.mask, lesson.chip.um_per_px)
+        seen = observation_operator(lesson.observe(rng), lesson.chip.mask, lesson.chip.um_per_px)
         case = Case.of(lesson.assumed, seen, lesson.chip, cropped=False)
         cases.append(case)
         truth = [lesson.velocity_um_s / case.speed, lesson.pressure_pa[..., None] / case.unit_pressure]
-        truths.append(np.moveaxis(case.box.part(np.concatenate(truth, axis=2)), -1, 0).astype(np.float32))
-    return Scene.of(cases, device=training.device), torch.from_numpy(np.stack(truths)).to(training.device)
+        truths.append(np.moveaxis(case.crop.part(np.concatenate(truth, axis=2)), -1, 0).astype(np.float32))
+    return NetworkInputs.of(cases, device=training.device), torch.from_numpy(np.stack(truths)).to(training.device)
 
 
-def _training_batches(lessons: list[Lesson], training: Training) -> Iterator[tuple[Scene, Tensor]]:
+def _training_batches(lessons: list[Lesson], training: Training) -> Iterator[tuple[NetworkInputs, Tensor]]:
     """Batches in random order and random orientation, without end."""
     import torch
 
@@ -162,20 +162,20 @@ def _training_batches(lessons: list[Lesson], training: Training) -> Iterator[tup
             yield scene.turned(*turned), truth
 
 
-def _validation_batches(lessons: list[Lesson], training: Training) -> Iterator[tuple[Scene, Tensor]]:
+def _validation_batches(lessons: list[Lesson], training: Training) -> Iterator[tuple[NetworkInputs, Tensor]]:
     """Each lesson once; the same observations whatever the seed of the training is."""
     rng = np.random.default_rng([0, 0xBA7C])
     for first in range(0, len(lessons), training.batch):
         yield _batch(lessons[first : first + training.batch], rng, training)
 
 
-def _predict(net: UNet, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+def _predict(net: UNet, scene: NetworkInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, pressure and the network's output."""
-    output = net(scene.told())
+    output = net(scene.with_observations())
     return *scene.correct(output), output
 
 
-def _loss(net: UNet, scene: Scene, truth: Tensor, training: Training) -> Tensor:
+def _loss(net: UNet, scene: NetworkInputs, truth: Tensor, training: Training) -> Tensor:
     """Relative errors of velocity and pressure; for `pi_unet` also negative log-likelihood and balance of mass."""
     from flowrec.refine.residuals import Physics, balances
 
@@ -201,7 +201,7 @@ def _error(field: Tensor, true: Tensor) -> Tensor:
     return (miss / size.clamp(min=1e-12) + 1e-6).sqrt()
 
 
-def _validation_error(net: UNet | None, exam: list[tuple[Scene, Tensor]]) -> float:
+def _validation_error(net: UNet | None, exam: list[tuple[NetworkInputs, Tensor]]) -> float:
     """Mean relative RMSE of the velocity; of the assumed field if there is no network."""
     import torch
 

@@ -6,8 +6,8 @@ from flowrec.errors import UsageError
 from flowrec.refine import weights
 from flowrec.refine.case import Case
 from flowrec.refine.network import trained_network
-from flowrec.refine.network_inputs import Scene, turn
-from flowrec.refine.observation_operator import sight
+from flowrec.refine.network_inputs import NetworkInputs, turn
+from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.training.lessons import prepare, read_lesson
 from flowrec.refine.training.train import Training, train
 
@@ -45,12 +45,12 @@ def test_a_vessel_case_is_not_taken_for_a_lesson(lessons, tmp_path):
 
 def test_a_turned_scene_is_the_scene_of_the_turned_flow(lessons):
     lesson = read_lesson(lessons[1][0])
-    seen = sight(lesson.observe(np.random.default_rng(0)), lesson.chip.mask, lesson.chip.um_per_px)
-    scene = Scene.of([Case.of(lesson.assumed, seen, lesson.chip, cropped=False)])
+    seen = observation_operator(lesson.observe(np.random.default_rng(0)), lesson.chip.mask, lesson.chip.um_per_px)
+    scene = NetworkInputs.of([Case.of(lesson.assumed, seen, lesson.chip, cropped=False)])
     back = scene
     for quarters, mirrored in ((1, False), (2, True), (0, True), (1, False)):
         back = back.turned(quarters, mirrored)
-    assert torch.equal(back.velocity, scene.velocity) and torch.equal(back.near, scene.near)
+    assert torch.equal(back.velocity, scene.velocity) and torch.equal(back.geodesic, scene.geodesic)
     # A flow to the right over a quarter turn against the clock goes up: y points down.
     right = torch.tensor([1.0, 0.0])[None, :, None, None].expand(1, 2, 4, 4)
     assert turn(right, 1, False)[0, :, 0, 0].tolist() == [0.0, -1.0]

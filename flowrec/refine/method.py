@@ -1,0 +1,39 @@
+"""What every method of refinement is given, and its verb."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from flowrec.chip.chip import Chip
+from flowrec.flow import FlowSolver
+from flowrec.messages import FlowField
+from flowrec.refine.observation_operator import ObservationOperator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """One refinement: the true flow is not part of it."""
+
+    assumed: FlowField  # flow of the chip's assumed parameters
+    operator: ObservationOperator  # with at least one observation
+    chip: Chip  # with the assumed parameters
+    solver: FlowSolver
+    assimilated: Callable[[], FlowField]  # computes the result of the assimilation, for methods that start from it
+
+
+class Refinement(Protocol):
+    """A method: a frozen dataclass of its settings."""
+
+    def fit(self, problem: Problem) -> FlowField:
+        """Better field (h, w) with the stamp and request of `problem.assumed`: zero in solid, with a note.
+
+        Its `std_um_s` is the standard deviation of each component, or None where the method gives none.
+
+        Raises
+        ------
+        FlowError
+            If the method can not give a field.
+        """
+        ...
