@@ -1,4 +1,4 @@
-"""Ticks to MCAP and back. What is asked for is imported then: `flowrec ls` needs no schema, codec or array."""
+"""Ticks to MCAP and back. Names are imported on demand: `flowrec ls` needs no schema, codec or array."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from flowrec.store.audit import digest_faults
     from flowrec.store.frame_encodings import encoding_for
-    from flowrec.store.metadata import SessionHeader
     from flowrec.store.part_continuity import files_of
-    from flowrec.store.paths import is_snapshot, taken
+    from flowrec.store.paths import is_snapshot, runs_in
     from flowrec.store.reader import SessionReader
-    from flowrec.store.recovery import Recovered, recover
-    from flowrec.store.ring_buffer import Snapshot
-    from flowrec.store.roi import Region, lit
-    from flowrec.store.run_recovery import recover_run
-    from flowrec.store.split import Split
+    from flowrec.store.recovery import Recovered, recover, recover_run
+    from flowrec.store.roi import Region, nonzero_window
+    from flowrec.store.session_file import Snapshot, Split, WriterOptions
+    from flowrec.store.session_metadata import SessionHeader
+    from flowrec.store.shapes import not_finite
     from flowrec.store.writer import SessionWriter
 
-_HOME = {
+_MODULES = {
     "Recovered": "recovery",
     "Region": "roi",
-    "SessionHeader": "metadata",
+    "SessionHeader": "session_metadata",
     "SessionReader": "reader",
     "SessionWriter": "writer",
-    "Snapshot": "ring_buffer",
-    "Split": "split",
+    "Snapshot": "session_file",
+    "Split": "session_file",
+    "WriterOptions": "session_file",
     "digest_faults": "audit",
     "encoding_for": "frame_encodings",
     "files_of": "part_continuity",
     "is_snapshot": "paths",
-    "lit": "roi",
+    "nonzero_window": "roi",
+    "not_finite": "shapes",
     "recover": "recovery",
-    "recover_run": "run_recovery",
-    "taken": "paths",
+    "recover_run": "recovery",
+    "runs_in": "paths",
 }
 
 __all__ = [
@@ -45,19 +46,21 @@ __all__ = [
     "SessionWriter",
     "Snapshot",
     "Split",
+    "WriterOptions",
     "digest_faults",
     "encoding_for",
     "files_of",
     "is_snapshot",
-    "lit",
+    "nonzero_window",
+    "not_finite",
     "recover",
     "recover_run",
-    "taken",
+    "runs_in",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    found = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
     return found

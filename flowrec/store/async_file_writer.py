@@ -1,41 +1,41 @@
-"""A file that is written from memory in a thread of its own: what is sealed elsewhere waits here for the disk."""
+"""Asynchronous file writer: queues finished chunks and writes them in a background thread."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent import futures
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from flowrec.store.chunk import Sealed, kept
-from flowrec.store.chunk_encoder import Packer
-from flowrec.store.metadata import SessionHeader
-from flowrec.store.session_file import Making, Piece
+from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
+from flowrec.store.session_file import SessionFile, WriterOptions
+from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.write_queue import Entry
 
 
-class Poured:
+class AsyncFileWriter(SessionFile):
     """Takes chunks at once and writes them in order.
 
     Parameters
     ----------
-    path, header : of the file.
-    making : what it is made with.
-    limit_bytes : how much may wait; beyond that `put` does.
+    path, header, options : of the file.
+    limit_bytes : how much may wait; beyond that `put` blocks.
+
+    Attributes
+    ----------
+    finished : the file is complete.
 
     Raises
     ------
-    PieceError : when the file can not be made; what fails later is raised by `check`.
+    FileError : when the file can not be made; what fails later is raised by `check`.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, making: Making, *, limit_bytes: int) -> None:
-        self.path = path
+    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, *, limit_bytes: int) -> None:
+        super().__init__(path, header, options)
         self.finished = False
-        self._piece = Piece(path, header, making)
         self._limit_bytes = limit_bytes
-        self._sync_every_s = making.sync_every_s
         self._synced_s, self._synced_size = time.monotonic(), 0
         self._waiting_bytes = 0
         self._written = threading.Condition()
@@ -43,34 +43,37 @@ class Poured:
         self._last: Future[None] | None = None
         self._thread = ThreadPoolExecutor(1, "session-snapshot")
 
-    @property
-    def size(self) -> int:
-        """Bytes handed to the operating system."""
-        return self._piece.size
+    def put_keyframe(self, encoder: ChunkEncoder, entry: Entry) -> None:
+        """Write the first tick. It is encoded in the thread, too, because that may take as long as writing it."""
+        encoder.sink = self.add_chunks
 
-    def begin_with(self, packer: Packer, entry: Entry) -> None:
-        """A tick that comes first; it is packed in the thread, too, for that may take as long as writing it."""
-        packer.take = self._piece.add_chunks
-        self._last = self._thread.submit(self._begin, packer, entry)
+        def encode() -> None:
+            encoder.add(entry)
+            encoder.seal()
 
-    def put(self, sealed: list[Sealed]) -> None:
-        """Chunks, the next ones in the file."""
-        chunks = kept(sealed)
-        for chunk in chunks:
-            nbytes = len(chunk.data)
+        self._submit(encode)
+
+    def put(self, chunks: list[SealedChunk]) -> None:
+        """Append chunks."""
+        for chunk in detached(chunks):
             with self._written:
                 self._written.wait_for(lambda: self._failure is not None or self._waiting_bytes <= self._limit_bytes)
-                self._waiting_bytes += nbytes
-            self._last = self._thread.submit(self._write, chunk, nbytes)
+                self._waiting_bytes += len(chunk.data)
+            self._submit(self._write, chunk)
 
     def sync_if_due(self) -> None:
-        """Have the disk keep what was written, also where nothing more comes."""
+        """Sync what was written, also where nothing more comes."""
         if self._last is not None and self._last.done():
-            self._last = self._thread.submit(self._sync_if_due)
+            self._submit(self._sync)
 
     def finish(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
-        """The end of the file, when all has been written."""
-        self._last = self._thread.submit(self._finish, outcome, top_um_s)
+        """Complete the file when all has been written."""
+
+        def finish() -> None:
+            self.complete(outcome, top_um_s)
+            self.finished = True
+
+        self._submit(finish)
 
     def check(self, *, wait: bool = False) -> None:
         """Raise what has failed; with `wait`, after all has been written."""
@@ -82,40 +85,30 @@ class Poured:
     def close(self) -> None:
         """Close the file as it is, with what was put."""
         self._thread.shutdown()
-        self._piece.close()
+        super().close()
 
-    def _begin(self, packer: Packer, entry: Entry) -> None:
-        try:
-            packer.add(entry)
-            packer.seal()
-        except BaseException as error:  # noqa: BLE001  whatever it is, the writer has to hear of it
-            self._failure = error
+    def _submit(self, work: Callable[..., None], *arguments: SealedChunk) -> None:
+        """Have the thread do something, unless something has failed before."""
 
-    def _write(self, chunk: Sealed, nbytes: int) -> None:
-        try:
-            if self._failure is None:
-                self._piece.add_chunks([chunk])
-                self._sync_if_due()
-        except BaseException as error:  # noqa: BLE001  as above
-            self._failure = error
-        finally:
-            with self._written:
-                self._waiting_bytes -= nbytes
-                self._written.notify_all()
-
-    def _sync_if_due(self) -> None:
-        now, size = time.monotonic(), self._piece.size
-        if self._failure is None and now >= self._synced_s + self._sync_every_s and self._synced_size < size:
+        def run() -> None:
             try:
-                self._piece.sync()
-            except BaseException as error:  # noqa: BLE001  as above
+                if self._failure is None:
+                    work(*arguments)
+            except BaseException as error:  # noqa: BLE001  whatever it is, the writer must raise it
                 self._failure = error
-            self._synced_s, self._synced_size = now, size
+            finally:
+                with self._written:
+                    self._waiting_bytes -= sum(len(chunk.data) for chunk in arguments)
+                    self._written.notify_all()
 
-    def _finish(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
-        try:
-            if self._failure is None:
-                self._piece.finish(outcome, top_um_s)
-                self.finished = True
-        except BaseException as error:  # noqa: BLE001  as above
-            self._failure = error
+        self._last = self._thread.submit(run)
+
+    def _write(self, chunk: SealedChunk) -> None:
+        self.add_chunks([chunk])
+        self._sync()
+
+    def _sync(self) -> None:
+        now, size = time.monotonic(), self.size
+        if now >= self._synced_s + self._options.sync_interval_s and self._synced_size < size:
+            self.sync()
+            self._synced_s, self._synced_size = now, size

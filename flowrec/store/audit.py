@@ -1,4 +1,4 @@
-"""A file read from its first byte to its last, whatever state it is in, and compared with what it says of itself."""
+"""Reads a file from its first byte to its last, whatever state it is in, and compares it with its own index."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
-from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.store.codec import decode, message_stamp
-from flowrec.store.digest import Digests
-from flowrec.store.mcap_reader import DamageError, Record, Source, UnfinishedError
-from flowrec.store.metadata import SessionHeader
-from flowrec.store.part_continuity import Piece, files_of
+from flowrec.messages import Message
+from flowrec.store.codec import message_stamp
+from flowrec.store.digest import FileDigest
+from flowrec.store.mcap_format import Record
+from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
+from flowrec.store.part_continuity import RunFile, files_of
 from flowrec.store.roi import Region
 from flowrec.store.scan import Scan, scan
-from flowrec.store.schema_check import Contents
-from flowrec.store.session_metadata import Head
+from flowrec.store.schema_check import SessionContents
+from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.shapes import misfit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
@@ -28,28 +29,28 @@ See = Callable[[str, int, Message], None]  # field of Tick, time of the tick in 
 
 @dataclass(slots=True)
 class Audit:
-    """What was found; texts for people, without advice.
+    """What was found; texts are without advice.
 
     Attributes
     ----------
     path, size_bytes : the file.
-    finished : it has an end, so that other verbs open it.
-    why_not : else, what is wrong with the end.
+    finished : it has a summary, so that other verbs open it.
+    why_not : else, what is wrong with its end.
     flowrec_version : of the program that wrote it.
     header : configuration, chip and origin; None where they are not whole, see `header_fault`.
     outcome : how the run ended; may be empty.
     counts : messages read, by field of Tick.
     first_ns, last_ns : times of the first and the last message of a known topic; both 0 without any.
-    contradictions : where the index is not what was read, so that reading by it fails.
-    disagreements : where it is not, and that does no harm.
-    lost : damaged bytes that had to be passed over.
+    contradictions : where the index differs from what was read, so that reading by it fails.
+    disagreements : where it differs, and that does no harm.
+    lost : damaged bytes that had to be skipped.
     first_lost : offset of the first of them.
     backwards : by field, how often the time of a tick was before that of the message before.
-    stamps_backwards : the same of the stamps that the source itself gave.
+    stamps_backwards : the same of the stamps in the messages.
     undecodable : by field, messages that make no sense; `first_undecodable` says why.
-    region : which part of most images was kept (region.py); None: they are whole.
+    region : which window of most images was recorded (roi.py); None: they are whole.
     edits : what differs from the digest that was recorded; None where there is no digest, or no end.
-    missing : by field, messages that should be between others, told by their numbers; not of images.
+    missing : by field, messages that are missing between others, by their sequence numbers; not of images.
     """
 
     path: Path
@@ -81,11 +82,11 @@ class Audit:
         return seconds(self.last_ns - self.first_ns)
 
     @property
-    def piece(self) -> Piece:
-        """The file as joints.py looks at it."""
+    def run_file(self) -> RunFile:
+        """The file as part_continuity.py compares it with others."""
         part = self.header.part if self.header is not None else None
         counts = {BY_FIELD[name].path: count for name, count in self.counts.items()}
-        return Piece(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.flowrec_version)
+        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.flowrec_version)
 
 
 def audit(
@@ -98,16 +99,16 @@ def audit(
 
     Parameters
     ----------
-    see : told every message that can be decoded; those of one tick need not follow each other.
-    progress : told up to which byte the file has been read.
-    begin : told what the head says, before the first message.
+    see : receives every message that can be decoded; those of one tick need not follow each other.
+    progress : receives the byte up to which the file has been read.
+    begin : receives what the head says, before the first message.
 
     Raises
     ------
     SessionError : it is no session, or none that this flowrec can read; its text says what it is.
     """
     try:
-        contents = Contents(path)
+        contents = SessionContents(path)
         found = Audit(path, contents.source.size)
     except (UnfinishedError, DamageError) as error:
         contents = _contents_without_index(path)
@@ -124,14 +125,13 @@ def audit(
             begin(found)
         reading = _Reading(found, contents, see)
         scanned = scan(contents.source, reading.take, progress)
-        found.lost = sum(lost.nbytes for lost in scanned.lost)
-        found.first_lost = scanned.lost[0].offset if scanned.lost else 0
+        found.lost, found.first_lost = scanned.lost_bytes, scanned.first_lost
         for channel, name in contents.fields.items():
-            if name != "frame" and channel in scanned.gaps:  # the number of an image is given by the camera
+            if name != "frame" and channel in scanned.gaps:  # the camera numbers the images
                 gaps = [gap for gap in scanned.gaps[channel] if gap.before_ns > found.first_ns]
                 found.missing[name] += sum(gap.messages for gap in gaps)
         if found.finished:
-            found.edits = reading.digests.faults(contents)
+            found.edits = reading.digest.faults(contents)
             for fatal, text in _disagreements(contents, scanned):
                 (found.contradictions if fatal else found.disagreements).append(text)
     return found
@@ -146,23 +146,21 @@ def digest_faults(path: Path) -> dict[Path, list[str] | None]:
     """
     found: dict[Path, list[str] | None] = {}
     for file in files_of(path):
-        with Head(file) as head:
-            digests = Digests(head.source.start_unix_ns)
-            if head.digest is not None:
-                scan(head.source, digests.take)
-            found[file] = digests.faults(head)
+        with SessionMetadata(file) as metadata:
+            digest = FileDigest(metadata.source.start_unix_ns)
+            if metadata.digest is not None:
+                scan(metadata.source, digest.add)
+            found[file] = digest.faults(metadata)
     return found
 
 
 class _Reading:
-    """Decodes chunk after chunk and keeps the tally."""
+    """Decodes chunk after chunk and counts."""
 
-    def __init__(self, found: Audit, contents: Contents, see: See) -> None:
+    def __init__(self, found: Audit, contents: SessionContents, see: See) -> None:
         self._found = found
-        self._fields = contents.fields
-        self._schemas = contents.schemas
-        self._start_unix_ns = contents.source.start_unix_ns
-        self.digests = Digests(contents.source.start_unix_ns)
+        self._contents = contents
+        self.digest = FileDigest(contents.source.start_unix_ns)
         self._see = see
         self._last_ns: dict[str, int] = {}
         self._last_stamp_ns: dict[str, int] = {}
@@ -170,9 +168,9 @@ class _Reading:
 
     def take(self, offset: int, records: list[Record]) -> None:
         found = self._found
-        self.digests.take(offset, records)
+        self.digest.add(offset, records)
         for record in records:
-            name = self._fields.get(record.channel)
+            name = self._contents.fields.get(record.channel)
             if name is None:
                 continue
             found.counts[name] += 1
@@ -182,16 +180,14 @@ class _Reading:
             found.backwards[name] += record.log_ns < self._last_ns.get(name, record.log_ns)
             self._last_ns[name] = record.log_ns
             try:
-                assert isinstance(record.payload, memoryview)
-                schema = self._schemas[record.channel]
-                message = decode(BY_FIELD[name].type, record.payload, record.sequence, schema, self._start_unix_ns)
-                wrong = shape_error(message)
+                message = self._contents.decode(record)
+                wrong = misfit(message)
             except SessionError as error:
                 wrong = str(error)
             if wrong:
                 found.undecodable[name] += 1
-                said = f"{BY_FIELD[name].path} in the chunk at byte {offset}: {wrong}"
-                found.first_undecodable = found.first_undecodable or said
+                fault = f"{BY_FIELD[name].path} in the chunk at byte {offset}: {wrong}"
+                found.first_undecodable = found.first_undecodable or fault
                 continue
             stamp_ns = message_stamp(message)
             found.stamps_backwards[name] += stamp_ns < self._last_stamp_ns.get(name, stamp_ns)
@@ -199,18 +195,18 @@ class _Reading:
             self._see(name, record.log_ns, message)
 
 
-def _contents_without_index(path: Path) -> Contents:
+def _contents_without_index(path: Path) -> SessionContents:
     """What a file says about itself, found by reading it."""
-    source = Source(path)
+    source = McapReader(path)
     try:
         found = scan(source)
     finally:
         source.close()
-    return Contents(path, found.summary)
+    return SessionContents(path, found.summary)
 
 
-def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]]:
-    """Where the index at the end differs from what was read, and whether the reader stumbles over it."""
+def _disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool, str]]:
+    """Where the index differs from what was read, and whether reading by it fails."""
     listed = {chunk.chunk_start_offset: chunk for chunk in contents.chunks}
     seen = {chunk.chunk_start_offset: chunk for chunk in found.summary.chunks}
     if listed.keys() - seen:
@@ -219,13 +215,10 @@ def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]
         yield True, f"{len(seen.keys() - listed)} chunks are not in the index"
     misled = sum(not _describes(listed[place], seen[place]) for place in listed.keys() & seen.keys())
     if misled:
-        yield True, f"{misled} chunks hold something else than the index tells"
-    counts = found.summary.statistics
-    assert counts is not None  # scan makes them
-    declared = contents.statistics
-    for channel in sorted(contents.channels.keys() | counts.channel_message_counts.keys()):
-        announced = declared.channel_message_counts.get(channel, 0)
-        read = counts.channel_message_counts.get(channel, 0)
+        yield True, f"{misled} chunks hold something else than the index says"
+    declared = contents.statistics.channel_message_counts
+    for channel in sorted(contents.channels.keys() | found.counts.keys()):
+        announced, read = declared.get(channel, 0), found.counts[channel]
         if announced != read:
             known = contents.channels.get(channel)
             topic = known.topic if known is not None else f"an undeclared channel {channel}"
@@ -244,7 +237,7 @@ def _disagreements(contents: Contents, found: Scan) -> Iterator[tuple[bool, str]
 
 
 def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
-    """Whether the reader finds in a chunk what the index lets it expect."""
+    """Whether the index of a chunk is right for a reader."""
     return (
         listed.message_start_time <= seen.message_start_time
         and seen.message_end_time <= listed.message_end_time

@@ -1,27 +1,46 @@
-"""One MCAP chunk being filled: messages of one group, sealed together."""
+"""Messages of ticks -> sealed MCAP chunks: encoding, grouping and compression. Knows neither file nor thread.
+
+The messages of a group (channels.py) are collected in one chunk: what must be read for one message, and what a
+compressor sees at once.
+"""
 
 from __future__ import annotations
 
 import struct
 import zlib
 from array import array
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 
-from flowrec.store.digest import added, of_message
-from flowrec.store.form import Payload
+from flowrec.errors import SessionError
+from flowrec.messages import Frame
+from flowrec.store.channels import FRAMES, GROUPS, SLOTS, STATE
+from flowrec.store.channels import VIEW as VIEW_GROUP
+from flowrec.store.codec import Payload, codec_of, encode_record, message_stamp
+from flowrec.store.digest import message_digest, sum_digests
+from flowrec.store.frame_encodings import FrameEncoding
+from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGE_HEAD, RECORD_HEAD
+from flowrec.store.roi import WindowCutter
+from flowrec.store.viewer_topics import ViewerTopics
+from flowrec.store.write_queue import Entry
+from flowrec.topics import BY_FIELD
 
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_FIXED_PART = 22  # bytes of a message record besides its payload
+_CHUNK_BYTES = {FRAMES: 1 << 20, STATE: 1 << 18, VIEW_GROUP: 1 << 18}  # a chunk is sealed beyond
+# A message must leave room in the largest chunk that is read for what surrounds it.
+_MESSAGE_LIMIT_BYTES = CHUNK_LIMIT_BYTES - (1 << 20)
 # Noise does not compress: level 1 gets the same 1.2 to 1.6 of a camera image as higher ones, five times quicker.
 _ZSTD_LEVEL = 1
-_INDEX_HEAD = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries
-_KEPT_BYTES = 32 << 20  # of memory from chunk to chunk
-_LARGE_BYTES = 1 << 16  # from here on numpy copies, which leaves the interpreter free meanwhile
+_INDEX_HEAD = struct.Struct("<HI")  # channel, bytes of the entries
+_MEMORY_BYTES = 1 << 18  # of a new chunk
+_REUSED_BYTES = 32 << 20  # larger memory is released after a chunk
+_LARGE_BYTES = 1 << 16  # numpy copies larger parts, because it releases the interpreter lock
+
+Sink = Callable[[list["SealedChunk"]], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,15 +57,15 @@ class ChannelIndex:
     def record(self) -> bytes:
         """As an MCAP MessageIndex; mcap's own takes 4 us for each message."""
         data = np.array(self.entries, "<u8").tobytes()
-        length = _INDEX_HEAD.size - 9 + len(data)
-        return _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, length, self.channel, len(data)) + data
+        body = _INDEX_HEAD.pack(self.channel, len(data)) + data
+        return RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body
 
 
 @dataclass(frozen=True, slots=True)
-class Sealed:
-    """What goes into one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
+class SealedChunk:
+    """The content of one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
 
-    `data` may lie in the builder's memory: it is to be written, or `kept`, before the builder is used again.
+    `data` may be a view of the builder's memory: write or detach it before the builder is used again.
     """
 
     compression: str
@@ -58,24 +77,24 @@ class Sealed:
     indexes: list[ChannelIndex]
 
 
-def kept(sealed: Iterable[Sealed]) -> list[Sealed]:
-    """Chunks whose bytes are their own."""
-    return [replace(chunk, data=bytes(chunk.data)) for chunk in sealed]
+def detached(chunks: Iterable[SealedChunk]) -> list[SealedChunk]:
+    """Chunks that own their bytes."""
+    return [replace(chunk, data=bytes(chunk.data)) for chunk in chunks]
 
 
 class ChunkBuilder:
     """Collects messages in order of time; `seal` empties it.
 
-    The memory is kept from chunk to chunk: a new one for each image costs as much as copying the image.
+    The memory is reused from chunk to chunk: a new one for each image costs as much as copying the image.
 
     Parameters
     ----------
-    compressed : with zstd; otherwise the chunk is stored as it is, for what is compressed already.
+    compressed : with zstd; otherwise the chunk is stored as it is, for content that is compressed already.
     """
 
     def __init__(self, *, compressed: bool = True) -> None:
         self.size = 0  # bytes before compression
-        self._memory = bytearray(1 << 18)
+        self._memory = bytearray(_MEMORY_BYTES)
         self._index: dict[int, array[int]] = {}
         self._digests: dict[int, int] = {}
         self._first_ns = self._last_ns = 0
@@ -90,29 +109,31 @@ class ChunkBuilder:
         if index is None:
             index = self._index[channel] = array("Q")
         index.extend((log_ns, self.size))
-        length = _FIXED_PART + sum(map(len, payload))
-        end = self.size + 9 + length
+        body_at = self.size + RECORD_HEAD.size
+        payload_at = body_at + MESSAGE_HEAD.size
+        end = payload_at + sum(map(len, payload))
         if end > len(self._memory):
-            # A new one, with the old content: the growth of a bytearray would refuse while somebody looks at it.
-            grown = bytearray(end + min(end, _KEPT_BYTES) // 4)
+            # A new buffer with the old content: a bytearray can not grow while a view of it exists.
+            grown = bytearray(end + min(end, _REUSED_BYTES) // 4)
             grown[: self.size] = memoryview(self._memory)[: self.size]
             self._memory = grown
-        _MESSAGE_HEAD.pack_into(self._memory, self.size, Opcode.MESSAGE, length, channel, sequence, log_ns, publish_ns)
-        at = self.size + _MESSAGE_HEAD.size
+        RECORD_HEAD.pack_into(self._memory, self.size, Opcode.MESSAGE, end - body_at)
+        MESSAGE_HEAD.pack_into(self._memory, body_at, channel, sequence, log_ns, publish_ns)
+        at = payload_at
         for part in payload:
             if len(part) < _LARGE_BYTES:
                 self._memory[at : at + len(part)] = part
             else:
                 np.copyto(np.frombuffer(self._memory, np.uint8, len(part), at), np.frombuffer(part, np.uint8))
             at += len(part)
-        content = memoryview(self._memory)[self.size + _MESSAGE_HEAD.size : end]
-        self._digests[channel] = added(self._digests.get(channel, 0), of_message(sequence, log_ns, content))
+        digest = message_digest(sequence, log_ns, memoryview(self._memory)[payload_at:end])
+        self._digests[channel] = sum_digests(self._digests.get(channel, 0), digest)
         self.size = end
 
-    def seal(self) -> Sealed:
-        """The finished chunk; the interpreter is free while it is compressed."""
+    def seal(self) -> SealedChunk:
+        """The finished chunk; the interpreter lock is released while it is compressed."""
         content = memoryview(self._memory)[: self.size]
-        sealed = Sealed(
+        chunk = SealedChunk(
             compression="zstd" if self._compressor else "",
             data=self._compressor.compress(content) if self._compressor else content,
             message_start_time=self._first_ns,
@@ -124,6 +145,81 @@ class ChunkBuilder:
             ],
         )
         self.size, self._index, self._digests = 0, {}, {}
-        if len(self._memory) > _KEPT_BYTES and self._compressor:
-            self._memory = bytearray(1 << 18)  # a flow field comes once a minute
-        return sealed
+        if len(self._memory) > _REUSED_BYTES and self._compressor:
+            self._memory = bytearray(_MEMORY_BYTES)  # a flow field comes once a minute
+        return chunk
+
+
+class ChunkEncoder:
+    """Encodes the messages of ticks and their viewer topics, and collects them in chunks by group.
+
+    Parameters
+    ----------
+    encoding : of the frames.
+    views : makes the viewer topics; shared by all files of a run, because it remembers the colour scale.
+    sink : receives full or sealed chunks, and has used them when it returns. May be replaced between calls.
+    start_unix_ns : Unix time of stamp 0, which is added to all times that MCAP and foxglove's schemas hold.
+
+    Attributes
+    ----------
+    sequences : the next sequence number by topic, where the writer counts.
+    """
+
+    def __init__(self, encoding: FrameEncoding, views: ViewerTopics, sink: Sink, start_unix_ns: int) -> None:
+        self.sink = sink
+        self.sequences: Counter[str] = Counter()
+        self._start_unix_ns = start_unix_ns
+        self._encoding = encoding
+        self._views = views
+        self._cutter = WindowCutter()
+        self._builders = {
+            group: ChunkBuilder(compressed=encoding.compressed_chunks or group != FRAMES) for group in GROUPS
+        }
+
+    @property
+    def size(self) -> int:
+        """Bytes in chunks that are not sealed yet, before compression."""
+        return sum(builder.size for builder in self._builders.values())
+
+    def add(self, entry: Entry) -> None:
+        """Encode the messages of one tick; hand on the chunks that are full.
+
+        Raises
+        ------
+        SessionError : a message that can not be encoded; and what `sink` raises.
+        """
+        for field, message in entry.messages.items():
+            if isinstance(message, Frame):
+                codec = self._encoding.codec
+                if entry.window is not None:
+                    message = self._cutter.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
+            else:
+                codec = codec_of(type(message))
+            sequence, payload = encode_record(message, codec, self._start_unix_ns)
+            self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
+        for path, stamp_ns, payload in self._views.of(entry.messages):
+            self._append(path, entry.stamp_ns, stamp_ns, payload, None)
+        full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]
+        if full:
+            self.sink([builder.seal() for builder in full])
+
+    def seal(self, groups: Iterable[str] = GROUPS) -> None:
+        """Hand on the chunks that are not full, too."""
+        filled = [self._builders[group] for group in groups if self._builders[group].size]
+        if filled:
+            self.sink([builder.seal() for builder in filled])
+
+    def _append(self, path: str, log_ns: int, publish_ns: int, payload: Payload, sequence: int | None) -> None:
+        if sequence is None:
+            sequence = self.sequences[path]
+            self.sequences[path] = (sequence + 1) % 2**32
+        slot = SLOTS[path]
+        size = sum(map(len, payload))
+        if size > _MESSAGE_LIMIT_BYTES:
+            raise SessionError(f"a message of {path} has {size} bytes, more than a chunk may hold; use a smaller chip")
+        builder = self._builders[slot.group]
+        if builder.size and builder.size + size > _MESSAGE_LIMIT_BYTES:
+            self.sink([builder.seal()])
+        # The stamp itself is in the payload; MCAP has no time before zero.
+        publish_unix_ns = max(0, publish_ns + self._start_unix_ns)
+        builder.add(slot.channel, sequence, log_ns + self._start_unix_ns, publish_unix_ns, payload)

@@ -1,78 +1,107 @@
-"""Message <-> bytes, one codec per message type, bit for bit.
+"""Message <-> bytes: one codec per message type, bit for bit.
 
-Frames (frames.py) and events (standard.py) travel in standard schemas, all others field by field (schemas.py).
+Events travel in foxglove.Log, camera frames in foxglove's image schemas (frame_encodings.py), all other messages in the
+schemas derived from messages.py (schema.py). The protobuf runtime serialises and parses. Only large byte fields bypass
+it, because it copies them three times while it holds the interpreter lock: protobuf allows fields in any order, so a
+large field follows the serialised rest as tag, length and bytes, and is cut out again before parsing.
+https://protobuf.dev/programming-guides/encoding
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from flowrec.declarations import Message, MessageField, message_fields
 from flowrec.errors import SessionError
-from flowrec.messages import Event, Frame, OperatorEvent
-from flowrec.store import standard
-from flowrec.store.encoder import encoder_of
-from flowrec.store.form import Codec, Payload
-from flowrec.store.frame_encodings import FRAME_CODECS, RAW_IMAGE
-from flowrec.store.schema import ARRAY_DATA, array_schema, schema_of
-from flowrec.store.wire import LARGE_BYTES, cut_out, own
+from flowrec.messages import Event, Message, OperatorEvent
+from flowrec.store.schema import ARRAY_DATA, FieldForm, Schema, array_schema, forms_of, foxglove_schema, schema_of
+from flowrec.units import NS_PER_S
+
+Payload = tuple[bytes | memoryview, ...]
 
 _M = TypeVar("_M", bound=Message)
-# Up to here a loop over the wire's values is quicker than numpy's general conversion.
-_SHORT_VECTOR = 64
-_LONG_VECTOR = 1 << 16
+_UNCOPIED_BYTES = 1 << 14  # a larger array bypasses protobuf when it is written
+_LARGE_BYTES = 1 << 16  # in a larger message arrays bypass protobuf when it is read
+_FIELDS_LIMIT = 64  # a message with more fields is left to protobuf as a whole
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
+# For lengths between these numpy converts quicker than a loop, but makes a list first.
+_SHORT_VECTOR, _LONG_VECTOR = 64, 1 << 16
+
+# Levels of foxglove.Log by Event.level; a level that is not listed is kept in the name.
+_LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+_LEVEL_NAMES = {number: name for name, number in _LEVELS.items()}
+_EVENT_NAME = "flowrec"
+_OPERATOR_NAME = "operator."
 
 
-_codecs: dict[type[Any], Codec] = {
-    Frame: FRAME_CODECS[RAW_IMAGE],
-    Event: standard.event_codec(),
-    OperatorEvent: standard.operator_codec(),
-}
+def _no_sequence(_message: Any) -> None:
+    return None
 
 
-def codec_of(message_type: type[Any], schema: str = "") -> Codec:
-    """The codec of a message type, of that schema where it may travel in several; made once."""
-    if message_type is Frame and schema in FRAME_CODECS:
-        return FRAME_CODECS[schema]
-    codec = _codecs.get(message_type)
-    if codec is None:
-        derived = schema_of(message_type)
-        codec = Codec(derived, encoder_of(message_type), _decoder(message_type, derived.wire))
-        _codecs[message_type] = codec
-    return codec
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """How one message type is stored.
+
+    Attributes
+    ----------
+    schema : protobuf schema of the payload.
+    encode : message -> parts of the payload, in order; large arrays are not copied.
+    decode : payload, MCAP sequence -> message.
+    sequence : message -> the MCAP sequence that it must have; None where the writer counts.
+    """
+
+    schema: Schema
+    encode: Callable[[Any], Payload]
+    decode: Callable[[bytes | memoryview, int], Any]
+    sequence: Callable[[Any], int | None] = _no_sequence
+
+    @property
+    def has_unix_time(self) -> bool:
+        """Whether the schema is one of foxglove's, whose `timestamp` is Unix time."""
+        return self.schema.name.startswith("foxglove.")
+
+
+@functools.cache
+def codec_of(message_type: type[Any]) -> Codec:
+    """The codec of a message type other than Frame, which has several (frame_encodings.py)."""
+    if message_type is Event:
+        return _event_codec()
+    if message_type is OperatorEvent:
+        return _operator_codec()
+    schema = schema_of(message_type)
+    return Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
 
 
 def encode(message: Message) -> bytes:
     """One message as bytes; errors as `encode_record`."""
-    return b"".join(encode_record(message)[1])
+    return b"".join(encode_record(message, codec_of(type(message)))[1])
 
 
-def encode_record(message: Message, codec: Codec | None = None, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
-    """The MCAP sequence that a message must have, if any, and its payload in parts, large arrays uncopied.
+def encode_record(message: Message, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
+    """The MCAP sequence that a message must have, if any, and the parts of its payload.
 
-    `codec` is the one of its type where nothing else is said. `start_unix_ns` is that of the session: foxglove's
-    schemas say Unix time, flowrec's own the session clock.
+    `start_unix_ns` is the Unix time at which the session clock is 0: foxglove's schemas hold Unix time, flowrec's own
+    the session clock.
 
     Raises
     ------
-    SessionError : a value that does not fit the message's declaration, such as an int beyond 64 bit.
+    SessionError : a value does not fit the message's declaration, such as an int beyond 64 bit.
     """
-    codec = codec or codec_of(type(message))
-    if start_unix_ns and codec.says_unix_time:
+    if start_unix_ns and codec.has_unix_time:
         message = replace(message, stamp_ns=message_stamp(message) + start_unix_ns)  # type: ignore[type-var]
     try:
         try:
             return codec.sequence(message), codec.encode(message)
         except UnicodeEncodeError:
-            # Half a character from a terminal must not end a run: it is kept in spelled-out form.
+            # A lone surrogate from a terminal must not end a run: it is stored as an escape sequence.
             return codec.sequence(message), codec.encode(_without_surrogates(message))
     except (TypeError, ValueError, OverflowError) as error:
         kind, stamp_ns = type(message).__name__, message_stamp(message)
@@ -80,24 +109,23 @@ def encode_record(message: Message, codec: Codec | None = None, start_unix_ns: i
 
 
 def decode(
-    message_type: type[_M],
-    payload: bytes | memoryview,
-    sequence: int = 0,
-    schema: str = "",
-    start_unix_ns: int = 0,
+    message_type: type[_M], codec: Codec, payload: bytes | memoryview, sequence: int = 0, start_unix_ns: int = 0
 ) -> _M:
-    """One message from its bytes; `sequence` is MCAP's, where a Frame keeps its index; `schema` as in `codec_of`.
+    """One message from its payload.
 
-    `start_unix_ns` as in `encode_record`.
+    Parameters
+    ----------
+    codec : of the message type.
+    sequence : of the MCAP message; it is the index of a Frame.
+    start_unix_ns : as in `encode_record`.
 
     Raises
     ------
-    SessionError : bytes that are no such message.
+    SessionError : the payload is no such message.
     """
     try:
-        codec = codec_of(message_type, schema)
         message: _M = codec.decode(payload, sequence)
-        if start_unix_ns and codec.says_unix_time:
+        if start_unix_ns and codec.has_unix_time:
             message = replace(message, stamp_ns=message_stamp(message) - start_unix_ns)  # type: ignore[type-var]
     except (DecodeError, ValueError, TypeError, OverflowError) as error:
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
@@ -110,25 +138,105 @@ def message_stamp(message: Message) -> int:
     return stamp
 
 
+def timestamp(stamp_ns: int) -> dict[str, int]:
+    """A stamp in ns as the fields of google.protobuf.Timestamp."""
+    seconds, nanos = divmod(stamp_ns, NS_PER_S)
+    return {"seconds": seconds, "nanos": nanos}
+
+
+def stamp_of(parsed: Any) -> int:
+    """The stamp of a parsed message that has a `timestamp`, in ns."""
+    stamp: int = parsed.timestamp.seconds * NS_PER_S + parsed.timestamp.nanos
+    return stamp
+
+
+def byte_field_head(number: int, nbytes: int) -> bytes:
+    """Tag and length of a byte field (or nested message) of `nbytes` bytes."""
+    return _varint(number << 3 | _BYTES) + _varint(nbytes)
+
+
+def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes | memoryview, dict[int, memoryview]]:
+    """The message without some of its byte fields, and those fields by number, as views of the payload.
+
+    Raises
+    ------
+    ValueError : the payload is no message, or has one of the fields twice.
+    """
+    rest: list[memoryview] = []
+    found: dict[int, memoryview] = {}
+    for count, (number, kind, begin, value, end) in enumerate(_fields(payload)):
+        if count == _FIELDS_LIMIT:
+            return payload, {}
+        if kind == _BYTES and number in numbers:
+            if number in found:
+                raise ValueError(f"field {number} is in it twice")
+            found[number] = payload[value:end]
+        else:
+            rest.append(payload[begin:end])
+    return b"".join(rest), found
+
+
+def detached(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int, memoryview]:
+    """The cut-out fields, copied where a view would keep a much larger buffer in memory."""
+    whole = payload.obj
+    copy = not isinstance(whole, bytes | bytearray) or len(whole) > 2 * sum(map(len, fields.values()))
+    return {number: memoryview(bytes(view)) if copy else view for number, view in fields.items()}
+
+
 def _without_surrogates(message: _M) -> _M:
     changes = {}
-    for form in message_fields(type(message)):
+    for form in forms_of(type(message)):
         value = getattr(message, form.name)
         changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
     return type(message)(**changes)
 
 
-def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview, int], Any]:
-    parse = wire.FromString
-    unpackers = [_unpacker(form) for form in message_fields(message_type)]
-    arrays = {number: form for number, form in enumerate(message_fields(message_type), 1) if form.kind == "array"}
+def _encoder(message_type: type[Any], schema: Schema) -> Callable[[Any], Payload]:
+    wire = schema.wire
+    forms = list(enumerate(forms_of(message_type), 1))
 
-    def decode(payload: bytes | memoryview, sequence: int) -> Any:
-        if len(payload) < LARGE_BYTES or not arrays:
+    def encode(message: Any) -> Payload:
+        values: dict[str, Any] = {}
+        large: Payload = ()
+        for number, form in forms:
+            value = getattr(message, form.name)
+            if value is None:
+                if not form.optional:
+                    raise ValueError(f"{form.name} is missing")
+            elif form.kind == "vector":
+                if value.ndim != 1:
+                    raise ValueError(f"a vector of shape {value.shape}")
+                values[form.name] = value.tolist()
+            elif form.kind != "array":
+                values[form.name] = value
+            elif value.nbytes < _UNCOPIED_BYTES:
+                values[form.name] = {"shape": value.shape, "dtype": value.dtype.str, "data": value.tobytes()}
+            else:
+                large += _large_array(number, value)
+        return (wire(**values).SerializeToString(), *large)
+
+    return encode
+
+
+def _large_array(number: int, array: NDArray[Any]) -> Payload:
+    """A field of type flowrec.Array whose values are not copied."""
+    front = array_schema().wire(shape=array.shape, dtype=array.dtype.str).SerializeToString()
+    front += byte_field_head(ARRAY_DATA, array.nbytes)
+    return byte_field_head(number, len(front) + array.nbytes) + front, array.reshape(-1).view(np.uint8).data
+
+
+def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memoryview, int], Any]:
+    parse = schema.wire.FromString
+    forms = forms_of(message_type)
+    unpackers = [_unpacker(form) for form in forms]
+    arrays = {number: form for number, form in enumerate(forms, 1) if form.kind == "array"}
+
+    def decode(payload: bytes | memoryview, _sequence: int) -> Any:
+        if len(payload) < _LARGE_BYTES or not arrays:
             parsed = parse(payload)
             return message_type(*[unpack(parsed) for unpack in unpackers])
-        rest, found = cut_out(memoryview(payload), arrays)
-        parsed, found = parse(rest), own(memoryview(payload), found)
+        rest, found = cut_byte_fields(memoryview(payload), arrays)
+        parsed, found = parse(rest), detached(memoryview(payload), found)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)
@@ -139,42 +247,127 @@ def _decoder(message_type: type[Any], wire: Any) -> Callable[[bytes | memoryview
     return decode
 
 
-def _unpacker(form: MessageField) -> Callable[[Any], Any]:
+def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
+    """Takes the value of one field out of a parsed message."""
     name, dtype = form.name, form.dtype
-    present: Callable[[Any], Any]
+    present: Callable[[Any], Any] = operator.attrgetter(name)
     if form.kind == "vector":
 
         def present(parsed: Any) -> Any:
             values = getattr(parsed, name)
             count = len(values)
-            # numpy's general conversion makes a list first, which is not to be a large one.
-            short_or_huge = count < _SHORT_VECTOR or count > _LONG_VECTOR
-            return np.fromiter(values, np.float64, count) if short_or_huge else np.array(values, np.float64)
+            if _SHORT_VECTOR <= count <= _LONG_VECTOR:
+                return np.array(values, np.float64)
+            return np.fromiter(values, np.float64, count)
 
     elif form.kind == "array":
-        assert dtype is not None
 
         def present(parsed: Any) -> Any:
-            return _unpacked_array(getattr(parsed, name), dtype)
+            field = getattr(parsed, name)
+            return _array(field, field.data, dtype)
 
-    else:
-        present = operator.attrgetter(name)
     if not form.optional:
         return present
     return lambda parsed: present(parsed) if parsed.HasField(name) else None
 
 
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
-    assert dtype is not None
-    rest, found = cut_out(field, (ARRAY_DATA,))
+    rest, found = cut_byte_fields(field, (ARRAY_DATA,))
     parsed = array_schema().wire.FromString(rest)
-    return _unpacked_array(parsed, dtype, found.get(ARRAY_DATA))
+    return _array(parsed, found.get(ARRAY_DATA, parsed.data), dtype)
 
 
-def _unpacked_array(parsed: Any, dtype: np.dtype[Any], cut: memoryview | None = None) -> NDArray[Any]:
+def _array(parsed: Any, data: bytes | memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
+    assert dtype is not None  # schema.py gives one to each array
     if parsed.dtype != dtype.str:
         raise ValueError(f"an array of {parsed.dtype!r} where {dtype.str!r} belongs")
-    shape, data = tuple(parsed.shape), cut if cut is not None else parsed.data
+    shape = tuple(parsed.shape)
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ValueError(f"an array of shape {shape} in {len(data)} bytes")
     return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _event_codec() -> Codec:
+    """Event <-> foxglove.Log."""
+    schema = foxglove_schema("Log")
+
+    def encode(event: Event) -> Payload:
+        level = _LEVELS.get(event.level, 0)
+        name = _EVENT_NAME if level else f"{_EVENT_NAME}.{event.level}"
+        return _log(schema, event.stamp_ns, level, event.text, name)
+
+    def decode(payload: bytes | memoryview, _sequence: int) -> Event:
+        parsed = schema.wire.FromString(payload)
+        level = _LEVEL_NAMES.get(parsed.level)
+        if level is None:
+            level = parsed.name.removeprefix(f"{_EVENT_NAME}.")
+        return Event(stamp_of(parsed), level, parsed.message)
+
+    return Codec(schema, encode, decode)
+
+
+def _operator_codec() -> Codec:
+    """OperatorEvent <-> foxglove.Log with the name `operator.ACTION` and the message `ACTION: TEXT`."""
+    schema = foxglove_schema("Log")
+
+    def encode(event: OperatorEvent) -> Payload:
+        text, name = f"{event.action}: {event.text}", _OPERATOR_NAME + event.action
+        return _log(schema, event.stamp_ns, _LEVELS["info"], text, name)
+
+    def decode(payload: bytes | memoryview, _sequence: int) -> OperatorEvent:
+        parsed = schema.wire.FromString(payload)
+        action = parsed.name.removeprefix(_OPERATOR_NAME)
+        return OperatorEvent(stamp_of(parsed), action, parsed.message.removeprefix(f"{action}: "))
+
+    return Codec(schema, encode, decode)
+
+
+def _log(schema: Schema, stamp_ns: int, level: int, text: str, name: str) -> Payload:
+    log = schema.wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name)
+    return (log.SerializeToString(),)
+
+
+@functools.lru_cache(maxsize=1024)  # tags and lengths repeat
+def _varint(number: int) -> bytes:
+    """Protobuf's variable-length form of an unsigned number."""
+    out = bytearray()
+    while number > 0x7F:
+        out.append(number & 0x7F | 0x80)
+        number >>= 7
+    out.append(number)
+    return bytes(out)
+
+
+def _fields(payload: memoryview) -> Iterator[tuple[int, int, int, int, int]]:
+    """Number, wire type, begin, begin of the value and end of each field."""
+    at, size = 0, len(payload)
+    while at < size:
+        begin = at
+        tag, at = _read_varint(payload, at)
+        kind = tag & 7
+        if kind == _BYTES:
+            length, at = _read_varint(payload, at)
+            end = at + length
+        elif kind == _VARINT:
+            end = _read_varint(payload, at)[1]
+        elif kind in (_FIXED64, _FIXED32):
+            end = at + (8 if kind == _FIXED64 else 4)
+        else:
+            raise ValueError(f"a field of the unknown wire type {kind}")
+        if end > size:
+            raise ValueError("a field that reaches beyond its message")
+        yield tag >> 3, kind, begin, at, end
+        at = end
+
+
+def _read_varint(payload: memoryview, at: int) -> tuple[int, int]:
+    """A number and the place after it."""
+    number = shift = 0
+    while shift < 64 and at < len(payload):
+        byte = payload[at]
+        at += 1
+        number |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return number, at
+        shift += 7
+    raise ValueError("a number without an end")

@@ -1,4 +1,4 @@
-"""A digest of what a session file holds: per topic over its messages, and over its head.
+"""The digest of what a session file holds: one per topic over its messages, and one over its head.
 
 It finds damage and edits after the recording, also where a replay can not: in inputs, truth, diagnostics, views and
 the configuration. It does not find a forger, who can compute it anew.
@@ -18,116 +18,112 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from mcap.records import Attachment, Metadata
 
 from flowrec.errors import SessionError, printable
-from flowrec.store.metadata import DIGEST, belongs
-
-if TYPE_CHECKING:  # both write or read what is hashed here
-    from flowrec.store.mcap_reader import Record
-    from flowrec.store.session_metadata import Head
+from flowrec.store.mcap_format import Record
+from flowrec.store.session_metadata import DIGEST, SessionMetadata, is_header_file
 
 _MODULUS = 1 << 256
 _MESSAGE = struct.Struct("<IQ")  # sequence, log time
 _LARGE_BYTES, _LARGE = 1 << 16, struct.Struct("<QI")  # length, checksum
-_HEAD = "head"  # what a digest calls the records that are no messages
+_HEAD = "head"  # key of the digest of the records that are no messages
 _PREFIX = "flowrec."
 _FAULTS_LIMIT, _TEXT_LIMIT = 40, 200  # a made-up file may name any number of topics
 
 
-def of_message(sequence: int, log_ns: int, payload: bytes | memoryview) -> int:
+def message_digest(sequence: int, log_ns: int, payload: bytes | memoryview) -> int:
     """What one message adds to the digest of its topic; `log_ns` as in the file."""
     hashed = hashlib.sha256(_MESSAGE.pack(sequence, log_ns))
     hashed.update(payload if len(payload) < _LARGE_BYTES else _LARGE.pack(len(payload), zlib.crc32(payload)))
     return int.from_bytes(hashed.digest(), "little")
 
 
-def of_record(record: Metadata | Attachment) -> int:
+def head_digest(record: Metadata | Attachment) -> int:
     """What one record outside the chunks adds to the digest of the head; 0 where it is none of flowrec's."""
     if isinstance(record, Metadata):
         if record.name == DIGEST or not record.name.startswith(_PREFIX):
             return 0
         hashed = hashlib.sha256(json.dumps([record.name, sorted(record.metadata.items())]).encode())
     else:
-        if not belongs(record.name):
+        if not is_header_file(record.name):
             return 0
         hashed = hashlib.sha256(json.dumps([record.name, record.media_type, record.log_time]).encode())
         hashed.update(record.data)
     return int.from_bytes(hashed.digest(), "little")
 
 
-def added(total: int, *summands: int) -> int:
+def sum_digests(*digests: int) -> int:
     """The digest of several things together."""
-    return (total + sum(summands)) % _MODULUS
+    return sum(digests) % _MODULUS
 
 
-def record_of(head: int, topics: Iterable[tuple[str, int, int]]) -> Metadata:
-    """The digest as a record of the file: of its head, and name, number of messages and digest of each topic."""
-    said = {topic: f"{count} {digest:064x}" for topic, count, digest in topics if count}
-    return Metadata(DIGEST, {_HEAD: f"{head:064x}", **said})
+def digest_record(head: int, topics: Iterable[tuple[str, int, int]]) -> Metadata:
+    """The record of a file's digest: of its head, and name, number of messages and digest of each topic."""
+    of_topics = {topic: f"{count} {digest:064x}" for topic, count, digest in topics if count}
+    return Metadata(DIGEST, {_HEAD: f"{head:064x}", **of_topics})
 
 
 @dataclass(slots=True)
-class Digests:
-    """The digests of a file, made while it is read. `start_unix_ns` is what times in the file are later by."""
+class FileDigest:
+    """The digest of a file, computed while it is read.
+
+    `start_unix_ns` of the session is added to the times of the messages, to have them as in the file.
+    """
 
     start_unix_ns: int = 0
     counts: Counter[int] = field(default_factory=Counter)
     sums: Counter[int] = field(default_factory=Counter)
 
-    def take(self, _offset: int, records: Iterable[Record]) -> None:
+    def add(self, _offset: int, records: Iterable[Record]) -> None:
         """Add the messages of one chunk."""
         for record in records:
             assert isinstance(record.payload, memoryview)
             self.counts[record.channel] += 1
-            digest = of_message(record.sequence, record.log_ns + self.start_unix_ns, record.payload)
-            self.sums[record.channel] = added(self.sums[record.channel], digest)
+            digest = message_digest(record.sequence, record.log_ns + self.start_unix_ns, record.payload)
+            self.sums[record.channel] = sum_digests(self.sums[record.channel], digest)
 
-    def faults(self, head: Head) -> list[str] | None:
-        """What differs from the digest in a finished file, for people, without advice; None: written without a digest.
+    def faults(self, file: SessionMetadata) -> list[str] | None:
+        """What differs from the digest that a finished file contains, as text without advice; None: it contains none.
 
         Topics and records that flowrec has not written are passed over.
         """
-        said = head.digest
-        if said is None:
+        recorded = file.digest
+        if recorded is None:
             # Files of the first release have neither a digest nor a start.
-            return ["the digest that was recorded is missing"] if self.start_unix_ns and head.outcome else None
+            return ["the digest that was recorded is missing"] if self.start_unix_ns and file.outcome else None
         found: dict[str, tuple[int, int]] = {}
-        for number, channel in head.channels.items():
+        # The channels of flowrec have a role.
+        ours: set[str] = set()
+        for number, channel in file.channels.items():
             count, total = found.get(channel.topic, (0, 0))
-            found[channel.topic] = count + self.counts[number], added(total, self.sums[number])
+            count, total = count + self.counts[number], sum_digests(total, self.sums[number])
+            found[channel.topic] = count, total
+            if "role" in channel.metadata:
+                ours.add(channel.topic)
         faults = []
-        try:
-            same = said.get(_HEAD) == f"{_of_head(head):064x}"
-        except SessionError:  # damage, of which the reader says more
-            same = False
-        if not same:
+        if not _head_matches(file, recorded.get(_HEAD)):
             faults.append("configuration, chip, origin or outcome are not those that were recorded")
-        ours = {topic for topic, (count, _) in found.items() if count and _is_ours(head, topic)}
-        for topic in sorted((said.keys() | ours) - {_HEAD}):
+        for topic in sorted((recorded.keys() | {topic for topic in ours if found[topic][0]}) - {_HEAD}):
             count, total = found.get(topic, (0, 0))
-            if said.get(topic, "0") == (f"{count} {total:064x}" if count else "0"):
+            if recorded.get(topic, "0") == (f"{count} {total:064x}" if count else "0"):
                 continue
-            recorded = said.get(topic, "0").split(" ")[0]
-            numbers = f", {count} where {recorded} were recorded" if recorded != str(count) else ""
+            expected = recorded.get(topic, "0").split(" ")[0]
+            numbers = f", {count} where {expected} were recorded" if expected != str(count) else ""
             faults.append(printable(f"the messages of {topic} are not those that were recorded{numbers}"[:_TEXT_LIMIT]))
         more = len(faults) - _FAULTS_LIMIT
         return faults if more <= 0 else [*faults[:_FAULTS_LIMIT], f"and so on, {more} more"]
 
 
-def _is_ours(head: Head, topic: str) -> bool:
-    """Whether flowrec has declared a topic: its channels say which role it plays."""
-    return any(channel.topic == topic and "role" in channel.metadata for channel in head.channels.values())
-
-
-def _of_head(head: Head) -> int:
+def _head_matches(file: SessionMetadata, recorded: str | None) -> bool:
     total = 0
-    for index in head.metadata:
-        total = added(total, of_record(Metadata(index.name, head.source.metadata(index))))
-    for place in head.attachments:
-        if belongs(place.name):
-            body = head.source.attachment_at(place.offset, place.length)
-            total = added(total, of_record(Attachment(0, body.log_ns, body.name, body.media_type, bytes(body.data))))
-    return total
+    try:
+        for index in file.metadata:
+            total = sum_digests(total, head_digest(Metadata(index.name, file.source.metadata(index))))
+        for place in file.attachments:
+            if is_header_file(place.name):
+                total = sum_digests(total, head_digest(file.source.attachment_at(place.offset, place.length)))
+    except SessionError:  # damage, of which the reader says more
+        return False
+    return recorded == f"{total:064x}"

@@ -1,57 +1,42 @@
-"""One session file -> what is new in each of its ticks; reader.py makes ticks of it."""
+"""One session file -> the new messages of each tick, decompressed ahead of the reader in threads."""
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from mcap.records import ChunkIndex
 
-from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.messages import Frame
-from flowrec.store.chunk_stream import by_time, lane, threads
-from flowrec.store.codec import decode
+from flowrec.messages import Frame, Message
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.image_codec import PIXELS_LIMIT
-from flowrec.store.mcap_reader import DamageError, Record
-from flowrec.store.schema_check import Contents
+from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
+from flowrec.store.mcap_reader import DamageError, McapReader
+from flowrec.store.schema_check import SessionContents
+from flowrec.store.shapes import misfit
+from flowrec.store.write_queue import NewMessages
 from flowrec.topics import BY_FIELD
 
-Kept = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
-News = dict[str, Any]  # messages by field of Tick
-_KEPT_MESSAGES = 64  # of restored states
-_KNOWN_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
+Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
+_CACHED_MESSAGES = 64  # of restored states
+_STATE_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
 _LARGE_CHUNK_BYTES = 1 << 22
-_GROWTH = 2  # of an image that is decoded ahead; JPEG packs more and is decoded when its turn comes
+_GROWTH = 2  # of an image that is decoded ahead; JPEG compresses more and is decoded when its turn comes
+_AHEAD_BYTES, _AHEAD_CHUNKS = 32 << 20, 16  # decompressed before they are asked for
+_THREADS = 2
+_FEW = 64  # messages of a chunk that may wait as objects
 
-
-class _Known:
-    """How much all that is known in a tick takes: bounded, whatever a file says."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._nbytes: dict[str, int] = {}
-        self._total = 0
-
-    def add(self, field: str, record: Record) -> None:
-        """Take note of the latest message of a topic."""
-        payload = record.payload
-        nbytes = payload.image.nbytes if isinstance(payload, Frame) else len(payload)  # type: ignore[arg-type]
-        self._total += nbytes - self._nbytes.get(field, 0)
-        self._nbytes[field] = nbytes
-        if self._total > _KNOWN_LIMIT_BYTES:
-            what = f"all that is known at {record.log_ns} ns takes {self._total} bytes, more than {_KNOWN_LIMIT_BYTES}"
-            raise DamageError(self._path, what)
-
-
-def _detached(record: Record) -> Record:
-    """The record without the chunk that it lies in."""
-    payload = record.payload
-    return record._replace(payload=memoryview(bytes(payload))) if isinstance(payload, memoryview) else record
+_Decode = Callable[[Record], Record]
+_ChunkContent = bytes | memoryview | list[Record]
+_by_time = attrgetter("log_ns")
 
 
 class FileReader:
@@ -61,9 +46,9 @@ class FileReader:
     ----------
     path : the file.
     contents : its index, where the file has none or a wrong one (recovery.py).
-    pass_over : told what is wrong with a message that makes no sense, which is then left out; without it that is
-        an error.
-    kept : restored messages, shared by the files of a run.
+    skip : receives what is wrong with a message that makes no sense, which is then left out; without it that is an
+        error.
+    cache : restored messages, shared by the files of a run.
 
     Attributes
     ----------
@@ -78,53 +63,53 @@ class FileReader:
     def __init__(
         self,
         path: Path,
-        contents: Contents | None = None,
-        pass_over: Callable[[str], None] | None = None,
-        kept: Kept | None = None,
+        contents: SessionContents | None = None,
+        skip: Callable[[str], None] | None = None,
+        cache: Cache | None = None,
     ) -> None:
         self.path = path
-        self._pass_over = pass_over
-        self.contents = contents if contents is not None else Contents(path)
+        self._skip = skip
+        self.contents = contents if contents is not None else SessionContents(path)
         self._source = self.contents.source
         self._fields = self.contents.fields
-        self._kept: Kept = kept if kept is not None else {}
+        self._cache: Cache = cache if cache is not None else {}
         self._frame_channels = self._channels_of({"frame"})
         encoding = ENCODINGS.get(self.contents.frame_encoding)
         self._lossless = encoding is None or encoding.lossless
 
-    def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, News]]:
+    def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, NewMessages]]:
         """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
-        known = _Known(self.path)
-        for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=by_time):
-            news: News = {}
+        size = _StateSize(self.path)
+        for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=_by_time):
+            new: NewMessages = {}
             for record in records:
                 field = self._fields[record.channel]
-                known.add(field, record)
+                size.add(field, record)
                 message = self._message(record)
                 if message is not None:
-                    news[field] = message
-            if news:
-                yield stamp_ns, news
+                    new[field] = message
+            if new:
+                yield stamp_ns, new
 
     def messages(self, field: str) -> Iterator[tuple[int, Any]]:
         """All messages of one topic, each with the stamp of its tick."""
         channels = self._channels_of({field})
-        with threads() as executor:
-            for record in lane(self._source, self._chunks_with(channels), executor, self._ready):
+        with _threads() as executor:
+            for record in _merged(self._source, self._chunks_with(channels), executor, self._decoded_frame):
                 if record.channel in channels:
                     message = self._message(record)
                     if message is not None:
                         yield record.log_ns, message
 
-    def state_at(self, stamp_ns: int, fields: Collection[str]) -> tuple[int, News]:
+    def state_at(self, stamp_ns: int, fields: Collection[str]) -> tuple[int, NewMessages]:
         """The latest message of each of these topics at or before a stamp, from as few chunks as possible.
 
         With the stamp of the tick that held the latest of them, -1 without any. The same message is the same object,
         however often it is asked for.
         """
         latest = self._latest(stamp_ns, self._channels_of(fields))
-        news = {field: message for field, record in latest.items() if (message := self._restored(record)) is not None}
-        return max((record.log_ns for record in latest.values()), default=-1), news
+        state = {field: message for field, record in latest.items() if (message := self._restored(record)) is not None}
+        return max((record.log_ns for record in latest.values()), default=-1), state
 
     def close(self) -> None:
         """Close the file; forgotten readers close it when they are collected."""
@@ -133,71 +118,69 @@ class FileReader:
     def _message(self, record: Record) -> Message | None:
         if isinstance(record.payload, Message):
             return record.payload
-        field = self._fields[record.channel]
         try:
-            schema = self.contents.schemas[record.channel]
-            message = decode(BY_FIELD[field].type, record.payload, record.sequence, schema, self._source.start_unix_ns)
-            wrong = shape_error(message)
+            message = self.contents.decode(record)
+            fault = misfit(message)
         except SessionError as error:
-            wrong = str(error)
-        if not wrong:
+            fault = str(error)
+        if not fault:
             return message
-        wrong = f"{BY_FIELD[field].path} at {record.log_ns} ns: {wrong}"
-        if self._pass_over is None:
-            raise DamageError(self.path, wrong)
-        self._pass_over(wrong)
+        fault = f"{BY_FIELD[self._fields[record.channel]].path} at {record.log_ns} ns: {fault}"
+        if self._skip is None:
+            raise DamageError(self.path, fault)
+        self._skip(fault)
         return None
 
-    def _ready(self, record: Record) -> Record:
-        """An image decoded, in a thread; where that fails, what is wrong is told when its turn comes."""
+    def _decoded_frame(self, record: Record) -> Record:
+        """An image decoded, in a thread; where that fails, the error is raised when its turn comes."""
         if record.channel not in self._frame_channels or isinstance(record.payload, Message) or not self._lossless:
             return record
         try:
-            schema = self.contents.schemas[record.channel]
-            frame = decode(Frame, record.payload, record.sequence, schema, self._source.start_unix_ns)
+            frame = self.contents.decode(record)
         except SessionError:
             return record
-        sound = not shape_error(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
+        assert isinstance(frame, Frame)
+        sound = not misfit(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
         return record._replace(payload=frame) if sound else record
 
     def _restored(self, record: Record) -> Message | None:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (self.path, record.channel, record.log_ns)
-        message = self._kept.pop(key, None) or self._message(record)
+        message = self._cache.pop(key, None) or self._message(record)
         if message is None:
             return None
-        self._kept[key] = message
-        if len(self._kept) > _KEPT_MESSAGES:
-            del self._kept[next(iter(self._kept))]
+        self._cache[key] = message
+        if len(self._cache) > _CACHED_MESSAGES:
+            del self._cache[next(iter(self._cache))]
         return message
 
     def _records(self, start_ns: int | None, with_frames: bool) -> Iterator[Record]:
         """The messages of known topics from a time on, state and frames merged."""
         start = 0 if start_ns is None else start_ns
-        state, frames = self._lanes(start)
+        state, frames = self._chunks_from(start)
         wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
         read = dict.fromkeys(wanted, 0)
-        with threads() as executor:
-            lanes = [lane(self._source, state, executor)]
+        with _threads() as executor:
+            streams = [_merged(self._source, state, executor)]
             if with_frames:
-                lanes.append(lane(self._source, frames, executor, self._ready))
-            for record in heapq.merge(*lanes, key=by_time):
+                streams.append(_merged(self._source, frames, executor, self._decoded_frame))
+            for record in heapq.merge(*streams, key=_by_time):
                 if record.log_ns >= start and record.channel in wanted:
                     read[record.channel] += 1
                     yield record
         if start_ns is None:
-            self._compare(read)
+            self._check_counts(read)
 
-    def _compare(self, read: Mapping[int, int]) -> None:
-        """A file that has less in it than it says must not pass for a whole one."""
+    def _check_counts(self, read: Mapping[int, int]) -> None:
+        """A file that contains less than it says must not pass for a whole one."""
         for channel, count in read.items():
             announced = self.contents.statistics.channel_message_counts.get(channel, 0)
             if count != announced:
                 path = BY_FIELD[self._fields[channel]].path
                 raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
 
-    def _lanes(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
-        """Chunks that reach beyond a time: those with anything but frames, and those with frames only."""
+    def _chunks_from(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
+        """Chunks that end at or after a time: those with anything but frames, and those with frames only."""
         state: list[ChunkIndex] = []
         frames: list[ChunkIndex] = []
         for chunk in self._chunks_with(set(self._fields)):
@@ -209,7 +192,7 @@ class FileReader:
         return state, frames
 
     def _chunks_with(self, channels: set[int]) -> list[ChunkIndex]:
-        # A chunk without an index may hold anything.
+        # A chunk without an index may contain anything.
         return [
             chunk
             for chunk in self.contents.chunks
@@ -221,22 +204,148 @@ class FileReader:
 
     def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
         latest: dict[str, Record] = {}
-        known = _Known(self.path)
+        size = _StateSize(self.path)
         for chunk in sorted(self._chunks_with(channels), key=lambda chunk: chunk.message_end_time, reverse=True):
             if chunk.message_start_time > stamp_ns:
                 continue
-            reach_ns = min(chunk.message_end_time, stamp_ns)
-            held = channels & set(chunk.message_index_offsets) if chunk.message_index_offsets else channels
-            fields = {self._fields[channel] for channel in held}
-            if all(field in latest and latest[field].log_ns >= reach_ns for field in fields):
+            end_ns = min(chunk.message_end_time, stamp_ns)
+            found = channels & set(chunk.message_index_offsets) if chunk.message_index_offsets else channels
+            fields = {self._fields[channel] for channel in found}
+            if all(field in latest and latest[field].log_ns >= end_ns for field in fields):
                 continue
             for record in self._source.messages(chunk):
                 field_name = self._fields.get(record.channel)
                 if field_name not in fields or field_name is None or record.log_ns > stamp_ns:
                     continue
                 if field_name not in latest or latest[field_name].log_ns <= record.log_ns:
-                    known.add(field_name, record)
+                    size.add(field_name, record)
                     latest[field_name] = record
             if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # which is not kept for the sake of a few messages in it
                 latest = {field: _detached(record) for field, record in latest.items()}
         return latest
+
+
+class _StateSize:
+    """The memory of the full state at a tick: bounded, whatever a file says."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._nbytes: dict[str, int] = {}
+        self._total = 0
+
+    def add(self, field: str, record: Record) -> None:
+        """Note the latest message of a topic."""
+        payload = record.payload
+        nbytes = payload.image.nbytes if isinstance(payload, Frame) else len(payload)  # type: ignore[arg-type]
+        self._total += nbytes - self._nbytes.get(field, 0)
+        self._nbytes[field] = nbytes
+        if self._total > _STATE_LIMIT_BYTES:
+            what = f"all that is known at {record.log_ns} ns takes {self._total} bytes, more than {_STATE_LIMIT_BYTES}"
+            raise DamageError(self._path, what)
+
+
+def _detached(record: Record) -> Record:
+    """The record without the chunk that it lies in."""
+    payload = record.payload
+    return record._replace(payload=memoryview(bytes(payload))) if isinstance(payload, memoryview) else record
+
+
+@contextlib.contextmanager
+def _threads() -> Iterator[Executor]:
+    """The threads that decompress; who stops reading early does not wait for what was to come."""
+    executor = ThreadPoolExecutor(_THREADS, "session-reader")
+    try:
+        yield executor
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _merged(
+    source: McapReader, chunks: Iterable[ChunkIndex], executor: Executor, decode: _Decode | None = None
+) -> Iterator[Record]:
+    """The messages of chunks in order of time; those of equal time stay in file order.
+
+    flowrec's own chunks of a group follow each other in time. Where other programs have rewritten a file, chunks that
+    overlap are read together and sorted.
+
+    Parameters
+    ----------
+    decode : what can be done with each record in the threads, where a chunk contains few and large ones: images. It
+        returns the record with a message of at most twice its size as payload, or as it was.
+
+    Raises
+    ------
+    SessionError : a chunk is damaged, or more chunks overlap than fit into memory.
+    """
+    waiting = deque(
+        _overlapping(source, sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)))
+    )
+    running: deque[tuple[list[ChunkIndex], Future[list[_ChunkContent]]]] = deque()
+    ahead_bytes = 0
+    while waiting or running:
+        while waiting and len(running) < _AHEAD_CHUNKS:
+            nbytes = _size(waiting[0])
+            if ahead_bytes and ahead_bytes + nbytes > _AHEAD_BYTES:
+                break  # a bundle that is larger than all that may be ahead comes alone
+            bundle = waiting.popleft()
+            running.append((bundle, executor.submit(_contents, source, bundle, decode)))
+            ahead_bytes += nbytes
+        bundle, future = running.popleft()
+        # A small message as an object takes more memory than as bytes: they are made for one bundle at a time.
+        records = _sorted_messages(source, bundle, future.result())
+        del future
+        yield from records
+        del records
+        ahead_bytes -= _size(bundle)
+
+
+def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[ChunkIndex]]:
+    """Bundles of chunks whose times overlap."""
+    bundle: list[ChunkIndex] = []
+    nbytes = end_ns = 0
+    for chunk in chunks:
+        if bundle and chunk.message_start_time > end_ns:
+            yield bundle
+            bundle, nbytes = [], 0
+        end_ns = max(end_ns, chunk.message_end_time) if bundle else chunk.message_end_time
+        bundle.append(chunk)
+        nbytes += chunk.uncompressed_size  # checked before the chunk is decompressed, or at least before it is used
+        if nbytes > CHUNK_LIMIT_BYTES and len(bundle) > 1:
+            raise source.damaged(chunk.chunk_start_offset, "too many chunks claim the same time")
+    if bundle:
+        yield bundle
+
+
+def _size(bundle: list[ChunkIndex]) -> int:
+    return sum(chunk.uncompressed_size for chunk in bundle)
+
+
+def _contents(source: McapReader, bundle: list[ChunkIndex], decode: _Decode | None) -> list[_ChunkContent]:
+    """Of each chunk its content, or its messages decoded."""
+    found: list[_ChunkContent] = []
+    for chunk in bundle:
+        content = source.chunk(chunk)
+        if decode is not None:
+            with source.parsing(chunk.chunk_start_offset):
+                few = len(list(itertools.islice(records_in(content), _FEW))) < _FEW
+            if few:
+                found.append([decode(record) for record in source.messages_in(content, chunk.chunk_start_offset)])
+                continue
+        found.append(content)
+    return found
+
+
+def _sorted_messages(source: McapReader, bundle: list[ChunkIndex], contents: list[_ChunkContent]) -> Iterator[Record]:
+    places = [chunk.chunk_start_offset for chunk in bundle]
+    records: list[Record] = []
+    for place, content in sorted(zip(places, contents, strict=True), key=lambda pair: pair[0]):
+        records += content if isinstance(content, list) else source.messages_in(content, place)
+        if len(records) > MESSAGES_LIMIT:
+            raise source.damaged(place, "too many messages claim the same time")
+    records.sort(key=_by_time)
+    # What comes later is merged by the times of the index; they are not to be trusted either.
+    first_ns = min(chunk.message_start_time for chunk in bundle)
+    last_ns = max(chunk.message_end_time for chunk in bundle)
+    if records and not first_ns <= records[0].log_ns <= records[-1].log_ns <= last_ns:
+        raise source.damaged(places[0], "there are messages of other times than the index tells")
+    return iter(records)

@@ -1,6 +1,6 @@
-"""Grey-level images as PNG and JPEG files, and back within bounds.
+"""Grey-level images as PNG and JPEG files, and decoding them within bounds.
 
-Writing is for the recorder's thread: everything slow in here leaves the interpreter free.
+Encoding runs in the writer's thread: everything slow releases the interpreter lock.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.store.form import Payload
+from flowrec.messages import Image
+from flowrec.store.codec import Payload
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER = struct.Struct(">IIBBBBB")  # width, height, bits, colour type, compression, filter, interlace
 _SIZE = struct.Struct(">I")
 _UP = 2  # PNG's filter that stores each row as its difference from the one above
 _JPEG_QUALITY = 90
-# Deflate packs no more than 1032 into one byte, baseline JPEG fewer pixels: more are a bomb.
+# Deflate compresses no more than 1032 pixels into one byte, baseline JPEG fewer.
 _PIXELS_PER_BYTE = 1100
-PIXELS_LIMIT = 32 << 20  # before it is packed: it is there twice while it is unpacked
+PIXELS_LIMIT = 32 << 20  # an image is in memory twice while it is decoded
 # Filter and strategy by which cv2's PNG is three times quicker than by default and smaller, on camera noise.
 _PNG_OPTIONS = (
     cv2.IMWRITE_PNG_FILTER,
@@ -35,7 +35,7 @@ _PNG_OPTIONS = (
 
 
 def png(image: Image) -> Payload:
-    """A PNG file, packed with Huffman codes."""
+    """A PNG file, compressed with Huffman codes."""
     return (_encoded(".png", image, _PNG_OPTIONS),)
 
 
@@ -45,9 +45,9 @@ def jpeg(image: Image) -> Payload:
 
 
 def row_differences(image: Image) -> Payload:
-    """A PNG file of row differences that nobody has packed yet: zstd, which packs the chunk, does so ten times quicker.
+    """A PNG file of row differences without compression: zstd, which compresses the chunk, is ten times quicker.
 
-    https://www.w3.org/TR/png-3/#9Filters; the stream inside is deflate's "stored" kind, which every viewer reads.
+    https://www.w3.org/TR/png-3/#9Filters; the stream consists of deflate's "stored" blocks, which every viewer reads.
     """
     _refuse_empty(image)
     height, width = image.shape
@@ -63,12 +63,12 @@ def row_differences(image: Image) -> Payload:
     )
 
 
-def picture(data: bytes | memoryview) -> Image:
+def decode_image(data: bytes | memoryview) -> Image:
     """The pixels of a PNG or JPEG file, (h, w) grey levels.
 
     Raises
     ------
-    ValueError : it is none, it is coloured, or it claims more pixels than its bytes can hold or anybody needs.
+    ValueError : it is neither, it is coloured, or it claims more pixels than its bytes or the limit allow.
     """
     data = memoryview(data)
     height, width = _shape_of(data)
@@ -98,7 +98,7 @@ def _stored_differences(data: memoryview, height: int, width: int) -> NDArray[np
         return None
     if zlib.crc32(data[start - 4 : end]) != _SIZE.unpack_from(data, end)[0]:
         return None
-    # Past zlib's head and without its own checksum: the one above was over both.
+    # After zlib's head and without its own checksum: the one above covers both.
     unpacker, nbytes = zlib.decompressobj(-zlib.MAX_WBITS), height * (width + 1)
     try:
         unpacked = unpacker.decompress(data[start + 2 : end - 4], nbytes + 1)

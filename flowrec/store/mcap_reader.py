@@ -7,45 +7,46 @@ errors of several libraries escape. Here every size is checked before it is used
 from __future__ import annotations
 
 import contextlib
-import os
 import struct
-import weakref
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
+from typing import IO, Any, cast
 
 import zstandard
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, ChunkIndex, Footer, Header, Metadata, MetadataIndex
+from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Footer, Header, Metadata, MetadataIndex
 
 from flowrec.errors import SessionError
-from flowrec.store.mcap_index import Summary, records_of, stream_of, summary_from
-from flowrec.store.mcap_writer import MAGIC
+from flowrec.store.byte_source import open_bytes
+from flowrec.store.mcap_format import (
+    ATTACHMENT_HEAD,
+    CHUNK_HEAD,
+    CHUNK_LIMIT_BYTES,
+    CRC,
+    FOOTER_BYTES,
+    LONG,
+    MAGIC,
+    MESSAGE_HEAD,
+    MESSAGES_LIMIT,
+    RECORD_HEAD,
+    Record,
+    Summary,
+    parse_summary,
+    records_in,
+    stream_of,
+)
 
-if TYPE_CHECKING:
-    from flowrec.declarations import Message
-
-# Of one chunk before compression: a flow field on 1900 x 1900 pixels. What a tick knows, such a chunk on its way into
-# the next tick, and an image on its way are what reading needs at most: with the program itself less than 512 MB.
-CHUNK_LIMIT_BYTES = 72 << 20
-# Above so many bytes a chunk must have taken at least a thousandth of them: noise, flow and text never pack better.
+# A larger chunk must be stored in at least a thousandth of its size: noise, flow and text never compress better.
 _FREE_BYTES, _RATIO_LIMIT = 16 << 20, 1000
-# What is read of a compressed chunk at a time, and how far back zstd may look; ours look back half a megabyte.
+# What is read of a compressed chunk at a time, and the largest zstd window; flowrec writes half a megabyte.
 _AT_ONCE_BYTES, _WINDOW_LIMIT_BYTES = 8 << 20, 8 << 20
-MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
 _HEADER_LIMIT_BYTES = 1 << 16
 _SUMMARY_LIMIT_BYTES = 256 << 20  # a day of three chunks every half second needs half of it
 _SMALL_LIMIT_BYTES = 4 << 20  # one record of metadata, schema or channel
-_ATTACHMENT_LIMIT_BYTES = 256 << 20
-RECORD_HEAD = struct.Struct("<BQ")
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-_CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, size and checksum of the content, length of the name
-_ATTACHMENT_HEAD = struct.Struct("<QQI")  # log and create time, length of the name
-_FOOTER_BYTES = 9 + 20
-_LONG, _CRC = struct.Struct("<Q"), struct.Struct("<I")
+_LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: 256 << 20}
 
 # What the libraries raise on damaged bytes, as found by reading thousands of mutated files.
 _DAMAGE = (
@@ -62,11 +63,11 @@ _DAMAGE = (
 
 
 class ForeignError(SessionError):
-    """An MCAP file, or none at all, that flowrec has not written."""
+    """A file that flowrec has not written, MCAP or not."""
 
 
 class UnfinishedError(SessionError):
-    """The end of the file is missing: the run was killed, goes on, or the file is cut off."""
+    """The end of the file is missing: the run was killed, is still going on, or the file is cut off."""
 
 
 class DamageError(SessionError):
@@ -77,31 +78,12 @@ class DamageError(SessionError):
         self.what = what
 
 
-class Record(NamedTuple):
-    """One message as it lies in a chunk, `log_ns` on the session clock."""
-
-    log_ns: int
-    channel: int
-    sequence: int
-    payload: memoryview | Message  # a message where it has been decoded already
-
-
-class AttachmentBody(NamedTuple):
-    """One attachment as it lies in the file."""
-
-    log_ns: int
-    create_ns: int
-    name: str
-    media_type: str
-    data: memoryview
-
-
-class Source:
-    """A finished MCAP file. Reads are independent of each other and may come from several threads.
+class McapReader:
+    """An MCAP file. Reads are independent of each other and may come from several threads.
 
     Attributes
     ----------
-    start_unix_ns : of the session (header.py), as soon as somebody has read it; log times are told less by it.
+    start_unix_ns : Unix time of stamp 0 of the session, as soon as it has been read; log times are reduced by it.
 
     Raises
     ------
@@ -111,25 +93,15 @@ class Source:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.start_unix_ns = 0
-        if path.is_dir():
-            raise SessionError(f"{path}: is a directory, not a session; name a .mcap file in it (`flowrec ls {path}`)")
+        self._bytes = open_bytes(path)
+        self.size, self.close = self._bytes.size, self._bytes.close
         try:
-            self._descriptor = os.open(path, os.O_RDONLY)
-        except FileNotFoundError as error:
-            raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
-        except ValueError as error:  # a name with a NUL, which only another file can have given
-            raise SessionError(f"{path}: is not the name of a file") from error
-        except OSError as error:
-            raise SessionError(f"{path}: can not be opened ({error.strerror}); check its permissions") from error
-        self.close = weakref.finalize(self, os.close, self._descriptor)
-        try:
-            self.size = os.fstat(self._descriptor).st_size
             self.header = self._read_header()
         except BaseException:
             self.close()
             raise
 
-    def start_at(self, unix_ns: int) -> None:
+    def set_start(self, unix_ns: int) -> None:
         """Set `start_unix_ns`.
 
         Raises
@@ -141,20 +113,12 @@ class Source:
         self.start_unix_ns = unix_ns
 
     def read(self, offset: int, length: int) -> bytes:
-        """That many bytes, no fewer."""
-        if not self.close.alive:
-            raise SessionError(f"{self.path}: has been closed; open the session again")
+        """Exactly that many bytes."""
         if not 0 <= offset <= offset + length <= self.size:
             raise self.damaged(offset, f"{length} bytes are announced, the file ends at {self.size}")
-        try:
-            data = os.pread(self._descriptor, length, offset)
-            while len(data) < length:  # one call reads 2 GiB at most
-                more = os.pread(self._descriptor, length - len(data), offset + len(data))
-                if not more:
-                    raise self.damaged(offset, "the file has become shorter while it was read")
-                data += more
-        except OSError as error:
-            raise SessionError(f"{self.path}: can not be read at byte {offset} ({error.strerror})") from error
+        data = self._bytes.read(offset, length)
+        if len(data) < length:
+            raise self.damaged(offset, "the file has become shorter while it was read")
         return data
 
     def damaged(self, offset: int, why: object) -> DamageError:
@@ -163,7 +127,7 @@ class Source:
 
     @contextlib.contextmanager
     def parsing(self, offset: int) -> Iterator[None]:
-        """Turns what a library raises on damaged bytes into a SessionError."""
+        """Turns any error that a library raises on damaged bytes into a SessionError."""
         try:
             yield
         except _DAMAGE as error:
@@ -171,8 +135,8 @@ class Source:
 
     def read_summary(self) -> Summary:
         """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
-        tail = self.read(max(0, self.size - _FOOTER_BYTES - len(MAGIC)), min(self.size, _FOOTER_BYTES + len(MAGIC)))
-        if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != _FOOTER_BYTES + len(MAGIC):
+        tail = self.read(max(0, self.size - FOOTER_BYTES - len(MAGIC)), min(self.size, FOOTER_BYTES + len(MAGIC)))
+        if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != FOOTER_BYTES + len(MAGIC):
             raise UnfinishedError(
                 f"{self.path}: was not finished (the run was killed, or the file is cut off);"
                 f" `flowrec recover {self.path}` makes a whole session of it"
@@ -186,51 +150,49 @@ class Source:
         if footer_at - start > _SUMMARY_LIMIT_BYTES:
             raise self.damaged(start, f"an index of {footer_at - start} bytes, more than {_SUMMARY_LIMIT_BYTES}")
         data = self.read(start, footer_at - start)
-        if footer.summary_crc and zlib.crc32(tail[: _FOOTER_BYTES - 4], zlib.crc32(data)) != footer.summary_crc:
+        if footer.summary_crc and zlib.crc32(tail[: FOOTER_BYTES - 4], zlib.crc32(data)) != footer.summary_crc:
             raise self.damaged(start, "the checksum of the index is wrong")
         with self.parsing(start):
-            return summary_from(data, len(MAGIC), start)
+            return parse_summary(data, len(MAGIC), start)
 
     def metadata(self, index: MetadataIndex) -> dict[str, str]:
         """One metadata record."""
-        body = self.body(index.offset, index.length, Opcode.METADATA)
-        with self.parsing(index.offset):
-            record: Metadata = Metadata.read(stream_of(body))
+        record: Metadata = self.record(index.offset, index.length, Opcode.METADATA, Metadata.read)
         return dict(record.metadata)
 
     def attachment(self, index: AttachmentIndex) -> bytes:
         """The content of one attachment, checksum verified."""
         found = self.attachment_at(index.offset, index.length)
         if len(found.data) != index.data_size or found.name != index.name:
-            raise self.damaged(index.offset, f"{found.name!r} is not what the index tells of it")
+            raise self.damaged(index.offset, f"{found.name!r} is not what the index describes")
         return bytes(found.data)
 
-    def attachment_at(self, offset: int, length: int) -> AttachmentBody:
+    def attachment_at(self, offset: int, length: int) -> Attachment:
         """One attachment, checksum verified."""
         body = self.body(offset, length, Opcode.ATTACHMENT)
         with self.parsing(offset):
-            log_ns, create_ns, name_bytes = _ATTACHMENT_HEAD.unpack_from(body)
-            name, at = _text(body, _ATTACHMENT_HEAD.size, name_bytes)
-            media_type, at = _text(body, at + 4, *_CRC.unpack_from(body, at))
-            (size,) = _LONG.unpack_from(body, at)
+            log_ns, create_ns, name_bytes = ATTACHMENT_HEAD.unpack_from(body)
+            name, at = _text(body, ATTACHMENT_HEAD.size, name_bytes)
+            media_type, at = _text(body, at + 4, *CRC.unpack_from(body, at))
+            (size,) = LONG.unpack_from(body, at)
             data, at = body[at + 8 : at + 8 + size], at + 8 + size
             if at + 4 != len(body):
                 raise ValueError(f"{name!r} is not as long as announced")
-            (crc,) = _CRC.unpack_from(body, at)
+            (crc,) = CRC.unpack_from(body, at)
             if crc and zlib.crc32(body[:at]) != crc:
                 raise ValueError(f"the checksum of {name!r} is wrong")
-        return AttachmentBody(log_ns, create_ns, name, media_type, data)
+        return Attachment(create_ns, log_ns, name, media_type, data)  # type: ignore[arg-type]  # a view is not copied
 
     def content(self, offset: int, length: int) -> bytes | memoryview:
-        """What is in a chunk: decompressed within our limits, whatever it announces; checksum verified."""
+        """The content of a chunk, decompressed within the limits whatever it announces; checksum verified."""
         self._check_size(offset, length, Opcode.CHUNK)
         whole = length <= _AT_ONCE_BYTES
         body = self.body(offset, length, Opcode.CHUNK) if whole else memoryview(self.read(offset, _AT_ONCE_BYTES))[9:]
         with self.parsing(offset):
-            _, _, size, crc, name_bytes = _CHUNK_HEAD.unpack_from(body)
-            compression, at = _text(body, _CHUNK_HEAD.size, name_bytes)
-            begin = at + _LONG.size
-            if _LONG.unpack_from(body, at)[0] != length - RECORD_HEAD.size - begin:
+            _, _, size, crc, name_bytes = CHUNK_HEAD.unpack_from(body)
+            compression, at = _text(body, CHUNK_HEAD.size, name_bytes)
+            begin = at + LONG.size
+            if LONG.unpack_from(body, at)[0] != length - RECORD_HEAD.size - begin:
                 raise ValueError("the chunk is not as long as announced")
             if not whole and _can_be_streamed(body[begin:], compression):
                 content: bytes | memoryview = self._streamed(
@@ -244,13 +206,13 @@ class Source:
         return content
 
     def _streamed(self, start: int, end: int, begin: memoryview, size: int) -> memoryview:
-        """What zstd has packed into the bytes from `start` to `end`, of which `begin` are the first: piece by piece."""
+        """The zstd frame from byte `start` to `end`, which starts with `begin`, decompressed in small steps."""
         _refuse_bomb(size, end - start)
         _refuse_other_size(begin, size)
         content = memoryview(bytearray(size))
         unpacker = zstandard.ZstdDecompressor(max_window_size=_WINDOW_LIMIT_BYTES)
         at = 0
-        with unpacker.stream_reader(cast(IO[bytes], _Pieces(self, start, end))) as stream:
+        with unpacker.stream_reader(cast(IO[bytes], _Range(self, start, end))) as stream:
             while at < size and (count := stream.readinto(content[at:])):
                 at += count
             if at < size or stream.read(1):
@@ -258,10 +220,10 @@ class Source:
         return content.toreadonly()
 
     def chunk(self, index: ChunkIndex) -> bytes | memoryview:
-        """`content` of a chunk of the index, of the size that the index tells."""
+        """`content` of a chunk of the index, of the size that the index gives."""
         content = self.content(index.chunk_start_offset, index.chunk_length)
         if len(content) != index.uncompressed_size:
-            raise self.damaged(index.chunk_start_offset, "the chunk has another size than the index tells")
+            raise self.damaged(index.chunk_start_offset, "the chunk has another size than the index says")
         return content
 
     def messages_in(self, content: bytes | memoryview, offset: int) -> list[Record]:
@@ -269,16 +231,16 @@ class Source:
         view = memoryview(content)
         found: list[Record] = []
         with self.parsing(offset):
-            for opcode, at, length in records_of(content):
+            for opcode, at, length in records_in(content):
                 if opcode == Opcode.MESSAGE:
                     if len(found) == MESSAGES_LIMIT:
                         raise ValueError(f"more than {MESSAGES_LIMIT} messages in one chunk")
-                    if length < _MESSAGE_HEAD.size:
+                    if length < MESSAGE_HEAD.size:
                         raise ValueError(f"a message of {length} bytes")
-                    channel, sequence, log_ns, _publish_ns = _MESSAGE_HEAD.unpack_from(content, at)
+                    channel, sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(content, at)
                     if log_ns < self.start_unix_ns:
                         raise ValueError("a message from before the session")
-                    payload = view[at + _MESSAGE_HEAD.size : at + length]
+                    payload = view[at + MESSAGE_HEAD.size : at + length]
                     found.append(Record(log_ns - self.start_unix_ns, channel, sequence, payload))
         return found
 
@@ -300,7 +262,7 @@ class Source:
         return header
 
     def body(self, offset: int, length: int, opcode: Opcode) -> memoryview:
-        """What follows the head of a record of that kind and whole length."""
+        """The body of a record of that kind and whole length."""
         self._check_size(offset, length, opcode)
         data = self.read(offset, length)
         with self.parsing(offset):
@@ -321,20 +283,17 @@ class Source:
             return parse(stream_of(body))
 
 
-class _Pieces:
-    """Bytes of a file, read when they are asked for."""
+class _Range:
+    """A range of a file as a stream."""
 
-    def __init__(self, source: Source, start: int, end: int) -> None:
-        self._source, self._at, self._end = source, start, end
+    def __init__(self, reader: McapReader, start: int, end: int) -> None:
+        self._reader, self._at, self._end = reader, start, end
 
     def read(self, count: int) -> bytes:
         """The next bytes, at most so many."""
-        data = self._source.read(self._at, min(count, self._end - self._at))
+        data = self._reader.read(self._at, min(count, self._end - self._at))
         self._at += len(data)
         return data
-
-
-_LIMIT_BYTES = {Opcode.CHUNK: CHUNK_LIMIT_BYTES + (1 << 16), Opcode.ATTACHMENT: _ATTACHMENT_LIMIT_BYTES}
 
 
 def _text(body: memoryview, at: int, nbytes: int) -> tuple[str, int]:
@@ -358,7 +317,7 @@ def _refuse_other_size(data: memoryview, size: int) -> None:
 
 
 def _can_be_streamed(begin: memoryview, compression: str) -> bool:
-    """Whether unpacking piece by piece needs little memory besides what comes out."""
+    """Whether streamed decompression needs little memory besides its output."""
     return compression == "zstd" and zstandard.get_frame_parameters(begin).window_size <= _WINDOW_LIMIT_BYTES
 
 

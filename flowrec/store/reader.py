@@ -11,11 +11,11 @@ from typing import Any, Self
 
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
-from flowrec.store.file_reader import FileReader, Kept
-from flowrec.store.metadata import SessionHeader
-from flowrec.store.part_continuity import Piece, Run, without_part
+from flowrec.store.file_reader import Cache, FileReader
+from flowrec.store.part_continuity import Run, RunFile
 from flowrec.store.roi import Region
-from flowrec.store.schema_check import Contents
+from flowrec.store.schema_check import SessionContents
+from flowrec.store.session_metadata import SessionHeader
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
 from flowrec.units import seconds
 
@@ -31,15 +31,15 @@ class SessionReader:
     Parameters
     ----------
     path : the session.
-    contents, pass_over : of a single file, as in file_reader.py.
+    contents, skip : of a single file, as in file_reader.py.
 
     Attributes
     ----------
     path : as it was named.
-    files : what it consists of, in order.
-    part : which piece of a run it is; None for a whole run.
-    carried_ns : the first tick is repeated from before this piece began, with all that was known by then: where a
-        replay of it sets out from. None where the session begins with the run.
+    files : its files, in order.
+    part : which file of a run it is; None for a whole run.
+    keyframe_ns : stamp of the first tick where that is a keyframe, the state before this file began, from which a
+        replay starts. None where the session begins with the run.
     outcome : how the run ended: `outcome`, `reason`, `ticks`, `dropped_frames`, ...; all text, may be empty.
     first_ns, last_ns : stamps of the first and the last tick; both 0 in an empty session.
     flowrec_version : of the program that wrote it.
@@ -51,33 +51,33 @@ class SessionReader:
     """
 
     def __init__(
-        self, path: Path | str, contents: Contents | None = None, pass_over: Callable[[str], None] | None = None
+        self, path: Path | str, contents: SessionContents | None = None, skip: Callable[[str], None] | None = None
     ) -> None:
         self.path = Path(path)
-        self._kept: Kept = {}
+        self._cache: Cache = {}
         self._closed = False
         self._open: dict[int, FileReader] = {}  # the one that was used longest ago first
         if contents is not None or self.path.exists():
-            self._open[0] = first = FileReader(self.path, contents, pass_over, self._kept)
-            self._run = Run(self.path, [Piece.of(first.contents)])
+            self._open[0] = first = FileReader(self.path, contents, skip, self._cache)
+            self._run = Run(self.path, [RunFile.of(first.contents)])
         else:
             self._run = Run.at(self.path)
-        self.files = [piece.path for piece in self._run.pieces]
+        self.files = [file.path for file in self._run.files]
         self.part = self._run.part
-        self.carried_ns = self.part.carried_ns if self.part is not None else None
+        self.keyframe_ns = self.part.keyframe_ns if self.part is not None else None
         self.first_ns, self.last_ns = self._run.first_ns, self._run.last_ns
         self.outcome = self._run.outcome
-        self.flowrec_version = self._run.pieces[0].flowrec_version
-        self._fields = [{topic.field for topic in TOPICS if topic.path in piece.counts} for piece in self._run.pieces]
+        self.flowrec_version = self._run.files[0].flowrec_version
+        self._fields = [{topic.field for topic in TOPICS if topic.path in file.counts} for file in self._run.files]
 
     @functools.cached_property
     def header(self) -> SessionHeader:
-        """Configuration, chip, provenance and weights, as they were written first into the file."""
+        """Configuration, chip, provenance and weights."""
         return self._file(0).contents.header
 
     @functools.cached_property
     def region(self) -> Region | None:
-        """Which part of most images was kept, the rest being black (region.py); None: they are whole."""
+        """Which window of most images was recorded, the rest being black (roi.py); None: they are whole."""
         return self._file(0).contents.region
 
     @functools.cached_property
@@ -109,13 +109,13 @@ class SessionReader:
             was new are left out.
         """
         tick = Tick() if start_ns is None else self.tick_before(start_ns - 1, with_frames=with_frames)
-        for number, piece in enumerate(self._run.pieces):
-            if start_ns is not None and piece.last_ns < start_ns:
+        for number, file in enumerate(self._run.files):
+            if start_ns is not None and file.last_ns < start_ns:
                 continue
-            # What is read whole is compared with what it says of itself.
-            late_ns = start_ns if start_ns is not None and (start_ns > piece.first_ns or not number) else None
+            # A file that is read from its beginning is compared with the counts in its index.
+            late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
             for stamp_ns, news in self._file(number).news(late_ns, with_frames=with_frames):
-                if not number or stamp_ns > piece.first_ns:
+                if not number or stamp_ns > file.first_ns:
                     tick = replace(tick, stamp_ns=stamp_ns, **news)
                     yield tick
 
@@ -125,10 +125,10 @@ class SessionReader:
         `tick_before(start_ns - 1)` holds the same objects as what `ticks(start_ns)` goes on from, so that a
         message of its first tick is new if and only if it is another object.
         """
-        begun = [number for number, piece in enumerate(self._run.pieces) if piece.first_ns <= stamp_ns]
+        begun = [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
         wanted = {field for field in BY_FIELD if with_frames or field != "frame"}
         found_ns, known = -1, dict[str, Any]()
-        # A part says at its beginning what is known; what it should not have said is looked for before it.
+        # The keyframe of a part has the state; what is missing there is searched for in the parts before.
         for number in reversed(begun):
             missing = (wanted - known.keys()) & self._fields[number]
             if missing:
@@ -145,10 +145,10 @@ class SessionReader:
         """
         if field not in BY_FIELD:
             raise SessionError(f"{self.path}: there is no topic {field!r}; the topics are {', '.join(BY_FIELD)}")
-        for number, piece in enumerate(self._run.pieces):
+        for number, file in enumerate(self._run.files):
             if field in self._fields[number]:
                 for stamp_ns, message in self._file(number).messages(field):
-                    if not number or stamp_ns > piece.first_ns:
+                    if not number or stamp_ns > file.first_ns:
                         yield message
 
     def close(self) -> None:
@@ -170,8 +170,8 @@ class SessionReader:
         if file is None:
             if self._closed:
                 raise SessionError(f"{self.path}: has been closed; open the session again")
-            file = FileReader(self.files[number], kept=self._kept)
-            if number and without_part(file.contents.header) != without_part(self.header):
+            file = FileReader(self.files[number], cache=self._cache)
+            if number and not file.contents.header.is_same_run(self.header):
                 raise SessionError(
                     f"{file.path}: has another head than {self.files[0].name}, so it is not of the same run;"
                     " move it away, or name it alone"

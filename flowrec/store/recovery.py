@@ -1,4 +1,4 @@
-"""A whole session from one whose run was killed, or whose file is cut off or damaged."""
+"""Makes a complete session of one whose run was killed, or whose file is cut off or damaged."""
 
 from __future__ import annotations
 
@@ -6,18 +6,27 @@ import contextlib
 import os
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.mcap_reader import DamageError, Source
-from flowrec.store.metadata import CHIP_FILE, CHIP_IMAGE_FILE, CONFIG_FILE, PROVENANCE, SESSION
-from flowrec.store.paths import PARTIAL_SUFFIX, partial_path
+from flowrec.store.mcap_reader import DamageError, McapReader
+from flowrec.store.part_continuity import is_continued, unfinished_of
+from flowrec.store.paths import PARTIAL_SUFFIX, part_number, part_path, partial_path, parts
 from flowrec.store.reader import SessionReader
 from flowrec.store.scan import Scan, scan
-from flowrec.store.schema_check import Contents
+from flowrec.store.schema_check import SessionContents
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_metadata import (
+    CHIP_FILE,
+    CHIP_IMAGE_FILE,
+    CONFIG_FILE,
+    PROVENANCE,
+    SESSION,
+    Part,
+)
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import held
 from flowrec.system.outputs import MCAP, OutputError, check_output, put_in_place
@@ -26,11 +35,12 @@ from flowrec.units import seconds
 
 _POLL_S = 1e-3
 _QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
+_REMAINS_SUFFIX = ".remains"
 _HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
 
 
 class NothingSavedError(SessionError):
-    """There is no whole tick in the remains of a run."""
+    """There is no complete tick in what a killed run has left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +50,10 @@ class Recovered:
     Attributes
     ----------
     path : the whole session.
-    ticks, duration_s : what is in it, without what a part repeats of the one before.
-    lost_bytes : of the old file, not to be used.
-    lost : what was lost, for people; empty when nothing was.
-    changed : False where the file was whole already.
+    ticks, duration_s : of its content, without the keyframe of a part.
+    lost_bytes : of the old file, unusable.
+    lost : what was lost, as text; empty when nothing was.
+    changed : False where the file was complete already.
     """
 
     path: Path
@@ -60,29 +70,25 @@ class Recovered:
 
 
 @dataclass(slots=True)
-class _Nonsense:
-    """Messages that were passed over."""
+class _Skipped:
+    """Messages that were skipped because they make no sense."""
 
     count: int = 0
     first: str = ""
 
-    def add(self, what: str) -> None:
+    def add(self, fault: str) -> None:
         self.count += 1
-        self.first = self.first or what
-
-    def told(self) -> Iterator[str]:
-        if self.count:
-            yield f"{self.count} messages that make no sense, the first is {self.first}"
+        self.first = self.first or fault
 
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write everything intact of a session to a new file.
 
-    A tick is whole when its inputs and what the stages made of them are there. The images of a killed run are often
-    ahead of the rest: they are kept as ticks with nothing but an image, which a replay passes over. Derived views are
-    made anew. What is missing is told in the new session's outcome. The remains `X.mcap.partial` are removed once
-    `X.mcap` is complete, but not where they hold topics that this flowrec does not know; any other file stays as it
-    is, and so does a whole one, which at most gets the name that its run could not give it.
+    A tick is complete when it has both inputs and outputs. The images of a killed run are often ahead of the rest: they
+    are kept as ticks with nothing but an image, which a replay skips. Viewer topics are made anew. The outcome of the
+    new session says what is missing. The file `X.mcap.partial` is removed once `X.mcap` is complete, but not where it
+    has topics that this flowrec does not know; any other file stays as it is, and so does a complete one, which at most
+    gets the name that its run could not give it.
 
     Parameters
     ----------
@@ -100,6 +106,41 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         raise SessionError(
             f"{path}: is being recorded just now, or recovered; stop that with Ctrl-C, and the file is whole"
         ) from error
+
+
+def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
+    """Recover a file as `recover` does or, where X.mcap is no file, whatever is unfinished of that run.
+
+    Where there is no complete tick in the last part, it is replaced by one with nothing but the keyframe, so that the
+    run has an end; the old file is renamed to NAME.remains.
+
+    Raises
+    ------
+    SessionError : as `recover`; `out` where there are several files; parts that are no run.
+    """
+    left = unfinished_of(path)
+    if path.exists() or not (left or parts(path)):
+        return [recover(path, out)]
+    if out is not None and len(left) != 1:
+        raise SessionError(f"{path}: is a run with {len(left)} unfinished files; recover it without --out, or name one")
+    done = []
+    for file in left:
+        try:
+            done.append(recover(file, out))
+        except NothingSavedError:
+            number = part_number(file)
+            if number < 2 or number <= len(parts(path)):
+                raise
+            file.rename(file.with_name(file.name.removesuffix(PARTIAL_SUFFIX) + _REMAINS_SUFFIX))
+    finished = parts(path)
+    if finished:
+        with SessionReader(finished[-1]) as last:
+            if last.part is not None and is_continued(last.outcome):
+                done.append(_end_of_run(path, last, last.part))
+    if not done:
+        with SessionReader(path) as whole:
+            done = [Recovered(path, whole.counts.get("track", 0), whole.duration_s, changed=False)]
+    return done
 
 
 def _recover(path: Path, out: Path | None) -> Recovered:
@@ -120,51 +161,51 @@ def _recover(path: Path, out: Path | None) -> Recovered:
             _refuse_if_taken(target)
             _rename(path, target)
             return Recovered(target, whole.ticks, whole.duration_s)
-        with contextlib.closing(Source(path)) as source:
+        with contextlib.closing(McapReader(path)) as source:
             found = scan(source)
         if partial and not found.summary.chunks:
             raise NothingSavedError(f"{path}: nothing can be saved: no message was on the disk; remove the file")
-        nonsense = _Nonsense()
-        contents = Contents(path, found.summary)
-        reader = SessionReader(path, contents, nonsense.add)
+        skipped = _Skipped()
+        contents = SessionContents(path, found.summary)
+        reader = SessionReader(path, contents, skipped.add)
         _require_head(path, found)
-        # Pixels that a JPEG has given are kept as they are: once more through it, they would be others.
+        # Pixels decoded from JPEG are stored losslessly: encoding them again would change them.
         known = ENCODINGS.get(contents.frame_encoding)
         frames = known.name if known is not None and known.lossless else "zstd"
         end_ns = _last_whole_ns(path, reader, found)
     _refuse_if_taken(target)
     draft = target.with_name(f"{target.stem}.recovering{target.suffix}")
     try:
-        ticks, lost = _rewrite(reader, found, end_ns, draft, frames, nonsense)
+        ticks, lost = _rewrite(reader, found, end_ns, draft, frames, skipped)
         done = _checked(draft)
         if done is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
         _refuse_if_taken(target)
         _rename(draft, target)
     except SessionError as error:
-        # Its own advice is about a draft that is gone.
+        # Its advice is about a draft that is gone.
         raise SessionError(f"{path}: is left as it was; {str(error).split('; ')[0]}") from error
     finally:
         reader.close()
         for remains in (draft, partial_path(draft)):
-            with contextlib.suppress(OSError):  # a read-only disk has had its say above
+            with contextlib.suppress(OSError):  # a read-only disk has raised an error above
                 remains.unlink(missing_ok=True)
     if partial and target == final and not _unknown_topics(found):
         path.unlink()
-    return Recovered(target, ticks, done.duration_s, sum(lost.nbytes for lost in found.lost), lost)
+    return Recovered(target, ticks, done.duration_s, found.lost_bytes, lost)
 
 
 def _checked(path: Path) -> Recovered | None:
-    """A file that is whole, every chunk of it; None for any other."""
+    """A file of which every chunk is intact; None for any other."""
     try:
-        with SessionReader(path, contents := Contents(path)) as reader:
+        with SessionReader(path, contents := SessionContents(path)) as reader:
             _ = reader.header
             for _tick in reader.ticks():
                 pass
             for chunk in contents.chunks:  # the rest: views for other programs
                 if contents.fields.keys().isdisjoint(chunk.message_index_offsets):
                     contents.source.messages(chunk)
-            repeated = reader.carried_ns is not None
+            repeated = reader.keyframe_ns is not None
             return Recovered(path, reader.counts.get("track", 0) - repeated, reader.duration_s, changed=False)
     except SessionError:
         return None
@@ -182,7 +223,7 @@ def _require_head(path: Path, found: Scan) -> None:
 
 
 def _last_whole_ns(path: Path, reader: SessionReader, found: Scan) -> int:
-    """Stamp of the last tick with inputs and outputs; those of one tick are always in the same chunk."""
+    """Stamp of the last tick with inputs and outputs, which are always in the same chunk."""
     ends = [found.last_ns.get(_channel(found, topic)) for topic in ("/coils/applied", "/robot/track")]
     if any(end is None for end in ends):
         raise NothingSavedError(
@@ -202,74 +243,71 @@ def _unknown_topics(found: Scan) -> list[str]:
 
 
 def _rewrite(
-    reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str, nonsense: _Nonsense
+    reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str, skipped: _Skipped
 ) -> tuple[int, str]:
-    """Write all ticks, of which those after `end_ns` are not whole; the number of whole ones and what was lost."""
+    """Write all ticks, of which those after `end_ns` are incomplete; the number of complete ones and what was lost."""
     before = Tick()
     whole = images_missing = images_ahead = dropped = 0
     # Only replays are written without images.
     has_images = "frame" in reader.counts or not reader.header.parent
-    with SessionWriter(
-        draft,
-        reader.header,
-        frames=frames,
-        overwrite=True,
-        block=True,
-        queue_limit_bytes=_QUEUE_BYTES,
-        region=reader.region,
-    ) as writer:
+    options = WriterOptions(
+        frames=frames, overwrite=True, block=True, queue_limit_bytes=_QUEUE_BYTES, region=reader.region
+    )
+    with SessionWriter(draft, reader.header, options) as writer:
         for tick in reader.ticks():
             if tick.stamp_ns > end_ns:
                 images_ahead += tick.frame is not before.frame
-            elif tick.stamp_ns == reader.carried_ns:
-                pass  # counted where it was recorded
+            elif tick.stamp_ns == reader.keyframe_ns:
+                pass  # the keyframe was counted where it was recorded
             elif tick.applied is not before.applied and tick.track is not before.track:
                 whole += 1
                 images_missing += has_images and tick.frame is before.frame
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
             before = tick
-            while writer.queue_bytes > _QUEUE_BYTES:  # a large one is not to wait while the next is read
+            while writer.queue_bytes > _QUEUE_BYTES:  # a large message must not wait while the next one is read
                 time.sleep(_POLL_S)
-        lost = "; ".join([*_losses(reader, found, images_missing - dropped, images_ahead), *nonsense.told()])
+        lost = "; ".join(_losses(reader, found, images_missing - dropped, images_ahead, skipped))
         writer.close(_outcome(reader, lost, end_ns, dropped))
     return whole, lost
 
 
-def _losses(reader: SessionReader, found: Scan, images_missing: int, images_ahead: int) -> Iterator[str]:
+def _losses(
+    reader: SessionReader, found: Scan, images_missing: int, images_ahead: int, skipped: _Skipped
+) -> Iterator[str]:
     if not found.ended:
         yield "the last moments, which were not on the disk"
-    if found.lost:
-        nbytes, first = sum(lost.nbytes for lost in found.lost), found.lost[0].offset
-        yield f"{nbytes} damaged or cut-off bytes, the first at {first}"
-    # The numbers of a part may go on from those of the part before.
-    begin_ns = -1 if reader.carried_ns is None else reader.carried_ns
+    if found.lost_bytes:
+        yield f"{found.lost_bytes} damaged or cut-off bytes, the first at {found.first_lost}"
+    # The sequence numbers of a part may continue those of the part before.
+    begin_ns = -1 if reader.keyframe_ns is None else reader.keyframe_ns
     gaps = [gap for gap in found.gaps.get(_channel(found, "/coils/applied"), []) if gap.before_ns > begin_ns]
     if gaps:
         from_s = seconds(gaps[0].before_ns - reader.first_ns)
         yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"
     # A topic that the file does not declare was not recorded, unless there are messages that belong to none.
-    undeclared = found.undeclared
-    if undeclared:
+    if found.undeclared:
         absent = sorted(set(BY_PATH) - {channel.topic for channel in found.summary.channels.values()})
-        yield f"{undeclared} messages of topics whose declaration is damaged ({', '.join(absent) or 'unknown'})"
+        yield f"{found.undeclared} messages of topics whose declaration is damaged ({', '.join(absent) or 'unknown'})"
     if unknown := _unknown_topics(found):
         yield f"{', '.join(unknown)}, which this flowrec does not know (the old file is kept)"
     if images_missing > 0:
         yield f"{images_missing} images"
     if images_ahead:
         yield f"all but the image of the last {images_ahead} ticks, which a replay passes over"
+    if skipped.count:
+        yield f"{skipped.count} messages that make no sense, the first is {skipped.first}"
 
 
 def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Mapping[str, str]:
-    said = {key: value for key, value in reader.outcome.items() if key not in ("ticks", "dropped_frames")}
+    recorded = {key: value for key, value in reader.outcome.items() if key not in ("ticks", "dropped_frames")}
     marks = {"recovered_from": reader.path.name, "frames_dropped": str(dropped)}
     if not lost:
-        return {"outcome": "ended", **said, **marks}
-    if "outcome" in said:
-        marks["ended_as"] = said["outcome"]
+        return {"outcome": "ended", **recorded, **marks}
+    if "outcome" in recorded:
+        marks["ended_as"] = recorded["outcome"]
     until_s = seconds(end_ns - reader.first_ns)
-    return {**said, **marks, "outcome": "cut", "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
+    return {**recorded, **marks, "outcome": "cut", "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
 
 
 def _refuse_if_taken(target: Path) -> None:
@@ -286,8 +324,19 @@ def _rename(source: Path, target: Path) -> None:
 
 @contextlib.contextmanager
 def _without_circular_advice(path: Path) -> Iterator[None]:
-    """The reader sends people here; here it would send them in a circle."""
+    """Replaces the advice of a DamageError, which is to recover the file."""
     try:
         yield
     except DamageError as error:
         raise SessionError(f"{path}: nothing can be saved: {error.what}; remove the file") from error
+
+
+def _end_of_run(path: Path, last: SessionReader, part: Part) -> Recovered:
+    """Write the part after `last`, of which nothing is left."""
+    target = part_path(path, part.number + 1)
+    header = replace(last.header, part=Part(part.run, part.number + 1, keyframe_ns=last.last_ns))
+    lost = f"everything after {last.path.name}"
+    with SessionWriter(target, header, WriterOptions(block=True)) as writer:
+        writer.write(replace(last.tick_before(last.last_ns), stamp_ns=last.last_ns))
+        writer.close({"outcome": "cut", "note": f"lost: {lost}", "recovered_from": last.path.name})
+    return Recovered(target, 0, 0.0, lost=lost)

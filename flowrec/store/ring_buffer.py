@@ -1,8 +1,8 @@
-"""The last seconds of a run in memory, and files of what was around an event.
+"""Ring buffer: the last seconds of a run in memory, and snapshot files of what was around an event.
 
-The ring is a row of segments of about a second, each with sealed chunks and all that was known when it began, so that
-dropping the oldest needs nothing decoded, and memory is that of compressed data. At an event the ring is poured into
-a file, and what follows goes the same way.
+The ring is a sequence of segments of about a second, each with sealed chunks and the full state when it began, so that
+dropping the oldest needs no decoding, and memory is that of compressed data. At an event the ring is written to a file,
+and what follows goes to the same file.
 """
 
 from __future__ import annotations
@@ -13,132 +13,102 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from flowrec.messages import Drops, Event, Frame, OperatorEvent
-from flowrec.store.async_file_writer import Poured
+from flowrec.messages import Drops, Event, OperatorEvent
+from flowrec.store.async_file_writer import AsyncFileWriter
 from flowrec.store.channels import FRAMES
-from flowrec.store.chunk import Sealed, kept
-from flowrec.store.chunk_encoder import Packer
-from flowrec.store.metadata import Part
+from flowrec.store.chunk import ChunkEncoder, SealedChunk, Sink, detached
 from flowrec.store.paths import partial_path, snapshot_path
-from flowrec.store.segments import Stretches, Tally, carried
-from flowrec.store.session_file import Making, Piece
-from flowrec.store.viewer_topics import Mirrors
-from flowrec.store.write_queue import Entry, News
+from flowrec.store.segments import Counters, SegmentRouter, keyframe
+from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
+from flowrec.store.session_metadata import Part, SessionHeader
+from flowrec.store.viewer_topics import ViewerTopics
+from flowrec.store.write_queue import Entry, NewMessages
 from flowrec.units import nanoseconds, seconds
 
-_SEGMENT_S, _SEGMENTS = 1.0, 8  # a segment is as long, or a share of the ring
-_TOLD = 20  # events of one snapshot
+_SEGMENT_S, _SEGMENTS = 1.0, 8  # length of a segment in s, at most this fraction of the ring
+_EVENTS_LISTED = 20  # of one snapshot
 _POLL_S = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """What is kept of a run around an event: a mark, a note, a warning, images that begin to be lost, a bad end.
-
-    Attributes
-    ----------
-    before_s, after_s : s of stamps before the event and after the last one that fell into the same snapshot.
-    megabytes : what may be held in memory, in MB; where it is too little, `before_s` is what fits.
-    """
-
-    before_s: float
-    after_s: float = 10.0
-    megabytes: float = 1000.0
-
-
 @dataclass(slots=True)
-class _Taken:
-    """A snapshot that is being taken."""
+class _SnapshotFile:
+    """A snapshot that is being written."""
 
-    file: Poured
+    file: AsyncFileWriter
     until_ns: int
-    why: list[str]
-    short: dict[str, str]  # what is to be said where the ring was too small
-    tally: Tally = field(default_factory=Tally)
-
-    def add(self, why: str, until_ns: int) -> None:
-        """Another event meanwhile."""
-        self.until_ns = until_ns
-        if len(self.why) < _TOLD:
-            self.why.append(why)
+    events: list[str]
+    shortage: dict[str, str]  # for the outcome, where the ring was too small
+    counters: Counters = field(default_factory=Counters)
 
     @property
-    def outcome(self) -> dict[str, str]:
-        """How it ends when its time is over."""
-        return {"outcome": "snapshot", "note": self.why[0], **self.said}
-
-    @property
-    def said(self) -> dict[str, str]:
-        """What is said of it in any case."""
-        return {**self.short, **({"also": "; ".join(self.why[1:])} if len(self.why) > 1 else {})}
+    def summary(self) -> dict[str, str]:
+        """For the outcome, however the snapshot ends."""
+        more = {"also": "; ".join(self.events[1:])} if len(self.events) > 1 else {}
+        return {**self.shortage, **more}
 
 
-class _Segment:
-    """Some ticks that follow each other: in memory, or poured into a file."""
+class _RingSegment:
+    """Consecutive ticks: in memory, or written to a snapshot."""
 
-    def __init__(self, snapshots: Snapshots, packer: Packer, known: News, carried_ns: int | None) -> None:
-        self.known = known  # at its beginning ...
-        self.carried_ns = carried_ns  # ... by the tick before it
+    def __init__(self, ring: RingBuffer, encoder: ChunkEncoder, state: NewMessages, keyframe_ns: int | None) -> None:
+        self.state = state  # at the last tick before it, ...
+        self.keyframe_ns = keyframe_ns  # ... which has this stamp
         self.begin_ns: int | None = None
-        self.sequences = Counter(packer.sequences)
-        self.image: list[Sealed] = []  # the last one before it
-        self.chunks: list[Sealed] = []
-        self.nbytes = 0
-        self.packer = packer
-        self.taken: _Taken | None = None
-        self.forgotten = False  # too old before all of its images had come
-        self.first = self.last = False  # of that snapshot, which ends ...
-        self.outcome: dict[str, str] = {}  # ... like this
-        self._snapshots = snapshots
-        packer.take = self._keep
+        self.sequences = Counter(encoder.sequences)
+        self.image: list[SealedChunk] = []  # the last one before it
+        self.chunks: list[SealedChunk] = []
+        self.encoder = encoder
+        self.snapshot: _SnapshotFile | None = None
+        self.discarded = False  # too old before all of its images had come
+        self.is_first = self.is_last = False  # of that snapshot, which ends ...
+        self.outcome: dict[str, str] = {}  # ... with this outcome
+        self._ring = ring
+        encoder.sink = self._keep(self.chunks)
 
     @property
-    def is_held(self) -> bool:
-        """In memory, and needed."""
-        return self.taken is None and not self.forgotten
+    def nbytes(self) -> int:
+        """Of its chunks in memory."""
+        return sum(len(chunk.data) for chunks in (self.chunks, self.image) for chunk in chunks)
 
     def add(self, entry: Entry) -> None:
         if self.begin_ns is None:
             self.begin_ns = entry.stamp_ns
-        if not self.forgotten:
-            self.packer.add(entry)
+        if not self.discarded:
+            self.encoder.add(entry)
 
-    def carry_image(self, stamp_ns: int, image: Frame) -> None:
-        if self.taken is not None and not self.first:
-            return  # the one before is in the same file
-        take, self.packer.take = self.packer.take, self._keep_image if self.taken is None else self.taken.file.put
-        self.packer.add(Entry(stamp_ns, {"frame": image}, 0))
-        self.packer.seal((FRAMES,))
-        self.packer.take = take
+    def add_keyframe_image(self, entry: Entry) -> None:
+        if self.snapshot is not None and not self.is_first:
+            return  # the segment before it is in the same file
+        sink = self.encoder.sink
+        self.encoder.sink = self._keep(self.image) if self.snapshot is None else self.snapshot.file.put
+        self.encoder.add(entry)
+        self.encoder.seal((FRAMES,))
+        self.encoder.sink = sink
 
-    def complete(self, tally: Tally) -> None:
-        self.packer.seal()
-        self._snapshots.completed(self, tally)
+    def end(self, counters: Counters) -> None:
+        self.encoder.seal()
+        self._ring.segment_ended(self, counters)
 
-    def pour(self, taken: _Taken) -> None:
-        """Into a file with what is there, and with what comes."""
-        self.taken = taken
-        taken.file.put(self.chunks)
-        self.chunks, self.image, self.nbytes, self.known = [], [], 0, {}
-        self.packer.take = taken.file.put
+    def write_to(self, snapshot: _SnapshotFile) -> None:
+        """Write what is in memory, and what comes, to a file."""
+        self.snapshot = snapshot
+        snapshot.file.put(self.chunks)
+        self.chunks, self.image, self.state = [], [], {}
+        self.encoder.sink = snapshot.file.put
 
-    def _keep(self, sealed: list[Sealed]) -> None:
-        self.chunks += kept(sealed)
-        self.nbytes += sum(len(chunk.data) for chunk in sealed)
-
-    def _keep_image(self, sealed: list[Sealed]) -> None:
-        self.image += kept(sealed)
-        self.nbytes += sum(len(chunk.data) for chunk in sealed)
+    @staticmethod
+    def _keep(chunks: list[SealedChunk]) -> Sink:
+        return lambda sealed: chunks.extend(detached(sealed))
 
 
-class Snapshots:
+class RingBuffer:
     """Keeps the last seconds of the entries, and writes files around events.
 
     Parameters
     ----------
-    making : what they are made with.
-    snapshot : what is kept.
-    remarks : told what happens, for a person.
+    path, header, options : of the run; `options.snapshot` is set.
+    run : a random word for the heads of its files.
+    remarks : receives what happens, as text.
 
     Attributes
     ----------
@@ -149,154 +119,155 @@ class Snapshots:
     SessionError : from any method, when the disk refuses, or a message can not be encoded.
     """
 
-    def __init__(self, making: Making, snapshot: Snapshot, run: str, remarks: deque[str]) -> None:
+    def __init__(
+        self, path: Path, header: SessionHeader, options: WriterOptions, run: str, remarks: deque[str]
+    ) -> None:
+        assert options.snapshot is not None
         self.files: list[Path] = []
+        self._path, self._header, self._options, self._run = path, header, options, run
+        self._settings: Snapshot = options.snapshot
         self._remarks = remarks
-        self._making = making
-        self._before_ns, self._after_ns = nanoseconds(snapshot.before_s), nanoseconds(snapshot.after_s)
+        self._before_ns, self._after_ns = nanoseconds(self._settings.before_s), nanoseconds(self._settings.after_s)
         self._segment_ns = min(nanoseconds(_SEGMENT_S), self._before_ns // _SEGMENTS)
-        self._limit_bytes = int(1e6 * snapshot.megabytes)
-        self._settings = snapshot
-        self._run = run
+        self._limit_bytes = int(1e6 * self._settings.megabytes)
         self._number = 0
-        self._mirrors = Mirrors(making.unwanted, making.header.start_unix_ns)
+        self._views = ViewerTopics(options.left_out_topics, header.start_unix_ns)
         self._sequences: Counter[str] = Counter()
-        self._free: list[Packer] = []
-        self._ring: deque[tuple[_Segment, Tally]] = deque()  # without those that still wait for images
-        self._short = False  # of memory, since the ring began to fill
-        self._taken: _Taken | None = None
-        self._ending: list[_Taken] = []
-        self._ended_bytes = 0
+        self._free: list[ChunkEncoder] = []
+        self._ring: deque[tuple[_RingSegment, Counters]] = deque()  # without those that still wait for images
+        self._is_short = False  # of memory, since the ring began to fill
+        self._snapshot: _SnapshotFile | None = None
+        self._finishing: list[_SnapshotFile] = []
+        self._finished_bytes = 0
         self._flushed_s, self._flushed_ns = time.monotonic(), 0
-        self._flush_s = making.flush_every_s
         self._dropped = 0
         self._dropped_ns: int | None = None
-        self._stretches = Stretches(self._segment({}, None))
-        self._try()
+        self._router = SegmentRouter(self._segment({}, None))
+        self._check_disk()
 
     @property
     def partial_path(self) -> Path:
-        """The file that is written just now, or that would be."""
-        return partial_path(snapshot_path(self._making.path, self._number + (self._taken is None)))
+        """The file that is written at present, or the next one."""
+        return partial_path(snapshot_path(self._path, self._number + (self._snapshot is None)))
 
     @property
     def size(self) -> int:
-        """Bytes of the files."""
-        taken = self._taken
-        growing = [*tuple(self._ending), *([taken] if taken is not None else [])]
-        return self._ended_bytes + sum(each.file.size for each in growing)
+        """Bytes of the files. May be asked for by another thread."""
+        return self._finished_bytes + sum(snapshot.file.size for snapshot in self._unfinished())
 
     @property
-    def patience_s(self) -> float | None:
-        """For how long one may wait for the next entry; None: for ever."""
-        if self._taken is None:
+    def timeout_s(self) -> float | None:
+        """How long one may wait for the next entry; None: for ever."""
+        if self._snapshot is None:
             return None
-        return max(_POLL_S, self._flushed_s + self._flush_s - time.monotonic())
+        return max(_POLL_S, self._flushed_s + self._options.flush_interval_s - time.monotonic())
 
     @property
     def flushed_ns(self) -> int | None:
-        """All that was added: who keeps a run in memory is not to wait for a disk."""
-        return self._stretches.last_ns
+        """Stamp of all that was added: a run that is kept in memory does not wait for a disk."""
+        return self._router.last_ns
 
     def add(self, entry: Entry) -> None:
-        """Keep one entry, or write it."""
-        self._hear_of_ended()
+        """Keep one entry in the ring, or write it."""
+        self._collect_finished()
         if entry.ticks:
-            taken = self._taken
-            if taken is not None and entry.stamp_ns > taken.until_ns:
-                self._end()
-            elif taken is None and self._is_full(entry.stamp_ns):
+            snapshot = self._snapshot
+            if snapshot is not None and entry.stamp_ns > snapshot.until_ns:
+                self._end({"outcome": "snapshot", "note": snapshot.events[0], **snapshot.summary})
+            elif snapshot is None and self._is_full(entry.stamp_ns):
                 self._cut()
-        self._stretches.add(entry)
-        why = self._why(entry)
-        if why:
-            self._take(why, entry.stamp_ns)
+        self._router.add(entry)
+        event = self._event_in(entry)
+        if event:
+            self._take(event, entry.stamp_ns)
 
     def flush_if_due(self) -> None:
-        """Hand on what has waited for long enough; in memory it may wait for ever."""
-        taken, last_ns = self._taken, self._stretches.last_ns or 0
-        if taken is None:
+        """Write what has waited for long enough; in memory it may wait for ever."""
+        snapshot, last_ns = self._snapshot, self._router.last_ns or 0
+        if snapshot is None:
             return
-        now = time.monotonic()
-        if now >= self._flushed_s + self._flush_s or seconds(last_ns - self._flushed_ns) >= self._flush_s:
-            for place in self._stretches.open:
-                if place.stretch.taken is taken:
-                    place.stretch.packer.seal()
-            taken.file.sync_if_due()
+        now, interval_s = time.monotonic(), self._options.flush_interval_s
+        if now >= self._flushed_s + interval_s or seconds(last_ns - self._flushed_ns) >= interval_s:
+            for place in self._router.open:
+                if place.segment.snapshot is snapshot:
+                    place.segment.encoder.seal()
+            snapshot.file.sync_if_due()
             self._flushed_s, self._flushed_ns = now, last_ns
 
     def flush(self) -> None:
-        """Nothing: nobody waits, see `flushed_ns`."""
+        """Nothing to do, see `flushed_ns`."""
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
-        """End what is being taken; with `why` take what the ring holds, for a run has ended badly."""
+        """End the snapshot; `why` the run has ended badly makes one of what the ring holds."""
         if why:
-            self._take(why, self._stretches.last_ns or 0)
-        taken = self._taken
-        if taken is not None:
-            self._end({**outcome, **taken.said})
-        self._hear_of_ended(wait=True)
+            self._take(why, self._router.last_ns or 0)
+        if self._snapshot is not None:
+            self._end({**outcome, **self._snapshot.summary})
+        self._collect_finished(wait=True)
 
     def close(self, reason: str = "") -> None:
         """Close all files as they are."""
-        taken = [*self._ending, *([self._taken] if self._taken is not None else [])]
-        for each in taken:
-            each.file.close()
+        for snapshot in self._unfinished():
+            snapshot.file.close()
 
-    def completed(self, segment: _Segment, tally: Tally) -> None:
-        """All images of a segment have come."""
-        taken = segment.taken
-        if segment.forgotten:
-            pass
-        elif taken is None:
-            self._ring.append((segment, tally))
+    def segment_ended(self, segment: _RingSegment, counters: Counters) -> None:
+        """Take a segment of which all images have come."""
+        snapshot = segment.snapshot
+        if snapshot is not None:
+            snapshot.counters.include(counters)
+            if segment.is_last:
+                outcome = {**segment.outcome, **snapshot.counters.summary(self._options.encoding)}
+                snapshot.file.finish(outcome, self._views.top_um_s)
+        elif not segment.discarded:
+            self._ring.append((segment, counters))
             self._trim()
-        else:
-            taken.tally.include(tally)
-            if segment.last:
-                taken.file.finish({**segment.outcome, **self._making.said(taken.tally)}, self._mirrors.top_um_s)
-        self._free.append(segment.packer)
+        self._free.append(segment.encoder)
 
-    def _segment(self, known: News, carried_ns: int | None) -> _Segment:
-        if self._free:
-            packer = self._free.pop()
-        else:
-            packer = Packer(self._making.frames, self._mirrors, _nowhere, self._making.header.start_unix_ns)
-            packer.sequences = self._sequences
-        return _Segment(self, packer, known, carried_ns)
+    def _unfinished(self) -> tuple[_SnapshotFile, ...]:
+        return (*self._finishing, *((self._snapshot,) if self._snapshot is not None else ()))
+
+    def _segment(self, state: NewMessages, keyframe_ns: int | None) -> _RingSegment:
+        encoder = self._free.pop() if self._free else self._encoder(self._views, self._sequences)
+        return _RingSegment(self, encoder, state, keyframe_ns)
+
+    def _encoder(self, views: ViewerTopics, sequences: Counter[str]) -> ChunkEncoder:
+        encoder = ChunkEncoder(self._options.encoding, views, _discard, self._header.start_unix_ns)
+        encoder.sequences = sequences
+        return encoder
 
     def _cut(self) -> None:
-        stretches = self._stretches
-        stretches.cut(self._segment(dict(stretches.known), stretches.last_ns))
+        self._router.cut(self._segment(dict(self._router.state), self._router.last_ns))
         self._trim()
 
     def _is_full(self, stamp_ns: int) -> bool:
-        segment = self._stretches.current.stretch
+        segment = self._router.current.segment
         if segment.begin_ns is None:
             return False
         return stamp_ns - segment.begin_ns >= self._segment_ns or _SEGMENTS * segment.nbytes >= self._limit_bytes
 
-    def _segments(self) -> list[_Segment]:
-        """Those in memory, from the oldest on."""
-        waiting = [place.stretch for place in self._stretches.open if place.stretch.is_held]
-        return [segment for segment, _ in self._ring] + waiting
+    def _segments(self) -> list[_RingSegment]:
+        """The segments in memory, oldest first."""
+        waiting = [place.segment for place in self._router.open]
+        return [segment for segment, _ in self._ring] + [
+            segment for segment in waiting if segment.snapshot is None and not segment.discarded
+        ]
 
-    def _is_old(self, segment: _Segment) -> bool:
-        """Whether it reaches far enough into the past, without those before it."""
-        last_ns = self._stretches.last_ns
+    def _is_old(self, segment: _RingSegment) -> bool:
+        """Whether the ring is long enough without the segments before this one."""
+        last_ns = self._router.last_ns
         return last_ns is not None and segment.begin_ns is not None and last_ns - segment.begin_ns >= self._before_ns
 
     def _trim(self) -> None:
-        """Forget what is older than asked for, or does not fit."""
-        now_ns = self._stretches.last_ns or 0
+        """Discard what is older than asked for, or does not fit into memory."""
+        now_ns = self._router.last_ns or 0
         while self._ring:
             segments = self._segments()
             begin_ns, old = segments[1].begin_ns, self._is_old(segments[1])
             large = sum(segment.nbytes for segment in segments) > self._limit_bytes
             if not old and not large:
                 return
-            if not old and not self._short:
-                self._short = True
+            if not old and not self._is_short:
+                self._is_short = True
                 held_s = seconds(now_ns - (begin_ns or now_ns))
                 self._remarks.append(
                     f"the last {held_s:.1f} of {self._settings.before_s:g} s fit into {self._settings.megabytes:g} MB;"
@@ -304,55 +275,53 @@ class Snapshots:
                 )
             self._ring.popleft()
 
-    def _take(self, why: str, stamp_ns: int) -> None:
-        """Begin a snapshot, or let the one that is being taken go on."""
-        if self._taken is not None:
-            self._taken.add(why, stamp_ns + self._after_ns)
+    def _take(self, event: str, stamp_ns: int) -> None:
+        """Begin a snapshot, or extend the one that is being written."""
+        if self._snapshot is not None:
+            self._snapshot.until_ns = stamp_ns + self._after_ns
+            if len(self._snapshot.events) < _EVENTS_LISTED:
+                self._snapshot.events.append(event)
             return
         self._trim()
-        segments, making = self._segments(), self._making
-        while len(segments) > 1 and self._is_old(segments[1]):  # still without some of its images, and not needed
-            segments.pop(0).forgotten = True
+        segments = self._segments()
+        while len(segments) > 1 and self._is_old(segments[1]):  # still waits for images, and is not needed
+            segments.pop(0).discarded = True
         first = segments[0]
         held_s = seconds(stamp_ns - (stamp_ns if first.begin_ns is None else first.begin_ns))
         self._number += 1
-        part = Part(self._run, self._number, "snapshot", first.carried_ns, why)
-        file = Poured(
-            snapshot_path(making.path, self._number),
-            replace(making.header, part=part),
-            making,
-            limit_bytes=self._limit_bytes,
-        )
-        short = {"short_of_memory": f"{held_s:.1f} of {self._settings.before_s:g} s before the event"}
-        self._taken = taken = _Taken(file, stamp_ns + self._after_ns, [why], short if self._short else {})
-        if first.carried_ns is not None:
+        header = replace(self._header, part=Part(self._run, self._number, "snapshot", first.keyframe_ns, event))
+        path = snapshot_path(self._path, self._number)
+        file = AsyncFileWriter(path, header, self._options, limit_bytes=self._limit_bytes)
+        shortage = {"short_of_memory": f"{held_s:.1f} of {self._settings.before_s:g} s before the event"}
+        snapshot = _SnapshotFile(file, stamp_ns + self._after_ns, [event], shortage if self._is_short else {})
+        self._snapshot = snapshot
+        if first.keyframe_ns is not None:
             # Numbered as if they had been written just before what follows.
-            packer = Packer(making.frames, self._mirrors.twin(), _nowhere, making.header.start_unix_ns)
-            packer.sequences = Counter({path: (number - 1) % 2**32 for path, number in first.sequences.items()})
-            file.begin_with(packer, carried(first.carried_ns, first.known))
+            sequences = Counter({topic: (number - 1) % 2**32 for topic, number in first.sequences.items()})
+            encoder = self._encoder(self._views.copy(), sequences)
+            file.put_keyframe(encoder, keyframe(first.keyframe_ns, first.state))
             file.put(first.image)
-        first.first = True
-        for _, tally in self._ring:
-            taken.tally.include(tally)
+        first.is_first = True
+        for _, counters in self._ring:
+            snapshot.counters.include(counters)
         for segment in segments:
-            segment.pour(taken)
+            segment.write_to(snapshot)
         self._ring.clear()
         self._flushed_s, self._flushed_ns = time.monotonic(), stamp_ns
-        self._remarks.append(f"{file.path}: {held_s:.1f} s before and what follows; {why}")
+        self._remarks.append(f"{file.path}: {held_s:.1f} s before and what follows; {event}")
 
-    def _end(self, outcome: Mapping[str, str] | None = None) -> None:
-        """The tick before was the last one of the snapshot; the ring begins to fill again."""
-        taken, segment = self._taken, self._stretches.current.stretch
-        assert taken is not None
-        segment.last, segment.outcome = True, dict(outcome if outcome is not None else taken.outcome)
-        self._taken, self._short = None, False
-        self._ending.append(taken)
+    def _end(self, outcome: Mapping[str, str]) -> None:
+        """End the snapshot with the tick before; the ring begins to fill again."""
+        snapshot, segment = self._snapshot, self._router.current.segment
+        assert snapshot is not None
+        segment.is_last, segment.outcome = True, dict(outcome)
+        self._snapshot, self._is_short = None, False
+        self._finishing.append(snapshot)
         self._cut()
 
-    def _why(self, entry: Entry) -> str:
-        """What of this entry is worth a snapshot, for people; empty: nothing."""
-        news = entry.news
-        event, operator, drops = news.get("event"), news.get("operator"), news.get("drops")
+    def _event_in(self, entry: Entry) -> str:
+        """The event in this entry that a snapshot is taken for, as text; empty: none."""
+        event, operator, drops = map(entry.messages.get, ("event", "operator", "drops"))
         if isinstance(operator, OperatorEvent) and operator.action in ("mark", "note"):
             return f"{operator.action}: {operator.text}".rstrip(": ")
         if isinstance(event, Event) and event.level in ("warning", "error"):
@@ -360,31 +329,29 @@ class Snapshots:
         if isinstance(drops, Drops):
             dropped = drops.by_backlog + drops.by_camera
             if dropped > self._dropped:
-                # Where images are lost all the time, each of them is no event.
+                # Where images are lost all the time, the first one is the event.
                 began = self._dropped_ns is None or entry.stamp_ns - self._dropped_ns > self._before_ns
                 self._dropped, self._dropped_ns = dropped, entry.stamp_ns
                 return "images are lost" if began else ""
         return ""
 
-    def _hear_of_ended(self, *, wait: bool = False) -> None:
-        """Of files that are whole, and of failures."""
-        for taken in (*self._ending, *([self._taken] if self._taken is not None else [])):
-            taken.file.check(wait=wait)
-        while self._ending and self._ending[0].file.finished:
-            done = self._ending.pop(0)
-            done.file.close()
-            self._ended_bytes += done.file.size
-            self.files.append(done.file.path)
-            self._remarks.append(f"{done.file.path}: whole, {done.file.size / 1e6:.1f} MB")
+    def _collect_finished(self, *, wait: bool = False) -> None:
+        """Note the files that are complete, and raise what has failed."""
+        for snapshot in self._unfinished():
+            snapshot.file.check(wait=wait)
+        while self._finishing and self._finishing[0].file.finished:
+            file = self._finishing.pop(0).file
+            file.close()
+            self._finished_bytes += file.size
+            self.files.append(file.path)
+            self._remarks.append(f"{file.path}: whole, {file.size / 1e6:.1f} MB")
 
-    def _try(self) -> None:
-        """Whether a file can be made here; better now than at the event."""
-        making = self._making
-        path = snapshot_path(making.path, 1)
-        piece = Piece(path, making.header, making)
-        piece.partial_path.unlink(missing_ok=True)
-        piece.close()  # after that, for another process may make a file of this name as soon as it is not locked
+    def _check_disk(self) -> None:
+        """Make a file and remove it: an error is better now than at the event."""
+        file = SessionFile(snapshot_path(self._path, 1), self._header, self._options)
+        file.partial_path.unlink(missing_ok=True)
+        file.close()  # after that, for another process may make a file of this name as soon as it is not locked
 
 
-def _nowhere(_sealed: list[Sealed]) -> None:
-    """Where a packer's chunks go before a segment has it."""
+def _discard(_chunks: list[SealedChunk]) -> None:
+    """The sink of an encoder that no segment uses yet."""

@@ -1,7 +1,7 @@
-"""Part of an image is enough: the window that the tracker read, the rest black, and now and then the whole image.
+"""Region of interest: of most images only the window that the tracker read is recorded, the rest is black.
 
-A window holds every pixel that had a say in where the robot is, so a replay with the recorded tracker is exact. The
-image keeps its size and its schema: every viewer reads it, and compression makes next to nothing of the black.
+A window contains every pixel that influenced the track, so a replay with the recorded tracker is exact. The image
+keeps its size and its schema: every viewer reads it, and the black compresses to almost nothing.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _ROBOT = "robot"
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Which images are cut down to a window, and to which.
+    """Which images are reduced to a window, and to which.
 
     Attributes
     ----------
     pad_px : how much larger than the region searched (Track.roi_px) a window is on each side.
     everywhere_px : the searched region of a tracker that looks everywhere; such images stay whole.
-    full_every_s : so often another one stays whole.
-    cut : False where the images have been cut before, and are to be kept as they come.
+    full_every_s : interval in s at which another image stays whole.
+    cut : False where the images have been cut before, and are recorded as they come.
     """
 
     pad_px: int
@@ -42,7 +42,7 @@ class Region:
 
     @property
     def notes(self) -> dict[str, str]:
-        """For the metadata of the channel: what a reader must know."""
+        """What a reader must know, for the metadata of the channel."""
         return {
             _NOTE: _ROBOT,
             _PAD: str(self.pad_px),
@@ -52,7 +52,7 @@ class Region:
 
 
 def region_from(notes: Mapping[str, str]) -> Region | None:
-    """What the metadata of a channel says; None: its images are whole. They have been cut, and are not to be again."""
+    """The region from the metadata of a channel, not to be applied again; None: its images are whole."""
     if notes.get(_NOTE) != _ROBOT:
         return None
     pad, every = notes.get(_PAD, ""), notes.get(_EVERY, "")
@@ -61,33 +61,24 @@ def region_from(notes: Mapping[str, str]) -> Region | None:
     return Region(pad_px, (0, 0, 0, 0), every_s, cut=False)
 
 
-class Windows:
-    """The window of one image after the other, of those that are kept."""
+class WindowSelector:
+    """Selects the window of one image after the other."""
 
     def __init__(self, region: Region) -> None:
-        self.images = 0
-        self.windows = 0  # images that are not whole
         self._region = region
         self._every_ns = nanoseconds(region.full_every_s)
-        self._whole_ns: int | None = None
+        self._whole_ns: int | None = None  # stamp of the last image that stayed whole
 
-    def begin(self) -> None:
-        """A file begins: its first image is whole."""
-        self._whole_ns = None
-
-    def of(self, frame: Frame, track: Track | None) -> Window | None:
-        """What is to be kept of an image; None: all of it."""
-        self.images += 1
-        window = self._looked_at(frame, track)
-        due = self._whole_ns is None or frame.stamp_ns >= self._whole_ns + self._every_ns
-        if window is None or due:
+    def window_of(self, frame: Frame, track: Track | None) -> Window | None:
+        """The window of an image that is to be recorded; None: the whole image."""
+        window = self._searched(frame, track)
+        if window is None or self._whole_ns is None or frame.stamp_ns >= self._whole_ns + self._every_ns:
             self._whole_ns = frame.stamp_ns
             return None
-        self.windows += 1
         return window
 
-    def _looked_at(self, frame: Frame, track: Track | None) -> Window | None:
-        # A track of another image says nothing about this one: it was the last before a failure.
+    def _searched(self, frame: Frame, track: Track | None) -> Window | None:
+        # A track of another image, the last before a failure, says nothing about this one.
         if (
             not self._region.cut
             or track is None
@@ -104,26 +95,26 @@ class Windows:
         return None if window == (0, 0, width, height) or window[0] >= window[2] or window[1] >= window[3] else window
 
 
-class Blank:
-    """Black images with a window in them, in one piece of memory: what `cut` returns is good until the next one."""
+class WindowCutter:
+    """Blackens images outside of a window. The image is reused: what `cut` returns is valid until the next call."""
 
     def __init__(self) -> None:
         self._image: Image = np.zeros((0, 0), np.uint8)
-        self._open: Window = (0, 0, 0, 0)
+        self._filled: Window = (0, 0, 0, 0)
 
     def cut(self, frame: Frame, window: Window) -> Frame:
         """The frame with all pixels outside of the window 0."""
         if self._image.shape != frame.image.shape:
             self._image = np.zeros(frame.image.shape, np.uint8)
-        x0, y0, x1, y1 = self._open
+        x0, y0, x1, y1 = self._filled
         self._image[y0:y1, x0:x1] = 0
-        x0, y0, x1, y1 = self._open = window
+        x0, y0, x1, y1 = self._filled = window
         self._image[y0:y1, x0:x1] = frame.image[y0:y1, x0:x1]
         return replace(frame, image=self._image)
 
 
-def lit(image: Image) -> Window:
-    """The smallest window outside of which an image is 0; all of it in one that is whole, for cameras are not blind."""
+def nonzero_window(image: Image) -> Window:
+    """The smallest window outside of which an image is 0; the whole image where all four edges have a pixel above 0."""
     height, width = image.shape
     if image.size and image[0].any() and image[-1].any() and image[:, 0].any() and image[:, -1].any():
         return 0, 0, width, height

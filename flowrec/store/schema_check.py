@@ -1,4 +1,4 @@
-"""Whether the messages of a session file are those of this flowrec."""
+"""Checks that the messages of a session file have the schemas of this flowrec."""
 
 from __future__ import annotations
 
@@ -6,83 +6,84 @@ from dataclasses import fields
 
 from google.protobuf import descriptor_pb2
 
-from flowrec.declarations import defaulted_fields
+import flowrec
 from flowrec.errors import SessionError
-from flowrec.store.codec import codec_of
-from flowrec.store.mcap_index import Summary
+from flowrec.messages import Message, defaulted_fields
+from flowrec.store.channels import FRAME_PATH, message_codec
+from flowrec.store.codec import Codec, decode
+from flowrec.store.mcap_format import Record, Summary
 from flowrec.store.roi import Region, region_from
-from flowrec.store.session_metadata import Head
+from flowrec.store.session_metadata import SessionMetadata
 from flowrec.topics import BY_FIELD, BY_PATH
-from flowrec.version import __version__
 
 
-class Contents(Head):
-    """The index of a session file whose messages can be read; besides what Head has:
+class SessionContents(SessionMetadata):
+    """A session file whose messages can be read; besides what SessionMetadata has:
 
     Attributes
     ----------
     fields : field of Tick by channel number, for the topics that this flowrec knows.
-    schemas : name of the schema by channel number, for the same.
+    codecs : how their messages are decoded, by channel number.
     recorded_fields : by field of Tick, the fields that its messages have in this file; an older file lacks some.
+    frame_encoding : name of the encoding of frames (frame_encodings.py); empty in files that do not say.
+    region : which window of most images was recorded (roi.py); None: they are whole.
     """
 
     def _open(self, summary: Summary | None) -> None:
         super()._open(summary)
-        self.fields = {
-            channel.id: BY_PATH[channel.topic].field for channel in self.channels.values() if channel.topic in BY_PATH
-        }
-        self.schemas: dict[int, str] = {}
+        self.fields: dict[int, str] = {}
+        self.codecs: dict[int, Codec] = {}
         self.recorded_fields: dict[str, frozenset[str]] = {}
-        for channel in self.fields:
-            self._check_schema(channel)
+        self.frame_encoding = ""
+        self.region: Region | None = None
+        for channel in self.channels.values():
+            if channel.topic in BY_PATH:
+                self.fields[channel.id] = BY_PATH[channel.topic].field
+                self._check_schema(channel.id)
+            if channel.topic == FRAME_PATH:
+                self.frame_encoding = channel.metadata.get("encoding", "")
+                self.region = region_from(channel.metadata)
 
-    @property
-    def frame_encoding(self) -> str:
-        """Name of the way in which frames travel (frames.py); empty in files that do not say."""
-        channels = self._summary.channels.values()
-        return next((c.metadata.get("encoding", "") for c in channels if c.topic == BY_FIELD["frame"].path), "")
+    def decode(self, record: Record) -> Message:
+        """The message in a record of a known topic.
 
-    @property
-    def region(self) -> Region | None:
-        """Which part of most images was kept (region.py); None: they are whole."""
-        channels = self._summary.channels.values()
-        return next((region_from(c.metadata) for c in channels if c.topic == BY_FIELD["frame"].path), None)
+        Raises
+        ------
+        SessionError : it is damaged.
+        """
+        kind = BY_FIELD[self.fields[record.channel]].type
+        assert isinstance(record.payload, memoryview)
+        return decode(kind, self.codecs[record.channel], record.payload, record.sequence, self.source.start_unix_ns)
 
     def _check_schema(self, channel_number: int) -> None:
-        channel = self._summary.channels[channel_number]
-        found = self._summary.schemas[channel.schema_id]
+        channel = self.channels[channel_number]
+        found = self.schemas[channel.schema_id]
         kind = BY_PATH[channel.topic].type
-        expected = codec_of(kind, found.name).schema
-        self.schemas[channel_number] = found.name
+        codec = self.codecs[channel_number] = message_codec(kind, found.name)
+        expected = codec.schema
         ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
         self.recorded_fields[self.fields[channel_number]] = ours_all
         same_kind = (found.name, found.encoding, channel.message_encoding) == (expected.name, "protobuf", "protobuf")
-        # The standard schemas may gain fields and comments with a new foxglove-sdk and stay what they are.
+        # The standard schemas may gain fields and comments with a new foxglove-sdk and stay compatible.
         if same_kind and (found.data == expected.data or not expected.name.startswith("flowrec.")):
             return
         with self.source.parsing(0):
             theirs, ours = _fields_of(found.data), _fields_of(expected.data)
-        # A field that has come since is empty in an older file; where the message allows for that, it is read.
-        if same_kind and theirs <= ours and {name for name, _ in ours - theirs} <= _may_be_missing(channel.topic):
+        # A field that was added since is empty in an older file; where the message allows for that, it is read.
+        missing = {name.removeprefix(f"{kind.__name__}.") for name, _ in ours - theirs}
+        if same_kind and theirs <= ours and not missing & (ours_all - defaulted_fields(kind)):
             there = {name.removeprefix(f"{kind.__name__}.") for name, _ in theirs}
             self.recorded_fields[self.fields[channel_number]] = ours_all & there
             return
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
             f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
-            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
+            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {flowrec.__version__})"
         )
 
 
-def _may_be_missing(topic: str) -> set[str]:
-    """Fields of the topic's message that have a default, and what only they need."""
-    kind = BY_PATH[topic].type
-    needed = {part.name for part in fields(kind)} - defaulted_fields(kind)  # type: ignore[arg-type]
-    known = _fields_of(codec_of(kind).schema.data)
-    return {name for name, _ in known if name.removeprefix(f"{kind.__name__}.") not in needed}
-
-
 def _fields_of(data: bytes) -> set[tuple[str, bytes]]:
+    """Name, with its message's, and declaration of each field in a FileDescriptorSet."""
     files = descriptor_pb2.FileDescriptorSet.FromString(data).file
     return {
         (f"{message.name}.{field.name}", field.SerializeToString(deterministic=True))

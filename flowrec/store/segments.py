@@ -1,49 +1,47 @@
-"""A run cut into stretches at the boundaries of ticks: which of them an entry belongs to.
+"""Routes queued entries to segments of a run: parts of it (split.py), or pieces of the ring buffer.
 
-Images wait behind the state (backlog.py), so when a stretch ends at a tick, images of it may still be on their way.
-Each tick announces its own, so one knows when all have come; until then several stretches are open.
+A run is cut at the boundaries of ticks. Images wait behind the state (write_queue.py), so when a segment ends at a
+tick, images of it may still be queued. Each tick announces its image; a segment stays open until every image that was
+announced for it has come, so several may be open at a time.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Generic, Protocol, TypeVar
 
-from flowrec.declarations import Message
-from flowrec.messages import Frame
-from flowrec.store.write_queue import Entry, News
+from flowrec.messages import Frame, Message
+from flowrec.store.frame_encodings import FrameEncoding
+from flowrec.store.write_queue import Entry, NewMessages
 
 
 @dataclass(slots=True)
-class Tally:
-    """What is counted of a stretch, or of several together."""
+class Counters:
+    """What is counted of a segment, or of several together."""
 
     ticks: int = 0
     dropped_frames: int = 0
     missing_frames: int = 0
     images: int = 0
-    windows: int = 0  # images of which only a part was kept
+    windows: int = 0  # images of which only a window was recorded
 
     def add(self, entry: Entry) -> None:
         """Count one entry."""
         self.ticks += entry.ticks
         self.dropped_frames += entry.dropped
         self.missing_frames += entry.missing
-        self.images += "frame" in entry.news
+        self.images += "frame" in entry.messages
         self.windows += entry.window is not None
 
-    def include(self, other: Tally) -> None:
-        """Add what was counted elsewhere."""
-        self.ticks += other.ticks
-        self.dropped_frames += other.dropped_frames
-        self.missing_frames += other.missing_frames
-        self.images += other.images
-        self.windows += other.windows
+    def include(self, other: Counters) -> None:
+        """Add other counters."""
+        for name in (counter.name for counter in fields(self)):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
-    def told(self) -> dict[str, str]:
-        """As an outcome says it."""
+    def summary(self, encoding: FrameEncoding) -> dict[str, str]:
+        """What is added to every outcome."""
         counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
         if self.missing_frames:
             counts["frames_missing_from_camera"] = str(self.missing_frames)
@@ -51,107 +49,104 @@ class Tally:
             counts["frames_windows"] = (
                 f"{self.windows} of {self.images} images hold what the tracker read, and are black elsewhere"
             )
+        if not encoding.lossless:
+            counts["frames_encoding"] = f"{encoding.name}, not lossless: a replay sees other pixels"
         return counts
 
 
-class Stretch(Protocol):
-    """Takes the entries of some ticks that follow each other."""
+class Segment(Protocol):
+    """Takes the entries of consecutive ticks."""
 
     def add(self, entry: Entry) -> None:
-        """Take one."""
+        """Take one entry."""
 
-    def carry_image(self, stamp_ns: int, image: Frame) -> None:
-        """Take the last image before the stretch, which had not come when it began."""
+    def add_keyframe_image(self, entry: Entry) -> None:
+        """Take the last image before the segment, which was still queued when the segment began."""
 
-    def complete(self, tally: Tally) -> None:
-        """All has come, so much."""
+    def end(self, counters: Counters) -> None:
+        """All entries have come."""
 
 
-S = TypeVar("S", bound=Stretch)
+S = TypeVar("S", bound=Segment)
 
 
 @dataclass(slots=True)
-class Open(Generic[S]):
-    """A stretch and what is known of it so far.
+class OpenSegment(Generic[S]):
+    """A segment and what is known of it so far.
 
     Attributes
     ----------
-    carried_ns : stamp of the last tick before it; None at the beginning of the run.
+    keyframe_ns : stamp of the last tick before it; None at the beginning of the run.
     begin_ns : stamp of its first tick; None before that.
     awaited, awaited_bytes : images that were announced and have not come.
     """
 
-    stretch: S
-    tally: Tally
-    carried_ns: int | None = None
+    segment: S
+    counters: Counters
+    keyframe_ns: int | None = None
     begin_ns: int | None = None
     awaited: int = 0
     awaited_bytes: int = 0
 
 
-class Stretches(Generic[S]):
-    """Gives each entry to the stretch that it belongs to.
+class SegmentRouter(Generic[S]):
+    """Gives each entry to the segment that it belongs to.
 
     Attributes
     ----------
-    known : the latest message of each topic but the image, by field of Tick.
-    last_ns : stamp of the tick at which it is known; None before the first.
+    state : the latest message of each topic but the image, by field of Tick.
+    last_ns : stamp of the tick at which that is the state; None before the first.
+    open : the segments that are not complete; ticks go to the last one, the others wait for images.
     """
 
     def __init__(self, first: S) -> None:
-        self.known: News = {}
+        self.state: NewMessages = {}
         self.last_ns: int | None = None
+        self.open: deque[OpenSegment[S]] = deque([OpenSegment(first, Counters())])
         self._image: Frame | None = None
-        self._open: deque[Open[S]] = deque([Open(first, Tally())])
 
     @property
-    def current(self) -> Open[S]:
+    def current(self) -> OpenSegment[S]:
         """The one that ticks go to."""
-        return self._open[-1]
-
-    @property
-    def open(self) -> tuple[Open[S], ...]:
-        """That, and before it those which still wait for images."""
-        return tuple(self._open)
+        return self.open[-1]
 
     def add(self, entry: Entry) -> None:
         """Hand on one entry."""
-        # The images come in order: those of an earlier stretch have all come before one of a later stretch does.
-        place = self._open[0] if entry.late else self._open[-1]
+        # Images come in order: those of an earlier segment have all come before the first one of a later segment.
+        place = self.open[0] if entry.late else self.open[-1]
         if entry.ticks and place.begin_ns is None:
             place.begin_ns = entry.stamp_ns
-        place.tally.add(entry)
-        place.stretch.add(entry)
+        place.counters.add(entry)
+        place.segment.add(entry)
         if entry.late:
             place.awaited -= 1
             place.awaited_bytes -= entry.nbytes
         else:
             self.last_ns = entry.stamp_ns
-            self.known.update(entry.news)
-            self.known.pop("frame", None)
+            self.state.update(entry.messages)
+            self.state.pop("frame", None)
             if entry.image_bytes:
                 place.awaited += 1
                 place.awaited_bytes += entry.image_bytes
-        image = entry.news.get("frame")
+        image = entry.messages.get("frame")
         if isinstance(image, Frame):
             self._image = image
-        self._let_go()
+        self._end_complete()
 
     def cut(self, following: S) -> None:
-        """End the current stretch with the last tick; the ticks from here on go to another one."""
-        self._open.append(Open(following, Tally(), carried_ns=self.last_ns))
-        self._let_go()
+        """End the current segment with the last tick; the ticks from here on go to another one."""
+        self.open.append(OpenSegment(following, Counters(), keyframe_ns=self.last_ns))
+        self._end_complete()
 
-    def _let_go(self) -> None:
-        """Complete the stretches that have all of theirs, in order."""
-        while len(self._open) > 1 and not self._open[0].awaited:
-            ended = self._open.popleft()
-            ended.stretch.complete(ended.tally)
-            following = self._open[0]
-            if self._image is not None and following.carried_ns is not None:
-                following.stretch.carry_image(following.carried_ns, self._image)
+    def _end_complete(self) -> None:
+        while len(self.open) > 1 and not self.open[0].awaited:
+            ended = self.open.popleft()
+            ended.segment.end(ended.counters)
+            following = self.open[0]
+            if self._image is not None and following.keyframe_ns is not None:
+                following.segment.add_keyframe_image(Entry(following.keyframe_ns, {"frame": self._image}, 0))
 
 
-def carried(stamp_ns: int, known: Mapping[str, Message]) -> Entry:
-    """The tick at which everything known is told once more; it counts for none."""
-    return Entry(stamp_ns, dict(known), 0)
+def keyframe(stamp_ns: int, state: Mapping[str, Message]) -> Entry:
+    """The full state at a tick as one entry, which is not counted as a tick."""
+    return Entry(stamp_ns, dict(state), 0)

@@ -1,4 +1,7 @@
-"""One file of a run while it is written: its head, its end, its two names, and what can go wrong with it."""
+"""One file of a run while it is written: its head, its end, its two names, and the errors of the disk.
+
+The options of a recording are here, because all files of a run are written with them.
+"""
 
 from __future__ import annotations
 
@@ -10,102 +13,145 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
+import flowrec
 from flowrec.errors import SessionError
-from flowrec.store.channels import declarations
-from flowrec.store.chunk import Sealed
-from flowrec.store.frame_encodings import FrameEncoding
-from flowrec.store.mcap_writer import McapFile
-from flowrec.store.metadata import OUTCOME, PROFILE, VIEW, SessionHeader, records_of
-from flowrec.store.paths import PARTIAL_SUFFIX, partial_path, pieces
+from flowrec.store.channels import declarations, left_out
+from flowrec.store.chunk import SealedChunk
+from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
+from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.paths import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.roi import Region
-from flowrec.store.segments import Tally
+from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
 from flowrec.system.outputs import MCAP, check_output, put_in_place, sync_directory, taken
-from flowrec.version import __version__
-
-
-class PieceError(SessionError):
-    """A file that can not be written any more; the text says which, and what next."""
 
 
 @dataclass(frozen=True, slots=True)
-class Making:
-    """What all files of a run are made with.
+class Split:
+    """When a part of a run is finished and the next one begins. With neither limit, a run is in one file.
 
     Attributes
     ----------
-    path, header : of the run.
-    frames : how images travel.
-    flush_s, sync_s : how old at most what is not with the operating system, and not kept by the disk, may become.
-    overwrite : replace what is there.
-    region : which part of most images is kept (region.py); None: all.
-    unwanted : topics that are not recorded.
+    megabytes : about the size of a part, in MB. A part whose keyframe alone is as large becomes twice as large.
+    seconds : length of a part, in s of stamps.
     """
 
-    path: Path
-    header: SessionHeader
-    frames: FrameEncoding
-    flush_s: float
-    sync_s: float
-    overwrite: bool
+    megabytes: float | None = None
+    seconds: float | None = None
+
+    def __bool__(self) -> bool:
+        return bool(self.megabytes or self.seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What is recorded around an event: a mark, a note, a warning, the first lost image, a bad end.
+
+    Attributes
+    ----------
+    before_s, after_s : s of stamps before the event and after the last event in the same snapshot.
+    megabytes : what may be held in memory, in MB; where it is too little, `before_s` is what fits.
+    """
+
+    before_s: float
+    after_s: float = 10.0
+    megabytes: float = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class WriterOptions:
+    """How a session is written; the section [recording] of the configuration, resolved.
+
+    Attributes
+    ----------
+    frames : encoding of the images, a name of frame_encodings.py: raw, zstd, png, delta, or jpeg, which alone is lossy.
+    flush_s : at most this much of a run is lost when the process is killed, in s, of stamps; without `block` also of
+        wall time, and besides the images that wait for a slow disk, at most `queue_limit_bytes` of them.
+    sync_s : the same when the power fails, as long as an fsync takes less than half of it.
+    overwrite : replace whatever there is of the run, once the new one is complete.
+    block : what to do when the disk is slower than the run. True: `write` waits (simulation), also while more than
+        `flush_s` of stamps is not yet with the operating system. False: images are decimated (write_queue.py) and
+        counted; nothing else is ever dropped (live run).
+    queue_limit_bytes : how much may wait for the disk.
+    split : write the run X.mcap to the files X.part001.mcap, X.part002.mcap, ..., each of which is readable alone.
+    snapshot : write nothing but X.snap001.mcap, ... around events.
+    region : record only the window around the robot of most images (roi.py); None: all of all images.
+    leave_out : topics that are not recorded, as names or patterns such as `/view/*`.
+    """
+
+    frames: str = "zstd"
+    flush_s: float = 0.5
+    sync_s: float = 1.0
+    overwrite: bool = False
+    block: bool = False
+    queue_limit_bytes: int = 256 << 20
+    split: Split | None = None
+    snapshot: Snapshot | None = None
     region: Region | None = None
-    unwanted: frozenset[str] = frozenset()
+    leave_out: tuple[str, ...] = ()
 
     @property
-    def sync_every_s(self) -> float:
-        """A message waits up to half of the time for the next fsync to begin, and the other half until it is done."""
+    def left_out_topics(self) -> frozenset[str]:
+        """The topics that `leave_out` stands for; raises UsageError as channels.left_out."""
+        return left_out(self.leave_out)
+
+    @property
+    def encoding(self) -> FrameEncoding:
+        """Of the images."""
+        return ENCODINGS[self.frames]
+
+    @property
+    def sync_interval_s(self) -> float:
+        """A message waits up to half of `sync_s` for the next fsync to begin, and the other half until it is done."""
         return self.sync_s / 2
 
     @property
-    def flush_every_s(self) -> float:
+    def flush_interval_s(self) -> float:
         """Half of the time is left for a thread that gets the processor late, or a slow disk."""
-        return 0.5 * min(self.flush_s, self.sync_every_s)
-
-    def said(self, tally: Tally) -> dict[str, str]:
-        """What is added to every outcome."""
-        if self.frames.lossless:
-            return tally.told()
-        return tally.told() | {"frames_encoding": f"{self.frames.name}, not lossless: a replay sees other pixels"}
+        return 0.5 * min(self.flush_s, self.sync_interval_s)
 
 
-class Piece:
-    """A file that is named `PATH.partial` until it is whole, and then gets its name in one step.
+class FileError(SessionError):
+    """A file that can not be written any more; the text says which, and what to do next."""
 
-    `sync` may run beside the other methods, in a thread of its own.
+
+class SessionFile:
+    """A file that is named `PATH.partial` until it is complete, and then renamed in one step.
+
+    `sync` may run in another thread than the other methods.
 
     Parameters
     ----------
     path : its name.
-    header : goes first into it.
-    making : what it is made with.
+    header : is written first.
+    options : of the recording.
 
     Attributes
     ----------
-    broken : something has failed; what could be written is for `flowrec recover`.
+    failed : something went wrong; what was written is for `flowrec recover`.
 
     Raises
     ------
-    PieceError : from any method, when the disk refuses.
+    FileError : from any method, when the disk refuses.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, making: Making) -> None:
+    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions) -> None:
         self.path = path
         self.partial_path = partial_path(path)
-        self.broken = False
-        self._listed = False
-        self._overwrite = making.overwrite
+        self.failed = False
+        self._name_synced = False
+        self._options = options
         try:
-            self._file = McapFile(self.partial_path, overwrite=making.overwrite)
+            self._file = McapWriter(self.partial_path, overwrite=options.overwrite)
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         try:
-            self._file.start(PROFILE, f"flowrec {__version__}")
-            for record in (*records_of(header), *declarations(making.frames, making.region)):
+            self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
+            for record in (*header_records(header), *declarations(options.encoding, options.region)):
                 self._file.add(record)
-        except OSError as error:
+        except BaseException as error:
             self._file.close()
-            raise _not_writable(self.partial_path, error) from error
-        except BaseException:
-            self._file.close()
+            if isinstance(error, OSError):
+                raise _not_writable(self.partial_path, error) from error
             raise
 
     @property
@@ -113,22 +159,22 @@ class Piece:
         """Bytes handed to the operating system."""
         return self._file.size
 
-    def add_chunks(self, sealed: list[Sealed]) -> None:
+    def add_chunks(self, chunks: list[SealedChunk]) -> None:
         """Append chunks, all in one write."""
-        with self._told():
-            self._file.add_chunks(sealed)
+        with self._checked():
+            self._file.add_chunks(chunks)
 
     def sync(self) -> None:
-        """Have the disk keep what was appended."""
-        with self._told():
+        """Force what was appended to the disk."""
+        with self._checked():
             self._file.sync()
-            if not self._listed:
+            if not self._name_synced:
                 sync_directory(self.partial_path.parent)  # or a power cut leaves content without a name
-                self._listed = True
+                self._name_synced = True
 
-    def finish(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
-        """The outcome, the scale of the views' colours and the summary, down to the disk; then the name."""
-        with self._told():
+    def complete(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
+        """Write outcome, colour scale of the views and summary, sync, and rename the file."""
+        with self._checked():
             if top_um_s is not None:
                 self._file.add(Metadata(VIEW, {"speed_scale_um_s": repr(top_um_s)}))
             self._file.add(Metadata(OUTCOME, dict(outcome)))
@@ -136,7 +182,7 @@ class Piece:
             self._file.finish()
             self._file.sync()
             try:
-                put_in_place(self.partial_path, self.path, overwrite=self._overwrite)
+                put_in_place(self.partial_path, self.path, overwrite=self._options.overwrite)
             except (FileExistsError, IsADirectoryError) as error:
                 raise taken(self.path, f" (the finished session stays in {self.partial_path})") from error
 
@@ -144,54 +190,53 @@ class Piece:
         """Close the file as it is."""
         self._file.close()
 
-    def spoiled(self, error: SessionError) -> PieceError:
-        """What to raise for a message that can not be stored."""
-        self.broken = True
-        return PieceError(f"{self.path}: {error}; `flowrec recover {self.partial_path}` keeps what came before")
+    def encoding_failed(self, error: SessionError) -> FileError:
+        """The error for a message that can not be stored."""
+        self.failed = True
+        return FileError(f"{self.path}: {error}; `flowrec recover {self.partial_path}` keeps what came before")
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _checked(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
-            self.broken = True
-            raise _disk_failed(self.partial_path, error) from error
-        except BaseException:
-            self.broken = True
+        except BaseException as error:
+            self.failed = True
+            if isinstance(error, OSError):
+                raise _disk_failed(self.partial_path, error) from error
             raise
 
 
 def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
-    """Refuse the output X.mcap as `check_output` does, and any piece of that run, finished or not, in the same way.
+    """Refuse the output X.mcap as `check_output` does, and any file of that run, finished or not, in the same way.
 
     Raises
     ------
     OutputError : as `check_output`.
-    PieceError : remains of a run are there, which `overwrite` would remove.
+    FileError : the unfinished file of a killed run is there, which `overwrite` would remove.
     """
-    there = pieces(path)
+    there = run_files(path)
     check_output(path, MCAP, inputs=inputs, overwrite=overwrite, also=(*there, partial_path(path)))
     if overwrite:
         return
-    for piece in there:
-        if not piece.name.endswith(PARTIAL_SUFFIX):
-            raise taken(piece)
-        raise PieceError(
-            f"{piece}: is left from a run that did not finish; `flowrec recover {piece}`"
+    for file in there:
+        if not file.name.endswith(PARTIAL_SUFFIX):
+            raise taken(file)
+        raise FileError(
+            f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
             " saves it, another --out or --overwrite goes on without it"
         )
 
 
-def _not_writable(path: Path, error: OSError) -> PieceError:
+def _not_writable(path: Path, error: OSError) -> FileError:
     if isinstance(error, FileNotFoundError):
-        return PieceError(f"{path.parent}: no such directory; make it, or choose another place with --out")
+        return FileError(f"{path.parent}: no such directory; make it, or choose another place with --out")
     if isinstance(error, BlockingIOError):
-        return PieceError(f"{path}: is being written by another process just now; choose another name with --out")
-    return PieceError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
+        return FileError(f"{path}: is being written by another process just now; choose another name with --out")
+    return FileError(f"{path}: can not be made ({error.strerror}); choose another place with --out")
 
 
-def _disk_failed(path: Path, error: OSError) -> PieceError:
+def _disk_failed(path: Path, error: OSError) -> FileError:
     if error.errno == errno.ENOENT:
-        return PieceError(f"{path}: is gone, it or its directory was removed or renamed; look for it there")
+        return FileError(f"{path}: is gone, it or its directory was removed or renamed; look for it there")
     what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
-    return PieceError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")
+    return FileError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")

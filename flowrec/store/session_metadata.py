@@ -1,47 +1,135 @@
-"""What a session file says about itself, whether or not its messages can be read: enough to list and describe it.
+"""What a session file says about itself: enough to list, describe and run it again, whether or not its messages can be
+read.
 
-Light to import: no numpy, no schemas. contents.py adds what reading needs.
+Light to import: no numpy, no schemas. schema_check.py adds what reading the messages needs.
 """
 
 from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
-from mcap.records import ChunkIndex, Statistics
+from mcap.records import Attachment, Metadata, Statistics
 
+import flowrec
 from flowrec.errors import SessionError
-from flowrec.store.mcap_index import Summary
-from flowrec.store.mcap_reader import ForeignError, Source
-from flowrec.store.metadata import (
-    CONFIG_FILE,
-    DIGEST,
-    FORMAT_VERSION,
-    OUTCOME,
-    PROFILE,
-    SESSION,
-    SessionHeader,
-    belongs,
-    header_from,
-    part_from,
-)
-from flowrec.version import __version__
+from flowrec.store.mcap_format import Summary
+from flowrec.store.mcap_reader import ForeignError, McapReader
+
+FORMAT_VERSION = 1
+PROFILE = "flowrec"
+
+# Metadata records.
+SESSION = "flowrec.session"
+PROVENANCE = "flowrec.provenance"
+PARENT = "flowrec.parent"
+PART = "flowrec.part"
+OUTCOME = "flowrec.outcome"
+VIEW = "flowrec.view"
+DIGEST = "flowrec.digest"
+# Attachments.
+CONFIG_FILE = "config.toml"
+CHIP_IMAGE_FILE = "chip.png"
+CHIP_FILE = "chip.toml"
+_WEIGHTS = "weights/"
 
 _METADATA_LIMIT_BYTES = 16 << 20
 _ATTACHMENTS_LIMIT_BYTES = 256 << 20
 _SHOWN = 40  # characters of a version; int() refuses thousands of digits
+_DIGITS = 20  # more than a number of 64 bit has
 
 
-class Head:
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Which file of a run this is, where a run has several.
+
+    Every file but the first starts with a keyframe: the full state at the last tick before it, at that tick's stamp.
+    It makes the file readable alone; readers of the whole run skip it.
+
+    Attributes
+    ----------
+    run : the same random word in all files of a run.
+    number : from 1.
+    kind : "part" of a run that was split, or "snapshot", each of which is complete in itself.
+    keyframe_ns : stamp of the keyframe; None where the run itself begins. Its key in the file is `carried_ns`.
+    why : the event that a snapshot was taken for.
+    """
+
+    run: str
+    number: int
+    kind: Literal["part", "snapshot"] = "part"
+    keyframe_ns: int | None = None
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionHeader:
+    """The resolved configuration, the chip and the origin of a session: what is written before the first message.
+
+    Attributes
+    ----------
+    config_toml : the resolved configuration.
+    chip_png, chip_toml : the mask's image file and the chip's description.
+    provenance : version, commit, packages, host, seed, operator, ...: all text.
+    parent : name and hash of the session that this one replays; empty for a live run.
+    weights : network weights by file name.
+    part : which file of a run this is; None where the run is in one file.
+    start_unix_ns : Unix time of stamp 0 of the session clock. In the file, log times, publish times and the timestamps
+        of foxglove's messages are Unix times: stamps plus this. 0 in files of the first release: there they are stamps.
+        It is the log time of the attachments, because those, unlike metadata, have a checksum.
+    """
+
+    config_toml: str
+    chip_png: bytes
+    chip_toml: str
+    provenance: Mapping[str, str]
+    parent: Mapping[str, str] = field(default_factory=dict)
+    weights: Mapping[str, bytes] = field(default_factory=dict)
+    part: Part | None = None
+    start_unix_ns: int = 0
+
+    def is_same_run(self, other: SessionHeader) -> bool:
+        """Whether two headers differ in their part at most."""
+        return replace(self, part=None) == replace(other, part=None)
+
+
+def header_records(header: SessionHeader) -> Iterator[Metadata | Attachment]:
+    """The MCAP records of a header, in the order in which they are written."""
+    yield Metadata(SESSION, {"format_version": str(FORMAT_VERSION), "flowrec_version": flowrec.__version__})
+    yield Metadata(PROVENANCE, dict(header.provenance))
+    yield Metadata(PARENT, dict(header.parent))
+    part = header.part
+    if part is not None:
+        facts = {"run": part.run, "number": str(part.number), "kind": part.kind, "why": part.why}
+        if part.keyframe_ns is not None:
+            facts["carried_ns"] = str(part.keyframe_ns)
+        yield Metadata(PART, facts)
+    attachments = [
+        (CONFIG_FILE, "application/toml", header.config_toml.encode()),
+        (CHIP_IMAGE_FILE, "image/png", header.chip_png),
+        (CHIP_FILE, "application/toml", header.chip_toml.encode()),
+        *((_WEIGHTS + name, "application/octet-stream", data) for name, data in sorted(header.weights.items())),
+    ]
+    for name, media_type, data in attachments:
+        yield Attachment(header.start_unix_ns, header.start_unix_ns, name, media_type, data)
+
+
+def is_header_file(name: str) -> bool:
+    """Whether an attachment is part of a session's header."""
+    return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith(_WEIGHTS)
+
+
+class SessionMetadata:
     """The index of a session file and what it says of the run.
 
     Parameters
     ----------
     path : the file.
-    summary : its index where the file's own is not to be used (scan.py makes one).
+    summary : an index to be used instead of the file's own (scan.py makes one).
 
     Attributes
     ----------
@@ -49,18 +137,18 @@ class Head:
     chunks : where the messages are.
     statistics : how many there are.
     outcome : how the run ended.
-    part : which piece of a run the file is; None where the run is in one file.
+    part : which file of a run it is; None where the run is in one file.
     flowrec_version : of the program that wrote it.
     digest : of the content, as it was recorded (digest.py); None in files of the first release.
-    channels, attachments, metadata : what else is listed.
+    channels, schemas, attachments, metadata : what else is listed.
 
     Raises
     ------
-    SessionError : it is none, or not for this flowrec.
+    SessionError : it is no session file, or not one for this flowrec.
     """
 
     def __init__(self, path: Path, summary: Summary | None = None) -> None:
-        self.source = Source(path)
+        self.source = McapReader(path)
         try:
             self._open(summary)
         except BaseException:
@@ -74,29 +162,28 @@ class Head:
                 f"{path}: is an MCAP file of another program (profile {header.profile!r}, library {header.library!r});"
                 " flowrec reads what `flowrec record` has written"
             )
-        self._summary = summary if summary is not None else self.source.read_summary()
-        metadata = self._metadata()
-        if SESSION not in metadata:
+        found = summary if summary is not None else self.source.read_summary()
+        self.channels, self.schemas, self.chunks = found.channels, found.schemas, found.chunks
+        self.attachments, self.metadata = found.attachments, found.metadata
+        records = self._records()
+        if SESSION not in records:
             raise ForeignError(
                 f"{path}: is an MCAP file without the record {SESSION!r}, so not a session;"
                 " flowrec reads what `flowrec record` has written"
             )
-        self.flowrec_version = metadata[SESSION].get("flowrec_version", "?")[:_SHOWN]
-        self._check_version(metadata[SESSION].get("format_version", ""))
-        self.outcome = metadata.get(OUTCOME, {})
-        self.digest = metadata.get(DIGEST)
+        self.flowrec_version = records[SESSION].get("flowrec_version", "?")[:_SHOWN]
+        self._check_version(records[SESSION].get("format_version", ""))
+        self.outcome = records.get(OUTCOME, {})
+        self.digest = records.get(DIGEST)
         with self.source.parsing(0):
-            self.part = part_from(metadata)
-            for index in self._summary.attachments:
+            self.part = _part_of(records)
+            for index in self.attachments:
                 if index.name == CONFIG_FILE:
-                    self.source.start_at(index.log_time)
+                    self.source.set_start(index.log_time)
             if summary is None:  # what scan.py has made is on the session clock
-                self._summary.set_back(self.source.start_unix_ns)
-        self.chunks: list[ChunkIndex] = self._summary.chunks
-        self.channels, self.attachments = self._summary.channels, self._summary.attachments
-        self.metadata = self._summary.metadata
-        assert self._summary.statistics is not None  # Source or Scan has seen to it
-        self.statistics: Statistics = self._summary.statistics
+                found.to_session_clock(self.source.start_unix_ns)
+        assert found.statistics is not None  # McapReader or scan.py has checked it
+        self.statistics: Statistics = found.statistics
 
     @property
     def counts(self) -> dict[str, int]:
@@ -121,21 +208,34 @@ class Head:
     def header(self) -> SessionHeader:
         """Read when asked for: the network's weights may be large."""
         # Only what a session is made of: whatever else is attached is not even read.
-        wanted = [index for index in self._summary.attachments if belongs(index.name)]
-        self._bound("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
-        attachments = {index.name: self.source.attachment(index) for index in wanted}
+        wanted = [index for index in self.attachments if is_header_file(index.name)]
+        self._limit("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
+        files = {index.name: self.source.attachment(index) for index in wanted}
+        records = self._records()
         try:
-            return header_from(self._metadata(), attachments, self.source.start_unix_ns)
+            return SessionHeader(
+                config_toml=files[CONFIG_FILE].decode(),
+                chip_png=files[CHIP_IMAGE_FILE],
+                chip_toml=files[CHIP_FILE].decode(),
+                provenance=records[PROVENANCE],
+                parent=records.get(PARENT, {}),
+                weights={
+                    name.removeprefix(_WEIGHTS): data for name, data in files.items() if name.startswith(_WEIGHTS)
+                },
+                part=self.part,
+                start_unix_ns=self.source.start_unix_ns,
+            )
         except KeyError as error:
             raise self.source.damaged(0, f"the record {error} is missing") from error
         except ValueError as error:
             raise self.source.damaged(0, error) from error
 
-    def _metadata(self) -> dict[str, dict[str, str]]:
-        self._bound("metadata", (index.length for index in self._summary.metadata), _METADATA_LIMIT_BYTES)
-        return {index.name: self.source.metadata(index) for index in self._summary.metadata}
+    def _records(self) -> dict[str, dict[str, str]]:
+        """The metadata records by name."""
+        self._limit("metadata", (index.length for index in self.metadata), _METADATA_LIMIT_BYTES)
+        return {index.name: self.source.metadata(index) for index in self.metadata}
 
-    def _bound(self, what: str, lengths: Iterable[int], limit: int) -> None:
+    def _limit(self, what: str, lengths: Iterable[int], limit: int) -> None:
         total = sum(lengths)
         if total > limit:
             raise self.source.damaged(0, f"{total} bytes of {what}, more than {limit}")
@@ -147,7 +247,7 @@ class Head:
         what = f"{self.source.path}: is a session of format {version!r}, written by flowrec {self.flowrec_version}"
         newer = version.isdecimal() and int(version) > FORMAT_VERSION
         need = f"install flowrec {self.flowrec_version} or later" if newer else "it is damaged or was edited"
-        raise SessionError(f"{what}; this is flowrec {__version__} with format {FORMAT_VERSION}: {need}")
+        raise SessionError(f"{what}; this is flowrec {flowrec.__version__} with format {FORMAT_VERSION}: {need}")
 
     def _by_topic(self, counts: Mapping[int, int]) -> dict[str, int]:
         found: Counter[str] = Counter()
@@ -156,3 +256,22 @@ class Head:
             if count and channel is not None and channel.metadata.get("role") != "view":
                 found[channel.topic] += count
         return dict(found)
+
+
+def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
+    """Which file of a run it is, from its metadata records.
+
+    Raises
+    ------
+    ValueError : the record makes no sense.
+    """
+    facts = records.get(PART)
+    if facts is None:
+        return None
+    number, kind, keyframe = facts.get("number", ""), facts.get("kind", ""), facts.get("carried_ns", "")
+    are_numbers = number.isdecimal() and (keyframe.isdecimal() or not keyframe)
+    if kind not in ("part", "snapshot") or not are_numbers or max(len(number), len(keyframe)) >= _DIGITS:
+        what = f"{kind[:40]!r} {number[:40]!r}, carried from {keyframe[:40]!r}"
+        raise ValueError(f"a piece of a run that is called {what}")
+    kind_of: Literal["part", "snapshot"] = "part" if kind == "part" else "snapshot"
+    return Part(facts.get("run", ""), int(number), kind_of, int(keyframe) if keyframe else None, facts.get("why", ""))

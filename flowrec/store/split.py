@@ -1,242 +1,346 @@
-"""A run in files that follow each other, each to be read alone; or in one.
+"""Writes a run to one file, or to parts that follow each other and are each readable alone.
 
-Part n + 1 begins with the tick at which part n ended, everything known at it; that and the last image before it are
-told once more, at their own stamps. A part is ended beside the writer's thread, which must not wait for a disk.
+Part n + 1 starts with a keyframe: the full state at the tick at which part n ended, and the last image before it, at
+their own stamps. A part is finished in a side thread, because the writer's thread must not wait for a disk.
 """
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from flowrec.errors import SessionError
-from flowrec.messages import Frame
-from flowrec.store.metadata import Part
+from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
 from flowrec.store.paths import part_path
-from flowrec.store.recorder import Recorder
-from flowrec.store.segments import Open, Stretches, Tally, carried
-from flowrec.store.session_file import Making
-from flowrec.store.viewer_topics import Mirrors
+from flowrec.store.segments import Counters, OpenSegment, SegmentRouter, keyframe
+from flowrec.store.session_file import FileError, SessionFile, WriterOptions
+from flowrec.store.session_metadata import Part, SessionHeader
+from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
-from flowrec.units import nanoseconds
+from flowrec.topics import BY_FIELD
+from flowrec.units import nanoseconds, seconds
+
+_POLL_S = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class Split:
-    """When a part has come to its end. With neither, a run is in one file.
+class PartFile(SessionFile):
+    """One part as it is recorded: encodes ticks, and bounds the age of what is not yet on the disk.
 
-    Attributes
-    ----------
-    megabytes : about the size of a part, in MB. One whose beginning alone is as large becomes twice as large.
-    seconds : how much of a run is in it, in s of stamps.
-    """
-
-    megabytes: float | None = None
-    seconds: float | None = None
-
-    def __bool__(self) -> bool:
-        return bool(self.megabytes or self.seconds)
-
-
-class _Part:
-    """One part as the stretch of the run that is in it."""
-
-    def __init__(self, parts: Parts, number: int, recorder: Recorder) -> None:
-        self.number = number
-        self.recorder = recorder
-        self.raw_bytes = 1  # of what went in
-        self.image_bytes = 0  # of the one that is told once more
-        self._parts = parts
-
-    def add(self, entry: Entry) -> None:
-        self.raw_bytes += entry.nbytes
-        self.recorder.add(entry)
-
-    def carry_image(self, stamp_ns: int, image: Frame) -> None:
-        before = self.size
-        self.recorder.add(Entry(stamp_ns, {"frame": image}, 0))
-        self.image_bytes += self.size - before
-
-    def complete(self, tally: Tally) -> None:
-        self._parts.end(self, tally)
-
-    @property
-    def size(self) -> int:
-        return self.recorder.size + self.recorder.waiting_bytes
-
-    @property
-    def first_bytes(self) -> int:
-        """What does not count as its own."""
-        return self.recorder.first_bytes + self.image_bytes
-
-    def news_bytes(self, awaited_bytes: int) -> float:
-        """What is in it besides, with the images that are still to come, if they pack as the ones before."""
-        news = self.size - self.first_bytes
-        return news + awaited_bytes * min(1.0, news / self.raw_bytes)
-
-
-class Parts:
-    """Writes entries to one file after the other.
+    What is older than `flush_s`, in wall time or in stamps, is with the operating system, and what is older than
+    `sync_s` is on the disk, as long as one fsync takes less than half of that. The fsync runs in a side thread: on a
+    busy disk it may take a second, in which a camera fills the queue.
 
     Parameters
     ----------
-    making : what they are made with.
-    split : when to go on to the next.
+    parts, number : the run, and which part of it this is.
+    header : of this part.
+    first : its keyframe. Encoding large flow fields takes a while; it is done in the side thread, and chunks of what
+        follows are held back meanwhile. None: the run begins here, and the head is synced at once.
 
     Attributes
     ----------
-    files : the finished ones, in order.
+    flushed_ns : stamp up to which the operating system has all that was added; None before the first flush.
+
+    Raises
+    ------
+    FileError : from any method, when the disk refuses, or a message can not be encoded.
+    """
+
+    def __init__(self, parts: Parts, number: int, path: Path, header: SessionHeader, first: Entry | None) -> None:
+        super().__init__(path, header, parts.options)
+        self.number = number
+        self.flushed_ns: int | None = None
+        self._parts = parts
+        self._encoder = ChunkEncoder(self._options.encoding, parts.views, self.add_chunks, header.start_unix_ns)
+        self._first_bytes = self.size  # of head and keyframe
+        self._image_bytes = 0  # of the keyframe's image
+        self._raw_bytes = 1  # of what was added
+        self._writing_keyframe: Future[None] | None = None
+        self._held: list[SealedChunk] = []
+        self._flushed_s = self._synced_s = time.monotonic()
+        self._synced_size = 0
+        self._since_ns: int | None = None  # stamp of the last flush, or of the first entry
+        self._last_ns = 0
+        self._syncing: Future[None] | None = None
+        self._side = ThreadPoolExecutor(1, "session-sync")
+        if first is None:
+            try:
+                self._synced_size = self.size
+                self.sync()
+                self._synced_s = time.monotonic()
+            except BaseException:
+                self.close()
+                raise
+            return
+        self._encoder.sink = self._hold
+        self._encoder.sequences.update(BY_FIELD[field].path for field in first.messages)
+        beside = ChunkEncoder(self._options.encoding, parts.views.copy(), self.add_chunks, header.start_unix_ns)
+        self._writing_keyframe = self._side.submit(_encode_all, beside, first)
+
+    @property
+    def timeout_s(self) -> float | None:
+        """How long one may wait for the next entry before `flush_if_due` has something to do; None: for ever."""
+        if self._writing_keyframe is not None:
+            return _POLL_S
+        if self._encoder.size:
+            return max(0.0, self._flushed_s + self._options.flush_interval_s - time.monotonic())
+        if self._synced_size < self.size:
+            # While the last fsync is still running there is nothing to do about the next one.
+            shortest = _POLL_S if self._sync_running else 0.0
+            return max(shortest, self._synced_s + self._options.sync_interval_s - time.monotonic())
+        return None
+
+    def is_larger_than(self, megabytes: float, awaited_bytes: int) -> bool:
+        """Whether the part has come to that size; one whose keyframe alone is as large, to twice the size.
+
+        The images that are awaited are counted as if they compress as what came before.
+        """
+        first_bytes = self._first_bytes + self._image_bytes
+        own_bytes = self._all_bytes - first_bytes
+        expected_bytes = own_bytes + awaited_bytes * min(1.0, own_bytes / self._raw_bytes)
+        if expected_bytes < max(1e6 * megabytes - first_bytes, first_bytes):
+            return False
+        if self._writing_keyframe is None:
+            return True
+        # The size of the keyframe must be known before it is known how much of the part is its own.
+        self._check_keyframe(wait=True)
+        return self.is_larger_than(megabytes, awaited_bytes)
+
+    def add(self, entry: Entry) -> None:
+        """Encode the messages of one tick; write the chunks that are full."""
+        self._raw_bytes += entry.nbytes
+        self._check_keyframe(wait=False)
+        if self._since_ns is None:
+            self._since_ns = entry.stamp_ns
+        self._last_ns = max(self._last_ns, entry.stamp_ns)
+        try:
+            self._encoder.add(entry)
+        except FileError:
+            raise
+        except SessionError as error:
+            raise self.encoding_failed(error) from error
+
+    def add_keyframe_image(self, entry: Entry) -> None:
+        before = self._all_bytes
+        self.add(entry)
+        self._image_bytes += self._all_bytes - before
+
+    def end(self, counters: Counters) -> None:
+        self._parts.finish_part(self, counters)
+
+    def flush_if_due(self) -> None:
+        """Write what has waited for long enough, and sync it."""
+        self._check_keyframe(wait=False)
+        options, now, stamps_s = self._options, time.monotonic(), seconds(self._last_ns - (self._since_ns or 0))
+        if now >= self._flushed_s + options.flush_interval_s or stamps_s >= options.flush_interval_s:
+            self._flush()
+        if now >= self._synced_s + options.sync_interval_s and self._synced_size < self.size and not self._sync_running:
+            self._join_sync()
+            self._write_waiting()
+            self._synced_s, self._synced_size = now, self.size
+            self._syncing = self._side.submit(self.sync)
+
+    def flush(self) -> None:
+        """Write what waits."""
+        self._check_keyframe(wait=True)
+        self._flush()
+
+    def finish(self, outcome: Mapping[str, str]) -> None:
+        """Write the rest of the messages, and complete the file."""
+        self.flush()
+        self._join_sync()
+        self.complete(outcome, self._parts.views.top_um_s)
+
+    def close(self) -> None:
+        self._side.shutdown()
+        super().close()
+
+    @property
+    def _all_bytes(self) -> int:
+        """Bytes in the file and, mostly before they are compressed, those that wait."""
+        return self.size + self._encoder.size + sum(len(chunk.data) for chunk in self._held)
+
+    def _flush(self) -> None:
+        self._write_waiting()
+        self._flushed_s, self._since_ns = time.monotonic(), self._last_ns
+
+    def _write_waiting(self) -> None:
+        self._encoder.seal()
+        if self._writing_keyframe is None and self._since_ns is not None:
+            self.flushed_ns = self._last_ns
+
+    def _hold(self, chunks: list[SealedChunk]) -> None:
+        self._held += detached(chunks)
+
+    def _check_keyframe(self, *, wait: bool) -> None:
+        """Write what was held back, once the keyframe is in the file."""
+        if self._writing_keyframe is None or not (wait or self._writing_keyframe.done()):
+            return
+        self._writing_keyframe.result()
+        self._writing_keyframe = None
+        self._first_bytes = self.size
+        self._encoder.sink = self.add_chunks
+        if self._held:
+            held, self._held = self._held, []
+            self.add_chunks(held)
+
+    @property
+    def _sync_running(self) -> bool:
+        return self._syncing is not None and not self._syncing.done()
+
+    def _join_sync(self) -> None:
+        """Wait for the side thread, and raise what has failed there."""
+        if self._syncing is not None:
+            self._syncing.result()
+            self._syncing = None
+
+
+def _encode_all(encoder: ChunkEncoder, entry: Entry) -> None:
+    encoder.add(entry)
+    encoder.seal()
+
+
+class Parts:
+    """Writes entries to one part after the other.
+
+    Parameters
+    ----------
+    path, header, options : of the run.
+    run : a random word for the heads of its parts.
+
+    Attributes
+    ----------
+    files : the finished parts, in order.
+    views : makes the viewer topics of all parts.
 
     Raises
     ------
     SessionError : from any method, when the disk refuses, or a message can not be encoded.
     """
 
-    def __init__(self, making: Making, split: Split, run: str) -> None:
+    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, run: str) -> None:
         self.files: list[Path] = []
-        self._making = making
-        self._split = split
-        self._run = run
-        self._mirrors = Mirrors(making.unwanted, making.header.start_unix_ns)
+        self.options = options
+        self.views = ViewerTopics(options.left_out_topics, header.start_unix_ns)
+        self._path, self._header, self._run = path, header, run
         self._until_ns: int | None = None
-        self._ended_bytes = 0
-        self._ending: deque[tuple[Recorder, Future[None]]] = deque()
-        self._beside = ThreadPoolExecutor(1, "session-finish")
-        self._stretches = Stretches(self._next(1, None))
+        self._finished_bytes = 0
+        self._finishing: deque[tuple[PartFile, Future[None]]] = deque()
+        self._side = ThreadPoolExecutor(1, "session-finish")
+        self._router = SegmentRouter(self._part(1))
 
     @property
     def partial_path(self) -> Path:
-        """The file that is written just now."""
-        return self._stretches.current.stretch.recorder.partial_path
+        """The file that is written at present."""
+        return self._router.current.segment.partial_path
 
     @property
     def size(self) -> int:
-        """Bytes handed to the operating system."""
-        ending = sum(recorder.size for recorder, _ in tuple(self._ending))
-        return self._ended_bytes + ending + sum(recorder.size for recorder in self._recorders())
+        """Bytes handed to the operating system. May be asked for by another thread."""
+        finishing = sum(part.size for part, _ in tuple(self._finishing))
+        return self._finished_bytes + finishing + sum(place.segment.size for place in tuple(self._router.open))
 
     @property
-    def patience_s(self) -> float | None:
-        """For how long one may wait for the next entry; None: for ever."""
-        return min((s for recorder in self._recorders() if (s := recorder.patience_s) is not None), default=None)
+    def timeout_s(self) -> float | None:
+        """How long one may wait for the next entry; None: for ever."""
+        return min((s for place in self._router.open if (s := place.segment.timeout_s) is not None), default=None)
 
     @property
     def flushed_ns(self) -> int | None:
-        """Stamp up to which all state is with the operating system; None before the first flush."""
-        stretches = self._stretches
-        flushed_ns = stretches.current.stretch.recorder.flushed_ns
+        """Stamp up to which the operating system has all state; None before the first flush."""
+        current = self._router.current
         # A part begins when the one before has been flushed.
-        return stretches.current.carried_ns if flushed_ns is None else flushed_ns
+        return current.keyframe_ns if current.segment.flushed_ns is None else current.segment.flushed_ns
 
     def add(self, entry: Entry) -> None:
         """Write one entry, to the part that it belongs to."""
-        self._hear_of_ended(wait=False)
+        self._collect_finished(wait=False)
         if entry.ticks and self._is_due(entry.stamp_ns):
-            self._go_on()
-        self._stretches.add(entry)
+            last, last_ns = self._router.current.segment, self._router.last_ns
+            assert last_ns is not None
+            last.flush()  # before anything of the next part: a kill must not leave a gap between them
+            self._router.cut(self._part(last.number + 1, keyframe(last_ns, self._router.state)))
+        self._router.add(entry)
 
     def flush_if_due(self) -> None:
-        """Have the disk keep what has waited for long enough."""
-        for recorder in self._recorders():
-            recorder.flush_if_due()
+        """Flush and sync what has waited for long enough."""
+        for place in self._router.open:
+            place.segment.flush_if_due()
 
     def flush(self) -> None:
         """Write what waits."""
-        self._stretches.current.stretch.recorder.flush()
+        self._router.current.segment.flush()
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
-        """End the last part; everything is on the disk then. `why` a run ended badly is for snapshots alone."""
-        last, recorder = self._stretches.current, self._stretches.current.stretch.recorder
+        """Finish the last part; everything is on the disk then. `why` a run ended badly is for snapshots alone."""
+        last = self._router.current
         try:
-            recorder.finish({**outcome, **self._making.said(last.tally)})
+            last.segment.finish({**outcome, **last.counters.summary(self.options.encoding)})
         finally:
-            self._hear_of_ended(wait=True)
-        self.files.append(recorder.path)
+            self._collect_finished(wait=True)
+        self.files.append(last.segment.path)
 
     def close(self, reason: str = "") -> None:
-        """Close all files. After a failure, with its `reason`, the sound ones are finished and those before them."""
-        self._beside.shutdown()
+        """Close all files. After a failure, with its `reason`, the parts that are not affected are finished first."""
+        self._side.shutdown()
         with contextlib.suppress(SessionError):
-            self._hear_of_ended(wait=True)
-        places = self._stretches.open
-        for place in places:
-            recorder = place.stretch.recorder
-            if reason and not recorder.broken and self._numbered:
-                last = place is places[-1]
-                ended = {"outcome": "failed", "reason": reason} if last else self._continued(place.stretch)
-                place.tally.dropped_frames += place.awaited
+            self._collect_finished(wait=True)
+        for place in self._router.open:
+            if reason and not place.segment.failed and self.options.split:
                 with contextlib.suppress(SessionError):  # the first failure matters more
-                    recorder.finish({**ended, **self._making.said(place.tally)})
-                    self.files.append(recorder.path)
-            recorder.close()
+                    self._finish_after_failure(place, reason)
+            place.segment.close()
 
-    def end(self, part: _Part, tally: Tally) -> None:
-        """Give a part that is not the last its end, in a thread of its own."""
-        part.recorder.flush()
-        outcome = {**self._continued(part), **self._making.said(tally)}
-        self._ending.append((part.recorder, self._beside.submit(part.recorder.finish, outcome)))
+    def finish_part(self, part: PartFile, counters: Counters) -> None:
+        """Finish a part that is not the last, in the side thread."""
+        part.flush()
+        outcome = {**self._continued(part), **counters.summary(self.options.encoding)}
+        self._finishing.append((part, self._side.submit(part.finish, outcome)))
 
-    @property
-    def _numbered(self) -> bool:
-        return bool(self._split)
-
-    def _recorders(self) -> Iterator[Recorder]:
-        return (place.stretch.recorder for place in self._stretches.open)
+    def _finish_after_failure(self, place: OpenSegment[PartFile], reason: str) -> None:
+        place.counters.dropped_frames += place.awaited
+        part, is_last = place.segment, place is self._router.current
+        outcome = {"outcome": "failed", "reason": reason} if is_last else self._continued(part)
+        part.finish({**outcome, **place.counters.summary(self.options.encoding)})
+        self.files.append(part.path)
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Whether a tick is the first one of another part."""
-        place = self._stretches.current
-        if place.begin_ns is None or not self._split:
+        split, place = self.options.split, self._router.current
+        if place.begin_ns is None or not split:
             return False
-        if self._split.seconds:
-            every_ns = max(1, nanoseconds(self._split.seconds))
+        if split.seconds:
+            every_ns = max(1, nanoseconds(split.seconds))
             if self._until_ns is None:
                 self._until_ns = place.begin_ns + every_ns
             if stamp_ns >= self._until_ns:
                 # The parts of an hour begin on the hour, whatever was lost in between.
                 self._until_ns += ((stamp_ns - self._until_ns) // every_ns + 1) * every_ns
                 return True
-        if self._split.megabytes and self._is_large(place):
-            # It has to be known what a part begins with before it can be said how much of it is its own.
-            place.stretch.recorder.wait_for_beginning()
-            return self._is_large(place)
-        return False
+        return bool(split.megabytes) and place.segment.is_larger_than(split.megabytes or 0.0, place.awaited_bytes)
 
-    def _is_large(self, place: Open[_Part]) -> bool:
-        part = place.stretch
-        enough = max(1e6 * (self._split.megabytes or 0.0) - part.first_bytes, part.first_bytes)
-        return part.news_bytes(place.awaited_bytes) >= enough
-
-    def _go_on(self) -> None:
-        last, last_ns = self._stretches.current.stretch, self._stretches.last_ns
-        assert last_ns is not None
-        last.recorder.flush()  # before anything of the next part: a kill must not leave a hole between them
-        part = self._next(last.number + 1, last_ns)
-        part.recorder.begin_with(carried(last_ns, self._stretches.known))
-        self._stretches.cut(part)
-
-    def _next(self, number: int, carried_ns: int | None) -> _Part:
-        making = self._making
-        path, header = making.path, making.header
-        if self._numbered:
+    def _part(self, number: int, first: Entry | None = None) -> PartFile:
+        path, header = self._path, self._header
+        if self.options.split:
             path = part_path(path, number)
-            header = replace(header, part=Part(self._run, number, carried_ns=carried_ns))
-        recorder = Recorder(path, header, making, self._mirrors, wait=carried_ns is None)
-        return _Part(self, number, recorder)
+            keyframe_ns = first.stamp_ns if first is not None else None
+            header = replace(header, part=Part(self._run, number, keyframe_ns=keyframe_ns))
+        return PartFile(self, number, path, header, first)
 
-    def _continued(self, part: _Part) -> dict[str, str]:
-        return {"outcome": "continued", "next": part_path(self._making.path, part.number + 1).name}
+    def _continued(self, part: PartFile) -> dict[str, str]:
+        return {"outcome": "continued", "next": part_path(self._path, part.number + 1).name}
 
-    def _hear_of_ended(self, *, wait: bool) -> None:
-        while self._ending and (wait or self._ending[0][1].done()):
-            recorder, ended = self._ending.popleft()
+    def _collect_finished(self, *, wait: bool) -> None:
+        while self._finishing and (wait or self._finishing[0][1].done()):
+            part, finished = self._finishing.popleft()
             try:
-                ended.result()
-                self.files.append(recorder.path)
-                self._ended_bytes += recorder.size
+                finished.result()
+                self.files.append(part.path)
+                self._finished_bytes += part.size
             finally:
-                recorder.close()
+                part.close()

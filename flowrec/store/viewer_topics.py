@@ -1,4 +1,4 @@
-"""Derived views for other viewers: what Rerun and Foxglove show of a bare session file. The reader ignores them.
+"""The table of viewer topics: derived messages that Rerun and Foxglove show of a session file. The reader ignores them.
 
 Positions are in um, one unit of the 3D view = 1 um, in the chip's frame (origin at pixel (0, 0), x right, y down),
 so that pose, path and grid lie over each other; the frame_id is empty because a named one needs a transform tree.
@@ -7,189 +7,175 @@ Both flow previews use one colour scale, viridis from 0 to the highest speed of 
 
 from __future__ import annotations
 
+import copy
 import functools
-import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
+from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.declarations import Message, Vector
-from flowrec.messages import Estimate, FlowField, Route, Track
-from flowrec.store.form import Payload
+from flowrec.messages import Estimate, FlowField, Message, Route, Track
+from flowrec.store.codec import Payload, byte_field_head, timestamp
 from flowrec.store.schema import foxglove_schema
-from flowrec.store.standard import timestamp
-from flowrec.store.wire import head_of
 from flowrec.units import NS_PER_S
 
 _UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
-# A ring about the robot: a single point of Rerun's default size drowns in the path.
-_MARK_POINTS, _MARK_UM = 24, 60.0
-_MARK_RGBA = (255, 64, 32, 255)
-# Field 3 of both, a Pose: its field 1 is a Vector3 with x and y, its field 2 a Quaternion with w alone.
-_POSE = struct.Struct("<BBBBBdBdBBBd")
-_POSE_HEAD, _POSE_TAIL = (0x1A, 31, 0x0A, 18), (0x12, 9, 0x21, 1.0)
-_ROBOT_EVERY_NS = NS_PER_S // 125  # more often nobody can see it move
+# The robot is drawn as a ring: a single point of Rerun's default size is hidden by the path.
+_RING_POINTS, _RING_UM = 24, 60.0
+_RING_RGBA = (255, 64, 32, 255)
+_ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
 _COLOURS = ("red", "green", "blue", "alpha")
 
 
 @dataclass(frozen=True, slots=True)
-class Mirror:
-    """One derived topic."""
+class ViewerTopic:
+    """One row of the table.
+
+    Attributes
+    ----------
+    path, schema : of the topic; the schema is one of foxglove's.
+    input : what it is derived from: robot, route, assumed or refined.
+    source : the same, in words, for the channel's metadata.
+    make : message, Unix time in ns, highest speed of the colour scale in um/s -> payload.
+    """
 
     path: str
     schema: str
+    input: str
     source: str
+    make: Callable[[Any, int, float], Payload]
 
 
-ROBOT_POSE = Mirror("/view/robot_pose", "PoseInFrame", "estimate, else track")
-# The same once more, for Rerun draws a point and does not draw a pose.
-ROBOT_POINT = Mirror("/view/robot_point", "PointCloud", "estimate, else track")
-PATH = Mirror("/view/path", "PosesInFrame", "route")
-PATH_POINTS = Mirror("/view/path_points", "PointCloud", "route")
-FLOW_ASSUMED = Mirror("/view/flow_assumed", "CompressedImage", "assumed")
-FLOW_REFINED = Mirror("/view/flow_refined", "CompressedImage", "refined")
-FLOW_REFINED_GRID = Mirror("/view/flow_refined_grid", "Grid", "refined")
+class ViewerTopics:
+    """Makes the viewer topics of one session but for `left_out`; remembers the colour scale. For use by one thread.
 
-MIRRORS = (ROBOT_POSE, ROBOT_POINT, PATH, PATH_POINTS, FLOW_ASSUMED, FLOW_REFINED, FLOW_REFINED_GRID)
+    `start_unix_ns` of the session is added to the timestamps in the messages.
 
-
-class Mirrors:
-    """Makes the derived messages of one session, but for `unwanted` topics; remembers the colour scale.
-
-    To be used by one thread. `start_unix_ns` of the session is added to the timestamps in the messages.
+    Attributes
+    ----------
+    top_um_s : speed at the bright end of the colour scale; None before the first flow field.
     """
 
-    def __init__(self, unwanted: frozenset[str] = frozenset(), start_unix_ns: int = 0) -> None:
-        self._unwanted, self._start_unix_ns = unwanted, start_unix_ns
-        self._wanted = {mirror for mirror in MIRRORS if mirror.path not in unwanted}
-        self.top_um_s: float | None = None  # speed at the bright end of the scale, set by the first field
+    def __init__(self, left_out: frozenset[str] = frozenset(), start_unix_ns: int = 0) -> None:
+        self.top_um_s: float | None = None
+        self._start_unix_ns = start_unix_ns
+        self._views = [view for view in VIEWER_TOPICS if view.path not in left_out]
         self._robot_ns = -_ROBOT_EVERY_NS
 
-    def twin(self) -> Mirrors:
-        """One for another thread that goes on from here, with the scale that is known by now."""
-        twin = Mirrors(self._unwanted, self._start_unix_ns)
-        twin.top_um_s, twin._robot_ns = self.top_um_s, self._robot_ns
-        return twin
+    def copy(self) -> ViewerTopics:
+        """One for another thread that continues from here, with the present colour scale."""
+        return copy.copy(self)
 
-    def of(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Payload]]:
-        """Mirror, stamp in ns and payload of whatever follows from the new messages of one tick, by field of Tick."""
-        for mirror, stamp_ns, make in self._due(news):
-            if mirror in self._wanted:
-                # What can not be drawn is drawn anyhow; to judge numbers is not the business of a view.
-                with np.errstate(all="ignore"):
-                    view = make()
-                yield mirror, stamp_ns, view
+    def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
+        """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""
+        for source, message in self._inputs(messages):
+            for view in self._views:
+                if view.input == source:
+                    # Numbers that can not be drawn are no error here.
+                    with np.errstate(all="ignore"):
+                        payload = view.make(message, message.stamp_ns + self._start_unix_ns, self.top_um_s or 1.0)
+                    yield view.path, message.stamp_ns, payload
 
-    def _due(self, news: Mapping[str, Message]) -> Iterator[tuple[Mirror, int, Callable[[], Payload]]]:
-        start = self._start_unix_ns
-        robot = news.get("estimate") or news.get("track")
+    def _inputs(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, Estimate | Track | Route | FlowField]]:
+        robot = messages.get("estimate") or messages.get("track")
         if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
             self._robot_ns = robot.stamp_ns
-            yield ROBOT_POSE, robot.stamp_ns, partial(_pose_in_frame, robot, robot.stamp_ns + start)
-            yield ROBOT_POINT, robot.stamp_ns, partial(_mark, robot, robot.stamp_ns + start)
-        route = news.get("route")
+            yield "robot", robot
+        route = messages.get("route")
         if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
-            yield PATH, route.stamp_ns, partial(_poses_in_frame, route, route.stamp_ns + start)
-            yield PATH_POINTS, route.stamp_ns, partial(_point_cloud, route, route.stamp_ns + start)
-        for name, mirror in (("assumed", FLOW_ASSUMED), ("refined", FLOW_REFINED)):
-            field = news.get(name)
-            if isinstance(field, FlowField) and _drawable(field):
-                yield mirror, field.stamp_ns, partial(self._preview, field, field.stamp_ns + start)
-                if mirror is FLOW_REFINED:
-                    yield FLOW_REFINED_GRID, field.stamp_ns, partial(_grid, field, field.stamp_ns + start)
-
-    def _preview(self, field: FlowField, unix_ns: int) -> Payload:
-        speed = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
-        np.nan_to_num(speed, copy=False, posinf=0.0)
-        if self.top_um_s is None:
-            self.top_um_s = float(speed.max()) or 1.0
-        solid = speed == 0.0
-        speed *= 255.0 / self.top_um_s
-        grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
-        colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
-        colours[solid] = 0
-        png = cv2.imencode(".png", colours)[1]
-        return _with_data("CompressedImage", png, timestamp=timestamp(unix_ns), format="png")
+            yield "route", route
+        for name in ("assumed", "refined"):
+            field = messages.get(name)
+            if isinstance(field, FlowField) and field.velocity_um_s.shape[2:] == (2,) and field.velocity_um_s.size:
+                if self.top_um_s is None:
+                    self.top_um_s = float(_speed_um_s(field).max()) or 1.0
+                yield name, field
 
 
-def _drawable(field: FlowField) -> bool:
-    return field.velocity_um_s.ndim == 3 and field.velocity_um_s.shape[2] == 2 and field.velocity_um_s.size > 0
-
-
-def _wire(name: str) -> Any:
-    return foxglove_schema(name).wire
-
-
-def _serialized(parsed: Any) -> bytes:
-    data: bytes = parsed.SerializeToString()
+def _serialized(name: str, **values: Any) -> bytes:
+    data: bytes = foxglove_schema(name).wire(**values).SerializeToString()
     return data
-
-
-def _pose(x_um: float, y_um: float) -> dict[str, dict[str, float]]:
-    return {"position": {"x": x_um, "y": y_um, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
-
-
-def _pose_in_frame(robot: Estimate | Track, unix_ns: int) -> Payload:
-    return (_timestamp(unix_ns) + _placed(robot.position_um),)
-
-
-def _mark(robot: Estimate | Track, unix_ns: int) -> Payload:
-    return (_timestamp(unix_ns) + _placed(robot.position_um) + _mark_points(),)
 
 
 @functools.lru_cache(maxsize=4)  # both views of the robot are of the same moment
 def _timestamp(unix_ns: int) -> bytes:
     """The field `timestamp`, which has the same number in PoseInFrame and PointCloud."""
-    return _serialized(_wire("PoseInFrame")(timestamp=timestamp(unix_ns)))
+    return _serialized("PoseInFrame", timestamp=timestamp(unix_ns))
 
 
-def _placed(position_um: Vector) -> bytes:
-    """The field `pose`, likewise; by hand, for it is made in every tick."""
-    return _POSE.pack(*_POSE_HEAD, 9, position_um[0], 17, position_um[1], *_POSE_TAIL)
+def _pose(x_um: float, y_um: float) -> fg.Pose:
+    return fg.Pose(position=fg.Vector3(x=x_um, y=y_um, z=0.0), orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+
+
+def _robot_pose(robot: Estimate | Track, unix_ns: int, _top_um_s: float) -> Payload:
+    x_um, y_um = robot.position_um.tolist()
+    return (_timestamp(unix_ns), fg.PoseInFrame(pose=_pose(x_um, y_um)).encode())
+
+
+def _robot_ring(robot: Estimate | Track, unix_ns: int, top_um_s: float) -> Payload:
+    # `pose` has the same number in both schemas, and protobuf merges messages that follow each other.
+    return (*_robot_pose(robot, unix_ns, top_um_s), _ring())
 
 
 @functools.cache
-def _mark_points() -> bytes:
-    """What is the same in every tick: protobuf merges messages that follow each other."""
+def _ring() -> bytes:
+    """The points about the robot; the first one is the robot itself."""
     colours = [{"name": name, "offset": 12 + place, "type": _UINT8} for place, name in enumerate(_COLOURS)]
-    turn = np.arange(_MARK_POINTS) * (2.0 * np.pi / _MARK_POINTS)
-    points = np.zeros(1 + _MARK_POINTS, [("at", "<f4", 3), ("colour", "u1", 4)])  # the first one is the robot itself
-    points["at"][1:, 0], points["at"][1:, 1] = _MARK_UM * np.cos(turn), _MARK_UM * np.sin(turn)
-    points["colour"] = _MARK_RGBA
+    angle = np.arange(_RING_POINTS) * (2.0 * np.pi / _RING_POINTS)
+    points = np.zeros(1 + _RING_POINTS, [("at", "<f4", 3), ("colour", "u1", 4)])
+    points["at"][1:, 0], points["at"][1:, 1] = _RING_UM * np.cos(angle), _RING_UM * np.sin(angle)
+    points["colour"] = _RING_RGBA
     fields = _float_fields("x", "y", "z") + colours
-    return _serialized(_wire("PointCloud")(point_stride=points.itemsize, fields=fields, data=points.tobytes()))
+    return _serialized("PointCloud", point_stride=points.itemsize, fields=fields, data=points.tobytes())
 
 
-def _poses_in_frame(route: Route, unix_ns: int) -> Payload:
+def _path(route: Route, unix_ns: int, _top_um_s: float) -> Payload:
     poses = [_pose(x, y) for x, y in route.waypoints_um.tolist()]
-    return (_serialized(_wire("PosesInFrame")(timestamp=timestamp(unix_ns), poses=poses)),)
+    return (_serialized("PosesInFrame", timestamp=timestamp(unix_ns)), fg.PosesInFrame(poses=poses).encode())
 
 
-def _point_cloud(route: Route, unix_ns: int) -> Payload:
+def _path_points(route: Route, unix_ns: int, _top_um_s: float) -> Payload:
     points = np.zeros((len(route.waypoints_um), 3), "<f4")
     points[:, :2] = route.waypoints_um
     return _with_data(
         "PointCloud",
         points,
         timestamp=timestamp(unix_ns),
-        pose=_pose(0.0, 0.0),
+        pose=_pose_fields(0.0),
         point_stride=12,
         fields=_float_fields("x", "y", "z"),
     )
 
 
-def _grid(field: FlowField, unix_ns: int) -> Payload:
+def _preview(field: FlowField, unix_ns: int, top_um_s: float) -> Payload:
+    speed = _speed_um_s(field)
+    solid = speed == 0.0
+    speed *= 255.0 / top_um_s
+    grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
+    colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
+    colours[solid] = 0
+    png = cv2.imencode(".png", colours)[1]
+    return _with_data("CompressedImage", png, timestamp=timestamp(unix_ns), format="png")
+
+
+def _speed_um_s(field: FlowField) -> NDArray[np.float32]:
+    """(h, w) speed; 0 where it is not finite."""
+    speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
+    np.nan_to_num(speed, copy=False, posinf=0.0)
+    return speed
+
+
+def _grid(field: FlowField, unix_ns: int, _top_um_s: float) -> Payload:
     width, size_um = field.velocity_um_s.shape[1], field.um_per_px
     return _with_data(
         "Grid",
         np.ascontiguousarray(field.velocity_um_s, "<f4"),
         timestamp=timestamp(unix_ns),
-        pose=_pose(-0.5 * size_um, -0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
+        pose=_pose_fields(-0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
         column_count=width,
         cell_size={"x": size_um, "y": size_um},
         row_stride=8 * width,
@@ -198,13 +184,28 @@ def _grid(field: FlowField, unix_ns: int) -> Payload:
     )
 
 
+def _pose_fields(xy_um: float) -> dict[str, dict[str, float]]:
+    return {"position": {"x": xy_um, "y": xy_um}, "orientation": {"w": 1.0}}
+
+
 def _with_data(name: str, data: NDArray[Any], **values: Any) -> Payload:
-    """A message with a field `data` that is not copied: protobuf makes three of it, and fields are large."""
-    wire = _wire(name)
+    """A message with a field `data` that is not copied: protobuf makes three copies, and fields are large."""
     view = data.reshape(-1).view(np.uint8).data
-    number = wire.DESCRIPTOR.fields_by_name["data"].number
-    return (_serialized(wire(**values)) + head_of(number, len(view)), view)
+    number = foxglove_schema(name).wire.DESCRIPTOR.fields_by_name["data"].number
+    return (_serialized(name, **values) + byte_field_head(number, len(view)), view)
 
 
 def _float_fields(*names: str) -> list[dict[str, Any]]:
     return [{"name": name, "offset": 4 * place, "type": _FLOAT32} for place, name in enumerate(names)]
+
+
+VIEWER_TOPICS = (
+    ViewerTopic("/view/robot_pose", "PoseInFrame", "robot", "estimate, else track", _robot_pose),
+    # The same as points, because Rerun draws no pose.
+    ViewerTopic("/view/robot_point", "PointCloud", "robot", "estimate, else track", _robot_ring),
+    ViewerTopic("/view/path", "PosesInFrame", "route", "route", _path),
+    ViewerTopic("/view/path_points", "PointCloud", "route", "route", _path_points),
+    ViewerTopic("/view/flow_assumed", "CompressedImage", "assumed", "assumed", _preview),
+    ViewerTopic("/view/flow_refined", "CompressedImage", "refined", "refined", _preview),
+    ViewerTopic("/view/flow_refined_grid", "Grid", "refined", "refined", _grid),
+)

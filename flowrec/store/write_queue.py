@@ -1,6 +1,6 @@
-"""What waits for the disk: a queue bounded by bytes, from the control loop to the writer's thread.
+"""The queue from the control loop to the writer's thread, bounded by bytes, and which images enter it.
 
-Two lanes: images wait behind everything else, so that a slow disk delays no pose and a kill takes none with it.
+It has two lanes: images wait behind everything else, so that a slow disk delays no pose and a kill takes none with it.
 """
 
 from __future__ import annotations
@@ -11,39 +11,45 @@ from typing import NamedTuple
 
 from flowrec.declarations import Message
 from flowrec.store.roi import Window
+from flowrec.units import NS_PER_S
 
-News = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
+NewMessages = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
+
+# One in 2, 4, 8 and 16 images is kept when the queue is filled to these ratios.
+_DECIMATE_ABOVE = (0.5, 0.625, 0.75, 0.875)
+_RESTORE_BELOW = 0.125
+_RESTORE_AFTER_S, _LONGEST_RESTORE_AFTER_S = 1.0, 32.0
 
 
 class Entry(NamedTuple):
-    """The new messages of one tick and about what they weigh in memory.
+    """The new messages of one tick, or its image, and about how many bytes they take in memory.
 
     Attributes
     ----------
-    stamp_ns, news, nbytes : its stamp, its messages, their weight.
+    stamp_ns, messages, nbytes : stamp of the tick, its messages, their size.
     ticks : 1 for a tick itself, 0 for its image and for what is added to it.
-    image_bytes : weight of its image, which follows in the other lane; 0 where none does.
-    late : it is that image.
-    dropped, missing : images that the writer left out, and that the camera has not delivered, up to here from the
-        entry before.
+    image_bytes : size of its image, which follows in the other lane; 0 where none does.
+    late : this is that image.
+    dropped, missing : images that the writer left out, and that the camera has not delivered, since the entry before.
+    window : of the image, where not all of it is recorded.
     """
 
     stamp_ns: int
-    news: News
+    messages: NewMessages
     nbytes: int
     ticks: int = 0
     image_bytes: int = 0
     late: bool = False
     dropped: int = 0
     missing: int = 0
-    window: Window | None = None  # of the image, where not all of it is to be kept
+    window: Window | None = None
 
 
-class Backlog:
-    """First in, first out in each lane; `close` lets the thread drain it, `abandon` frees everyone who waits."""
+class WriteQueue:
+    """First in, first out in each lane; `close` lets the thread drain it, `abandon` releases everyone who waits."""
 
     def __init__(self, limit_bytes: int) -> None:
-        self.nbytes = 0  # waiting, or in the hands of the thread
+        self.nbytes = 0  # waiting, or in work
         self._limit = limit_bytes
         self._state: deque[Entry] = deque()
         self._images: deque[Entry] = deque()
@@ -54,7 +60,7 @@ class Backlog:
 
     @property
     def fill(self) -> float:
-        """Share of the room that is taken, 0 to 1."""
+        """Ratio of the limit that is used, 0 to 1."""
         return self.nbytes / self._limit
 
     def has_room(self, nbytes: int) -> bool:
@@ -67,7 +73,7 @@ class Backlog:
             self._changed.wait_for(lambda: self._abandoned or self.has_room(nbytes))
 
     def wait_for_flush(self, stamp_ns: int) -> None:
-        """Block until the ticks up to a stamp are with the operating system, or until the queue is abandoned."""
+        """Block until the operating system has the ticks up to a stamp, or until the queue is abandoned."""
         with self._changed:
             if self._flushed_ns < stamp_ns:
                 self._flush_wanted = True
@@ -80,23 +86,24 @@ class Backlog:
         return self._flush_wanted
 
     def flushed(self, stamp_ns: int) -> None:
-        """The ticks up to a stamp are with the operating system."""
+        """Note that the operating system has the ticks up to a stamp."""
         if stamp_ns > self._flushed_ns:  # set by this thread alone
             with self._changed:
                 self._flushed_ns, self._flush_wanted = stamp_ns, False
                 self._changed.notify_all()
 
     def put(self, entry: Entry, image: Entry | None = None) -> None:
-        """Append an entry, `image` to the lane that waits; never blocks."""
+        """Append an entry, and its image to the other lane; never blocks."""
         with self._changed:
-            for news, lane in ((entry, self._state), (image, self._images)):
-                if news is not None:
-                    lane.append(news)
-                    self.nbytes += news.nbytes
+            self._state.append(entry)
+            self.nbytes += entry.nbytes
+            if image is not None:
+                self._images.append(image)
+                self.nbytes += image.nbytes
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None) -> Entry | None:
-        """The next entry; None after the time is over, when all is taken and a flush is wanted, or the end has come."""
+        """The next entry; None after the timeout, when all is taken and a flush is wanted, or at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._state or self._images or self._closed or self._flush_wanted, timeout_s)
             lane = self._state or self._images
@@ -108,20 +115,20 @@ class Backlog:
         return bool(self._images)
 
     def drop_images(self) -> int:
-        """Take the images out of what waits; how many there were."""
+        """Remove the images that wait; returns how many there were."""
         with self._changed:
             dropped = len(self._images)
             for place, image in enumerate(self._images):
-                self._images[place] = image._replace(news={}, dropped=1)
-            for place, entry in enumerate(self._state):  # where nobody minds to wait, images travel with the rest
-                if "frame" in entry.news:
-                    others = {name: message for name, message in entry.news.items() if name != "frame"}
-                    self._state[place] = entry._replace(news=others, dropped=entry.dropped + 1)
+                self._images[place] = image._replace(messages={}, dropped=1)
+            for place, entry in enumerate(self._state):  # a writer that blocks puts images with the rest
+                if "frame" in entry.messages:
+                    others = {name: message for name, message in entry.messages.items() if name != "frame"}
+                    self._state[place] = entry._replace(messages=others, dropped=entry.dropped + 1)
                     dropped += 1
         return dropped
 
     def done(self, entry: Entry) -> None:
-        """The entry has been dealt with: its bytes are free again."""
+        """Free the bytes of an entry that has been dealt with."""
         with self._changed:
             self.nbytes -= entry.nbytes
             self._changed.notify_all()
@@ -133,16 +140,47 @@ class Backlog:
             return self._closed and not self._state and not self._images
 
     def close(self) -> None:
-        """Nothing more will come."""
+        """Nothing more will be put."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
 
     def abandon(self) -> None:
-        """Forget what waits; the disk has failed."""
+        """Discard what waits, because the disk has failed."""
         with self._changed:
             self._closed = self._abandoned = True
             self._state.clear()
             self._images.clear()
             self.nbytes = 0
             self._changed.notify_all()
+
+
+class FrameDecimation:
+    """Decides which images are left out when the disk is slower than the camera.
+
+    One in `every` images is kept, counted from the first, so that the kept ones are evenly spaced also across a change.
+    When the queue has run low, `every` is halved; if it must soon be doubled again, the next try waits twice as long.
+
+    Attributes
+    ----------
+    every : 1, 2, 4, 8 or 16.
+    """
+
+    def __init__(self) -> None:
+        self.every = 1
+        self._number = -1
+        self._restore_after_s = _RESTORE_AFTER_S
+        self._changed_ns: int | None = None  # when `every` was last halved or doubled
+
+    def keeps(self, fill: float, stamp_ns: int) -> bool:
+        """Whether to keep the next image, the queue being filled to that ratio (0 to 1)."""
+        self._number += 1
+        wanted: int = 2 ** sum(fill >= limit for limit in _DECIMATE_ABOVE)
+        since_s = float("inf") if self._changed_ns is None else (stamp_ns - self._changed_ns) / NS_PER_S
+        if wanted > self.every:
+            if since_s < self._restore_after_s:
+                self._restore_after_s = min(2.0 * self._restore_after_s, _LONGEST_RESTORE_AFTER_S)
+            self.every, self._changed_ns = wanted, stamp_ns
+        elif self.every > 1 and fill < _RESTORE_BELOW and since_s >= self._restore_after_s:
+            self.every, self._changed_ns = self.every // 2, stamp_ns
+        return self._number % self.every == 0

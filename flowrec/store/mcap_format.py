@@ -1,30 +1,53 @@
-"""The index at the end of a file, parsed within bounds.
+"""The MCAP format: magic, record layouts, the limits within which flowrec reads, and the summary of a file.
 
-mcap's own records take some 20 us each; a session of hours has ten thousands of chunks and must open at once.
+mcap's own records take some 20 us each to parse; a session of hours has ten thousands of chunks and must open at once.
+Layout: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
 
-_RECORD_HEAD = struct.Struct("<BQ")
-_CHUNK_PLACE = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the map of channels
-_CHANNEL_BYTES = 10  # channel number and the offset of its own index, which nobody needs
+if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
+    from flowrec.messages import Message
+
+MAGIC = b"\x89MCAP0\r\n"
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
+MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+CHUNK_HEAD = struct.Struct("<QQQII")  # first and last time, size and checksum of the content, length of the name
+ATTACHMENT_HEAD = struct.Struct("<QQI")  # log and create time, length of the name
+LONG, CRC = struct.Struct("<Q"), struct.Struct("<I")
+FOOTER_BYTES = RECORD_HEAD.size + 20
+_CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the map of channels
+_CHANNEL_BYTES = 10  # channel number and the offset of its own index, which is not read
 _LENGTH_AND_NAME = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
 
-# Of schemas, channels, metadata and attachments together, each of which takes some 20 us. Ours have 60.
+# Size of one chunk before compression: a flow field on 1900 x 1900 pixels. Reading needs at most what a tick knows,
+# such a chunk on its way into the next tick, and an image on its way: with the program itself less than 512 MB.
+CHUNK_LIMIT_BYTES = 72 << 20
+MESSAGES_LIMIT = 1 << 17  # held as objects at a time, some 400 bytes each
+# Of schemas, channels, metadata and attachments together, each of which takes some 20 us. flowrec writes 60.
 DECLARED_LIMIT = 10_000
 
 _Declared = TypeVar("_Declared", Schema, Channel)
+
+
+class Record(NamedTuple):
+    """One message as it is in a chunk, `log_ns` on the session clock."""
+
+    log_ns: int
+    channel: int
+    sequence: int
+    payload: memoryview | Message  # a message where it has been decoded already
 
 
 @dataclass(slots=True)
@@ -41,36 +64,27 @@ class Summary:
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
 
-    def set_back(self, start_ns: int) -> None:
-        """Turn the times of the chunks, which are Unix times, into stamps of a session that started at `start_ns`.
+    def to_session_clock(self, start_unix_ns: int) -> None:
+        """Turn the Unix times of the chunks into stamps of a session that started at `start_unix_ns`.
 
         Raises
         ------
-        ValueError : one is before the start.
+        ValueError : a chunk is before the start.
         """
-        if not self.chunks or not start_ns:
+        if not self.chunks or not start_unix_ns:
             return
-        assert self.statistics is not None  # summary_from has seen to it, and that its times are those of the chunks
-        self.statistics.message_start_time -= start_ns
-        self.statistics.message_end_time -= start_ns
+        assert self.statistics is not None  # parse_summary has checked that, and that its times are those of the chunks
+        self.statistics.message_start_time -= start_unix_ns
+        self.statistics.message_end_time -= start_unix_ns
         if self.statistics.message_start_time < 0:
             raise ValueError("a chunk begins before the session")
         for chunk in self.chunks:
-            chunk.message_start_time -= start_ns
-            chunk.message_end_time -= start_ns
-
-    def places(self) -> Iterator[tuple[int, int]]:
-        """Offset and length of everything that is listed."""
-        for chunk in self.chunks:
-            yield chunk.chunk_start_offset, chunk.chunk_length
-        for attachment in self.attachments:
-            yield attachment.offset, attachment.length
-        for metadata in self.metadata:
-            yield metadata.offset, metadata.length
+            chunk.message_start_time -= start_unix_ns
+            chunk.message_end_time -= start_unix_ns
 
 
-def summary_from(data: bytes, data_start: int, data_end: int) -> Summary:
-    """The summary in its bytes; what it lists lies between `data_start` and `data_end` of the file.
+def parse_summary(data: bytes, data_start: int, data_end: int) -> Summary:
+    """The summary from its bytes; what it lists lies between `data_start` and `data_end` of the file.
 
     Raises
     ------
@@ -79,25 +93,35 @@ def summary_from(data: bytes, data_start: int, data_end: int) -> Summary:
     summary = Summary()
     interned: dict[tuple[bytes, bytes], dict[int, int]] = {}
     listed_bytes = declared = 0
-    for opcode, at, length in records_of(data):
+    for opcode, at, length in records_in(data):
         if opcode == Opcode.CHUNK_INDEX:
             chunk = _chunk_index(data, at, at + length, interned)
-            # At once, so that a list of nonsense does not fill the memory first.
+            # Checked at once, so that a list of nonsense does not fill the memory first.
             listed_bytes += chunk.chunk_length
             if listed_bytes > data_end or not chunk.chunk_length:
                 raise ValueError("the chunks that are listed do not fit into the file")
             summary.chunks.append(chunk)
-        else:
-            declared += 1
-            if declared > DECLARED_LIMIT:
-                raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
-            _take_in(summary, opcode, data[at : at + length])
+            continue
+        declared += 1
+        if declared > DECLARED_LIMIT:
+            raise ValueError(f"more than {DECLARED_LIMIT} records besides chunks")
+        stream = stream_of(data[at : at + length])
+        if opcode == Opcode.SCHEMA:
+            declare(summary.schemas, Schema.read(stream))
+        elif opcode == Opcode.CHANNEL:
+            declare(summary.channels, Channel.read(stream))
+        elif opcode == Opcode.ATTACHMENT_INDEX:
+            summary.attachments.append(AttachmentIndex.read(stream))
+        elif opcode == Opcode.METADATA_INDEX:
+            summary.metadata.append(MetadataIndex.read(stream))
+        elif opcode == Opcode.STATISTICS:
+            summary.statistics = Statistics.read(stream)
     _check_places(summary, data_start, data_end)
     _check_counts(summary)
     return summary
 
 
-def records_of(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
+def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and length of the body of each record.
 
     Raises
@@ -106,8 +130,8 @@ def records_of(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
     """
     at, end = 0, len(data)
     while at < end:
-        opcode, length = _RECORD_HEAD.unpack_from(data, at)
-        at += _RECORD_HEAD.size
+        opcode, length = RECORD_HEAD.unpack_from(data, at)
+        at += RECORD_HEAD.size
         if length > end - at:
             raise ValueError(f"a record of {length} bytes where {end - at} are left")
         yield opcode, at, length
@@ -117,6 +141,15 @@ def records_of(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
 def stream_of(data: bytes | memoryview) -> ReadDataStream:
     """What mcap's records parse themselves from."""
     return ReadDataStream(io.BytesIO(data))
+
+
+def bytes_of(*records: McapRecord) -> bytes:
+    """Records as they stand in the file."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
 
 
 def declare(known: dict[int, _Declared], record: _Declared) -> None:
@@ -131,8 +164,8 @@ def declare(known: dict[int, _Declared], record: _Declared) -> None:
 
 
 def _chunk_index(data: bytes, at: int, end: int, interned: dict[tuple[bytes, bytes], dict[int, int]]) -> ChunkIndex:
-    first_ns, last_ns, offset, length, map_bytes = _CHUNK_PLACE.unpack_from(data, at)
-    at += _CHUNK_PLACE.size
+    first_ns, last_ns, offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(data, at)
+    at += _CHUNK_INDEX_HEAD.size
     rest = at + map_bytes
     if map_bytes % _CHANNEL_BYTES or rest + _LENGTH_AND_NAME.size > end:
         raise ValueError("the index of a chunk is damaged")
@@ -154,23 +187,16 @@ def _chunk_index(data: bytes, at: int, end: int, interned: dict[tuple[bytes, byt
     )  # fmt: skip
 
 
-def _take_in(summary: Summary, opcode: int, body: bytes) -> None:
-    if opcode == Opcode.SCHEMA:
-        declare(summary.schemas, Schema.read(stream_of(body)))
-    elif opcode == Opcode.CHANNEL:
-        declare(summary.channels, Channel.read(stream_of(body)))
-    elif opcode == Opcode.ATTACHMENT_INDEX:
-        summary.attachments.append(AttachmentIndex.read(stream_of(body)))
-    elif opcode == Opcode.METADATA_INDEX:
-        summary.metadata.append(MetadataIndex.read(stream_of(body)))
-    elif opcode == Opcode.STATISTICS:
-        summary.statistics = Statistics.read(stream_of(body))
+def _places(summary: Summary) -> Iterable[tuple[int, int]]:
+    """Offset and length of everything that is listed."""
+    yield from ((chunk.chunk_start_offset, chunk.chunk_length) for chunk in summary.chunks)
+    yield from ((index.offset, index.length) for index in (*summary.attachments, *summary.metadata))
 
 
 def _check_places(summary: Summary, start: int, end: int) -> None:
-    """Each thing at a place of its own: else a small file could be read for ever."""
+    """Each thing has a place of its own: else a small file could be read for ever."""
     reached = start
-    for offset, length in sorted(summary.places()):
+    for offset, length in sorted(_places(summary)):
         if offset < reached:
             raise ValueError(f"what is listed at byte {offset} lies over something else")
         reached = offset + length

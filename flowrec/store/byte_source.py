@@ -1,0 +1,94 @@
+"""Readers of bytes: where the bytes of a session come from. mcap_reader.py asks one of them for size and ranges.
+
+Another kind (an URL, an archive) is one class and one row of BYTE_SOURCES.
+"""
+
+from __future__ import annotations
+
+import os
+import weakref
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Protocol
+
+from flowrec.errors import SessionError
+
+
+class ByteSource(Protocol):
+    """Bytes that can be read by range, from several threads at a time.
+
+    Attributes
+    ----------
+    path : its name, for messages.
+    size : number of bytes when it was opened.
+    """
+
+    path: Path
+    size: int
+
+    def read(self, offset: int, length: int) -> bytes:
+        """The bytes of a range that lies within `size`; fewer where the source has become shorter.
+
+        Raises
+        ------
+        SessionError : it can not be read, or has been closed.
+        """
+
+    def close(self) -> None:
+        """Release it; a forgotten one is released when it is collected."""
+
+
+class LocalFile:
+    """A file on this machine.
+
+    Raises
+    ------
+    SessionError : it can not be opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if path.is_dir():
+            raise SessionError(f"{path}: is a directory, not a session; name a .mcap file in it (`flowrec ls {path}`)")
+        try:
+            self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        except FileNotFoundError as error:
+            raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error
+        except ValueError as error:  # a name with a NUL, which only another file can have given
+            raise SessionError(f"{path}: is not the name of a file") from error
+        except OSError as error:
+            raise SessionError(f"{path}: can not be opened ({error.strerror}); check its permissions") from error
+        self._closer = weakref.finalize(self, os.close, self._descriptor)
+        self.size = os.fstat(self._descriptor).st_size
+
+    def read(self, offset: int, length: int) -> bytes:
+        if not self._closer.alive:
+            raise SessionError(f"{self.path}: has been closed; open the session again")
+        data = b""
+        try:
+            while len(data) < length:  # one call reads 2 GiB at most
+                more = os.pread(self._descriptor, length - len(data), offset + len(data))
+                if not more:
+                    break
+                data = data + more if data else more
+        except OSError as error:
+            raise SessionError(f"{self.path}: can not be read at byte {offset} ({error.strerror})") from error
+        return data
+
+    def close(self) -> None:
+        self._closer()
+
+
+# By the scheme of an URL.
+BYTE_SOURCES: Mapping[str, Callable[[Path], ByteSource]] = {"file": LocalFile}
+
+
+def open_bytes(path: Path) -> ByteSource:
+    """The bytes that a path or URL names.
+
+    Raises
+    ------
+    SessionError : they can not be opened.
+    """
+    scheme = str(path).partition(":")[0]
+    return BYTE_SOURCES.get(scheme, LocalFile)(path)
