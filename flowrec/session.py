@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from flowrec.errors import FlowrecError, SessionError, UsageError
-from flowrec.store.metadata import SessionHeader
 from flowrec.store.part_continuity import Run, files_of
-from flowrec.store.paths import pieces
-from flowrec.store.session_metadata import Head
+from flowrec.store.paths import run_files
+from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.summary import Figures, of_text
 from flowrec.system.toml_file import parse_toml
 from flowrec.units import nanoseconds, seconds
@@ -61,7 +60,7 @@ class Session:
     @cached_property
     def header(self) -> SessionHeader:
         """Configuration, chip, provenance and parent as they were written before the first message."""
-        with Head(self.run.pieces[0].path) as head:
+        with SessionMetadata(self.run.files[0].path) as head:
             return head.header
 
     @property
@@ -227,9 +226,10 @@ def files_behind(path: Path) -> list[Path]:
     """
     files: list[Path] = []
     while path not in files:
-        files += [path, *pieces(path)]
-        with contextlib.suppress(SessionError), Head(files_of(path)[0]) as head:  # who reads it says what is wrong
-            path = path.with_name(Path(head.header.parent.get("file", "")).name or path.name)
+        files += [path, *run_files(path)]
+        # What is wrong with a file is the error of whoever reads it.
+        with contextlib.suppress(SessionError), SessionMetadata(files_of(path)[0]) as file:
+            path = path.with_name(Path(file.header.parent.get("file", "")).name or path.name)
     return files
 
 

@@ -12,8 +12,8 @@ from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig, calibration_of, to_toml
 from flowrec.provenance import provenance
 from flowrec.session import files_behind, session_sha256
-from flowrec.store import Region, SessionHeader, SessionWriter, Snapshot, Split, encoding_for, files_of
-from flowrec.store.session_metadata import Head
+from flowrec.store import Region, SessionHeader, SessionWriter, Snapshot, Split, WriterOptions, encoding_for, files_of
+from flowrec.store.session_metadata import SessionMetadata
 
 _QUEUE_S = 2.0
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
@@ -45,20 +45,19 @@ def session_writer(
         named = {"file": parent.name, "sha256": session_sha256(files)}
         header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
     header = replace(header, provenance={**header.provenance, **_durability(config, live=live)})
-    return SessionWriter(
-        path,
-        header,
+    options = WriterOptions(
         frames=frames_of(config),
         flush_s=config.recording.flush_s,
         sync_s=config.recording.sync_s,
-        queue_limit_bytes=queue_bytes_of(config),
-        block=not live,
         overwrite=overwrite,
-        pieces=_pieces_of(config) if in_pieces else None,
+        block=not live,
+        queue_limit_bytes=queue_bytes_of(config),
+        files=_files_of(config) if in_pieces else Split(),
         region=region_of(config, chip, again=parent is not None),
         leave_out=config.recording.leave_out,
-        inputs=(*inputs, *(files_behind(parent) if parent is not None else ())),
     )
+    inputs = (*inputs, *(files_behind(parent) if parent is not None else ()))
+    return SessionWriter(path, header, options, inputs=inputs)
 
 
 def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
@@ -70,11 +69,11 @@ def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
 
 
 def _start_unix_ns(file: Path) -> int:
-    with Head(file) as head:
+    with SessionMetadata(file) as head:
         return head.source.start_unix_ns
 
 
-def _pieces_of(config: ResolvedConfig) -> Split | Snapshot:
+def _files_of(config: ResolvedConfig) -> Split | Snapshot:
     recording = config.recording
     if recording.snapshot_before_s:
         return Snapshot(recording.snapshot_before_s, recording.snapshot_after_s, recording.snapshot_mb)

@@ -27,7 +27,7 @@ from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import LockstepWorker, Sink, run
 from flowrec.session_writer import session_header
-from flowrec.store import SessionWriter
+from flowrec.store import SessionWriter, WriterOptions
 from flowrec.terminal import progress, table
 from flowrec.view import LiveView
 
@@ -108,7 +108,9 @@ def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] 
             with ExitStack() as stack:
                 sinks: list[Sink] = []
                 if "recording" in kind:
-                    writer = SessionWriter(path, session_header(config, chip), block=False, overwrite=True)
+                    writer = SessionWriter(
+                        path, session_header(config, chip), WriterOptions(block=False, overwrite=True)
+                    )
                     sinks.append(stack.enter_context(writer))
                 if "viewing" in kind:
                     sinks.append(stack.enter_context(LiveView(scene_of(config, chip, pipeline, path), "serve")))

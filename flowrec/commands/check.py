@@ -17,9 +17,9 @@ from flowrec.declarations import Role
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
 from flowrec.store.audit import audit
-from flowrec.store.part_continuity import fault_of, goes_on, without_part
-from flowrec.store.paths import part_number, part_path, pieces
-from flowrec.store.topic_filter import is_left_out
+from flowrec.store.channels import is_left_out
+from flowrec.store.part_continuity import continuity_fault, is_continued
+from flowrec.store.paths import part_number, part_path, run_files
 from flowrec.summary import finite
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS
@@ -38,7 +38,7 @@ def files_to_check(path: Path) -> list[Path]:
     """The file of that name or, where there is none, the existing parts of that run, finished or not."""
     if path.exists():
         return [path]
-    return sorted(filter(part_number, pieces(path)), key=part_number) or [path]
+    return sorted(filter(part_number, run_files(path)), key=part_number) or [path]
 
 
 def check(session: Session | Path | str, progress: Callable[[int], None] | None = None) -> Verdict:
@@ -289,7 +289,7 @@ def _check_run(path: Path, checks: Sequence[_FileCheck]) -> Verdict:
         which = f"part {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} of {len(checks)} parts"
         run.findings.append(replace(finding, text=f"{which}: {finding.text}"))
     _check_continuity(run, checks)
-    if last.finished and goes_on(last.outcome):
+    if last.finished and is_continued(last.outcome):
         following = part_path(path, part_number(last.path) + 1).name
         run.bad(
             "end", f"the run goes on in {following}, which is not here; `flowrec recover {path}` ends it before that"
@@ -325,7 +325,7 @@ def _check_continuity(run: Verdict, checks: Sequence[_FileCheck]) -> None:
         if check.found.header is None:  # already reported
             before = None
             continue
-        fault = fault_of(check.found.piece, number, before.found.piece if before is not None else None)
+        fault = continuity_fault(check.found.run_file, number, before.found.run_file if before is not None else None)
         if fault is not None and (before is not None or number == 1):
             run.bad("parts", f"part {number} {fault}")
         elif before is not None:
@@ -339,10 +339,10 @@ def _compare_ends(run: Verdict, name: str, before: _FileCheck, after: _FileCheck
     """Compare the header and the keyframe of a part with what the part before ended with."""
     was, now = before.found.header, after.found.header
     assert was is not None and now is not None
-    if without_part(was) != without_part(now):
+    if not was.is_same_run(now):
         run.bad("parts", f"{name} has another head (configuration, chip or origin) than the part before")
     outcome = before.found.outcome
-    if before.found.finished and not goes_on(outcome) and outcome.get("outcome") != "cut":
+    if before.found.finished and not is_continued(outcome) and outcome.get("outcome") != "cut":
         run.odd("parts", f"{name} goes on although the part before says that the run ended with it")
     # An image that was dropped may be in one of them only; no stage reads truths and timings.
     read = {topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {"frame"}

@@ -86,7 +86,7 @@ class Tally:
     def begin(self, found: Audit) -> None:
         """Take the header, before the first message."""
         part = found.header.part if found.header is not None else None
-        self._keyframe_ns = part.carried_ns if part is not None else None
+        self._keyframe_ns = part.keyframe_ns if part is not None else None
 
     def add(self, name: str, log_ns: int, message: Message) -> None:
         """Count one message: its field of Tick, the time of its tick in ns, itself."""

@@ -15,9 +15,9 @@ from typing import Any
 
 from flowrec.errors import SessionError
 from flowrec.session import Session, toml_table
-from flowrec.store.metadata import Part
 from flowrec.store.part_continuity import Run
 from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
+from flowrec.store.session_metadata import Part
 from flowrec.summary import name_of, of_text, shown
 from flowrec.system.locks import is_growing
 from flowrec.units import seconds
@@ -43,7 +43,7 @@ def info(session: Session | Path | str) -> dict[str, Any]:
         "note": _why(outcome),
         "duration_s": session.duration_s,
         "size_bytes": _size(run),
-        "parts": len(run.pieces) if run.in_parts else None,
+        "parts": len(run.files) if run.in_parts else None,
         **_chip(toml_table(header.chip_toml, f"{path}: chip.toml inside"), header.chip_png),
         "rig": _name(session.setting("rig")),
         "phases": [str(phase) for phase in phases] if isinstance(phases, list) else [],
@@ -152,12 +152,12 @@ def _listed(path: Path, files: list[Path]) -> Listed:
 
 
 def _size(run: Run) -> int:
-    return sum(piece.path.stat().st_size for piece in run.pieces)
+    return sum(file.path.stat().st_size for file in run.files)
 
 
 def _piece(part: Part, path: Path) -> str:
     said = f"{part.kind} {part.number} of the run {run_path(path).stem}" + _bracketed(part.why)
-    return said if part.carried_ns is None else f"{said}, goes on from {seconds(part.carried_ns):.2f} s"
+    return said if part.keyframe_ns is None else f"{said}, goes on from {seconds(part.keyframe_ns):.2f} s"
 
 
 def _chip(said: Mapping[str, Any], png: bytes) -> dict[str, Any]:

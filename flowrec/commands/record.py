@@ -32,8 +32,8 @@ from flowrec.run.loop import LockstepWorker, Preloaded, ProcessWorker, RunReport
 from flowrec.run.watchdog import Guard
 from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
-from flowrec.store import SessionWriter, is_snapshot, taken
-from flowrec.store.paths import pieces, run_path
+from flowrec.store import SessionWriter, is_snapshot, runs_in
+from flowrec.store.paths import run_files, run_path
 from flowrec.summary import Figures, as_text, finite, rows_for_people
 from flowrec.system.outputs import MCAP, RRD, check_output
 from flowrec.system.realtime_priority import first_of_all
@@ -171,7 +171,7 @@ def default_path(config: Config, folder: Path | None = None) -> Path:
     words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
     stem = "_".join(word.replace(" ", "-") for word in words if word)
     folder = folder or Path()
-    names = taken(folder)
+    names = runs_in(folder)
     for number in range(1, 10_000):
         path = folder / f"{stem}_{number:03d}.mcap"
         if path not in names:
@@ -375,7 +375,7 @@ def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
     folder = out.parent if out is not None else Path()
     made: dict[Path, str] = {}
     if config.recording.recover_leftovers:
-        besides = frozenset(pieces(out.resolve())) if out is not None and overwrite else frozenset()
+        besides = frozenset(run_files(out.resolve())) if out is not None and overwrite else frozenset()
         made = look_after(folder, besides)
     path = out if out is not None else default_path(config)
     same = next((file for file in made if run_path(file) == path), None)

@@ -248,9 +248,9 @@ def replay(
         pipeline = replace(pipeline, hindsight=hindsight(session, pipeline))
     path, reader = session.path, session.reader
     start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
-    if reader.carried_ns is not None:
+    if reader.keyframe_ns is not None:
         # A part of a run begins with a keyframe, whose inputs the part before holds.
-        start_ns = max(start_ns or 0, reader.carried_ns + 1)
+        start_ns = max(start_ns or 0, reader.keyframe_ns + 1)
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
     worker = LockstepWorker(pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from flowrec.store.roi import Region, nonzero_window
     from flowrec.store.session_file import Snapshot, Split, WriterOptions
     from flowrec.store.session_metadata import SessionHeader
-    from flowrec.store.shapes import not_finite
     from flowrec.store.writer import SessionWriter
 
 _MODULES = {
@@ -32,7 +31,6 @@ _MODULES = {
     "files_of": "part_continuity",
     "is_snapshot": "paths",
     "nonzero_window": "roi",
-    "not_finite": "shapes",
     "recover": "recovery",
     "recover_run": "recovery",
     "runs_in": "paths",
@@ -52,7 +50,6 @@ __all__ = [
     "files_of",
     "is_snapshot",
     "nonzero_window",
-    "not_finite",
     "recover",
     "recover_run",
     "runs_in",

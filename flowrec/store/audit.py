@@ -9,8 +9,8 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
+from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.messages import Message
 from flowrec.store.codec import message_stamp
 from flowrec.store.digest import FileDigest
 from flowrec.store.mcap_format import Record
@@ -20,7 +20,6 @@ from flowrec.store.roi import Region
 from flowrec.store.scan import Scan, scan
 from flowrec.store.schema_check import SessionContents
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
-from flowrec.store.shapes import misfit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
@@ -181,7 +180,7 @@ class _Reading:
             self._last_ns[name] = record.log_ns
             try:
                 message = self._contents.decode(record)
-                wrong = misfit(message)
+                wrong = shape_error(message)
             except SessionError as error:
                 wrong = str(error)
             if wrong:

@@ -14,6 +14,7 @@ from typing import Any
 from mcap.records import Channel
 from mcap.records import Schema as SchemaRecord
 
+from flowrec.declarations import Role
 from flowrec.errors import UsageError
 from flowrec.messages import Frame
 from flowrec.store.codec import Codec, codec_of
@@ -21,7 +22,7 @@ from flowrec.store.frame_encodings import ENCODINGS, FRAME_CODECS, FrameEncoding
 from flowrec.store.roi import Region
 from flowrec.store.schema import Schema, foxglove_schema
 from flowrec.store.viewer_topics import VIEWER_TOPICS
-from flowrec.topics import BY_FIELD, TOPICS, Role
+from flowrec.topics import BY_FIELD, TOPICS
 
 FRAMES, STATE, VIEW = "frames", "state", "view"
 GROUPS = (FRAMES, STATE, VIEW)

@@ -20,9 +20,10 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
+from flowrec.declarations import Message, MessageField, message_fields
 from flowrec.errors import SessionError
-from flowrec.messages import Event, Message, OperatorEvent
-from flowrec.store.schema import ARRAY_DATA, FieldForm, Schema, array_schema, forms_of, foxglove_schema, schema_of
+from flowrec.messages import Event, Frame, OperatorEvent
+from flowrec.store.schema import ARRAY_DATA, Schema, array_schema, foxglove_schema, schema_of
 from flowrec.units import NS_PER_S
 
 Payload = tuple[bytes | memoryview, ...]
@@ -69,20 +70,24 @@ class Codec:
         return self.schema.name.startswith("foxglove.")
 
 
-@functools.cache
+_CODECS: dict[type[Any], Codec] = {}
+
+
 def codec_of(message_type: type[Any]) -> Codec:
     """The codec of a message type other than Frame, which has several (frame_encodings.py)."""
-    if message_type is Event:
-        return _event_codec()
-    if message_type is OperatorEvent:
-        return _operator_codec()
-    schema = schema_of(message_type)
-    return Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
-
-
-def encode(message: Message) -> bytes:
-    """One message as bytes; errors as `encode_record`."""
-    return b"".join(encode_record(message, codec_of(type(message)))[1])
+    codec = _CODECS.get(message_type)
+    if codec is None:
+        if message_type is Frame:
+            raise TypeError("the codec of a Frame depends on its encoding")
+        if message_type is Event:
+            codec = _event_codec()
+        elif message_type is OperatorEvent:
+            codec = _operator_codec()
+        else:
+            schema = schema_of(message_type)
+            codec = Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
+        _CODECS[message_type] = codec
+    return codec
 
 
 def encode_record(message: Message, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
@@ -185,7 +190,7 @@ def detached(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int,
 
 def _without_surrogates(message: _M) -> _M:
     changes = {}
-    for form in forms_of(type(message)):
+    for form in message_fields(type(message)):
         value = getattr(message, form.name)
         changes[form.name] = value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
     return type(message)(**changes)
@@ -193,7 +198,7 @@ def _without_surrogates(message: _M) -> _M:
 
 def _encoder(message_type: type[Any], schema: Schema) -> Callable[[Any], Payload]:
     wire = schema.wire
-    forms = list(enumerate(forms_of(message_type), 1))
+    forms = list(enumerate(message_fields(message_type), 1))
 
     def encode(message: Any) -> Payload:
         values: dict[str, Any] = {}
@@ -227,7 +232,7 @@ def _large_array(number: int, array: NDArray[Any]) -> Payload:
 
 def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memoryview, int], Any]:
     parse = schema.wire.FromString
-    forms = forms_of(message_type)
+    forms = message_fields(message_type)
     unpackers = [_unpacker(form) for form in forms]
     arrays = {number: form for number, form in enumerate(forms, 1) if form.kind == "array"}
 
@@ -247,7 +252,7 @@ def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memor
     return decode
 
 
-def _unpacker(form: FieldForm) -> Callable[[Any], Any]:
+def _unpacker(form: MessageField) -> Callable[[Any], Any]:
     """Takes the value of one field out of a parsed message."""
     name, dtype = form.name, form.dtype
     present: Callable[[Any], Any] = operator.attrgetter(name)

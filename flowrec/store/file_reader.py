@@ -14,17 +14,17 @@ from typing import Any
 
 from mcap.records import ChunkIndex
 
+from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.messages import Frame, Message
+from flowrec.messages import Frame
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.image_codec import PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.schema_check import SessionContents
-from flowrec.store.shapes import misfit
-from flowrec.store.write_queue import NewMessages
 from flowrec.topics import BY_FIELD
 
+NewMessages = dict[str, Any]  # by field of Tick
 Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 _CACHED_MESSAGES = 64  # of restored states
 _STATE_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
@@ -120,7 +120,7 @@ class FileReader:
             return record.payload
         try:
             message = self.contents.decode(record)
-            fault = misfit(message)
+            fault = shape_error(message)
         except SessionError as error:
             fault = str(error)
         if not fault:
@@ -140,7 +140,7 @@ class FileReader:
         except SessionError:
             return record
         assert isinstance(frame, Frame)
-        sound = not misfit(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
+        sound = not shape_error(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
         return record._replace(payload=frame) if sound else record
 
     def _restored(self, record: Record) -> Message | None:

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowrec.messages import Frame, Image
+from flowrec.declarations import Image
+from flowrec.messages import Frame
 from flowrec.store.codec import Codec, Payload, byte_field_head, cut_byte_fields, detached, stamp_of, timestamp
 from flowrec.store.image_codec import PIXELS_LIMIT, decode_image, jpeg, png, row_differences
 from flowrec.store.schema import foxglove_schema

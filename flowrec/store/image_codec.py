@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.messages import Image
+from flowrec.declarations import Image
 from flowrec.store.codec import Payload
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"

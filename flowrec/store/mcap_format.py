@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
 
 if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
-    from flowrec.messages import Message
+    from flowrec.declarations import Message
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -190,7 +190,8 @@ def _chunk_index(data: bytes, at: int, end: int, interned: dict[tuple[bytes, byt
 def _places(summary: Summary) -> Iterable[tuple[int, int]]:
     """Offset and length of everything that is listed."""
     yield from ((chunk.chunk_start_offset, chunk.chunk_length) for chunk in summary.chunks)
-    yield from ((index.offset, index.length) for index in (*summary.attachments, *summary.metadata))
+    yield from ((index.offset, index.length) for index in summary.attachments)
+    yield from ((index.offset, index.length) for index in summary.metadata)
 
 
 def _check_places(summary: Summary, start: int, end: int) -> None:

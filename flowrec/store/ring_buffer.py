@@ -106,7 +106,8 @@ class RingBuffer:
 
     Parameters
     ----------
-    path, header, options : of the run; `options.snapshot` is set.
+    path, header, options : of the run.
+    settings : what a snapshot contains.
     run : a random word for the heads of its files.
     remarks : receives what happens, as text.
 
@@ -120,12 +121,17 @@ class RingBuffer:
     """
 
     def __init__(
-        self, path: Path, header: SessionHeader, options: WriterOptions, run: str, remarks: deque[str]
+        self,
+        path: Path,
+        header: SessionHeader,
+        options: WriterOptions,
+        settings: Snapshot,
+        run: str,
+        remarks: deque[str],
     ) -> None:
-        assert options.snapshot is not None
         self.files: list[Path] = []
         self._path, self._header, self._options, self._run = path, header, options, run
-        self._settings: Snapshot = options.snapshot
+        self._settings = settings
         self._remarks = remarks
         self._before_ns, self._after_ns = nanoseconds(self._settings.before_s), nanoseconds(self._settings.after_s)
         self._segment_ns = min(nanoseconds(_SEGMENT_S), self._before_ns // _SEGMENTS)

@@ -6,15 +6,15 @@ from dataclasses import fields
 
 from google.protobuf import descriptor_pb2
 
-import flowrec
+from flowrec.declarations import Message, defaulted_fields
 from flowrec.errors import SessionError
-from flowrec.messages import Message, defaulted_fields
 from flowrec.store.channels import FRAME_PATH, message_codec
 from flowrec.store.codec import Codec, decode
 from flowrec.store.mcap_format import Record, Summary
 from flowrec.store.roi import Region, region_from
 from flowrec.store.session_metadata import SessionMetadata
 from flowrec.topics import BY_FIELD, BY_PATH
+from flowrec.version import __version__
 
 
 class SessionContents(SessionMetadata):
@@ -78,7 +78,7 @@ class SessionContents(SessionMetadata):
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
             f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
-            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {flowrec.__version__})"
+            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
         )
 
 

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Generic, Protocol, TypeVar
 
-from flowrec.messages import Frame, Message
+from flowrec.declarations import Message
+from flowrec.messages import Frame
 from flowrec.store.frame_encodings import FrameEncoding
 from flowrec.store.write_queue import Entry, NewMessages
 

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import SealedChunk
@@ -23,6 +22,7 @@ from flowrec.store.paths import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.roi import Region
 from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
 from flowrec.system.outputs import MCAP, check_output, put_in_place, sync_directory, taken
+from flowrec.version import __version__
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +72,8 @@ class WriterOptions:
         `flush_s` of stamps is not yet with the operating system. False: images are decimated (write_queue.py) and
         counted; nothing else is ever dropped (live run).
     queue_limit_bytes : how much may wait for the disk.
-    split : write the run X.mcap to the files X.part001.mcap, X.part002.mcap, ..., each of which is readable alone.
-    snapshot : write nothing but X.snap001.mcap, ... around events.
+    files : a Split: the run X.mcap is written to the files X.part001.mcap, X.part002.mcap, ..., each of which is
+        readable alone; a Snapshot: nothing is written but X.snap001.mcap, ... around events.
     region : record only the window around the robot of most images (roi.py); None: all of all images.
     leave_out : topics that are not recorded, as names or patterns such as `/view/*`.
     """
@@ -84,8 +84,7 @@ class WriterOptions:
     overwrite: bool = False
     block: bool = False
     queue_limit_bytes: int = 256 << 20
-    split: Split | None = None
-    snapshot: Snapshot | None = None
+    files: Split | Snapshot = Split()
     region: Region | None = None
     leave_out: tuple[str, ...] = ()
 
@@ -145,7 +144,7 @@ class SessionFile:
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         try:
-            self._file.start(PROFILE, f"flowrec {flowrec.__version__}")
+            self._file.start(PROFILE, f"flowrec {__version__}")
             for record in (*header_records(header), *declarations(options.encoding, options.region)):
                 self._file.add(record)
         except BaseException as error:

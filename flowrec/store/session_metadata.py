@@ -15,10 +15,10 @@ from typing import Literal, Self
 
 from mcap.records import Attachment, Metadata, Statistics
 
-import flowrec
 from flowrec.errors import SessionError
 from flowrec.store.mcap_format import Summary
 from flowrec.store.mcap_reader import ForeignError, McapReader
+from flowrec.version import __version__
 
 FORMAT_VERSION = 1
 PROFILE = "flowrec"
@@ -99,7 +99,7 @@ class SessionHeader:
 
 def header_records(header: SessionHeader) -> Iterator[Metadata | Attachment]:
     """The MCAP records of a header, in the order in which they are written."""
-    yield Metadata(SESSION, {"format_version": str(FORMAT_VERSION), "flowrec_version": flowrec.__version__})
+    yield Metadata(SESSION, {"format_version": str(FORMAT_VERSION), "flowrec_version": __version__})
     yield Metadata(PROVENANCE, dict(header.provenance))
     yield Metadata(PARENT, dict(header.parent))
     part = header.part
@@ -247,7 +247,7 @@ class SessionMetadata:
         what = f"{self.source.path}: is a session of format {version!r}, written by flowrec {self.flowrec_version}"
         newer = version.isdecimal() and int(version) > FORMAT_VERSION
         need = f"install flowrec {self.flowrec_version} or later" if newer else "it is damaged or was edited"
-        raise SessionError(f"{what}; this is flowrec {flowrec.__version__} with format {FORMAT_VERSION}: {need}")
+        raise SessionError(f"{what}; this is flowrec {__version__} with format {FORMAT_VERSION}: {need}")
 
     def _by_topic(self, counts: Mapping[int, int]) -> dict[str, int]:
         found: Counter[str] = Counter()

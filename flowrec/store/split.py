@@ -18,7 +18,7 @@ from flowrec.errors import SessionError
 from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
 from flowrec.store.paths import part_path
 from flowrec.store.segments import Counters, OpenSegment, SegmentRouter, keyframe
-from flowrec.store.session_file import FileError, SessionFile, WriterOptions
+from flowrec.store.session_file import FileError, SessionFile, Split, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
@@ -211,6 +211,7 @@ class Parts:
     Parameters
     ----------
     path, header, options : of the run.
+    split : when the next part begins.
     run : a random word for the heads of its parts.
 
     Attributes
@@ -223,11 +224,11 @@ class Parts:
     SessionError : from any method, when the disk refuses, or a message can not be encoded.
     """
 
-    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, run: str) -> None:
+    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, split: Split, run: str) -> None:
         self.files: list[Path] = []
         self.options = options
         self.views = ViewerTopics(options.left_out_topics, header.start_unix_ns)
-        self._path, self._header, self._run = path, header, run
+        self._path, self._header, self._split, self._run = path, header, split, run
         self._until_ns: int | None = None
         self._finished_bytes = 0
         self._finishing: deque[tuple[PartFile, Future[None]]] = deque()
@@ -291,7 +292,7 @@ class Parts:
         with contextlib.suppress(SessionError):
             self._collect_finished(wait=True)
         for place in self._router.open:
-            if reason and not place.segment.failed and self.options.split:
+            if reason and not place.segment.failed and self._split:
                 with contextlib.suppress(SessionError):  # the first failure matters more
                     self._finish_after_failure(place, reason)
             place.segment.close()
@@ -311,7 +312,7 @@ class Parts:
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Whether a tick is the first one of another part."""
-        split, place = self.options.split, self._router.current
+        split, place = self._split, self._router.current
         if place.begin_ns is None or not split:
             return False
         if split.seconds:
@@ -326,7 +327,7 @@ class Parts:
 
     def _part(self, number: int, first: Entry | None = None) -> PartFile:
         path, header = self._path, self._header
-        if self.options.split:
+        if self._split:
             path = part_path(path, number)
             keyframe_ns = first.stamp_ns if first is not None else None
             header = replace(header, part=Part(self._run, number, keyframe_ns=keyframe_ns))

@@ -18,7 +18,8 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.messages import Estimate, FlowField, Message, Route, Track
+from flowrec.declarations import Message
+from flowrec.messages import Estimate, FlowField, Route, Track
 from flowrec.store.codec import Payload, byte_field_head, timestamp
 from flowrec.store.schema import foxglove_schema
 from flowrec.units import NS_PER_S
@@ -164,7 +165,8 @@ def _preview(field: FlowField, unix_ns: int, top_um_s: float) -> Payload:
 
 def _speed_um_s(field: FlowField) -> NDArray[np.float32]:
     """(h, w) speed; 0 where it is not finite."""
-    speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
+    with np.errstate(over="ignore"):
+        speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
     np.nan_to_num(speed, copy=False, posinf=0.0)
     return speed
 

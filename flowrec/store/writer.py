@@ -22,7 +22,7 @@ from flowrec.store.channels import FRAME_PATH
 from flowrec.store.paths import run_files
 from flowrec.store.ring_buffer import RingBuffer
 from flowrec.store.roi import Window, WindowSelector
-from flowrec.store.session_file import WriterOptions, refuse_if_taken
+from flowrec.store.session_file import Snapshot, WriterOptions, refuse_if_taken
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, NewMessages, WriteQueue
@@ -99,10 +99,10 @@ class SessionWriter:
         self._replaced = {file: file.stat().st_ino for file in run_files(self.path)} if options.overwrite else {}
         run = os.urandom(8).hex()  # the same in all files of the run, and in no other run
         self._output: Parts | RingBuffer
-        if options.snapshot is not None:
-            self._output = RingBuffer(self.path, header, options, run, self.remarks)
+        if isinstance(options.files, Snapshot):
+            self._output = RingBuffer(self.path, header, options, options.files, run, self.remarks)
         else:
-            self._output = Parts(self.path, header, options, run)
+            self._output = Parts(self.path, header, options, options.files, run)
         self._queue = WriteQueue(options.queue_limit_bytes)
         self._thread = threading.Thread(target=self._work, name="session-writer", daemon=True)
         self._thread.start()
@@ -315,5 +315,9 @@ class SessionWriter:
 
 
 def _nbytes(message: Message) -> int:
-    arrays = (getattr(message, name) for name in _PIXEL_FIELDS[type(message)])
-    return _MESSAGE_BYTES + sum(array.nbytes for array in arrays if array is not None)
+    nbytes = _MESSAGE_BYTES
+    for name in _PIXEL_FIELDS[type(message)]:
+        pixels = getattr(message, name)
+        if pixels is not None:
+            nbytes += pixels.nbytes
+    return nbytes

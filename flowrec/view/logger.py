@@ -28,7 +28,7 @@ from flowrec.messages import (
     Track,
     Truth,
 )
-from flowrec.store import lit
+from flowrec.store import nonzero_window
 from flowrec.units import NS_PER_S
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
@@ -159,7 +159,7 @@ class TickLogger:
 
     def _completed(self, image: Image) -> Image:
         """A window in the last whole image, dimmed, which says where it is and that the rest is not of now."""
-        x0, y0, x1, y1 = lit(image)
+        x0, y0, x1, y1 = nonzero_window(image)
         if (x0, y0) == (0, 0) and (y1, x1) == image.shape:
             self._whole, self._around = image, None
             return image

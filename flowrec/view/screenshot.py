@@ -15,7 +15,7 @@ from rerun.experimental import ViewerClient, ViewerState
 
 from flowrec.errors import FlowrecError
 from flowrec.store.mcap_reader import ForeignError
-from flowrec.store.session_metadata import Head
+from flowrec.store.session_metadata import SessionMetadata
 from flowrec.system.outputs import PICTURE, new_file
 from flowrec.units import nanoseconds
 from flowrec.view import viewer
@@ -77,7 +77,7 @@ def screenshot(
 def _start_unix_ns(path: Path) -> int:
     """Unix time of session time 0; 0 for a file of another program, whose times are as they are."""
     try:
-        with Head(path) as head:
+        with SessionMetadata(path) as head:
             return head.source.start_unix_ns
     except ForeignError:
         return 0

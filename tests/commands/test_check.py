@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.errors import SessionError
-from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from tests.store.made_up import HEADER, ticks_of
@@ -175,7 +175,7 @@ def test_a_configuration_that_is_not_understood_can_not_be_replayed(tmp_path):
 
 
 def _made_up(tmp_path):
-    with SessionWriter(tmp_path / "made_up.mcap", HEADER, block=True) as writer:
+    with SessionWriter(tmp_path / "made_up.mcap", HEADER, WriterOptions(block=True)) as writer:
         for tick in itertools.islice(ticks_of(20, shape=(8, 8)), 20):
             writer.write(tick)
     return tmp_path / "made_up.mcap"

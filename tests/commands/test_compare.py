@@ -18,7 +18,7 @@ from flowrec.cli import app
 from flowrec.commands.compare import Comparison
 from flowrec.config import load_config, to_toml
 from flowrec.messages import Demand, FlowField, Tick
-from flowrec.store import SessionHeader, SessionWriter
+from flowrec.store import SessionHeader, SessionWriter, WriterOptions
 from tests.rewritten import array_of, rewrite
 from tests.store.made_up import HEADER, ticks_of
 
@@ -104,7 +104,7 @@ def small_session(path: Path, ticks: list[Tick], parent: bool = False, sets: tup
     parents = {"file": "a.mcap", "sha256": ""} if parent else {}
     config = load_config(None, sets)
     header = SessionHeader(to_toml(config), HEADER.chip_png, HEADER.chip_toml, HEADER.provenance, parents)
-    with SessionWriter(path, header, block=True, leave_out=config.recording.leave_out) as writer:
+    with SessionWriter(path, header, WriterOptions(block=True, leave_out=config.recording.leave_out)) as writer:
         for tick in ticks:
             writer.write(tick)
     return path

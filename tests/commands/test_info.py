@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 from flowrec.cli import app
 from flowrec.commands.info import list_sessions
 from flowrec.errors import SessionError
-from flowrec.store import SessionWriter
+from flowrec.store import SessionWriter, WriterOptions
 from tests.store.made_up import HEADER, ticks_of
 
 
@@ -20,7 +20,7 @@ def typed(*words: object) -> Result:
 
 
 def write(path: Path, count: int) -> Path:
-    with SessionWriter(path, HEADER, block=True) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
         for tick in ticks_of(count, shape=(8, 8)):
             writer.write(tick)
         writer.close({"outcome": "reached"})
@@ -62,7 +62,7 @@ def test_a_run_that_is_going_on_is_listed_as_such(tmp_path: Path) -> None:
 
 
 def test_listing_reads_no_messages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flowrec.store.mcap_reader.Source.messages", None)
+    monkeypatch.setattr("flowrec.store.mcap_reader.McapReader.messages", None)
     assert list_sessions(folder)[0].outcome == "reached"
 
 

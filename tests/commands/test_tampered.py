@@ -20,8 +20,8 @@ from flowrec.config import load_config
 from flowrec.declarations import Role
 from flowrec.messages import Clocks, Drops, Health, Tick
 from flowrec.session_writer import session_header
-from flowrec.store import SessionWriter, Split
-from flowrec.store.viewer_topics import MIRRORS
+from flowrec.store import SessionWriter, Split, WriterOptions
+from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.topics import TOPICS
 from tests.conftest import SMALL
 from tests.rewritten import leaves_of, parser_of, rewrite
@@ -29,7 +29,7 @@ from tests.store.made_up import ticks_of
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 PATHS = [topic.path for topic in TOPICS]
-VIEWS = [mirror.path for mirror in MIRRORS]
+VIEWS = [mirror.path for mirror in VIEWER_TOPICS]
 
 
 def run(*words: object) -> tuple[int, str]:
@@ -53,7 +53,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of a few kilobytes with a message of each topic; the stages have nothing to do with it."""
     path = tmp_path_factory.mktemp("small") / "small.mcap"
     config = load_config(None, SMALL)
-    with SessionWriter(path, session_header(config, load_chip(config.chip)), block=True) as writer:
+    with SessionWriter(path, session_header(config, load_chip(config.chip)), WriterOptions(block=True)) as writer:
         for tick in every_topic():
             writer.write(tick)
     return path
@@ -94,7 +94,7 @@ def test_every_value_of_a_message_is_under_the_digest(topic: str, small: Path, t
 def test_one_pixel_of_a_large_image_is_under_the_digest(tmp_path: Path) -> None:
     config = load_config(None, SMALL)
     header = session_header(config, load_chip(config.chip))
-    with SessionWriter(tmp_path / "large.mcap", header, block=True, frames="raw") as writer:
+    with SessionWriter(tmp_path / "large.mcap", header, WriterOptions(block=True, frames="raw")) as writer:
         for tick in ticks_of(2, shape=(300, 400)):
             writer.write(tick)
 
@@ -262,7 +262,7 @@ def test_what_verify_prints_of_a_file_has_its_control_characters_escaped(tmp_pat
 def test_each_part_of_a_run_has_a_digest_of_its_own(tmp_path: Path) -> None:
     config = load_config(None, SMALL)
     header = session_header(config, load_chip(config.chip))
-    with SessionWriter(tmp_path / "run.mcap", header, block=True, pieces=Split(seconds=0.1)) as writer:
+    with SessionWriter(tmp_path / "run.mcap", header, WriterOptions(block=True, files=Split(seconds=0.1))) as writer:
         for tick in every_topic():
             writer.write(tick)
     parts = sorted(tmp_path.glob("run.part*.mcap"))

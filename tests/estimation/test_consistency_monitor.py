@@ -11,8 +11,8 @@ import pytest
 from flowrec.control.events import event_of
 from flowrec.estimation import HealthMonitor, Kalman, Observer
 from flowrec.messages import Estimate, Health, Tick
-from flowrec.store.codec import encode
 from tests.estimation.lap import ROBOT, driven, vortex
+from tests.store.made_up import encode
 
 KALMAN = Observer(kalman=Kalman(position_noise_um=3.0))
 

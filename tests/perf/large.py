@@ -24,7 +24,6 @@ import zstandard
 
 from flowrec.bench.harness import Results, run
 from flowrec.store.channels import FRAMES, SLOTS, STATE
-from flowrec.store.codec import encode_record
 from flowrec.terminal import progress, table
 from flowrec.topics import TOPICS
 from flowrec.units import NS_PER_S
@@ -44,6 +43,7 @@ from tests.store.drafts import (
     small_draft,
     text,
 )
+from tests.store.made_up import encode
 
 _FLUSH_S = 0.5
 _FRAME_CHUNK_BYTES = 1 << 20
@@ -120,9 +120,7 @@ def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> It
     draft: Draft = small_draft()
     rng = np.random.default_rng(0)
     payloads = {
-        topic.path: b"".join(encode_record(made_up(topic.type, _START_NS, 0, rng))[1])
-        for topic in TOPICS
-        if topic.field in _PER_TICK
+        topic.path: encode(made_up(topic.type, _START_NS, 0, rng)) for topic in TOPICS if topic.field in _PER_TICK
     }
     period_ns = round(NS_PER_S / load.rate_hz)
     per_flush = round(_FLUSH_S * load.rate_hz)

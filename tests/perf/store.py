@@ -18,7 +18,7 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run
-from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.terminal import progress, table
 from tests.perf import store_equal
 from tests.perf.store_kills import kills
@@ -126,7 +126,7 @@ def _disk_mb_s(folder: Path, nbytes: float) -> float:
 def _reading(folder: Path, count: int) -> dict[str, float]:
     """Seconds to open, seek, read and recover one session of poses and 640x512 images."""
     path = folder / "session.mcap"
-    with SessionWriter(path, made_up_header(), frames="delta", block=True) as writer:
+    with SessionWriter(path, made_up_header(), WriterOptions(frames="delta", block=True)) as writer:
         for tick in ticks_of(pictures(640, 512), count, 100.0):
             writer.write(tick)
     found: dict[str, float] = {"mb": path.stat().st_size / 1e6, "ticks": count}

@@ -27,17 +27,17 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from flowrec.declarations import Message, message_fields
 from flowrec.messages import FlowField, Track
 from flowrec.run.loop import SWITCH_S
-from flowrec.store import chunk, encoder, mcap_writer
-from flowrec.store.channels import SLOTS, declarations
+from flowrec.store import chunk, codec, mcap_writer
+from flowrec.store.channels import SLOTS, declarations, message_codec
 from flowrec.store.chunk import ChunkBuilder
-from flowrec.store.codec import codec_of, encode
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.mcap_writer import McapFile
+from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.schema import Schema
 from flowrec.system.realtime_priority import first_of_all
 from flowrec.terminal import progress, table
 from flowrec.topics import BY_FIELD
 from tests.perf.store_writers import frames_given, poses_given
+from tests.store.made_up import encode
 
 _CHUNK_BYTES = 1 << 20
 _STEP_NS = 1_000_000
@@ -63,7 +63,7 @@ class Load(NamedTuple):
 
 
 def _ours(path: Path, load: Load) -> Open:
-    file, builder = McapFile(path), ChunkBuilder()
+    file, builder = McapWriter(path), ChunkBuilder()
     file.start("flowrec", "bench")
     for record in declarations(ENCODINGS["zstd"]):
         file.add(record)
@@ -139,14 +139,14 @@ WRITERS: dict[str, Callable[[Path, Load], Open]] = {
 
 def lines_of(name: str) -> int:
     """Lines of our own code behind a writer or encoder, those of the bench that stand for it included."""
-    own = {"flowrec": (chunk, mcap_writer, _ours), "mcap": (_mcap,), "protobuf, ours": (encoder,)}
+    own = {"flowrec": (chunk, mcap_writer, _ours), "mcap": (_mcap,), "protobuf, ours": (codec,)}
     fallback = protobuf_encoder if name.startswith("protobuf") else _foxglove
     return sum(len(inspect.getsource(part).splitlines()) for part in own.get(name, (fallback,)))
 
 
 def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
     """What makes the payload of a message by protobuf's own runtime."""
-    wire, forms = codec_of(message_type).schema.wire, message_fields(message_type)
+    wire, forms = message_codec(message_type).schema.wire, message_fields(message_type)
 
     def by_protobuf(message: Any) -> bytes:
         made = wire()
@@ -170,7 +170,7 @@ def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
 
 def our_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
     """The same by ours, in one piece."""
-    parts_of = codec_of(message_type).encode
+    parts_of = message_codec(message_type).encode
     return lambda message: b"".join(parts_of(message))
 
 
@@ -188,7 +188,7 @@ def loads(share: float = 1.0) -> list[Load]:
         ("images 2448x2048", frames_given(2448, 2048), 100, 60.0),
     ]
     return [
-        Load(name, given[0].field, codec_of(type(given[0].message)).schema, [one.payload for one in given], n, hz)
+        Load(name, given[0].field, message_codec(type(given[0].message)).schema, [one.payload for one in given], n, hz)
         for name, given, count, hz in rows
         if (n := max(round(count * share), 20))
     ]

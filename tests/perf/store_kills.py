@@ -19,8 +19,8 @@ import numpy as np
 from flowrec.declarations import Image
 from flowrec.errors import SessionError
 from flowrec.messages import OperatorEvent, Tick
-from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
-from flowrec.store.paths import PARTIAL_SUFFIX, pieces
+from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, WriterOptions, recover
+from flowrec.store.paths import PARTIAL_SUFFIX, run_files
 from flowrec.terminal import progress, table
 from flowrec.units import seconds
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
@@ -41,7 +41,7 @@ class Kind:
     rate_hz: float = 100.0
     frames: str = "delta"
     realtime: bool = True
-    pieces: Split | Snapshot | None = None
+    pieces: Split | Snapshot = field(default_factory=Split)
     mark_every: int = 0  # ticks
     state_s: float = _FLUSH_S
     images_s: float = _FLUSH_S
@@ -133,7 +133,7 @@ def _kill(kind: Kind, images: list[Image], path: Path, after_s: float, found: _F
         os.waitpid(child, 0)
         handed_ns, _ = _HANDED.unpack_from(handed)
     found.kills += 1
-    left = pieces(path)
+    left = run_files(path)
     found.files += len(left)
     state: list[tuple[int, int]] = []  # number of the tick and its stamp
     frame_ns = 0
@@ -162,13 +162,13 @@ def _kill(kind: Kind, images: list[Image], path: Path, after_s: float, found: _F
         if found.state_s[-1] > kind.state_s or found.images_s[-1] > kind.images_s:
             found.faults.append(f"more than stated is lost: {found.state_s[-1]:.2f} s, {found.images_s[-1]:.2f} s")
     found.before_the_first_flush += not state
-    for piece in pieces(path):
+    for piece in run_files(path):
         piece.unlink()
 
 
 def _own_ticks(reader: SessionReader) -> Iterator[Tick]:
     """Without the one that a piece repeats of what was before it."""
-    begin_ns = -1 if reader.carried_ns is None else reader.carried_ns
+    begin_ns = -1 if reader.keyframe_ns is None else reader.keyframe_ns
     return (tick for tick in reader.ticks() if tick.stamp_ns > begin_ns)
 
 
@@ -195,9 +195,8 @@ def _spread(lost_s: list[float]) -> dict[str, float]:
 
 def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> None:
     """Record until somebody ends it. In real time, stamps are those of the monotonic clock."""
-    with SessionWriter(
-        path, made_up_header(), frames=kind.frames, flush_s=_FLUSH_S, block=not kind.realtime, pieces=kind.pieces
-    ) as writer:
+    options = WriterOptions(frames=kind.frames, flush_s=_FLUSH_S, block=not kind.realtime, files=kind.pieces)
+    with SessionWriter(path, made_up_header(), options) as writer:
         for number, made in enumerate(ticks_of(images, 10**6, kind.rate_hz)):
             tick = _at(made, time.monotonic_ns()) if kind.realtime else made
             if kind.mark_every and number % kind.mark_every == 0:

@@ -101,7 +101,8 @@ def _writer(kind: str, path: Path) -> SessionWriter | BareThread | BareProcess |
         return BareThread()
     if kind == "a bare process":
         return BareProcess(_WIDTH * _HEIGHT)
-    return SessionWriter(path, made_up_header(), frames=kind, overwrite=True, queue_limit_bytes=_QUEUE_BYTES)
+    options = WriterOptions(frames=kind, overwrite=True, queue_limit_bytes=_QUEUE_BYTES)
+    return SessionWriter(path, made_up_header(), options)
 
 
 def _queue_of(writer: object) -> tuple[float, int]:
@@ -132,9 +133,9 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
     count = round(minutes * 60 * _SOAK_RATE_HZ)
     with tempfile.TemporaryDirectory(dir=folder) as name:
         path = Path(name) / "soak.mcap"
-        pieces = Snapshot(_RING_S) if keeping else None
+        pieces = Snapshot(_RING_S) if keeping else Split()
         with (
-            SessionWriter(path, made_up_header(), frames="delta", pieces=pieces) as writer,
+            SessionWriter(path, made_up_header(), WriterOptions(frames="delta", files=pieces)) as writer,
             progress("soaking", count) as done,
         ):
             began = time.perf_counter()

@@ -13,7 +13,7 @@ from flowrec.chip import load_chip
 from flowrec.config import load_config
 from flowrec.resolve import resolve
 from flowrec.session_writer import region_of
-from flowrec.store import Region, SessionWriter
+from flowrec.store import Region, SessionWriter, WriterOptions
 from flowrec.terminal import progress
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
@@ -44,7 +44,7 @@ def _row(
     height, width = images[0].shape
     count = round(seconds * rate_hz)
     began = time.process_time()
-    with SessionWriter(path, made_up_header(), frames=encoding, block=True, region=region) as writer:
+    with SessionWriter(path, made_up_header(), WriterOptions(frames=encoding, block=True, region=region)) as writer:
         for tick in ticks_of(images, count, rate_hz):
             assert tick.track is not None
             writer.write(replace(tick, track=replace(tick.track, roi_px=roi)))

@@ -15,7 +15,7 @@ import numpy as np
 from flowrec.declarations import Image
 from flowrec.messages import FlowField, OperatorEvent, Tick
 from flowrec.run.loop import SWITCH_S
-from flowrec.store import SessionWriter, Snapshot, Split
+from flowrec.store import SessionWriter, Snapshot, Split, WriterOptions
 from flowrec.terminal import progress, table
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
@@ -34,8 +34,8 @@ def splits(folder: Path | None, split_s: float, duration_s: float, rounds: int) 
     """
     images = pictures(_WIDTH, _HEIGHT)
     ring = [np.ones_like(images[0]) for _ in range(_RING)]
-    kinds: dict[str, Split | Snapshot | None] = {
-        "one file": None,
+    kinds: dict[str, Split | Snapshot] = {
+        "one file": Split(),
         "parts": Split(seconds=split_s),
         "ring": Snapshot(split_s, split_s, 4000.0),
     }
@@ -54,7 +54,7 @@ def splits(folder: Path | None, split_s: float, duration_s: float, rounds: int) 
 
 
 def _fly(
-    folder: Path, pieces: Split | Snapshot | None, images: list[Image], ring: list[Image], duration_s: float
+    folder: Path, pieces: Split | Snapshot, images: list[Image], ring: list[Image], duration_s: float
 ) -> dict[str, Any]:
     path = folder / "split.mcap"
     write_ms: list[float] = []
@@ -62,7 +62,7 @@ def _fly(
     cpu_s = time.process_time()
     before_s = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
-    with SessionWriter(path, made_up_header(), frames="zstd", pieces=pieces, overwrite=True) as writer:
+    with SessionWriter(path, made_up_header(), WriterOptions(frames="zstd", files=pieces, overwrite=True)) as writer:
         began = time.perf_counter()
         for number, tick in enumerate(_ticks(images, round(duration_s * _RATE_HZ))):
             wait_s = began + number / _RATE_HZ - time.perf_counter()

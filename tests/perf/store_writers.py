@@ -15,14 +15,14 @@ from mcap.writer import CompressionType, Writer
 
 from flowrec.declarations import Image, Message
 from flowrec.messages import Applied, Estimate, Frame, Tick, Track
-from flowrec.store import SessionHeader, SessionWriter
-from flowrec.store.channels import SLOTS, declarations
+from flowrec.store import SessionHeader, SessionWriter, WriterOptions
+from flowrec.store.channels import SLOTS, declarations, message_codec
 from flowrec.store.chunk import ChunkBuilder
-from flowrec.store.codec import codec_of, encode
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.mcap_writer import McapFile
+from flowrec.store.mcap_writer import McapWriter
 from flowrec.topics import BY_FIELD
 from flowrec.units import nanoseconds
+from tests.store.made_up import encode
 
 _NOISE = 3.0  # grey levels, one sigma: a camera's at this brightness
 _STEP_NS = 1_000_000
@@ -98,7 +98,7 @@ def _session(encoding: str) -> Write:
     """The whole SessionWriter: messages in, a finished session on the disk out."""
 
     def write(path: Path, data: list[Given], count: int) -> None:
-        with SessionWriter(path, made_up_header(), frames=encoding, block=True) as writer:
+        with SessionWriter(path, made_up_header(), WriterOptions(frames=encoding, block=True)) as writer:
             for number in range(count):
                 given = data[number % len(data)]
                 fresh: dict[str, Any] = {given.field: given.message}
@@ -110,7 +110,7 @@ def _session(encoding: str) -> Write:
 def _file(path: Path, data: list[Given], count: int) -> None:
     """The file below the SessionWriter alone: bytes in, as the bare writers have it."""
     slot = SLOTS[BY_FIELD[data[0].field].path]
-    file, builder = McapFile(path), ChunkBuilder()
+    file, builder = McapWriter(path), ChunkBuilder()
     file.start("flowrec", "bench")
     for record in declarations(ENCODINGS["zstd"]):
         file.add(record)
@@ -126,7 +126,7 @@ def _file(path: Path, data: list[Given], count: int) -> None:
 
 def _mcap(compression: CompressionType) -> Write:
     def write(path: Path, data: list[Given], count: int) -> None:
-        schema = codec_of(type(data[0].message)).schema
+        schema = message_codec(type(data[0].message)).schema
         with path.open("wb") as stream:
             writer = Writer(stream, compression=compression)
             writer.start()
@@ -142,7 +142,7 @@ def _mcap(compression: CompressionType) -> Write:
 
 def _foxglove(options: MCAPWriteOptions, file_of: Callable[[Given], bytes] = lambda given: given.payload) -> Write:
     def write(path: Path, data: list[Given], count: int) -> None:
-        schema = codec_of(type(data[0].message)).schema
+        schema = message_codec(type(data[0].message)).schema
         context = foxglove.Context()
         writer = foxglove.open_mcap(path, context=context, writer_options=options)
         described = foxglove.Schema(name=schema.name, encoding="protobuf", data=schema.data)

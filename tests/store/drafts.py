@@ -21,10 +21,10 @@ from flowrec.config import ResolvedConfig, load_config
 from flowrec.declarations import Message, array_fields, message_fields
 from flowrec.resolve import resolve
 from flowrec.session_writer import session_header
-from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations
+from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations, message_codec
 from flowrec.store.codec import encode_record
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.metadata import records_of
+from flowrec.store.session_metadata import header_records
 from flowrec.topics import TOPICS
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -137,7 +137,7 @@ def small_draft() -> Draft:
     said = session_header(_plain(resolve(config, chip)), chip)
     facts = {"flowrec": "0", "wall_time": "2026-01-01T00:00:00+00:00", "wall_ns": "1", "monotonic_ns": "1"}
     records: list[Any] = [
-        *records_of(replace(said, provenance=facts, start_unix_ns=0)),
+        *header_records(replace(said, provenance=facts, start_unix_ns=0)),
         *declarations(ENCODINGS["zstd"]),
     ]
     head = tuple(_parts(records))
@@ -150,7 +150,7 @@ def small_draft() -> Draft:
                 chunks.append([])
         for topic in TOPICS:
             message = made_up(topic.type, stamp_ns, number, rng)
-            sequence, payload = encode_record(message)
+            sequence, payload = encode_record(message, message_codec(topic.type))
             slot = SLOTS[topic.path]
             sent[slot.group][-1].append(
                 Sent(slot.channel, number if sequence is None else sequence, stamp_ns, b"".join(payload))

@@ -22,7 +22,19 @@ from flowrec.messages import (
     Track,
     Truth,
 )
-from flowrec.store import SessionHeader
+from flowrec.store import SessionHeader, codec
+from flowrec.store.channels import message_codec
+
+
+def encode(message, schema=""):
+    """A message as bytes, in the schema where it has several."""
+    return b"".join(codec.encode_record(message, message_codec(type(message), schema))[1])
+
+
+def decode(kind, payload, sequence=0, schema=""):
+    """Its inverse."""
+    return codec.decode(kind, message_codec(kind, schema), payload, sequence)
+
 
 PERIOD_NS = 16_666_667
 START_UNIX_NS = 1_790_000_000_123_456_789

@@ -17,13 +17,12 @@ import pytest
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
-from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
-from flowrec.store.frame_decimation import Thinning
-from flowrec.store.mcap_reader import Source
-from flowrec.store.mcap_writer import McapFile
+from flowrec.store.mcap_reader import McapReader
+from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.scan import scan
-from flowrec.store.write_queue import Backlog, Entry
+from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from flowrec.units import seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
@@ -34,7 +33,7 @@ class GatedDisk:
     def __init__(self, monkeypatch):
         self.allowed, self.taken, self.full = math.inf, 0, False
         self._changed = threading.Condition()
-        put = McapFile._put
+        put = McapWriter._put
 
         def gated(file, parts):
             with self._changed:
@@ -44,15 +43,15 @@ class GatedDisk:
                 self.taken += sum(map(len, parts))
             put(file, parts)
 
-        drop = Backlog.drop_images
+        drop = WriteQueue.drop_images
 
         def given_up(backlog):
             count = drop(backlog)
             self.allow(math.inf)  # who waits for the images all the same waits for ever
             return count
 
-        monkeypatch.setattr(McapFile, "_put", gated)
-        monkeypatch.setattr(Backlog, "drop_images", given_up)
+        monkeypatch.setattr(McapWriter, "_put", gated)
+        monkeypatch.setattr(WriteQueue, "drop_images", given_up)
 
     def allow(self, nbytes):
         """So many more; from the first call on only what was allowed."""
@@ -73,19 +72,19 @@ TICKS_BEGIN_NS = next(ticks_of(1)).stamp_ns
 
 def slow_disk(monkeypatch, bytes_s):
     """Every write takes as long as its bytes would at that rate."""
-    put = McapFile._put
+    put = McapWriter._put
 
     def slowly(self, parts):
         time.sleep(sum(map(len, parts)) / bytes_s)
         put(self, parts)
 
-    monkeypatch.setattr(McapFile, "_put", slowly)
+    monkeypatch.setattr(McapWriter, "_put", slowly)
 
 
 def test_a_slow_disk_costs_evenly_spaced_images_and_nothing_else(tmp_path, monkeypatch):
     disk = GatedDisk(monkeypatch)
     ticks = list(ticks_of(240, shape=(256, 256)))  # 65 kB each, three times what the disk takes
-    with SessionWriter(tmp_path / "s.mcap", HEADER, frames="raw", queue_limit_bytes=1 << 20) as writer:
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(frames="raw", queue_limit_bytes=1 << 20)) as writer:
         for tick in ticks:
             writer.write(tick)
             disk.allow(22_000)
@@ -114,11 +113,11 @@ def test_a_run_that_must_end_soon_drops_the_images_that_wait_and_counts_them(tmp
     disk = GatedDisk(monkeypatch)
     ticks = list(ticks_of(120, shape=(256, 256)))  # 8 MB
     # With less of flush_s a run that may block would wait for the disk, which here takes no more.
-    writer = SessionWriter(tmp_path / "s.mcap", HEADER, frames="raw", block=block, flush_s=10.0)
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(frames="raw", block=block, flush_s=10.0))
     disk.allow(2_000_000)
     for tick in ticks:
         writer.write(tick)
-    writer.close({"outcome": "stopped"}, patience_s=0.3)
+    writer.close({"outcome": "stopped"}, timeout_s=0.3)
     reader = SessionReader(tmp_path / "s.mcap")
     kept = [frame.index for frame in reader.messages("frame")]
     again = list(reader.ticks())
@@ -130,7 +129,7 @@ def test_a_run_that_must_end_soon_drops_the_images_that_wait_and_counts_them(tmp
 
 def kept_by(disk_share, seconds=60.0, rate_hz=60.0, room_s=1.0):
     """What is kept, in a model of a queue of that many seconds and a disk that takes that share of the frames."""
-    thinning, waiting, kept = Thinning(), 0.0, []
+    thinning, waiting, kept = FrameDecimation(), 0.0, []
     for number in range(round(seconds * rate_hz)):
         waiting = max(0.0, waiting - disk_share)
         if thinning.keeps(waiting / (room_s * rate_hz), number * PERIOD_NS):
@@ -157,7 +156,7 @@ def test_a_try_that_failed_is_repeated_ever_more_seldom():
 
 def test_a_disk_that_takes_all_is_given_all_also_after_a_hiccup():
     assert len(kept_by(1.0)) == 3600
-    thinning, fill = Thinning(), 0.0
+    thinning, fill = FrameDecimation(), 0.0
     kept = []
     for number in range(1200):
         fill = max(0.0, fill - (0.0 if 100 < number < 150 else 1.5 / 60))  # 0.8 s in which nothing is taken
@@ -179,49 +178,49 @@ def test_frames_that_the_camera_never_delivered_are_counted_apart(tmp_path):
 
 
 def test_a_run_that_waits_for_its_disk_is_never_more_than_flush_s_ahead_of_it(tmp_path, monkeypatch):
-    put = McapFile._put
+    put = McapWriter._put
 
     def slowly(self, parts):
         time.sleep(0.02)  # in which a run that does not wait would be far ahead
         put(self, parts)
 
-    monkeypatch.setattr(McapFile, "_put", slowly)
+    monkeypatch.setattr(McapWriter, "_put", slowly)
     ahead_s = []
-    with SessionWriter(tmp_path / "s.mcap", HEADER, block=True, flush_s=0.5) as writer:
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True, flush_s=0.5)) as writer:
         for tick in ticks_of(150, shape=(8, 8)):
             writer.write(tick)
             # As a kill would find it now.
-            with contextlib.closing(Source(writer.partial_path)) as source:
+            with contextlib.closing(McapReader(writer.partial_path)) as source:
                 held_ns = scan(source).last_ns.get(SLOTS["/robot/track"].channel, TICKS_BEGIN_NS)
             ahead_s.append(seconds(tick.stamp_ns - held_ns))
     assert 0.0 < max(ahead_s) <= 0.5
 
 
 def test_poses_do_not_queue_behind_images():
-    backlog = Backlog(1000)
+    backlog = WriteQueue(1000)
     for stamp in range(3):
         backlog.put(Entry(stamp, {"track": None}, 1), Entry(stamp, {"frame": None}, 100))
     taken = [backlog.take(None) for _ in range(6)]
-    assert [(entry.stamp_ns, *entry.news) for entry in taken] == [
+    assert [(entry.stamp_ns, *entry.messages) for entry in taken] == [
         *((stamp, "track") for stamp in range(3)),
         *((stamp, "frame") for stamp in range(3)),
     ]
 
 
 def test_a_power_cut_costs_no_more_than_what_was_not_yet_kept_by_the_disk(tmp_path, monkeypatch):
-    kept, sync = [], McapFile.sync
+    kept, sync = [], McapWriter.sync
 
     def noted(self):
         size = os.fstat(self._file.fileno()).st_size  # what the disk is sure to have afterwards
         sync(self)
         kept.append((time.monotonic(), size))
 
-    monkeypatch.setattr(McapFile, "sync", noted)
+    monkeypatch.setattr(McapWriter, "sync", noted)
     # An fsync of 0.1 s holds up nobody.
     monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.1))
     path = tmp_path / "s.mcap"
     said = []
-    with SessionWriter(path, HEADER, flush_s=0.2, sync_s=0.5) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(flush_s=0.2, sync_s=0.5)) as writer:
         for tick in ticks_of(150, shape=(8, 8)):
             began = time.monotonic()
             writer.write(tick)
@@ -300,7 +299,7 @@ def test_a_disk_that_can_not_keep_what_was_written_is_told_and_the_file_gets_no_
 def test_a_directory_that_disappears_ends_the_run(tmp_path):
     folder = tmp_path / "usb"
     folder.mkdir()
-    writer = SessionWriter(folder / "s.mcap", HEADER, sync_s=0.2)
+    writer = SessionWriter(folder / "s.mcap", HEADER, WriterOptions(sync_s=0.2))
     shutil.rmtree(folder)
 
     def fly():
@@ -335,10 +334,10 @@ def test_a_place_that_may_not_be_written_is_told_before_anything_runs():
 FULL = """
 import resource, sys, time
 from flowrec.errors import SessionError
-from flowrec.store import SessionWriter
+from flowrec.store import SessionWriter, WriterOptions
 from tests.store.made_up import HEADER, ticks_of
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
-writer = SessionWriter(sys.argv[1], HEADER, flush_s=0.05)
+writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.05))
 for call in (lambda: [(writer.write(tick), time.sleep(0.002)) for tick in ticks_of(2000)], writer.close):
     try:
         call()

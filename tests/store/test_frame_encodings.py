@@ -22,9 +22,9 @@ from flowrec.config import load_config
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
 from flowrec.session_writer import frames_of
-from flowrec.store import SessionReader, SessionWriter, codec, encoding_for, recover
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, codec, encoding_for, recover
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.image_codec import picture, row_differences
+from flowrec.store.image_codec import decode_image, row_differences
 from flowrec.store.schema import foxglove_schema
 from tests.store.made_up import HEADER, ticks_of
 
@@ -34,11 +34,11 @@ LOSSLESS = [name for name, encoding in ENCODINGS.items() if encoding.lossless]
 
 def there_and_back(frame, encoding):
     sequence, parts = codec.encode_record(frame, encoding.codec)
-    return codec.decode(Frame, b"".join(parts), sequence, encoding.codec.schema.name)
+    return codec.decode(Frame, encoding.codec, b"".join(parts), sequence)
 
 
 def record(path, frames, **options):
-    with SessionWriter(path, HEADER, frames=frames, block=True, **options) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(frames=frames, block=True, **options)) as writer:
         for tick in TICKS:
             writer.write(tick)
     return path
@@ -131,7 +131,7 @@ def test_an_image_file_that_claims_more_pixels_than_it_can_hold_is_refused_unrea
     colour = cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()
     for data in (png, jpeg, colour, b"", b"\xff\xd8\xff", b"GIF89a", bytes(png[:20])):
         with pytest.raises(ValueError, match=r"image|PNG"):
-            picture(bytes(data))
+            decode_image(bytes(data))
 
 
 @settings(max_examples=150)
@@ -143,7 +143,7 @@ def test_a_damaged_image_file_is_a_session_error_or_an_image(data):
     for _ in range(data.draw(st.integers(1, 3))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     with contextlib.suppress(SessionError):
-        assert codec.decode(Frame, payload, 7, ENCODINGS[name].codec.schema.name).image.ndim == 2
+        assert codec.decode(Frame, ENCODINGS[name].codec, payload, 7).image.ndim == 2
 
 
 def test_an_empty_image_is_refused_by_the_encodings_that_can_not_hold_it():

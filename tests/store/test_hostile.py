@@ -28,9 +28,8 @@ from flowrec.declarations import Message, invalid_numbers, message_fields, shape
 from flowrec.errors import ChipError, FlowError, SessionError, UsageError, printable
 from flowrec.messages import Estimate, Frame
 from flowrec.refine.weights import read_weights
-from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
-from flowrec.store.codec import encode_record
 from flowrec.topics import BY_FIELD, TOPICS
 from tests.store.drafts import (
     ATTACHMENT,
@@ -46,6 +45,7 @@ from tests.store.drafts import (
     small_draft,
     text,
 )
+from tests.store.made_up import encode
 
 _CHUNK_OPCODE = 6
 DRAFT = small_draft()
@@ -254,7 +254,7 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
 
 def test_an_image_that_promises_more_than_it_has_is_refused(tmp_path):
     wire = made_up(Frame, 10**9, 0, np.random.default_rng(0))
-    sound = b"".join(encode_record(wire)[1])
+    sound = encode(wire)
     from flowrec.store.schema import foxglove_schema
 
     parsed = foxglove_schema("RawImage").wire.FromString(sound)
@@ -279,7 +279,7 @@ def test_a_mask_that_promises_more_than_it_has_is_refused():
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
 def test_a_pose_that_is_no_number_is_flagged(tmp_path, number):
     estimate = made_up(Estimate, 10**9, 0, np.random.default_rng(0))
-    payload = b"".join(encode_record(replace(estimate, position_um=np.array([number, 1.0])))[1])
+    payload = encode(replace(estimate, position_um=np.array([number, 1.0])))
     path = file_of(tmp_path, with_message(STATE, lambda sent: replace(sent, payload=payload)))
     verdict = check(path)
     assert verdict.word == "usable"
@@ -288,7 +288,7 @@ def test_a_pose_that_is_no_number_is_flagged(tmp_path, number):
 
 def test_an_array_of_another_shape_is_refused_before_anybody_computes_with_it(tmp_path):
     estimate = made_up(Estimate, 10**9, 0, np.random.default_rng(0))
-    payload = b"".join(encode_record(replace(estimate, position_um=np.zeros(0)))[1])
+    payload = encode(replace(estimate, position_um=np.zeros(0)))
     path = file_of(tmp_path, with_message(STATE, lambda sent: replace(sent, payload=payload)))
     refused(path, r"position_um has the shape \(0,\) where \(2\) belongs")
     done = saved(path, tmp_path)
@@ -321,7 +321,7 @@ def test_time_that_goes_backwards_is_flagged_or_refused(tmp_path):
 
 def test_a_source_that_stamps_back_in_time_is_flagged(tmp_path):
     late = made_up(Frame, 9 * 10**9, 0, np.random.default_rng(0))
-    payload = b"".join(encode_record(late)[1])
+    payload = encode(late)
     path = file_of(tmp_path, with_message(FRAMES, lambda sent: replace(sent, payload=payload)))
     assert any("the source of /camera/frame stamped 1 messages back" in f.text for f in check(path).findings)
 
@@ -333,7 +333,7 @@ def spoiled(session, tmp_path, field, **changes):
     said = getattr(ticks[-5], field)
     other = replace(said, **{name: np.full_like(getattr(said, name), value) for name, value in changes.items()})
     path = tmp_path / "spoiled.mcap"
-    with SessionWriter(path, header, block=True) as writer:
+    with SessionWriter(path, header, WriterOptions(block=True)) as writer:
         for tick in ticks:
             writer.write(replace(tick, **{field: other}) if getattr(tick, field) is said else tick)
     return path

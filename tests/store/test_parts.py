@@ -22,9 +22,9 @@ from flowrec.messages import Tick
 from flowrec.resolve import resolve
 from flowrec.session import Session, session_sha256
 from flowrec.session_writer import session_header
-from flowrec.store import SessionReader, SessionWriter, recover_run
-from flowrec.store.metadata import Part
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover_run
 from flowrec.store.paths import part_path, partial_path
+from flowrec.store.session_metadata import Part
 from flowrec.topics import BY_FIELD
 from tests.store.made_up import ticks_of
 
@@ -45,10 +45,10 @@ def in_parts(path, cuts, ticks=SPARSE, header=HEADER, outcome=None):
     files = []
     for number, (begin, end) in enumerate(pairwise(bounds), 1):
         carried = ticks[begin - 1] if begin else None
-        part = Part("one run", number, carried_ns=None if carried is None else carried.stamp_ns)
+        part = Part("one run", number, keyframe_ns=None if carried is None else carried.stamp_ns)
         following = part_path(path, number + 1).name
         last = number == len(bounds) - 1
-        with SessionWriter(part_path(path, number), replace(header, part=part), block=True) as writer:
+        with SessionWriter(part_path(path, number), replace(header, part=part), WriterOptions(block=True)) as writer:
             for tick in [*([carried] if carried is not None else []), *ticks[begin:end]]:
                 writer.write(tick)
             writer.close(outcome or {"outcome": "reached"} if last else {"outcome": "continued", "next": following})
@@ -72,7 +72,7 @@ def news(ticks, before):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("whole") / "x.mcap"
-    with SessionWriter(path, HEADER, block=True) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
         for tick in SPARSE:
             writer.write(tick)
         writer.close({"outcome": "reached"})
@@ -104,7 +104,7 @@ def test_however_a_session_is_cut_its_ticks_are_the_same_from_any_time(whole, tm
         assert list(news(mine, before)) == list(news(theirs, expected))
         assert (reader.first_ns, reader.last_ns, reader.counts) == (whole.first_ns, whole.last_ns, whole.counts)
         assert reader.outcome == whole.outcome and reader.header == replace(
-            HEADER, part=Part("one run", 1, carried_ns=None)
+            HEADER, part=Part("one run", 1, keyframe_ns=None)
         )
         for field in ("frame", "true_field", "route"):
             messages = list(reader.messages(field))
@@ -113,7 +113,7 @@ def test_however_a_session_is_cut_its_ticks_are_the_same_from_any_time(whole, tm
     number = data.draw(st.integers(1, len(files)))
     with SessionReader(files[number - 1]) as part:
         ticks = list(part.ticks())
-        assert (ticks[0].stamp_ns == part.carried_ns) == (number > 1)
+        assert (ticks[0].stamp_ns == part.keyframe_ns) == (number > 1)
         assert all(same(tick, replace(whole.tick_before(tick.stamp_ns), true_field=tick.true_field)) for tick in ticks)
 
 
@@ -154,7 +154,7 @@ def damage(run, what):
         in_parts(other, [11, 12, 40], header=replace(HEADER, config_toml=HEADER.config_toml + "\n"))
         part_path(other, 2).replace(second)
     elif what == "no part":
-        with SessionWriter(second, HEADER, overwrite=True) as writer:
+        with SessionWriter(second, HEADER, WriterOptions(overwrite=True)) as writer:
             writer.write(TICKS[11])
     elif what == "carries too early":
         in_parts(other, [10, 11, 12, 40])
@@ -164,7 +164,7 @@ def damage(run, what):
 def _rewritten(source, target, change):
     with SessionReader(source) as reader:
         header = replace(reader.header, part=change(reader.header.part))
-        with SessionWriter(target, header, block=True, overwrite=True) as writer:
+        with SessionWriter(target, header, WriterOptions(block=True, overwrite=True)) as writer:
             for tick in reader.ticks():
                 writer.write(tick)
             writer.close({"outcome": "continued"})
@@ -226,7 +226,7 @@ def test_recover_makes_a_run_whole_whatever_is_left_of_its_last_part(run, whole,
     reader = SessionReader(run)
     ticks = list(reader.ticks())
     assert all(map(same, ticks, whole.ticks()))
-    assert SessionReader(last).part == Part("one run", 4, carried_ns=TICKS[39].stamp_ns)
+    assert SessionReader(last).part == Part("one run", 4, keyframe_ns=TICKS[39].stamp_ns)
     assert len(ticks) == 40 + done.ticks == int(reader.outcome["ticks"]) and done.complete == (len(ticks) == 60)
     assert reader.outcome["outcome"] == ("reached" if done.complete else "cut")
     assert check(run).word == ("good" if done.complete else "usable")
@@ -262,7 +262,7 @@ def test_a_part_that_repeats_something_else_is_odd(run):
     with SessionReader(second) as reader:
         ticks = list(reader.ticks())
         ticks[0] = replace(ticks[0], estimate=replace(ticks[0].estimate, stamp_ns=5))
-        with SessionWriter(second, reader.header, block=True, overwrite=True) as writer:
+        with SessionWriter(second, reader.header, WriterOptions(block=True, overwrite=True)) as writer:
             for tick in ticks:
                 writer.write(tick)
             writer.close(reader.outcome)

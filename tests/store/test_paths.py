@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.store.paths import part_path, partial_path, parts, pieces, run_path, snapshot_path
+from flowrec.store.paths import part_path, partial_path, parts, run_files, run_path, snapshot_path
 
 
 @pytest.mark.parametrize("make", [lambda p: p, lambda p: part_path(p, 7), lambda p: snapshot_path(p, 1234)])
@@ -21,4 +21,4 @@ def test_parts_are_in_order_of_their_number_and_nothing_else_is_among_them(tmp_p
     for path in (*(part_path(run, number) for number in numbers), *others):
         path.touch()
     assert parts(run) == [part_path(run, number) for number in sorted(numbers)]
-    assert set(pieces(run)) == {part_path(run, number) for number in numbers} | set(others[:2])
+    assert set(run_files(run)) == {part_path(run, number) for number in numbers} | set(others[:2])

@@ -16,11 +16,11 @@ from flowrec.commands.replay import Change
 from flowrec.declarations import Role
 from flowrec.errors import SessionError
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.store import SessionReader, SessionWriter, recover
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
-from flowrec.store.mcap_reader import Source
-from flowrec.store.recorder import Recorder
+from flowrec.store.mcap_reader import McapReader
 from flowrec.store.scan import scan
+from flowrec.store.split import PartFile
 from flowrec.system.locks import is_growing
 from flowrec.topics import TOPICS
 from tests.store.made_up import HEADER, ticks_of
@@ -35,8 +35,8 @@ def small(tmp_path_factory):
     """A made-up session of many chunks: three ticks a flush."""
     path = tmp_path_factory.mktemp("recovery") / "small.mcap"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Recorder, "flush_if_due", flush_every(3))
-        with SessionWriter(path, HEADER, block=True) as writer:
+        patch.setattr(PartFile, "flush_if_due", flush_every(3))
+        with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
             for tick in TICKS:
                 writer.write(tick)
             writer.close({"outcome": "reached", "note": "there"})
@@ -56,7 +56,7 @@ def flush_every(ticks):
 
 def chunks_of(path):
     """Start, end and channels of each chunk."""
-    source = Source(path)
+    source = McapReader(path)
     found = scan(source).summary.chunks
     return [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length, set(c.message_index_offsets)) for c in found]
 
@@ -123,7 +123,7 @@ def test_a_last_tick_of_inputs_alone_is_not_taken_for_a_whole_one(tmp_path):
     # What a stage that failed leaves; then the file was cut before its end.
     last = replace(TICKS[5], **{name: getattr(TICKS[4], name) for name in OUTPUTS})
     path = tmp_path / "s.mcap"
-    with SessionWriter(path, HEADER, frames="raw") as writer:
+    with SessionWriter(path, HEADER, WriterOptions(frames="raw")) as writer:
         for tick in (*TICKS[:5], last):
             writer.write(tick)
         writer.close({"outcome": "failed"})
@@ -139,7 +139,7 @@ def test_a_last_tick_of_inputs_alone_is_not_taken_for_a_whole_one(tmp_path):
 
 def test_a_replay_takes_no_image_of_a_tick_that_it_passes_over_for_one_of_the_next(tmp_path):
     whole, alone, blind = TICKS[:3]
-    with SessionWriter(tmp_path / "s.mcap", HEADER, block=True) as writer:
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
         writer.write(whole)
         writer.write(replace(whole, stamp_ns=alone.stamp_ns, frame=alone.frame))
         writer.write(replace(blind, frame=alone.frame))
@@ -262,7 +262,7 @@ def test_a_full_disk_leaves_the_remains_as_they_were(small, tmp_path, monkeypatc
     def refuse(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("flowrec.store.mcap_writer.McapFile.add_chunks", refuse)
+    monkeypatch.setattr("flowrec.store.mcap_writer.McapWriter.add_chunks", refuse)
     with pytest.raises(SessionError, match=r"left as it was.*disk is full") as error:
         recover(path)
     assert "flowrec recover" not in str(error.value)

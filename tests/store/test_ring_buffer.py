@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
-from flowrec.store import SessionReader, SessionWriter, Snapshot, recover
+from flowrec.store import SessionReader, SessionWriter, Snapshot, WriterOptions, recover
 from flowrec.store.paths import snapshot_path
 from flowrec.units import NS_PER_S
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
@@ -37,7 +37,7 @@ def with_events(*events, ticks=QUIET):
 
 
 def record(path, ticks, snapshot=ABOUT, outcome=None, why="", **options):
-    writer = SessionWriter(path, HEADER, pieces=snapshot, **options)
+    writer = SessionWriter(path, HEADER, WriterOptions(files=snapshot, **options))
     for tick in ticks:
         writer.write(tick)
     writer.close(outcome or {"outcome": "reached"}, why=why)
@@ -70,7 +70,7 @@ def span_of(path):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     path = tmp_path_factory.mktemp("snapshots") / "whole.mcap"
-    with SessionWriter(path, HEADER, block=True) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
         for tick in with_events((400, ("mark", ""))):
             writer.write(tick)
     return path
@@ -142,7 +142,7 @@ def test_alarms_lost_images_and_bad_ends_are_events_and_what_a_person_is_told_is
     (bad,) = record(tmp_path / "bad.mcap", QUIET, outcome={"outcome": "lost"}, why="the run ended lost").files
     first, last, said = span_of(bad)
     assert last == 599 and 600 - 120 - 17 <= first <= 600 - 120 and said["flowrec.outcome"]["outcome"] == "lost"
-    writer = SessionWriter(tmp_path / "raised.mcap", HEADER, pieces=ABOUT)
+    writer = SessionWriter(tmp_path / "raised.mcap", HEADER, WriterOptions(files=ABOUT))
     with pytest.raises(RuntimeError):
         fly_until_the_pump_falls_off(writer)
     first, last, said = span_of(writer.files[0])
@@ -158,7 +158,9 @@ def test_the_ring_takes_no_more_memory_than_it_may_and_says_what_it_holds(tmp_pa
         for n, tick in enumerate(with_events((590, ("mark", ""))))
     )
     writer = SessionWriter(
-        tmp_path / "x.mcap", HEADER, pieces=Snapshot(8.0, 5.0, megabytes=4.0), block=True, queue_limit_bytes=1 << 20
+        tmp_path / "x.mcap",
+        HEADER,
+        WriterOptions(files=Snapshot(8.0, 5.0, megabytes=4.0), block=True, queue_limit_bytes=1 << 20),
     )
     highest = memory_mb()
     began = highest
@@ -176,10 +178,10 @@ def test_the_ring_takes_no_more_memory_than_it_may_and_says_what_it_holds(tmp_pa
 
 def test_a_place_that_may_not_be_written_or_is_taken_is_told_before_the_run(tmp_path):
     with pytest.raises(SessionError, match="no such directory"):
-        SessionWriter(tmp_path / "missing" / "x.mcap", HEADER, pieces=ABOUT)
+        SessionWriter(tmp_path / "missing" / "x.mcap", HEADER, WriterOptions(files=ABOUT))
     snapshot_path(tmp_path / "x.mcap", 3).touch()
     with pytest.raises(SessionError, match=r"snap003\.mcap: exists already"):
-        SessionWriter(tmp_path / "x.mcap", HEADER, pieces=ABOUT)
+        SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=ABOUT))
     record(tmp_path / "x.mcap", QUIET, overwrite=True)  # nothing has come of it, so nothing is taken away
     assert names_in(tmp_path) == ["x.snap003.mcap"]
     record(tmp_path / "x.mcap", with_events((300, ("mark", ""))), overwrite=True)
@@ -188,9 +190,9 @@ def test_a_place_that_may_not_be_written_or_is_taken_is_told_before_the_run(tmp_
 
 KILLED = """
 import sys, time
-from flowrec.store import SessionWriter, Snapshot
+from flowrec.store import SessionWriter, WriterOptions, Snapshot
 from tests.store.test_ring_buffer import HEADER, with_events
-writer = SessionWriter(sys.argv[1], HEADER, flush_s=0.1, pieces=Snapshot(2.0, 8.0))
+writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.1, files=Snapshot(2.0, 8.0)))
 for number, tick in enumerate(with_events((200, ("mark", "")))):
     writer.write(tick)
     while writer.queue_bytes:

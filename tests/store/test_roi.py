@@ -12,7 +12,7 @@ from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config
 from flowrec.errors import UsageError
-from flowrec.store import Region, SessionReader, SessionWriter, lit, recover
+from flowrec.store import Region, SessionReader, SessionWriter, WriterOptions, nonzero_window, recover
 from flowrec.store.frame_encodings import ENCODINGS
 from tests.conftest import SMALL
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
@@ -27,7 +27,7 @@ def seen_at(tick, roi, **more):
 
 
 def written(path, ticks, frames="zstd", block=True):
-    with SessionWriter(path, HEADER, frames=frames, region=REGION, block=block) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(frames=frames, region=REGION, block=block)) as writer:
         for tick in ticks:
             writer.write(tick)
     return SessionReader(path)
@@ -59,16 +59,16 @@ def test_a_window_holds_what_was_searched_and_its_pad_and_is_black_elsewhere(tmp
         assert np.array_equal(kept, expected), number
     assert whole[:3] == [0, 3, 7] and int(0.5e9 // PERIOD_NS) + 1 > 20
     assert reader.outcome["frames_windows"].startswith(f"{40 - len(whole)} of 40 images")
-    assert lit(ticks[0].frame.image) == (0, 0, 200, 160)
+    assert nonzero_window(ticks[0].frame.image) == (0, 0, 200, 160)
 
 
 def test_where_an_image_is_lit_is_found():
     image = np.zeros((40, 60), np.uint8)
-    assert lit(image) == (0, 0, 0, 0) and lit(image[:0]) == (0, 0, 0, 0)
+    assert nonzero_window(image) == (0, 0, 0, 0) and nonzero_window(image[:0]) == (0, 0, 0, 0)
     image[10, 20] = image[30, 7] = 3
-    assert lit(image) == (7, 10, 21, 31)
+    assert nonzero_window(image) == (7, 10, 21, 31)
     image[0] = image[-1] = 1
-    assert lit(image) == (0, 0, 60, 40)
+    assert nonzero_window(image) == (0, 0, 60, 40)
 
 
 def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(session, tmp_path, capsys):
@@ -82,7 +82,7 @@ def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(
     # The run itself is the one of whole images.
     for whole, cut in zip(SessionReader(session).ticks(), SessionReader(path).ticks(), strict=False):
         assert whole.track.same_as(cut.track) and whole.currents.same_as(cut.currents)
-        x0, y0, x1, y1 = lit(cut.frame.image)
+        x0, y0, x1, y1 = nonzero_window(cut.frame.image)
         assert np.array_equal(whole.frame.image[y0:y1, x0:x1], cut.frame.image[y0:y1, x0:x1])
     verdict = check(path)
     assert verdict.exit_status == 0 and "exact for the recorded tracker" in verdict.facts["windows"]

@@ -20,7 +20,7 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
-from flowrec.store import SessionReader, SessionWriter
+from flowrec.store import SessionReader, SessionWriter, WriterOptions
 from flowrec.store.schema import foxglove_schema
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
@@ -28,7 +28,7 @@ TICKS = list(ticks_of(150))
 
 
 def record(path, ticks=TICKS, outcome=None, **options):
-    with SessionWriter(path, HEADER, block=True, **options) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(block=True, **options)) as writer:
         for tick in ticks:
             writer.write(tick)
         writer.close(outcome or {"outcome": "reached"})
@@ -221,7 +221,7 @@ def test_a_session_is_dated_by_the_day_on_which_it_was_recorded(session):
 
 def test_a_session_that_does_not_say_when_it_started_has_stamps_for_times(tmp_path):
     path = tmp_path / "old.mcap"
-    with SessionWriter(path, replace(HEADER, start_unix_ns=0), block=True) as writer:
+    with SessionWriter(path, replace(HEADER, start_unix_ns=0), WriterOptions(block=True)) as writer:
         for tick in TICKS[:20]:
             writer.write(tick)
     found, _ = seen_by_others(path)
@@ -262,7 +262,7 @@ def test_rerun_accepts_the_bare_file(path, tmp_path):
 
 
 def test_a_full_queue_of_a_live_run_drops_images_only(tmp_path):
-    with SessionWriter(tmp_path / "s.mcap", HEADER, queue_limit_bytes=10_000) as writer:
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(queue_limit_bytes=10_000)) as writer:
         for tick in TICKS:
             writer.write(tick)
         writer.close({"outcome": "reached"})

@@ -20,13 +20,13 @@ from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import OperatorEvent, Tick
-from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, recover
+from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, WriterOptions, recover
 from flowrec.store.channels import SLOTS
-from flowrec.store.mcap_reader import Source
-from flowrec.store.mcap_writer import McapFile
-from flowrec.store.paths import part_path, pieces
+from flowrec.store.mcap_reader import McapReader
+from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.paths import part_path, run_files
 from flowrec.store.scan import scan
-from flowrec.store.viewer_topics import Mirrors
+from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_disk import GatedDisk, slow_disk
@@ -38,7 +38,7 @@ SPAN_S = seconds(TICKS[-1].stamp_ns - TICKS[0].stamp_ns)
 
 
 def record(path, split, *, ticks=TICKS, **options):
-    writer = SessionWriter(path, HEADER, pieces=split, **options)
+    writer = SessionWriter(path, HEADER, WriterOptions(files=split, **options))
     for tick in ticks:
         writer.write(tick)
     writer.close({"outcome": "reached"})
@@ -100,7 +100,7 @@ def test_nothing_is_lost_or_doubled_between_parts_and_each_can_be_read_alone(who
         writer = record(path, split, frames=frames, block=block)
         files = writer.files
         assert files == ([part_path(path, n + 1) for n in range(len(files))] if split else [path])
-        assert pieces(path) == sorted(files) and writer.dropped_frames == 0
+        assert run_files(path) == sorted(files) and writer.dropped_frames == 0
         everything = sorted(messages_in(whole)[0])
         assert sorted(news_of(files) if split else messages_in(path)[0]) == everything
         reader = SessionReader(whole)
@@ -137,12 +137,12 @@ def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(t
 
 def test_an_end_in_a_hurry_counts_what_it_drops_in_the_part_that_lacks_it(tmp_path, monkeypatch):
     disk = GatedDisk(monkeypatch)
-    writer = SessionWriter(tmp_path / "x.mcap", HEADER, pieces=Split(seconds=0.4), frames="raw")
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=0.4), frames="raw"))
     disk.allow(600_000)  # of 1.1 MB
     for tick in TICKS:
         writer.write(tick)
         disk.until_idle(writer)
-    writer.close({"outcome": "stopped"}, patience_s=0.4)
+    writer.close({"outcome": "stopped"}, timeout_s=0.4)
     kept = 0
     for piece in writer.files:
         messages, told = messages_in(piece)
@@ -160,23 +160,23 @@ def test_any_piece_that_is_there_refuses_and_overwrite_leaves_none_of_them(tmp_p
     older = record(path, Split(seconds=0.2), block=True).files
     for split in (None, Split(seconds=1.0)):
         with pytest.raises(SessionError, match=r"x\.part001\.mcap: exists already; .*--overwrite"):
-            SessionWriter(path, HEADER, pieces=split)
+            SessionWriter(path, HEADER, WriterOptions(files=split))
     newer = record(path, Split(seconds=1.0), block=True, overwrite=True).files
-    assert len(newer) < len(older) and pieces(path) == newer
+    assert len(newer) < len(older) and run_files(path) == newer
     record(path, None, block=True, overwrite=True)
     assert names_in(tmp_path) == ["x.mcap"]
 
 
 def test_a_next_part_that_can_not_be_made_ends_the_run_and_leaves_whole_parts(tmp_path, monkeypatch):
-    made = McapFile.__init__
+    made = McapWriter.__init__
 
     def refuse(self, path, **options):
         if "part003" in path.name:
             raise OSError(errno.ENOSPC, "No space left on device")
         made(self, path, **options)
 
-    monkeypatch.setattr(McapFile, "__init__", refuse)
-    writer = SessionWriter(tmp_path / "x.mcap", HEADER, pieces=Split(seconds=0.5))
+    monkeypatch.setattr(McapWriter, "__init__", refuse)
+    writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=0.5)))
 
     def fly():
         for tick in TICKS:
@@ -188,22 +188,22 @@ def test_a_next_part_that_can_not_be_made_ends_the_run_and_leaves_whole_parts(tm
             call()
         assert "\n" not in str(error.value)
     assert sorted(names_in(tmp_path)) == ["x.part001.mcap", "x.part002.mcap"]
-    outcomes = [messages_in(piece)[1]["flowrec.outcome"] for piece in pieces(tmp_path / "x.mcap")]
+    outcomes = [messages_in(piece)[1]["flowrec.outcome"] for piece in run_files(tmp_path / "x.mcap")]
     assert [outcome["outcome"] for outcome in outcomes] == ["continued", "failed"]
 
 
 def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, monkeypatch):
-    plain = McapFile.add_chunks
+    plain = McapWriter.add_chunks
 
     def refuse(self, sealed):
         if "part002" in str(self._file.name) and self.size > 80_000:
             raise OSError(errno.ENOSPC, "No space left on device")
         plain(self, sealed)
 
-    monkeypatch.setattr(McapFile, "add_chunks", refuse)
+    monkeypatch.setattr(McapWriter, "add_chunks", refuse)
 
     def fly():
-        with SessionWriter(tmp_path / "x.mcap", HEADER, pieces=Split(seconds=1.0), block=True) as writer:
+        with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=1.0), block=True)) as writer:
             for tick in TICKS:
                 writer.write(tick)
 
@@ -217,9 +217,9 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
 
 KILLED = """
 import sys, time
-from flowrec.store import SessionWriter, Split
+from flowrec.store import SessionWriter, WriterOptions, Split
 from tests.store.made_up import HEADER, ticks_of
-writer = SessionWriter(sys.argv[1], HEADER, flush_s=0.05, pieces=Split(seconds=0.1))
+writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.05, files=Split(seconds=0.1)))
 for number, tick in enumerate(ticks_of(10_000, shape=(64, 64))):
     writer.write(tick)
     while writer.queue_bytes:
@@ -236,14 +236,14 @@ def test_a_kill_at_or_about_a_split_leaves_whole_parts_and_a_last_one_to_be_save
             pass
         run.send_signal(signal.SIGKILL)
         run.stdout.read()
-    left = pieces(path)
+    left = run_files(path)
     for piece in left:
         if piece.suffix == ".partial":
             try:
                 recover(piece)
             except SessionError:
                 piece.unlink()  # begun just now: it holds nothing that the others do not
-    saved = pieces(path)
+    saved = run_files(path)
     assert saved == [part_path(path, number + 1) for number in range(len(saved))]
     stamps = sorted({log for _, log, _, _ in news_of(saved)})
     assert stamps == [tick.stamp_ns for tick in ticks_of(len(stamps), shape=(8, 8))]
@@ -253,13 +253,13 @@ def test_a_kill_at_or_about_a_split_leaves_whole_parts_and_a_last_one_to_be_save
 
 @pytest.mark.parametrize("split", [Split(seconds=0.3), Snapshot(0.3, 0.3)])
 def test_what_makes_views_is_used_by_one_thread(tmp_path, monkeypatch, split):
-    used, make = {}, Mirrors.of
+    used, make = {}, ViewerTopics.of
 
     def noted(mirrors, news):
         used.setdefault(id(mirrors), (mirrors, set()))[1].add(threading.get_ident())
         return make(mirrors, news)
 
-    monkeypatch.setattr(Mirrors, "of", noted)
+    monkeypatch.setattr(ViewerTopics, "of", noted)
     marked = replace(TICKS[60], operator=OperatorEvent(TICKS[60].stamp_ns, "mark", ""))
     record(tmp_path / "x.mcap", split, ticks=[*TICKS[:60], marked, *TICKS[61:]], block=True)
     assert len(used) > 1 and all(len(threads) == 1 for _, threads in used.values())
@@ -279,7 +279,7 @@ def copy_as_it_is(folder, to):
 def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda number: time.sleep(0.15))
     path, moments = tmp_path / "x.mcap", []
-    with SessionWriter(path, HEADER, pieces=Split(seconds=0.3), flush_s=0.1) as writer:
+    with SessionWriter(path, HEADER, WriterOptions(files=Split(seconds=0.3), flush_s=0.1)) as writer:
         for number, tick in enumerate(TICKS):
             writer.write(tick)
             time.sleep(0.004)
@@ -287,10 +287,10 @@ def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next
                 moments.append(tmp_path / f"{number}")
                 copy_as_it_is(tmp_path, moments[-1])
     for moment in moments:
-        left = pieces(moment / "x.mcap")
+        left = run_files(moment / "x.mcap")
         stamps = set()
         for piece in left:
-            with contextlib.closing(Source(piece)) as source:
+            with contextlib.closing(McapReader(piece)) as source:
                 found = scan(source)
                 for chunk in found.summary.chunks:
                     stamps |= {record.log_ns for record in source.messages(chunk) if record.channel == APPLIED}

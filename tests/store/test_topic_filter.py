@@ -3,8 +3,8 @@
 import pytest
 
 from flowrec.errors import UsageError
-from flowrec.store import SessionReader, SessionWriter
-from flowrec.store.topic_filter import left_out
+from flowrec.store import SessionReader, SessionWriter, WriterOptions
+from flowrec.store.channels import left_out
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(60))
@@ -12,7 +12,7 @@ TICKS = list(ticks_of(60))
 
 def test_what_is_left_out_is_not_in_the_file_and_the_rest_is_unchanged(tmp_path):
     for name, patterns in (("all", ()), ("less", ("/view/*", "/truth/*", "/camera/frame"))):
-        with SessionWriter(tmp_path / f"{name}.mcap", HEADER, block=True, leave_out=patterns) as writer:
+        with SessionWriter(tmp_path / f"{name}.mcap", HEADER, WriterOptions(block=True, leave_out=patterns)) as writer:
             for tick in TICKS:
                 writer.write(tick)
     everything, less = SessionReader(tmp_path / "all.mcap"), SessionReader(tmp_path / "less.mcap")

@@ -23,8 +23,8 @@ from mcap.writer import Writer
 
 from flowrec.errors import SessionError
 from flowrec.messages import Currents
-from flowrec.store import SessionReader, SessionWriter, channels, metadata
-from flowrec.store.mcap_writer import McapFile
+from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, session_metadata
+from flowrec.store.mcap_writer import McapWriter
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(30, shape=(8, 8)))
@@ -55,7 +55,7 @@ def test_an_existing_session_is_refused_before_anything_is_made(tmp_path):
         SessionWriter(path, HEADER)
     assert one_line(error).startswith(str(path))
     assert names_in(tmp_path) == ["s.mcap"] and path.read_bytes() == b"precious"
-    SessionWriter(path, HEADER, overwrite=True).close()
+    SessionWriter(path, HEADER, WriterOptions(overwrite=True)).close()
     assert SessionReader(path).outcome["outcome"] == "ended"
 
 
@@ -84,12 +84,12 @@ def test_a_name_taken_during_the_run_is_not_overwritten(tmp_path):
 
 @pytest.mark.parametrize("block", [True, False])
 def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatch, block):
-    writer = SessionWriter(tmp_path / "s.mcap", HEADER, flush_s=0.0, block=block, queue_limit_bytes=2000)
+    writer = SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(flush_s=0.0, block=block, queue_limit_bytes=2000))
 
     def refuse(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(McapFile, "add_chunks", refuse)
+    monkeypatch.setattr(McapWriter, "add_chunks", refuse)
 
     def fly():
         for tick in ticks_of(10_000, shape=(8, 8)):
@@ -106,10 +106,10 @@ def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatc
 KILLED = """
 import sys, time
 from dataclasses import replace
-from flowrec.store import SessionWriter
+from flowrec.store import SessionWriter, WriterOptions
 sys.path.insert(0, sys.argv[2])
 from made_up import HEADER, ticks_of
-writer = SessionWriter(sys.argv[1], HEADER, flush_s=10.0, sync_s=20.0)
+writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=10.0, sync_s=20.0))
 for number, tick in enumerate(ticks_of(150, shape=(8, 8))):
     writer.write(replace(tick, stamp_ns=(number + 1) * 10**9))
     while writer.queue_bytes:
@@ -173,8 +173,8 @@ def test_what_is_no_session_is_named_as_what_it_is(tmp_path, session):
 
 
 def test_a_session_of_a_later_format_says_which_flowrec_it_needs(tmp_path, monkeypatch):
-    monkeypatch.setattr(metadata, "FORMAT_VERSION", 2)
-    monkeypatch.setattr("flowrec.store.metadata.__version__", "9.9.0")
+    monkeypatch.setattr(session_metadata, "FORMAT_VERSION", 2)
+    monkeypatch.setattr("flowrec.store.session_metadata.__version__", "9.9.0")
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
     monkeypatch.undo()
     with pytest.raises(SessionError, match=r"format '2'.*install flowrec 9\.9\.0 or later"):
@@ -228,8 +228,8 @@ def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
     def plant(self, sealed):
         plain(self, [replace(chunk, data=bomb, uncompressed_size=1000) for chunk in sealed])
 
-    plain = McapFile.add_chunks
-    monkeypatch.setattr(McapFile, "add_chunks", plant)
+    plain = McapWriter.add_chunks
+    monkeypatch.setattr(McapWriter, "add_chunks", plant)
     with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
         writer.write(TICKS[0])
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -20,7 +20,7 @@ from flowrec.cli import main
 from flowrec.commands.record import record
 from flowrec.config import load_config
 from flowrec.errors import FlowrecError, SessionError
-from flowrec.store import SessionReader, SessionWriter
+from flowrec.store import SessionReader, SessionWriter, WriterOptions
 from flowrec.system.locks import is_growing, open_new, remove_idle
 from tests.conftest import SMALL
 from tests.store.made_up import HEADER, ticks_of
@@ -210,12 +210,12 @@ def test_a_run_onto_a_session_that_another_process_records_is_refused_and_that_o
 
 def test_a_second_writer_is_refused_and_the_first_loses_nothing(tmp_path):
     ticks = list(ticks_of(20))
-    with SessionWriter(tmp_path / "x.mcap", HEADER, block=True) as first:
+    with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(block=True)) as first:
         for tick in ticks[:10]:
             first.write(tick)
         for overwrite in (True, False):
             with pytest.raises(SessionError, match=r"x\.mcap"):
-                SessionWriter(tmp_path / "x.mcap", HEADER, overwrite=overwrite).close()
+                SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(overwrite=overwrite)).close()
         for tick in ticks[10:]:
             first.write(tick)
     assert len(list(SessionReader(tmp_path / "x.mcap").ticks())) == 20
@@ -239,7 +239,7 @@ def test_a_writer_waits_for_one_who_only_asks_and_then_holds_its_lock(tmp_path):
     asks = partial.open("rb")
     fcntl.flock(asks, fcntl.LOCK_SH)
     threading.Timer(0.2, asks.close).start()
-    with SessionWriter(tmp_path / "x.mcap", HEADER, overwrite=True):
+    with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(overwrite=True)):
         assert is_locked(partial)
 
 
@@ -260,7 +260,7 @@ def test_two_hundred_sessions_begun_beside_one_who_asks_without_end_hold_their_l
     with subprocess.Popen([sys.executable, "-c", asking, str(partial)]) as prober:
         try:
             for _ in range(200):
-                with SessionWriter(tmp_path / "x.mcap", HEADER, overwrite=True):
+                with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(overwrite=True)):
                     held += is_locked(partial)
         finally:
             prober.kill()
@@ -272,7 +272,7 @@ def test_remains_that_are_a_link_to_another_session_are_replaced_and_the_other_s
     other = tmp_path / "other.mcap"
     other.write_bytes(b"precious")
     link(other, tmp_path / "x.mcap.partial")
-    SessionWriter(tmp_path / "x.mcap", HEADER, overwrite=True).close()
+    SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(overwrite=True)).close()
     assert other.read_bytes() == b"precious"
     assert SessionReader(tmp_path / "x.mcap").header == HEADER
 
@@ -296,7 +296,7 @@ def test_a_name_that_was_taken_during_a_run_is_not_replaced_at_its_end(links, tm
 
 def test_what_was_made_of_the_same_run_meanwhile_stays(tmp_path):
     (tmp_path / "x.part001.mcap").write_bytes(b"of an older run")
-    with SessionWriter(tmp_path / "x.mcap", HEADER, overwrite=True):
+    with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(overwrite=True)):
         (tmp_path / "x.part002.mcap").write_bytes(b"of another run")
     assert sorted(contents(tmp_path)) == ["x.mcap", "x.part002.mcap"]
 
