@@ -24,7 +24,7 @@ from flowrec.config import load_config
 from flowrec.declarations import Image
 from flowrec.messages import Frame, OperatorEvent, Tick
 from flowrec.run.loop import Sink
-from flowrec.store import SessionWriter, Snapshot
+from flowrec.store import SessionWriter, Snapshot, Split, WriterOptions
 from flowrec.system.realtime_priority import first_of_all
 from flowrec.terminal import progress
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
