@@ -27,7 +27,7 @@ from flowrec.errors import UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.methods import Methods
-from flowrec.planning import Planner, SurveyPlanner
+from flowrec.planning import PLANNERS, Planner, SurveyPlanner
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
 from flowrec.rig_settings import Camera, CameraSettings, Safety, Simulated
@@ -299,10 +299,11 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
             "all of a run; set one of them to 0"
         )
-    if "time_to_go" in config.control.needs and config.plan.method != "time_field":
+    if not set(config.control.needs) <= set(PLANNERS[config.plan.method].provides):
+        able = " or ".join(repr(row.name) for row in PLANNERS.values() if set(config.control.needs) <= set(row.provides))
         raise UsageError(
             f"{origin('control.method', 'plan.method')}: control.method = {config.control.method!r} needs the time to "
-            f"go, which plan.method = {config.plan.method!r} does not know; set plan.method = 'time_field', or "
+            f"go, which plan.method = {config.plan.method!r} does not know; set plan.method = {able}, or "
             "control.method = 'vector'"
         )
 

@@ -17,7 +17,8 @@ from flowrec.control import Coils
 from flowrec.control.mission import Place, PlacedMission, Point
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.flow import FlowSolver
-from flowrec.planning.free_space import Drift, Swift, swept_out, too_swift
+from flowrec.planning.feasibility import swept_out, too_swift
+from flowrec.planning.free_space import CourseError, FastFlowMargin
 from flowrec.rig_settings import Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
 
@@ -48,11 +49,11 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
     plan = replace(config.plan, swift=_timed(config.plan.swift, swift))
     survey = replace(config.survey, swift=_timed(config.survey.swift, swift))
-    drift = plan.swift.drift(robot, robot.speed_limit_um_s)
+    course_error = plan.swift.course_error(robot, robot.speed_limit_um_s)
     mission = _narrowed(
         PlacedMission,
         config.mission,
-        start=_start(config.mission.start, chip, robot, drift, config.flow, config.coils),
+        start=_start(config.mission.start, chip, robot, course_error, config.flow, config.coils),
         goal=_point(chip, config.mission.goal, "goal", robot),
     )
     _refuse_apart(chip, mission)
@@ -117,11 +118,11 @@ def _fitted(config: Config, chip: Chip) -> tuple[Robot, Camera]:
     return robot, _narrowed(Camera, camera, um_per_px=um_per_px, rate_hz=rate_hz)
 
 
-def _timed(swift: Swift, times: Mapping[str, float]) -> Swift:
+def _timed(swift: FastFlowMargin, times: Mapping[str, float]) -> FastFlowMargin:
     return replace(swift, **{key: value for key, value in times.items() if getattr(swift, key) is None})
 
 
-def _start(place: Place, chip: Chip, robot: Robot, drift: Drift, solver: FlowSolver, coils: Coils) -> Point:
+def _start(place: Place, chip: Chip, robot: Robot, course_error: CourseError, solver: FlowSolver, coils: Coils) -> Point:
     """The start; for a named outlet the place nearest to it where the robot can be held.
 
     That is five radii inside, as elsewhere, or farther if the assumed flow carries the robot out before the coils have
@@ -134,8 +135,8 @@ def _start(place: Place, chip: Chip, robot: Robot, drift: Drift, solver: FlowSol
         point = opening_point_um(chip, place, radii * robot.radius_um)
         start_um = np.array(point)
         if not (
-            swept_out(chip, field, start_um, drift, coils.ramp_s)
-            or too_swift(chip, field, start_um, start_um, robot.radius_um, drift)
+            swept_out(chip, field, start_um, course_error, coils.ramp_s)
+            or too_swift(chip, field, start_um, start_um, robot.radius_um, course_error)
         ):
             return point
     return _point(chip, place, "start", robot)

@@ -1,6 +1,6 @@
 """`flowrec bench plan`: every planner on the same trips, up and down, beside the time that nobody can beat.
 
-All planners plan at the robot's full speed in the flow as it is, and the same judge (planning/timing.py) times them.
+All planners plan at the robot's full speed in the flow as it is, and the same judge (planning/route.py) times them.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from flowrec.errors import UsageError
 from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField, Route
 from flowrec.planning import Planner, travel_time
-from flowrec.planning.free_space import Space, open_space
-from flowrec.planning.rrt import Rrt
+from flowrec.planning.free_space import FreeSpace, open_space
+from flowrec.planning.planner import RrtSettings
 from flowrec.terminal import progress, say, table
 
 RATIOS = (0.5, 0.9, 1.3)  # fastest flow over the robot's speed
@@ -115,7 +115,7 @@ def measure(
                     if planner.method.startswith("rrt"):
                         if number >= tree_channels:
                             continue
-                        planner = replace(planner, rrt=Rrt(iterations=tree_iterations))
+                        planner = replace(planner, rrt=RrtSettings(iterations=tree_iterations))
                     row, found[method] = _one(world, field, ends, ratio, direction, method, planner, optimum)
                     rows.append(row)
                 if ratio == 0.9 and direction == "up":
@@ -362,7 +362,7 @@ def _speed_on(world: World, trip: Trip, repeats: int = 7) -> dict[str, Any]:
     }
 
 
-def _dijkstra(space: Space, goal: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
+def _dijkstra(space: FreeSpace, goal: NDArray[np.float64], speed: float) -> NDArray[np.float64]:
     """Time to go over 8 neighbours by scipy: graph and search."""
     free = space.free
     h, w = free.shape

@@ -16,11 +16,10 @@ from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField
-from flowrec.planning.cost_rasters import Terrain
 from flowrec.planning.eikonal import descend, time_field
 from flowrec.planning.free_space import open_space
-from flowrec.planning.path_refinement import SPACING_PX, relax
-from flowrec.planning.timing import travel_time
+from flowrec.planning.path_refinement import SPACING_PX, refine_path
+from flowrec.planning.route import travel_time
 from flowrec.refine.training.vessels import draw_mask
 from flowrec.robot import Robot
 
@@ -137,17 +136,16 @@ def best_time(
     """
     space = open_space(world.chip, field, world.robot.radius_um, 0.5 * world.robot.radius_um)
     px = space.um_per_px
-    even = np.full_like(space.clearance, speed_um_s / px)
-    terrain = Terrain(space.free, space.clearance, space.need, space.vx, space.vy, even).finer(finer)
+    rasters = space.cost_rasters(speed_um_s / px)
+    fine = rasters.finer(finer)
     px = px / finer
     start, goal = np.rint(start_um / px), np.rint(goal_um / px)
-    times = time_field(terrain, goal)
+    times = time_field(fine, goal)
     least = float(times[int(start[1]), int(start[0])])
     if not np.isfinite(least):
         return np.inf, np.inf
-    path = descend(terrain, times, start, goal)
+    path = descend(fine, times, start, goal)
     if path is None:
         return least, least
-    wide = (space.clearance, space.need, space.vx, space.vy, np.ones_like(even), even, -1.0, SPACING_PX / finer)
-    ways = (relax(path / finer, *wide) * space.um_per_px, path * px)
+    ways = (refine_path(path / finer, rasters, spacing=SPACING_PX / finer) * space.um_per_px, path * px)
     return min(float(travel_time(field, points, speed_um_s)[0][-1]) for points in ways), least

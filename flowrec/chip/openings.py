@@ -16,9 +16,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from flowrec.chip.chip import Opening, Side
+from flowrec.chip.chip import Chip, Opening, Side
 from flowrec.errors import ChipError
 
 SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
@@ -142,3 +142,20 @@ def set_inlet_speed(openings: tuple[Opening, ...], speed_um_s: float) -> tuple[O
         replace(o, value=o.value * speed_um_s / fastest if fastest > 0 else speed_um_s) if o.kind == "inlet" else o
         for o in openings
     )
+
+
+def distance_px(opening: Opening, x: ArrayLike, y: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """From points x, y (...) in px to the nearest place of an opening on the border of a mask of `shape` (h, w)."""
+    h, w = shape[:2]
+    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
+    if opening.side in ("left", "right"):
+        away, along = x - (-0.5 if opening.side == "left" else w - 0.5), y
+    else:
+        away, along = y - (-0.5 if opening.side == "top" else h - 0.5), x
+    return np.asarray(np.hypot(away, along - np.clip(along, opening.first, opening.last)))
+
+
+def distance_um(chip: Chip, opening: Opening, point_um: ArrayLike) -> float:
+    """From a point (2,) um to the nearest place of an opening on the border of the chip."""
+    x, y = np.asarray(point_um, np.float64) / chip.um_per_px
+    return float(distance_px(opening, x, y, chip.mask.shape)) * chip.um_per_px

@@ -24,7 +24,7 @@ from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
-from flowrec.planning.free_space import no_room, swept_out, too_swift
+from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.disk_monitor import DiskWatch, refuse_below
@@ -151,16 +151,17 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
     """
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
-    drift = config.plan.swift.drift(robot, robot.speed_limit_um_s)
-    reason = too_swift(chip, field, start, start, robot.radius_um, drift)
+    course_error = config.plan.swift.course_error(robot, robot.speed_limit_um_s)
+    reason = too_swift(chip, field, start, start, robot.radius_um, course_error)
     if reason:
         raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
     if {"plan", "navigate"} & set(config.mission.phases):
         goal = np.asarray(config.mission.goal, np.float64)
-        reason = no_room(chip, field, start, goal, robot) or too_swift(chip, field, start, goal, robot.radius_um, drift)
+        reason = no_room(chip, field, start, goal, robot)
+        reason = reason or too_swift(chip, field, start, goal, robot.radius_um, course_error)
         if reason:
             raise UnreachableError(f"unreachable: {reason}")
-    reason = swept_out(chip, field, start, drift, config.coils.ramp_s)
+    reason = swept_out(chip, field, start, course_error, config.coils.ramp_s)
     if reason:
         raise UnreachableError(f"unreachable: {reason}")
 

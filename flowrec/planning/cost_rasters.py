@@ -1,43 +1,46 @@
-"""What a search looks at: where the robot may be, how the water flows there and how fast it swims, on pixels or finer.
+"""The rasters that a search for the least cost reads: free pixels, clearance, flow and speed, on any resolution.
 
 Channels are often only a few pixels wide, and against a flow nearly as fast as the robot half a pixel from the wall
-decides. The rasters stay what they are, bilinear between the pixel centres; a finer terrain only looks more closely.
+decides. The rasters are bilinear between the pixel centres; `finer` evaluates the same functions on more points.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.system.numba_setup import compiled
 
-Points = NDArray[np.float64]
 Raster = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+# The 8 neighbours of a pixel, by the angle; the opposite of number k is number k + 4.
+NEIGHBOUR_X = np.array([1, 1, 0, -1, -1, -1, 0, 1], np.int64)
+NEIGHBOUR_Y = np.array([0, 1, 1, 1, 0, -1, -1, -1], np.int64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Terrain:
-    """Rasters (h, w) in pixels and seconds, float64 and C-contiguous."""
+class CostRasters(NamedTuple):
+    """Rasters (h, w) in pixels and seconds, C-contiguous; a named tuple, so that kernels take it as one argument."""
 
     free: Mask  # where the robot's centre may be
-    clearance: Raster
-    need: float  # clearance that is asked for
-    vx: Raster
-    vy: Raster
-    speed: Raster  # of the robot through the fluid, what is left of it after a possible error of the flow
-    idle: float = -1.0  # positive: energy counts, not time, see zermelo.step_energy
+    clearance: Raster  # px
+    need: float  # px, the clearance that the robot needs
+    vx: Raster  # px/s
+    vy: Raster  # px/s
+    speed: Raster  # px/s of the robot through the fluid, less what a possible error of the flow takes
+    idle: float = -1.0  # px/s; positive: the cost is energy, not time (`kernels.step_energy`)
 
-    def finer(self, k: int) -> Terrain:
-        """The same with k pixels per pixel side; the centres of the old ones are every k-th of the new ones."""
+    def finer(self, k: int) -> CostRasters:
+        """The same rasters with k points per pixel; pixel (j, i) becomes point (k j, k i). Values are in new pixels."""
         if k == 1:
             return self
-        free, clearance, vx, vy, speed = _look_closer(
-            self.free, self.clearance, self.need, self.vx, self.vy, self.speed, k
-        )
-        return Terrain(free, clearance, self.need * k, vx, vy, speed, self.idle * k)
+        free = self.free
+        cells = free[:-1, :-1] | free[:-1, 1:] | free[1:, :-1] | free[1:, 1:]  # with a free corner
+        clearance = _refined(self.clearance, cells, k, -1.0 / k)
+        allowed = _joined_neighbours(free, k) | (clearance >= self.need - 1e-9)
+        vx, vy, speed = (k * _refined(raster, cells, k, 0.0) for raster in (self.vx, self.vy, self.speed))
+        return CostRasters(allowed, k * clearance, self.need * k, vx, vy, speed, self.idle * k)
 
 
 @compiled
@@ -58,56 +61,41 @@ def interpolated(raster: Raster, k: int) -> Raster:
 
 
 @compiled
-def _look_closer(
-    free: Mask, clearance: Raster, need: float, vx: Raster, vy: Raster, speed: Raster, k: int
-) -> tuple[Mask, Raster, Raster, Raster, Raster]:
-    h, w = free.shape
-    shape = ((h - 1) * k + 1, (w - 1) * k + 1)
-    open_ = np.zeros(shape, np.bool_)
-    room = np.full(shape, -1.0)
-    along_x = np.zeros(shape)
-    along_y = np.zeros(shape)
-    swim = np.zeros(shape)
+def _refined(raster: Raster, cells: Mask, k: int, elsewhere: float) -> Raster:
+    """`interpolated` within some cells (h - 1, w - 1) between pixel centres only; a constant elsewhere."""
+    h, w = raster.shape
+    fine = np.full(((h - 1) * k + 1, (w - 1) * k + 1), elsewhere)
     for j in range(h - 1):
         for i in range(w - 1):
-            if not (free[j, i] or free[j, i + 1] or free[j + 1, i] or free[j + 1, i + 1]):
+            if not cells[j, i]:
                 continue
             for n in range(k + 1):
                 b = n / k
                 for m in range(k + 1):
                     a = m / k
-                    p = (1.0 - a) * (1.0 - b)
-                    q = a * (1.0 - b)
-                    r = (1.0 - a) * b
-                    s = a * b
-                    c = i * k + m
-                    d = j * k + n
-                    here = (
-                        p * clearance[j, i]
-                        + q * clearance[j, i + 1]
-                        + r * clearance[j + 1, i]
-                        + s * clearance[j + 1, i + 1]
+                    fine[j * k + n, i * k + m] = (
+                        (1.0 - a) * (1.0 - b) * raster[j, i]
+                        + a * (1.0 - b) * raster[j, i + 1]
+                        + (1.0 - a) * b * raster[j + 1, i]
+                        + a * b * raster[j + 1, i + 1]
                     )
-                    room[d, c] = k * here
-                    along_x[d, c] = k * (p * vx[j, i] + q * vx[j, i + 1] + r * vx[j + 1, i] + s * vx[j + 1, i + 1])
-                    along_y[d, c] = k * (p * vy[j, i] + q * vy[j, i + 1] + r * vy[j + 1, i] + s * vy[j + 1, i + 1])
-                    swim[d, c] = k * (
-                        p * speed[j, i] + q * speed[j, i + 1] + r * speed[j + 1, i] + s * speed[j + 1, i + 1]
-                    )
-                    if here >= need - 1e-9:
-                        open_[d, c] = True
-            # Pixels that touch are joined, though on the ridge of an oblique channel the bilinear clearance dips.
-            for n in range(k + 1):
-                if free[j, i] and free[j + 1, i + 1]:
-                    open_[j * k + n, i * k + n] = True
-                if free[j, i + 1] and free[j + 1, i]:
-                    open_[j * k + n, (i + 1) * k - n] = True
-                if free[j, i] and free[j, i + 1]:
-                    open_[j * k, i * k + n] = True
-                if free[j, i] and free[j + 1, i]:
-                    open_[j * k + n, i * k] = True
-                if free[j + 1, i] and free[j + 1, i + 1]:
-                    open_[(j + 1) * k, i * k + n] = True
-                if free[j, i + 1] and free[j + 1, i + 1]:
-                    open_[j * k + n, (i + 1) * k] = True
-    return open_, room, along_x, along_y, swim
+    return fine
+
+
+@compiled
+def _joined_neighbours(free: Mask, k: int) -> Mask:
+    """The points on the straight lines between free neighbours, of a raster (h, w) with k points per pixel.
+
+    Neighbours are joined although the bilinear clearance dips between them on the ridge of an oblique channel.
+    """
+    h, w = free.shape
+    joined = np.zeros(((h - 1) * k + 1, (w - 1) * k + 1), np.bool_)
+    for j in range(h):
+        for i in range(w):
+            for c in range(4):
+                a = i + NEIGHBOUR_X[c]
+                b = j + NEIGHBOUR_Y[c]
+                if free[j, i] and 0 <= a < w and b < h and free[b, a]:
+                    for n in range(k + 1):
+                        joined[j * k + n * NEIGHBOUR_Y[c], i * k + n * NEIGHBOUR_X[c]] = True
+    return joined

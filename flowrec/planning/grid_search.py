@@ -1,64 +1,148 @@
-"""A* and Dijkstra on the pixels themselves: neighbours are fixed offsets, costs are computed as they are needed."""
+"""A* and Dijkstra's algorithm on the pixels, and the two planners that are nothing else: fastest and shortest.
+
+One compiled search serves all: the neighbours are offsets, and the cost of an edge is one of three, each with its
+heuristic h for the way from x to the goal:
+
+    LENGTH       |dx|,                                              h = |goal - x|
+    TRAVEL_TIME  time at ground speed, Simpson's rule over dx,      h = |goal - x| / (V + max |v|)
+    PAPER        |dx| |dx / |dx| - v / V| with v where dx begins,   h = the same for goal - x
+
+The first two heuristics are admissible and consistent. The third is not admissible (see astar_paper.py).
+"""
 
 from __future__ import annotations
 
 import heapq
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.interpolation import bilinear
-from flowrec.planning.zermelo import line_is_clear, step_time
+from flowrec.messages import Route
+from flowrec.planning.cost_rasters import CostRasters, Raster
+from flowrec.planning.free_space import FreeSpace
+from flowrec.planning.kernels import line_is_clear, step_time
+from flowrec.planning.path_refinement import refined_route
+from flowrec.planning.problem import Problem
+from flowrec.planning.route import no_route, too_fast
 from flowrec.system.numba_setup import compiled
 
-Raster = NDArray[np.float64]
+LENGTH, TRAVEL_TIME, PAPER = 0, 1, 2
+Points = NDArray[np.float64]
 
 
-def directions(reach: int) -> NDArray[np.int64]:
-    """(n, 2) steps (x, y) in all distinct directions within `reach` pixels: 8, 16, 32 for reach 1, 2, 3."""
-    span = range(-reach, reach + 1)
+@dataclass(frozen=True, slots=True)
+class AstarLength:
+    """The shortest path on the pixels; the flow only times it."""
+
+    reach_px: int
+
+    def plan(self, problem: Problem) -> Route:
+        """The route of a problem."""
+        path = shortest_path(problem, LENGTH, directions(self.reach_px))
+        return too_fast_route(problem, self.reach_px) if path is None else problem.timed(problem.with_ends(path))
+
+
+@dataclass(frozen=True, slots=True)
+class AstarTime:
+    """The fastest path on the pixels, refined off them."""
+
+    reach_px: int
+    refine: bool
+
+    def plan(self, problem: Problem) -> Route:
+        """The route of a problem."""
+        path = shortest_path(problem, TRAVEL_TIME, directions(self.reach_px))
+        if path is None:
+            return too_fast_route(problem, self.reach_px)
+        path, rasters = problem.with_ends(path), problem.space.cost_rasters(problem.speed)
+        return refined_route(problem, rasters, path) if self.refine else problem.timed(path)
+
+
+def directions(reach_px: int) -> NDArray[np.int64]:
+    """(n, 2) offsets (x, y) in all distinct directions within `reach_px` pixels: 8, 16, 32 for 1, 2, 3."""
+    span = range(-reach_px, reach_px + 1)
     return np.array([(a, b) for a in span for b in span if math.gcd(a, b) == 1], np.int64)
 
 
-@compiled
-def search(
-    free: NDArray[np.bool_],
-    clearance: Raster,
-    need: float,
-    vx: Raster,
-    vy: Raster,
-    weight: Raster,
-    steps: NDArray[np.int64],
-    start: int,
-    goal: int,
-    speed: float,
-    timed: bool,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Cheapest ways from `start` until `goal` is reached, or everywhere when `goal` is negative.
+def shortest_path(problem: Problem, cost: int, offsets: NDArray[np.int64]) -> Points | None:
+    """(n, 2) px from the start's node to the goal's at the least cost; None if there is no path."""
+    space, goal = problem.space, problem.goal.node
+    spent, parent = search(space, cost, offsets, problem.speed, problem.start.node, goal)
+    return backtrack(parent, goal, space.width) if np.isfinite(spent[goal]) else None
 
-    Nodes are flat indices of free pixels (h, w). An edge costs its exact travel time at `speed` px/s (Simpson's
-    rule over the edge) or, untimed, its length in px; times the mean `weight` (>= 1) of its ends. The heuristic is
-    the straight way at the fastest ground speed anywhere, |goal - x| / (V + max |v|): admissible and consistent.
+
+def too_fast_route(problem: Problem, reach_px: int) -> Route:
+    """No route, with the place on the shortest path where the ground speed is lowest."""
+    path = shortest_path(problem, LENGTH, directions(reach_px))
+    assert path is not None, "free neighbours are joined by edges"
+    reason = too_fast(problem.field, path * problem.space.um_per_px, problem.speed_um_s)
+    return no_route(problem.method, reason)
+
+
+def search(
+    space: FreeSpace,
+    cost: int,
+    offsets: NDArray[np.int64],
+    speed: float,
+    start: int,
+    goal: int = -1,
+    weight: Raster | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """`best_first` on a free space, for a robot of `speed` (px/s); every edge keeps the clearance `space.need`."""
+    rasters = space.cost_rasters(speed)._replace(clearance=space.clearance)
+    weight = np.ones_like(space.clearance) if weight is None else weight
+    return best_first(rasters, weight, cost, offsets, start, goal)
+
+
+def backtrack(parent: NDArray[np.int64], end: int, width: int) -> Points:
+    """(n, 2) points (x, y) in px from the root of the search to `end`."""
+    chain = [end]
+    while parent[chain[-1]] >= 0:
+        chain.append(int(parent[chain[-1]]))
+    nodes = np.array(chain[::-1])
+    return np.column_stack([nodes % width, nodes // width]).astype(np.float64)
+
+
+@compiled
+def paper_cost(dx: float, dy: float, vx: float, vy: float, speed: float) -> float:
+    """The paper's cost of a displacement (px) that begins in a flow (px/s): finite however fast the flow is."""
+    distance = math.hypot(dx, dy)
+    if distance == 0.0:
+        return 0.0
+    return distance * math.hypot(dx / distance - vx / speed, dy / distance - vy / speed)
+
+
+@compiled
+def best_first(
+    rasters: CostRasters, weight: Raster, cost: int, offsets: NDArray[np.int64], start: int, goal: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Paths of least cost from `start` until `goal` is reached, or to everywhere if `goal` is negative.
+
+    Nodes are flat indices of free pixels (h, w). Edges lead to the pixels at `offsets` (n, 2) that are free and in a
+    clear line; their cost is multiplied by the mean `weight` (h, w) >= 1 of their ends. No node is expanded twice.
 
     Returns
     -------
     cost (h*w,), inf where not reached, and the parent (h*w,) of each node, -1 where there is none.
     """
+    free, clearance, need, vx, vy, speed, _ = rasters
     h, w = free.shape
-    cost = np.full(h * w, np.inf)
+    spent = np.full(h * w, np.inf)
     parent = np.full(h * w, -1, np.int64)
     closed = np.zeros(h * w, np.bool_)
-    pace = 1.0
-    if timed:
+    fastest = 1.0  # of the heuristic
+    if cost == TRAVEL_TIME:
         fastest = 0.0
         for j in range(h):
             for i in range(w):
                 fastest = max(fastest, math.hypot(vx[j, i], vy[j, i]))
-        pace = speed + fastest
+        fastest = speed.max() + fastest
     goal_j = goal // w
     goal_i = goal - goal_j * w
-    cost[start] = 0.0
+    spent[start] = 0.0
     heap = [(0.0, start)]
     while len(heap) > 0:
         _, node = heapq.heappop(heap)
@@ -69,9 +153,9 @@ def search(
             break
         j = node // w
         i = node - j * w
-        for k in range(len(steps)):
-            di = steps[k, 0]
-            dj = steps[k, 1]
+        for k in range(len(offsets)):
+            di = offsets[k, 0]
+            dj = offsets[k, 1]
             a = i + di
             b = j + dj
             if a < 0 or b < 0 or a >= w or b >= h or not free[b, a]:
@@ -80,38 +164,35 @@ def search(
             if closed[other]:
                 continue
             length = math.hypot(di, dj)
-            # Pixels that touch are joined by what they are, though on the ridge of an oblique channel the bilinear
-            # clearance dips between them; a longer step is looked at unless its ends leave no doubt: clearance
-            # changes by at most a pixel per pixel.
-            if (
-                length > 1.5
-                and min(clearance[j, i], clearance[b, a]) < need + 0.5 * length
-                and not line_is_clear(clearance, i, j, a, b, need)
-            ):
-                continue
+            # Neighbours that touch are always joined, although the bilinear clearance dips between them on the ridge of
+            # an oblique channel. A longer edge is clear without a look at it if its ends have half its length to
+            # spare, because the clearance changes by at most a pixel per pixel.
+            if length > 1.5 and min(clearance[j, i], clearance[b, a]) < need + 0.5 * length:
+                # The paper's edges have no direction: their lines are sampled from the lower node.
+                if cost == PAPER and other < node:
+                    clear = line_is_clear(clearance, a, b, i, j, need)
+                else:
+                    clear = line_is_clear(clearance, i, j, a, b, need)
+                if not clear:
+                    continue
             edge = length
-            if timed:
+            if cost == TRAVEL_TIME:
                 x = i + 0.5 * di
                 y = j + 0.5 * dj
-                middle = step_time(di, dj, bilinear(vx, x, y), bilinear(vy, x, y), speed)
-                first = step_time(di, dj, vx[j, i], vy[j, i], speed)
-                last = step_time(di, dj, vx[b, a], vy[b, a], speed)
+                middle = step_time(di, dj, bilinear(vx, x, y), bilinear(vy, x, y), bilinear(speed, x, y))
+                first = step_time(di, dj, vx[j, i], vy[j, i], speed[j, i])
+                last = step_time(di, dj, vx[b, a], vy[b, a], speed[b, a])
                 edge = (first + 4.0 * middle + last) / 6.0
-            through = cost[node] + 0.5 * (weight[j, i] + weight[b, a]) * edge
-            if through < cost[other]:
-                cost[other] = through
+            elif cost == PAPER:
+                edge = paper_cost(di, dj, vx[j, i], vy[j, i], speed[j, i])
+            through = spent[node] + 0.5 * (weight[j, i] + weight[b, a]) * edge
+            if through < spent[other]:
+                spent[other] = through
                 parent[other] = node
                 ahead = 0.0
-                if goal >= 0:
-                    ahead = math.hypot(goal_i - a, goal_j - b) / pace
+                if goal >= 0 and cost == PAPER:
+                    ahead = paper_cost(goal_i - a, goal_j - b, vx[b, a], vy[b, a], speed[b, a])
+                elif goal >= 0:
+                    ahead = math.hypot(goal_i - a, goal_j - b) / fastest
                 heapq.heappush(heap, (through + ahead, other))
-    return cost, parent
-
-
-def backtrack(parent: NDArray[np.int64], end: int, width: int) -> NDArray[np.float64]:
-    """(n, 2) points (x, y) in px from the root of the search to `end`."""
-    chain = [end]
-    while parent[chain[-1]] >= 0:
-        chain.append(int(parent[chain[-1]]))
-    nodes = np.array(chain[::-1])
-    return np.column_stack([nodes % width, nodes // width]).astype(np.float64)
+    return spent, parent

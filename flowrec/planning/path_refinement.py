@@ -1,7 +1,7 @@
-"""Local refinement of a path: chords and smooth bumps along its normal, from wide to narrow, kept when they save time.
+"""Local refinement of a path: chords, then smooth bumps along its normal from wide to narrow, kept if they cost less.
 
-A lattice path zigzags between a few directions; this takes it to within a fraction of a percent of the local optimum
-(notes/planning-control.md, section 1), and never nearer to a wall than it was or has to be.
+A grid path zigzags between a few directions. The refinement takes it to within a fraction of a percent of the local
+optimum, and never nearer to a wall than it was or has to be.
 """
 
 from __future__ import annotations
@@ -12,106 +12,106 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.interpolation import bilinear
-from flowrec.planning.zermelo import lowest_clearance, segment_cost
+from flowrec.messages import Route
+from flowrec.planning.cost_rasters import CostRasters, Raster
+from flowrec.planning.kernels import lowest_clearance, segment_cost
+from flowrec.planning.problem import Problem
+from flowrec.planning.route import subdivided
 from flowrec.system.numba_setup import compiled
 
 Points = NDArray[np.float64]
-Raster = NDArray[np.float64]
 SPACING_PX = 1.5  # of the points of a path
-_LONGEST_PX = 12.0  # chord
-_WIDEST_PX = 48.0  # half of the widest bump
+_LONGEST_CHORD_PX = 12.0
+_WIDEST_BUMP_PX = 48.0  # half width
 _SWEEPS = 12
 
 
-def relax(
+def refined_route(
+    problem: Problem,
+    rasters: CostRasters,
     path: Points,
-    clearance: Raster,
-    need: float,
-    vx: Raster,
-    vy: Raster,
-    weight: Raster,
-    speed: Raster,
-    idle: float = -1.0,
+    idle_um_s: float | None = None,
     spacing: float = SPACING_PX,
+) -> Route:
+    """The timed route along the refinement of a path (n, 2) px, or along the path if the refinement is impossible."""
+    route = problem.timed(refine_path(path, rasters, spacing=spacing), idle_um_s)
+    return route if route.reachable else problem.timed(path, idle_um_s)
+
+
+def refine_path(
+    path: Points, rasters: CostRasters, weight: Raster | None = None, spacing: float = SPACING_PX
 ) -> Points:
-    """A path (n, 2) in px with the same ends that takes less weighted time, its points at most `spacing` px apart.
+    """A path (n, 2) in px with the same ends and a lower cost, its points at most `spacing` px apart.
 
-    `speed` (h, w) is the robot's through the fluid; with `idle` > 0 it takes less energy instead (`step_energy`).
-
-    Every part of it keeps the clearance `need` (px), or, where the given path did not, at least that of the given one.
+    The cost is that of `kernels.segment_cost` times `weight` (h, w), 1 if it is not given. Every part keeps the
+    clearance `rasters.need`, or that of the given path where it was less.
     """
-    rasters = (clearance, need, vx, vy, weight, speed, idle)
+    if weight is None:
+        weight = np.ones_like(rasters.clearance)
     for step in dict.fromkeys((max(spacing, SPACING_PX), spacing)):
-        points = _even_steps(_pulled(path, *rasters, _LONGEST_PX), step)
+        chords = _with_chords(path, rasters, weight, _LONGEST_CHORD_PX)
+        # Every vertex stays: to omit one would cut the corner of a wall. A single step would have no point to move.
+        points = subdivided(chords, step, 1e-9, single_leg=2)
         if len(points) < 2:
             return points
-        widest = math.ceil(_WIDEST_PX / step)
+        widest = math.ceil(_WIDEST_BUMP_PX / step)
         widths = widest // 2 ** np.arange(widest.bit_length())
-        path = _bumps(points, *rasters, step, widths, _SWEEPS)
+        path = _with_bumps(points, rasters, weight, step, widths, _SWEEPS)
     return path
 
 
-def _even_steps(path: Points, spacing: float) -> Points:
-    """The same path in steps of at most `spacing`: no vertex is left out, which would cut the corners of walls."""
-    lengths = np.hypot(*np.diff(path, axis=0).T)
-    path = path[np.concatenate([[True], lengths > 1e-9])]
-    if len(path) < 2:
-        return path
-    lengths = np.hypot(*np.diff(path, axis=0).T)
-    counts = np.maximum(1, np.ceil(lengths / spacing - 1e-9)).astype(np.int64)
-    if len(counts) == 1:
-        counts = np.maximum(counts, 2)  # a single step has nothing to move
-    leg = np.repeat(np.arange(len(counts)), counts)
-    share = (np.arange(counts.sum()) - (np.cumsum(counts) - counts)[leg]) / counts[leg]
-    return np.concatenate([path[leg] + share[:, None] * np.diff(path, axis=0)[leg], path[-1:]])
+@compiled
+def _cost(
+    points: Points, legs: int, rasters: CostRasters, weight: Raster, limit: float, costs: NDArray[np.float64]
+) -> float:
+    """Sum of the weighted costs of the first legs of a polyline (n, 2); each is written to `costs` (legs,).
+
+    It ends early when the sum reaches a limit.
+    """
+    _, _, _, vx, vy, speed, idle = rasters
+    total = 0.0
+    for k in range(legs):
+        x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
+        middle = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1))
+        costs[k] = middle * segment_cost(vx, vy, speed, idle, x0, y0, x1, y1, 1.0)
+        total += costs[k]
+        if total >= limit:
+            break
+    return total
 
 
 @compiled
-def _pulled(
-    path: Points,
-    clearance: Raster,
-    need: float,
-    vx: Raster,
-    vy: Raster,
-    weight: Raster,
-    speed: Raster,
-    idle: float,
-    longest: float,
-) -> Points:
+def _with_chords(path: Points, rasters: CostRasters, weight: Raster, longest: float) -> Points:
     """The path with chords wherever they cost no more and come no nearer to a wall than what they replace.
 
-    Walls of pixels are notched: a path that hugs them follows every notch, and bumps alone do not get it off.
+    Walls of pixels are notched: a path along them follows every notch, and bumps alone do not smooth it.
     """
     n = len(path)
+    clearance = rasters.clearance
+    chord = np.empty((math.ceil(longest) + 1, 2))
+    costs = np.empty(len(chord))
     kept = np.empty((n, 2))
     kept[0] = path[0]
     count = 1
     i = 0
     while i < n - 1:
         best = i + 1
-        lowest = need
+        lowest = rasters.need
         spent = 0.0
         for j in range(i + 1, n):
             x0, y0, x1, y1 = path[j - 1, 0], path[j - 1, 1], path[j, 0], path[j, 1]
             lowest = min(lowest, lowest_clearance(clearance, x0, y0, x1, y1))
-            spent += bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
-                vx, vy, speed, x0, y0, x1, y1, idle, 1.0
-            )
+            spent += _cost(path[j - 1 :], 1, rasters, weight, math.inf, costs)
             x0, y0 = path[i, 0], path[i, 1]
-            if math.hypot(x1 - x0, y1 - y0) > longest:
+            length = math.hypot(x1 - x0, y1 - y0)
+            if length > longest:
                 break
             if j > best and lowest_clearance(clearance, x0, y0, x1, y1) >= lowest - 1e-9:
-                pieces = max(1, math.ceil(math.hypot(x1 - x0, y1 - y0)))
-                chord = 0.0
-                for k in range(pieces):
-                    a = x0 + (x1 - x0) * k / pieces
-                    b = y0 + (y1 - y0) * k / pieces
-                    c = x0 + (x1 - x0) * (k + 1) / pieces
-                    d = y0 + (y1 - y0) * (k + 1) / pieces
-                    chord += bilinear(weight, 0.5 * (a + c), 0.5 * (b + d)) * segment_cost(
-                        vx, vy, speed, a, b, c, d, idle, 1.0
-                    )
-                if chord <= spent:
+                legs = max(1, math.ceil(length))
+                for k in range(legs + 1):
+                    chord[k, 0] = x0 + (x1 - x0) * k / legs
+                    chord[k, 1] = y0 + (y1 - y0) * k / legs
+                if _cost(chord, legs, rasters, weight, math.inf, costs) <= spent:
                     best = j
         kept[count] = path[best]
         count += 1
@@ -120,32 +120,30 @@ def _pulled(
 
 
 @compiled
-def _bumps(
+def _with_bumps(
     path: Points,
-    clearance: Raster,
-    need: float,
-    vx: Raster,
-    vy: Raster,
+    rasters: CostRasters,
     weight: Raster,
-    speed: Raster,
-    idle: float,
     spacing: float,
     widths: NDArray[np.int64],
     sweeps: int,
 ) -> Points:
+    """The path (n, 2) with its points shifted along the normal by cosine bumps of half widths `widths`, in points.
+
+    A bump is kept if it lowers the cost; its height halves when hardly any is kept.
+    """
+    clearance = rasters.clearance
     h, w = clearance.shape
     points = path.copy()
     n = len(points)
-    times = np.empty(n - 1)
+    costs = np.empty(n - 1)
     floors = np.empty(n - 1)
     for k in range(n - 1):
+        _cost(points[k:], 1, rasters, weight, math.inf, costs[k:])
         x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
-        times[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
-            vx, vy, speed, x0, y0, x1, y1, idle, 1.0
-        )
-        floors[k] = min(need, lowest_clearance(clearance, x0, y0, x1, y1))
+        floors[k] = min(rasters.need, lowest_clearance(clearance, x0, y0, x1, y1))
     moved = np.empty((2 * widths.max() + 1, 2))
-    taken = np.empty(2 * widths.max())
+    new_costs = np.empty(2 * widths.max())
     for width in widths:
         height = 0.17 * width * spacing
         stride = max(1, width // 2)
@@ -159,7 +157,7 @@ def _bumps(
                 norm = math.hypot(tangent_x, tangent_y)
                 if norm < 1e-9:
                     continue
-                before = times[first:last].sum()
+                limit = costs[first:last].sum() * (1.0 - 1e-7)
                 for sign in (-1.0, 1.0):
                     good = True
                     for k in range(first, last + 1):
@@ -168,38 +166,24 @@ def _bumps(
                             bump = 0.0  # the ends are given
                         x = points[k, 0] - sign * height * bump * tangent_y / norm
                         y = points[k, 1] + sign * height * bump * tangent_x / norm
+                        moved[k - first, 0] = x
+                        moved[k - first, 1] = y
                         # Beyond the border nothing is known of walls or flow.
                         if bump > 0.0 and (x < 0.0 or y < 0.0 or x > w - 1.0 or y > h - 1.0):
                             good = False
                             break
-                        moved[k - first, 0] = x
-                        moved[k - first, 1] = y
-                    if not good:
-                        continue
-                    after = 0.0
+                    good = good and _cost(moved, last - first, rasters, weight, limit, new_costs) < limit
                     for k in range(last - first):
-                        x0, y0, x1, y1 = moved[k, 0], moved[k, 1], moved[k + 1, 0], moved[k + 1, 1]
-                        taken[k] = bilinear(weight, 0.5 * (x0 + x1), 0.5 * (y0 + y1)) * segment_cost(
-                            vx, vy, speed, x0, y0, x1, y1, idle, 1.0
-                        )
-                        after += taken[k]
-                        if after >= before * (1.0 - 1e-7):
-                            good = False
+                        if not good:
                             break
-                    if not good:
-                        continue
-                    for k in range(last - first):
                         x0, y0, x1, y1 = moved[k, 0], moved[k, 1], moved[k + 1, 0], moved[k + 1, 1]
-                        if lowest_clearance(clearance, x0, y0, x1, y1) < floors[first + k] - 1e-9:
-                            good = False
-                            break
-                    if not good:
-                        continue
-                    points[first : last + 1] = moved[: last - first + 1]
-                    times[first:last] = taken[: last - first]
-                    accepted += 1
-                    break
-            # A height that hardly moves anything any more has done its work.
+                        good = lowest_clearance(clearance, x0, y0, x1, y1) >= floors[first + k] - 1e-9
+                    if good:
+                        points[first : last + 1] = moved[: last - first + 1]
+                        costs[first:last] = new_costs[: last - first]
+                        accepted += 1
+                        break
+            # A height at which hardly any bump is kept has done its work.
             if accepted * 20 * stride <= n:
                 height *= 0.5
             if height < 0.02:

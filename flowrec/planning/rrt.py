@@ -1,11 +1,10 @@
-"""Rapidly-exploring random trees from OMPL 2: what a user might pick instead, for comparison.
+"""Rapidly-exploring random trees of OMPL 2, for comparison.
 
-    rrt       LaValle's, the first way that is found, as in the paper's comparison
-    rrt_star  Karaman and Frazzoli's, with the travel time in the flow as its cost, until the samples are used up
+    rrt       LaValle (1998): the first path found, as in the paper's comparison
+    rrt_star  Karaman and Frazzoli (2011), with the travel time in the flow as its cost, until the iterations are used
 
-The number of iterations is limited, not the time, and every plan seeds OMPL anew: the same request has the same
-answer, on any machine. OMPL stays the judge of what it does; flow, walls and cost are asked of the same kernels as
-every other planner's.
+The number of iterations is limited, not the time, and every plan seeds OMPL anew: the same problem has the same
+solution on any machine. Clearance and cost come from the kernels of the other planners.
 """
 
 from __future__ import annotations
@@ -13,39 +12,46 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from ompl import base, geometric, util
 
-from flowrec.errors import UsageError
-from flowrec.planning.free_space import Space
-from flowrec.planning.zermelo import line_is_clear, segment_cost
-from flowrec.ranges import Range, Seed, Share
+from flowrec.messages import Route
+from flowrec.planning.free_space import FreeSpace
+from flowrec.planning.kernels import line_is_clear, segment_cost
+from flowrec.planning.planner import RrtSettings
+from flowrec.planning.problem import Problem
+from flowrec.planning.route import no_route
 
 Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Rrt:
-    """Settings of both trees."""
+    """The first path that the tree finds."""
 
-    seed: Seed = 0
-    iterations: Annotated[int, Range(1, 100_000_000)] = 20000  # at most; rrt stops at its first way
-    range_px: Annotated[float, Range(0.1, 1e5)] = 12.0  # longest branch
-    goal_bias: Share = 0.05  # share of the samples that are the goal itself
+    rrt: RrtSettings
 
-    def search(self, space: Space, start: Points, goal: Points, speed: float | None) -> Points | None:
-        """(n, 2) px from start to goal, None when the iterations do not suffice; the fastest at a `speed` (px/s).
+    def plan(self, problem: Problem) -> Route:
+        """The route of a problem."""
+        path = self._search(problem)
+        if path is None:
+            reason = f"{problem.method} found no way in {self.rrt.iterations} iterations"
+            return no_route(problem.method, reason)
+        return problem.timed(problem.with_ends(path))
 
-        Raises
-        ------
-        UsageError
-            If OMPL is not installed.
-        """
-        base, geometric, util = _ompl()
-        # OMPL warns that what was made before goes on as before; nothing that was is used again.
-        util.RNG.setSeed(self.seed + 1)  # it takes 0 for no seed
+    def _tree(self, problem: Problem, definition: Any, information: Any) -> Any:
+        """OMPL's planner."""
+        return geometric.RRT(information)
+
+    def _search(self, problem: Problem) -> Points | None:
+        """(n, 2) px from node to node; None when the iterations do not suffice."""
+        util.setLogLevel(util.LogLevel.LOG_NONE)
+        # OMPL warns that objects made before keep the old seed; none of them is used again.
+        util.RNG.setSeed(self.rrt.seed + 1)  # OMPL takes 0 for no seed
+        space = problem.space
         h, w = space.free.shape
         plane = base.RealVectorStateSpace(2)
         bounds = base.RealVectorBounds(2)
@@ -55,44 +61,43 @@ class Rrt:
         plane.setBounds(bounds)
         information = base.SpaceInformation(plane)
 
-        class Motion(base.MotionValidator):  # type: ignore[misc,name-defined]
+        class Motion(base.MotionValidator):  # type: ignore[misc]
             def checkMotion(self, a: Any, b: Any, *_: Any) -> bool:  # noqa: N802
-                return _passable(space, a[0], a[1], b[0], b[1])
+                return line_is_clear(space.clearance, a[0], a[1], b[0], b[1], space.need - 1e-9)
 
         information.setStateValidityChecker(lambda state: space.clearance_at(np.array([state[0], state[1]])) > 0.0)
         information.setMotionValidator(Motion(information))
         information.setup()
-        problem = base.ProblemDefinition(information)
+        definition = base.ProblemDefinition(information)
         ends = []
-        for point in (start, goal):
+        for node in (problem.start.node, problem.goal.node):
             state = information.allocState()
-            state[0], state[1] = float(point[0]), float(point[1])
+            state[0], state[1] = map(float, space.pixel(node))
             ends.append(state)
-        problem.setStartAndGoalStates(*ends, 0.5)
-        if speed is None:
-            planner = geometric.RRT(information)
-        else:
-            problem.setOptimizationObjective(_travel_time(base, information, space, speed))
-            planner = geometric.RRTstar(information)
-        planner.setRange(self.range_px)
-        planner.setGoalBias(self.goal_bias)
-        planner.setProblemDefinition(problem)
-        planner.setup()
+        definition.setStartAndGoalStates(*ends, 0.5)
+        tree = self._tree(problem, definition, information)
+        tree.setRange(self.rrt.range_px)
+        tree.setGoalBias(self.rrt.goal_bias)
+        tree.setProblemDefinition(definition)
+        tree.setup()
         counted = itertools.count()
-        planner.solve(base.PlannerTerminationCondition(lambda: next(counted) >= self.iterations))
-        if not problem.hasExactSolution():
+        tree.solve(base.PlannerTerminationCondition(lambda: next(counted) >= self.rrt.iterations))
+        if not definition.hasExactSolution():
             return None
-        states = problem.getSolutionPath().getStates()
+        states = definition.getSolutionPath().getStates()
         return np.array([[state[0], state[1]] for state in states], np.float64)
 
 
-def _passable(space: Space, x0: float, y0: float, x1: float, y1: float) -> bool:
-    """Whether the robot keeps its clearance along a segment."""
-    return line_is_clear(space.clearance, x0, y0, x1, y1, space.need - 1e-9)
+class RrtStar(Rrt):
+    """The fastest path that the tree finds within the iterations."""
+
+    def _tree(self, problem: Problem, definition: Any, information: Any) -> Any:
+        definition.setOptimizationObjective(_travel_time(information, problem.space, problem.speed))
+        return geometric.RRTstar(information)
 
 
-def _travel_time(base: Any, information: Any, space: Space, speed: float) -> Any:
-    """OMPL's objective: Zermelo's time along each branch."""
+def _travel_time(information: Any, space: FreeSpace, speed: float) -> Any:
+    """OMPL's objective: Zermelo's travel time along each branch."""
     everywhere = np.full_like(space.clearance, speed)
     fastest = speed + float(np.hypot(space.vx, space.vy).max())
 
@@ -101,8 +106,7 @@ def _travel_time(base: Any, information: Any, space: Space, speed: float) -> Any
             return base.Cost(0.0)
 
         def motionCost(self, a: Any, b: Any) -> Any:  # noqa: N802
-            cost = segment_cost(space.vx, space.vy, everywhere, a[0], a[1], b[0], b[1], -1.0, 0.5)
-            return base.Cost(cost)
+            return base.Cost(segment_cost(space.vx, space.vy, everywhere, -1.0, a[0], a[1], b[0], b[1], 0.5))
 
         def motionCostHeuristic(self, a: Any, b: Any) -> Any:  # noqa: N802
             return base.Cost(math.hypot(b[0] - a[0], b[1] - a[1]) / fastest)
@@ -111,19 +115,3 @@ def _travel_time(base: Any, information: Any, space: Space, speed: float) -> Any
             return False
 
     return TravelTime(information)
-
-
-def _ompl() -> tuple[Any, Any, Any]:
-    """OMPL's base, geometric and util parts, quiet.
-
-    Raises
-    ------
-    UsageError
-        If it is not installed.
-    """
-    try:
-        from ompl import base, geometric, util
-    except ImportError as error:
-        raise UsageError("plan: rrt and rrt_star need OMPL 2: pip install 'flowrec[ompl]'") from error
-    util.setLogLevel(util.LogLevel.LOG_NONE)
-    return base, geometric, util

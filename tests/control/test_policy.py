@@ -13,6 +13,7 @@ from flowrec.errors import UsageError
 from flowrec.flow import sample
 from flowrec.messages import Estimate, Route
 from flowrec.planning import Planner
+from flowrec.planning.time_field import TimeField
 from flowrec.robot import Robot
 from flowrec.store import SessionReader
 from tests.conftest import SMALL
@@ -165,7 +166,7 @@ def test_a_robot_out_of_sight_is_soon_asked_for_nothing_under_the_policy_too():
 
 
 def test_a_route_without_a_time_to_go_is_told_to_who_asked_for_the_policy(tmp_path, monkeypatch):
-    monkeypatch.setattr(Planner, "_with_policy", lambda self, route, *others: route)
+    monkeypatch.setattr(TimeField, "_with_time_to_go", lambda self, route, *others: route)
     for method, told in (("policy", 1), ("vector", 0)):
         sets = [*SMALL, f"control.method={method}", "mission.phases=plan"]
         done = record(load_config(None, sets), tmp_path / f"{method}.mcap")

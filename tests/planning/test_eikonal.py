@@ -7,8 +7,9 @@ import pytest
 from flowrec.errors import UsageError
 from flowrec.messages import FlowField
 from flowrec.planning import Planner, travel_time
-from flowrec.planning.cost_rasters import Terrain
-from flowrec.planning.eikonal import time_field, with_band
+from flowrec.planning.cost_rasters import CostRasters
+from flowrec.planning.eikonal import time_field
+from flowrec.planning.wall_band import extend_to_walls
 from tests.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, open_water, poiseuille, robot
 
 FULL = Planner(speed_share=1.0, robust_deviations=0.0)
@@ -16,7 +17,7 @@ FULL = Planner(speed_share=1.0, robust_deviations=0.0)
 
 def water(flow, size=121, speed=1.0, idle=-1.0):
     one = np.ones((size, size))
-    return Terrain(one > 0.0, 60.0 * one, 1.0, flow[0] * one, flow[1] * one, speed * one, idle)
+    return CostRasters(one > 0.0, 60.0 * one, 1.0, flow[0] * one, flow[1] * one, speed * one, idle)
 
 
 def zermelo(flow, size=121):
@@ -53,8 +54,8 @@ def test_without_flow_the_time_to_go_is_that_of_scikit_fmm_around_walls():
     skfmm = pytest.importorskip("skfmm")
     chip, _ = loop()
     one = np.ones(chip.mask.shape)
-    terrain = Terrain(chip.mask, np.where(chip.mask, 50.0, -1.0), 1.0, 0.0 * one, 0.0 * one, 2.0 * one)
-    times = time_field(terrain, np.array([6.0, 20.0]))
+    rasters = CostRasters(chip.mask, np.where(chip.mask, 50.0, -1.0), 1.0, 0.0 * one, 0.0 * one, 2.0 * one)
+    times = time_field(rasters, np.array([6.0, 20.0]))
     y, x = np.mgrid[0 : one.shape[0], 0 : one.shape[1]]
     seed = np.ma.MaskedArray(np.hypot(x - 6.0, y - 20.0) - 2.0, ~chip.mask)
     theirs = skfmm.travel_time(seed, 2.0 * one) + 1.0
@@ -63,15 +64,15 @@ def test_without_flow_the_time_to_go_is_that_of_scikit_fmm_around_walls():
     assert np.isinf(times[~chip.mask]).all()
 
 
-def test_a_finer_terrain_has_the_same_ways_and_the_same_times():
+def test_a_finer_rasters_has_the_same_ways_and_the_same_times():
     chip, field = loop()
     free = chip.mask
     clearance = np.where(free, 2.0, -2.0)
     speed = np.full(free.shape, 20.0)
     vx, vy = (np.ascontiguousarray(field.velocity_um_s[..., c], float) / PX for c in (0, 1))
-    terrain = Terrain(free, clearance, 2.0, vx, vy, speed)
+    rasters = CostRasters(free, clearance, 2.0, vx, vy, speed)
     goal = np.array([60.0, 20.0])
-    coarse, fine = time_field(terrain, goal), time_field(terrain.finer(3), 3.0 * goal)[::3, ::3]
+    coarse, fine = time_field(rasters, goal), time_field(rasters.finer(3), 3.0 * goal)[::3, ::3]
     np.testing.assert_array_equal(np.isfinite(coarse), np.isfinite(fine))
     known = np.isfinite(coarse) & (coarse > 0.5)
     np.testing.assert_allclose(coarse[known], fine[known], rtol=0.03)
@@ -101,8 +102,8 @@ def test_a_short_cut_too_narrow_for_the_robot_does_not_attract():
     fluid[9:14, 20] = True
     one = np.ones(free.shape)
     clearance = np.where(free, 2.0, np.where(fluid, 0.5, -1.0))
-    times = time_field(Terrain(free, clearance, 2.0, 0.0 * one, 0.0 * one, one), np.array([20.0, 5.0]))
-    band = with_band(times, free, clearance, 2.0, 1.0)
+    times = time_field(CostRasters(free, clearance, 2.0, 0.0 * one, 0.0 * one, one), np.array([20.0, 5.0]))
+    band = extend_to_walls(times, free, clearance, 2.0, 1.0)
     assert times[16, 20] > 90.0 and times[5, 24] < 5.0
     assert (band[13, 20] > band[14, 20]) and np.isinf(band[9:14, 20]).any(), "closed where the two sides meet"
     assert np.isinf(band[~fluid]).all()

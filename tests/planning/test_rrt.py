@@ -5,7 +5,7 @@ import pytest
 
 from flowrec.errors import UsageError
 from flowrec.planning import Planner
-from flowrec.planning.rrt import Rrt
+from flowrec.planning.planner import RrtSettings
 from tests.planning.worlds import loop, robot
 
 EAST, WEST = (1330.0, 205.0), (60.0, 205.0)
@@ -14,14 +14,14 @@ EAST, WEST = (1330.0, 205.0), (60.0, 205.0)
 def test_trees_find_a_way_the_same_one_every_time_and_the_star_a_faster_one_but_none_beats_the_time_field():
     pytest.importorskip("ompl")
     chip, field = loop()
-    tree = Planner(method="rrt", rrt=Rrt(iterations=3000))
+    tree = Planner(method="rrt", rrt=RrtSettings(iterations=3000))
     first, again = (tree.plan(field, EAST, WEST, chip, robot(200.0)) for _ in range(2))
     np.testing.assert_array_equal(first.waypoints_um, again.waypoints_um)
-    star = Planner(method="rrt_star", rrt=Rrt(iterations=1500)).plan(field, EAST, WEST, chip, robot(200.0))
+    star = Planner(method="rrt_star", rrt=RrtSettings(iterations=1500)).plan(field, EAST, WEST, chip, robot(200.0))
     best = Planner(robust_deviations=0.0).plan(field, EAST, WEST, chip, robot(200.0))
     assert first.reachable and star.reachable
     assert best.arrival_s[-1] < star.arrival_s[-1] < first.arrival_s[-1]
-    few = Planner(method="rrt", rrt=Rrt(iterations=5)).plan(field, EAST, WEST, chip, robot(200.0))
+    few = Planner(method="rrt", rrt=RrtSettings(iterations=5)).plan(field, EAST, WEST, chip, robot(200.0))
     assert not few.reachable and "rrt found no way in 5 iterations" in few.reason
 
 

@@ -3,10 +3,10 @@
 import pytest
 
 from flowrec.planning import Planner, SurveyPlanner
-from flowrec.planning.free_space import Swift, open_space
+from flowrec.planning.free_space import FastFlowMargin, open_space
 from tests.planning.worlds import PX, channel, chip_of, field_of, poiseuille, robot
 
-SWIFT = Swift(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
+SWIFT = FastFlowMargin(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
 
 
 def lowest_um(route, wall_um=75.0, height_um=390.0):
@@ -20,10 +20,10 @@ def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
     field, chip = field_of(mask, 600.0), chip_of(mask)
     ends = (100.0, 195.0), (1000.0, 195.0)
     calm = open_space(chip, field, 10.0, 1.0)
-    swift = open_space(chip, field, 10.0, 1.0, SWIFT.drift(robot(), 100.0))
+    swift = open_space(chip, field, 10.0, 1.0, SWIFT.course_error(robot(), 100.0))
     # The robot's radius, 0.2 x 600 x 0.1 um for the map, 0.1 x 100 x 0.1 for the heading, the rest for the bend.
     need_um = 10.0 + 12.0 + 1.0 + (0.05 * 700.0) ** 2 / 160.0
-    assert (swift.clearance - swift.room + swift.need)[20, 50] * PX == pytest.approx(need_um)
+    assert (swift.clearance - swift.usable_clearance + swift.need)[20, 50] * PX == pytest.approx(need_um)
     assert calm.free.sum() > swift.free.sum() > 0
     assert (swift.clearance[swift.free] * PX >= need_um).all()
     assert lowest_um(Planner(swift=SWIFT).plan(field, *ends, chip, robot())) >= need_um

@@ -1,0 +1,108 @@
+"""Extension of a time to go to the fluid nearer to the walls than the robot should be, so that -grad T leads back.
+
+Layer by layer from the free pixels, a pixel gets the largest time of its neighbours one layer nearer to them, plus a
+toll for the clearance that it lacks. So no way through the band pays, and where two free regions meet in a passage too
+narrow for the robot, the band is closed.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flowrec.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, Mask, Raster
+from flowrec.system.numba_setup import compiled
+
+# A lacking pixel of clearance costs this many times what a pixel takes in still fluid: then -grad T leads out of the
+# band within some 20 degrees of straight.
+_BAND_TOLL = 3.0
+_LEAST_TOLL = 0.05  # px
+# A step between neighbours that costs more than swimming this far connects two regions through too narrow a passage.
+_TORN_PX = 30.0
+
+
+def extend_to_walls(times: Raster, free: Mask, clearance: Raster, need: float, speed: float) -> Raster:
+    """The times (h, w) with those of the fluid outside `free`; clearance and `need` in px, `speed` in px/s."""
+    band = times.copy()
+    _fill_band(band, free, clearance, need, _BAND_TOLL / speed, _TORN_PX / speed)
+    # Beyond the border nothing is known, and no camera looks there: half a pixel counts as lacking.
+    half = 0.5 * _BAND_TOLL / speed
+    for edge, inner in ((band[0], band[1]), (band[-1], band[-2]), (band[:, 0], band[:, 1]), (band[:, -1], band[:, -2])):
+        np.maximum(edge, inner + half, out=edge, where=np.isfinite(edge) & np.isfinite(inner))
+    return band
+
+
+@compiled
+def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: float, torn: float) -> None:
+    h, w = free.shape
+    fluid = clearance > 0.0
+    # Breadth-first from the free pixels beside the band; `layer` is the number of steps from them.
+    layer = np.full((h, w), -1, np.int64)
+    rows = np.empty(h * w, np.int64)
+    columns = np.empty(h * w, np.int64)
+    tail = 0
+    for j in range(h):
+        for i in range(w):
+            if not free[j, i]:
+                continue
+            layer[j, i] = 0
+            if not math.isfinite(times[j, i]):
+                continue
+            for k in range(8):
+                a = i + NEIGHBOUR_X[k]
+                b = j + NEIGHBOUR_Y[k]
+                if 0 <= a < w and 0 <= b < h and fluid[b, a] and not free[b, a]:
+                    rows[tail] = j
+                    columns[tail] = i
+                    tail += 1
+                    break
+    border = tail
+    head = 0
+    while head < tail:
+        j = rows[head]
+        i = columns[head]
+        head += 1
+        for k in range(8):
+            a = i + NEIGHBOUR_X[k]
+            b = j + NEIGHBOUR_Y[k]
+            if a < 0 or b < 0 or a >= w or b >= h or not fluid[b, a] or layer[b, a] >= 0:
+                continue
+            # Between two solid pixels that touch at their corners there is no way.
+            if not fluid[j, a] and not fluid[b, i]:
+                continue
+            layer[b, a] = layer[j, i] + 1
+            rows[tail] = b
+            columns[tail] = a
+            tail += 1
+    for m in range(border, tail):
+        j = rows[m]
+        i = columns[m]
+        # Neighbours along the axes first: a diagonal one is also farther up or down the channel.
+        for diagonal in range(2):
+            worst = -1.0
+            for k in range(diagonal, 8, 2):
+                a = i + NEIGHBOUR_X[k]
+                b = j + NEIGHBOUR_Y[k]
+                if a < 0 or b < 0 or a >= w or b >= h or layer[b, a] != layer[j, i] - 1:
+                    continue
+                if (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
+                    lacking = max(min(clearance[b, a], need) - clearance[j, i], _LEAST_TOLL)
+                    worst = max(worst, times[b, a] + toll * lacking)
+            if worst >= 0.0:
+                times[j, i] = worst
+                break
+    closed = np.zeros(tail, np.bool_)
+    for m in range(border, tail):
+        j = rows[m]
+        i = columns[m]
+        for k in range(8):
+            a = i + NEIGHBOUR_X[k]
+            b = j + NEIGHBOUR_Y[k]
+            if 0 <= a < w and 0 <= b < h and math.isfinite(times[b, a]) and abs(times[b, a] - times[j, i]) > torn:
+                closed[m] = fluid[j, a] or fluid[b, i]
+                if closed[m]:
+                    break
+    for m in range(border, tail):
+        if closed[m]:
+            times[rows[m], columns[m]] = math.inf
