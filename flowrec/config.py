@@ -299,11 +299,11 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
             "all of a run; set one of them to 0"
         )
-    if not set(config.control.needs) <= set(PLANNERS[config.plan.method].provides):
-        able = " or ".join(repr(row.name) for row in PLANNERS.values() if set(config.control.needs) <= set(row.provides))
+    able = [row.name for row in PLANNERS.values() if set(config.control.needs) <= set(row.provides)]
+    if config.plan.method not in able:
         raise UsageError(
             f"{origin('control.method', 'plan.method')}: control.method = {config.control.method!r} needs the time to "
-            f"go, which plan.method = {config.plan.method!r} does not know; set plan.method = {able}, or "
+            f"go, which plan.method = {config.plan.method!r} does not know; set plan.method = {able[0]!r}, or "
             "control.method = 'vector'"
         )
 

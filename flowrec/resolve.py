@@ -122,7 +122,9 @@ def _timed(swift: FastFlowMargin, times: Mapping[str, float]) -> FastFlowMargin:
     return replace(swift, **{key: value for key, value in times.items() if getattr(swift, key) is None})
 
 
-def _start(place: Place, chip: Chip, robot: Robot, course_error: CourseError, solver: FlowSolver, coils: Coils) -> Point:
+def _start(
+    place: Place, chip: Chip, robot: Robot, course_error: CourseError, solver: FlowSolver, coils: Coils
+) -> Point:
     """The start; for a named outlet the place nearest to it where the robot can be held.
 
     That is five radii inside, as elsewhere, or farther if the assumed flow carries the robot out before the coils have

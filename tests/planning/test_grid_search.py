@@ -7,7 +7,8 @@ import pytest
 import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 
-from flowrec.planning.grid_search import backtrack, directions, search
+from flowrec.planning.cost_rasters import CostRasters
+from flowrec.planning.grid_search import LENGTH, TRAVEL_TIME, backtrack, best_first, directions
 
 
 def ground_speed(along, flow, speed):
@@ -63,12 +64,12 @@ def test_astar_finds_the_cost_that_dijkstra_finds_on_random_grids(reach, timed):
         exact = dijkstra(costs, indices=start)
         known = np.flatnonzero(np.isfinite(exact) & (np.arange(h * w) % w > 5))
         goals = rng.choice(known, 12, replace=False)
-        everywhere, _ = search(free, clearance, 1.0, vx, vy, weight, directions(reach), start, -1, speed, timed)
+        rasters = CostRasters(free, clearance, 1.0, vx, vy, np.full((h, w), speed))
+        cost_kind = TRAVEL_TIME if timed else LENGTH
+        everywhere, _ = best_first(rasters, weight, cost_kind, directions(reach), start, -1)
         np.testing.assert_allclose(everywhere, exact, rtol=1e-9)
         for goal in goals:
-            cost, parent = search(
-                free, clearance, 1.0, vx, vy, weight, directions(reach), start, int(goal), speed, timed
-            )
+            cost, parent = best_first(rasters, weight, cost_kind, directions(reach), start, int(goal))
             assert cost[goal] == pytest.approx(exact[goal], rel=1e-9)
             nodes = backtrack(parent, int(goal), w).astype(int) @ [1, w]
             assert nodes[0] == start and nodes[-1] == goal
@@ -80,5 +81,6 @@ def test_an_edge_whose_flow_is_too_fast_is_not_walked_and_what_lies_behind_is_no
     vx = np.zeros((3, 9))
     vx[:, 4] = -2.0
     none, one = np.zeros((3, 9)), np.ones((3, 9))
-    cost, _ = search(free, 9.0 * one, 1.0, vx, none, one, directions(1), 9, -1, 1.0, True)
+    rasters = CostRasters(free, 9.0 * one, 1.0, vx, none, one)
+    cost, _ = best_first(rasters, one, TRAVEL_TIME, directions(1), 9, -1)
     assert np.isfinite(cost.reshape(3, 9)[:, :3]).all() and np.isinf(cost.reshape(3, 9)[:, 4:]).all()

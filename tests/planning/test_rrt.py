@@ -27,6 +27,7 @@ def test_trees_find_a_way_the_same_one_every_time_and_the_star_a_faster_one_but_
 
 def test_without_ompl_the_trees_say_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "ompl", None)
+    monkeypatch.delitem(sys.modules, "flowrec.planning.rrt", raising=False)
     chip, field = loop()
     with pytest.raises(UsageError, match=r"pip install 'flowrec\[ompl\]'"):
         Planner(method="rrt").plan(field, EAST, WEST, chip, robot(200.0))
