@@ -25,7 +25,8 @@ from flowrec.config import ResolvedConfig, load_config
 from flowrec.messages import Currents, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.loop import LockstepWorker, Sink, run
+from flowrec.run.loop import Sink, run
+from flowrec.run.workers import LockstepWorker
 from flowrec.session_writer import session_header
 from flowrec.store import SessionWriter, WriterOptions
 from flowrec.terminal import progress, table
@@ -92,7 +93,7 @@ def paced_run(
         *(pipeline, PacedRig(prepared), worker, sinks),
         on_tick=lambda tick: timings.append(tick.timing),
         queue_state=queue_state,
-        end_when_finished=False,
+        live=False,
     )
     return [timing for timing in timings[len(timings) // 10 :] if timing is not None]
 

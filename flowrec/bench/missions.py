@@ -35,7 +35,8 @@ from flowrec.planning import Planner
 from flowrec.resolve import resolve
 from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
 from flowrec.robot import USUAL_DELAY_S, Robot
-from flowrec.run.loop import LockstepWorker, run
+from flowrec.run.loop import run
+from flowrec.run.workers import LockstepWorker
 from flowrec.terminal import progress, say, table
 from flowrec.units import seconds
 

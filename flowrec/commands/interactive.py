@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 
 from flowrec.messages import Tick
-from flowrec.run.control import Desk
-from flowrec.run.disk_monitor import DiskWatch
-from flowrec.run.keyboard import HELP, KeyBoard, listening
-from flowrec.run.signals import Signals
-from flowrec.run.watchdog import Guard
+from flowrec.run.control import RunControl
+from flowrec.run.disk_monitor import DiskMonitor
+from flowrec.run.watchdog import Watchdog
 from flowrec.store import SessionWriter
 from flowrec.terminal import StatusLine, progress, say
 
@@ -20,19 +19,19 @@ class Unattended:
 
     Attributes
     ----------
-    desk : what the run is asked, for example `desk.stop("enough")` from another thread.
+    run_control : controls the run from another thread, for example `run_control.stop("enough")`.
     """
 
-    def __init__(self, desk: Desk | None = None) -> None:
-        self.desk = desk if desk is not None else Desk()
+    def __init__(self, run_control: RunControl | None = None) -> None:
+        self.run_control = run_control if run_control is not None else RunControl()
 
     def armed(
-        self, guard: Guard | None = None, give_up: Callable[[], str] = lambda: ""
+        self, watchdog: Watchdog | None = None, give_up: Callable[[], str] = lambda: ""
     ) -> AbstractContextManager[None]:
         """While something is open that has to be ended in good order; see Signals."""
         return nullcontext()
 
-    def shown(self, writer: SessionWriter, disk: DiskWatch) -> AbstractContextManager[Callable[[Tick], None]]:
+    def shown(self, writer: SessionWriter, disk: DiskMonitor) -> AbstractContextManager[Callable[[Tick], None]]:
         """While the loop runs; what is yielded takes every tick."""
         return nullcontext(lambda _tick: None)
 
@@ -51,28 +50,40 @@ class AtTerminal(Unattended):
 
     def __init__(self) -> None:
         super().__init__()
-        self._board: KeyBoard | None = None
+        self._typed_note: Callable[[], str | None] = lambda: None
         self._leave_terminal: Callable[[], None] = lambda: None
 
     def armed(
-        self, guard: Guard | None = None, give_up: Callable[[], str] = lambda: ""
+        self, watchdog: Watchdog | None = None, give_up: Callable[[], str] = lambda: ""
     ) -> AbstractContextManager[None]:
-        return Signals(self.desk, guard, give_up, lambda: self._leave_terminal()).armed()
+        handled: AbstractContextManager[None] = nullcontext()
+        if sys.platform != "win32":
+            from flowrec.run.signals import Signals
+
+            handled = Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handled()
+        return handled
 
     @contextmanager
-    def shown(self, writer: SessionWriter, disk: DiskWatch) -> Iterator[Callable[[Tick], None]]:
-        with listening(self.desk) as terminal:
-            if terminal is not None:
-                self._board, self._leave_terminal = terminal
-            status = StatusLine(lambda: writer.bytes_written, lambda: disk.text, lambda: self.note)
-            with status.shown():
+    def shown(self, writer: SessionWriter, disk: DiskMonitor) -> Iterator[Callable[[Tick], None]]:
+        with ExitStack() as stack:
+            help_text = ""
+            if sys.platform != "win32":
+                from flowrec.run.keyboard import HELP, keyboard_of
+
+                terminal = stack.enter_context(keyboard_of(self.run_control))
                 if terminal is not None:
-                    say(HELP)
-                yield status
+                    keyboard, self._leave_terminal = terminal
+                    self._typed_note = lambda: keyboard.note
+                    help_text = HELP
+            status = StatusLine(lambda: writer.bytes_written, lambda: disk.text, self._typed_note)
+            stack.enter_context(status.shown())
+            if help_text:
+                say(help_text)
+            yield status
 
     def progress(self, what: str, total: float) -> AbstractContextManager[Callable[[float], None]]:
         return progress(what, total)
 
     @property
     def note(self) -> str | None:
-        return self._board.note if self._board is not None else None
+        return self._typed_note()

@@ -27,9 +27,11 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.disk_monitor import DiskWatch, refuse_below
-from flowrec.run.loop import LockstepWorker, Preloaded, ProcessWorker, RunReport, Sink, Worker, run
-from flowrec.run.watchdog import Guard
+from flowrec.run.disk_monitor import DiskMonitor, refuse_below
+from flowrec.run.loop import RunReport, Sink, run
+from flowrec.run.watchdog import Watchdog
+from flowrec.run.worker_process import ProcessWorker
+from flowrec.run.workers import LockstepWorker, Preloaded, Worker
 from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
 from flowrec.store import SessionWriter, is_snapshot, runs_in
@@ -43,11 +45,11 @@ from flowrec.units import seconds
 if TYPE_CHECKING:
     from flowrec.view import LiveView
 
-# Of the 2 s that a run may take to end: the rest is for the coils (desk.py) and for Python itself.
+# Of the 2 s that a run may take to end: the rest is for the coils (run_control.py) and for Python itself.
 CLOSE_PATIENCE_S = 0.5  # for images that still wait to be written
 VIEW_PATIENCE_S = 0.2  # for a viewer to show the last of it
 _GIVE_UP_S = 1.0  # for a file to be closed beside a thread that is stuck
-_LEAST_FRAMES = 3.0  # of the camera in the guard's time
+_LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
 
 View = Literal["spawn", "serve", "rrd", "none"]
 
@@ -207,7 +209,7 @@ def record(
     Parameters
     ----------
     view : spawn, serve, rrd or none.
-    realtime : keep the rig to the wall clock, with a guard of its ticks (guard.py).
+    realtime : keep the rig to the wall clock, with a watchdog of its ticks (run/watchdog.py).
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     inputs : files that were read for it besides those that `config` names; no output may be one of either.
 
@@ -228,8 +230,8 @@ def record(
     rig = SimulatedRig.of(pipeline, resolved, resolved.duration_s, realtime)
     folder, floor_gb = path.resolve().parent, resolved.recording.disk_floor_gb
     control = control if control is not None else Unattended()
-    desk = control.desk
-    guard = Guard(rig, timeout_s, partial(desk.stop, zero=True), warn)
+    run_control = control.run_control
+    watchdog = Watchdog(rig, timeout_s, partial(run_control.stop, zero=True), warn)
     witness = Witness()
     clocks = ClockWatch()
     low: list[str] = []
@@ -237,11 +239,11 @@ def record(
 
     def disk_low(reason: str) -> None:
         low.append(reason)
-        desk.stop(reason)
+        run_control.stop(reason)
 
     with ExitStack() as stack:
         # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
-        stack.enter_context(control.armed(guard, lambda: _closed_beside(opened, desk.reason)))
+        stack.enter_context(control.armed(watchdog, lambda: _closed_beside(opened, run_control.reason)))
         writer = stack.enter_context(
             session_writer(
                 path, resolved, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
@@ -263,7 +265,7 @@ def record(
         stack.callback(worker.close)
         if fields:
             worker = Preloaded(worker, fields)
-        disk = stack.enter_context(DiskWatch(folder, lambda: writer.bytes_written, floor_gb, disk_low).watching())
+        disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
         # A run that does not keep real time never waits: it would keep a core for itself.
         priority = first_of_all() if realtime else nullcontext(enter_result=False)
         with control.shown(writer, disk) as show, priority as first:
@@ -277,11 +279,11 @@ def record(
                 rig,
                 worker,
                 sinks,
-                desk=desk,
+                control=run_control,
                 on_tick=on_tick,
                 queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
                 clocks=clocks,
-                guard=guard,
+                watchdog=watchdog,
             )
         facts = facts_of(chip, report, witness.true_field)
         if resolved.control.method != "policy":  # which has no reference to be off
@@ -293,14 +295,14 @@ def record(
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
-        writer.close(outcome, CLOSE_PATIENCE_S if desk.reason else None, why=bad)
+        writer.close(outcome, CLOSE_PATIENCE_S if run_control.reason else None, why=bad)
         _say_remarks(writer)
-        if live is not None and desk.reason:
+        if live is not None and run_control.reason:
             live.close(VIEW_PATIENCE_S)
     facts["frames_dropped"] = writer.dropped_frames  # more may have been, for want of time
     files = tuple(writer.files)
-    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(desk.reason))
-    if view == "rrd" and desk.reason:
+    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason))
+    if view == "rrd" and run_control.reason:
         say(f"the run was stopped: no .rrd was made; flowrec export {path} makes it")
     elif view == "rrd":
         from flowrec.commands.export import export
@@ -311,7 +313,7 @@ def record(
 
 
 def _guard_timeout_s(config: ResolvedConfig) -> float:
-    """The guard's time, which must suffice for the camera's frames."""
+    """The watchdog's timeout, which must not be shorter than a few frames of the camera."""
     timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
     if timeout_s * rate_hz < _LEAST_FRAMES:
         raise UsageError(

@@ -23,8 +23,8 @@ from flowrec.estimation.smoother import observe, smooth
 from flowrec.messages import Applied, Demand, Mission, Observations, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.run.jobs import work
-from flowrec.run.loop import LockstepWorker, RunReport, Sink, run
+from flowrec.run.loop import RunReport, Sink, run
+from flowrec.run.workers import LockstepWorker, work
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
 from flowrec.store import SessionReader, SessionWriter
@@ -280,11 +280,11 @@ def replay(
         progress = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
         with control.armed():
             report = run(
-                pipeline, rig, worker, sinks, start=start, desk=control.desk, on_tick=on_tick, end_when_finished=False
+                pipeline, rig, worker, sinks, start=start, control=control.run_control, on_tick=on_tick, live=False
             )
         if report.ticks == 0:
             raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
-        stopped, last = control.desk.reason, report.last
+        stopped, last = control.run_control.reason, report.last
         if stale and not stopped:
             last = _closing_work(pipeline, config, last, rig.recorded, stale)
             if last is not report.last and sinks:

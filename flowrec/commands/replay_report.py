@@ -21,8 +21,8 @@ from flowrec.messages import FlowField, Observations, Route, Tick
 from flowrec.pipeline import assemble
 from flowrec.planning import travel_time
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.jobs import no_observations
-from flowrec.run.loop import LockstepWorker, Preloaded, RunReport, Sink, run
+from flowrec.run.loop import RunReport, Sink, run
+from flowrec.run.workers import LockstepWorker, Preloaded, no_observations
 from flowrec.session import files_behind
 from flowrec.session_writer import session_writer
 from flowrec.summary import Row, Value, finite

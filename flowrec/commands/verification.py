@@ -10,7 +10,7 @@ from flowrec.enums import WorkOrder
 from flowrec.errors import printable
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import Pipeline
-from flowrec.run.jobs import work
+from flowrec.run.workers import work
 from flowrec.store import digest_faults
 from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS
 

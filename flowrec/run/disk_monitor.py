@@ -1,11 +1,11 @@
-"""The disk under a run: how much is left, how long that will do, and the floor below which the run is ended.
+"""Disk monitor: free space, the time until it is used up, and the floor below which a run is ended.
 
-A thread looks: asking a disk that does not answer may take for ever.
+A thread asks for the free space, because a disk may never answer.
 """
 
 from __future__ import annotations
 
-import os
+import shutil
 import threading
 import time
 from collections import deque
@@ -16,24 +16,23 @@ from pathlib import Path
 from flowrec.errors import SessionError
 
 _PERIOD_S = 1.0
-_SPAN = 30  # looks back over which the rate is taken
+_SAMPLES = 30  # over which the rate is taken
 _GB = 1e9
 
 FreeBytes = Callable[[Path], int]
 
 
 def free_bytes(folder: Path) -> int:
-    """What may still be written there."""
-    state = os.statvfs(folder)
-    return state.f_bavail * state.f_frsize
+    """Bytes that may still be written there."""
+    return shutil.disk_usage(folder).free
 
 
 def refuse_below(floor_gb: float, folder: Path, free: FreeBytes = free_bytes) -> None:
-    """Raise SessionError where a run would be ended as soon as it has begun."""
+    """Raise SessionError if a run would be ended as soon as it has begun."""
     try:
         left_gb = free(folder) / _GB
     except OSError:
-        return  # whoever makes the file knows better what is wrong
+        return  # creating the file gives the better error
     if left_gb < floor_gb:
         raise SessionError(
             f"{folder}: {left_gb:.2g} GB left on this disk, less than recording.disk_floor_gb = {floor_gb:g}; "
@@ -41,15 +40,15 @@ def refuse_below(floor_gb: float, folder: Path, free: FreeBytes = free_bytes) ->
         )
 
 
-class DiskWatch:
-    """Looks every second at what is left where a session is written.
+class DiskMonitor:
+    """Takes the free space every second where a session is written.
 
     Parameters
     ----------
-    folder : where.
-    written : bytes of the session so far.
-    floor_gb : below it `low` is called, once, with the reason; 0: never.
-    free : who is asked, for tests.
+    folder : of the session.
+    written : returns the bytes of the session so far.
+    floor_gb : below it `low` is called once with the reason; 0: never.
+    free : returns the free bytes of a folder.
     """
 
     def __init__(
@@ -66,33 +65,30 @@ class DiskWatch:
         self._low = low
         self._free = free
         self._left: int | None = None
-        self._looks: deque[tuple[float, int]] = deque(maxlen=_SPAN)
+        self._samples: deque[tuple[float, int]] = deque(maxlen=_SAMPLES)
 
     @contextmanager
-    def watching(self) -> Iterator[DiskWatch]:
-        """Look for the length of the context."""
+    def running(self) -> Iterator[DiskMonitor]:
+        """Context in which the thread runs."""
         over = threading.Event()
-        threading.Thread(target=self._watch, args=(over,), name="disk", daemon=True).start()
+        threading.Thread(target=self._run, args=(over,), name="disk", daemon=True).start()
         try:
             yield self
         finally:
             over.set()
 
-    def _watch(self, over: threading.Event) -> None:
-        while True:
-            if self.look():
-                return
-            if over.wait(_PERIOD_S):
-                return
+    def _run(self, over: threading.Event) -> None:
+        while not self.sample() and not over.wait(_PERIOD_S):
+            pass
 
-    def look(self) -> bool:
-        """Look once; whether it was too little."""
+    def sample(self) -> bool:
+        """Take the free space once; whether it is below the floor."""
         try:
             self._left = self._free(self._folder)
         except OSError:
-            self._left = None  # the writer will hear of it
+            self._left = None  # the writer will get the error
             return False
-        self._looks.append((time.monotonic(), self._written()))
+        self._samples.append((time.monotonic(), self._written()))
         if self._floor_gb > 0.0 and self._left < self._floor_gb * _GB:
             self._low(f"disk floor: {self._left / _GB:.2g} GB left on {self._folder}")
             return True
@@ -100,15 +96,15 @@ class DiskWatch:
 
     @property
     def text(self) -> str:
-        """For the status line: `disk 120 GB left, 6 h`; the time is that to the floor, at the present rate."""
+        """For the status line: `disk 120 GB left, 6 h`, the time until the floor at the present rate."""
         if self._left is None:
             return "disk ?"
-        said = f"disk {self._left / _GB:.3g} GB left"
-        (begin_s, begin), (end_s, end) = (self._looks[0], self._looks[-1]) if self._looks else ((0.0, 0), (0.0, 0))
+        text = f"disk {self._left / _GB:.3g} GB left"
+        (begin_s, begin), (end_s, end) = self._samples[0], self._samples[-1]
         if end <= begin or end_s <= begin_s:
-            return said
+            return text
         room = max(self._left - self._floor_gb * _GB, 0.0)
-        return f"{said}, {_duration(room * (end_s - begin_s) / (end - begin))}"
+        return f"{text}, {_duration(room * (end_s - begin_s) / (end - begin))}"
 
 
 def _duration(seconds: float) -> str:

@@ -1,7 +1,7 @@
-"""Keys of the terminal during a run: no display server, works over SSH.
+"""Keys during a run. They are read from the terminal, so they need no display server and work over SSH.
 
-q stops, m marks, n opens a note, space holds the robot and lets it go on, ! takes the field away at once. Only a
-terminal is read, and only in the foreground: input that is piped in belongs to whoever started the run.
+q stops, m marks, n opens a note, space holds the robot or lets it go on, ! switches the field off at once. Only a
+terminal is read, and only in the foreground: piped input belongs to the program that started the run.
 """
 
 from __future__ import annotations
@@ -20,54 +20,57 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from flowrec.run.control import Desk
+from flowrec.enums import Action
+from flowrec.run.control import RunControl
+
+assert sys.platform != "win32"  # there is no termios
 
 HELP = "keys: q stop   m mark   n note   space hold, go on   ! zero field at once"
-_LOOK_S = 0.25
+_POLL_S = 0.25
 _LONGEST_NOTE = 500
-_SEQUENCE = re.compile("\x1b(\\[[0-?]*[ -/]*[@-~]|O.)")  # arrows and function keys: none of ours
+_SEQUENCE = re.compile("\x1b(\\[[0-?]*[ -/]*[@-~]|O.)")  # arrows and function keys, which are ignored
 _ESCAPE, _ENTER, _RUBOUT, _KILL_LINE = "\x1b", ("\r", "\n"), ("\x7f", "\x08"), "\x15"
 
 
-class KeyBoard:
-    """What the keys mean; knows nothing of terminals.
+class Keyboard:
+    """What the keys mean, independent of the terminal.
 
     Attributes
     ----------
-    note : the note that is being typed; None: none is.
+    note : the note that is being typed; None without one.
     """
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, control: RunControl) -> None:
         self.note: str | None = None
-        self._desk = desk
+        self._control = control
         self._marks = 0
 
     def take(self, typed: str) -> None:
-        """What one look at the terminal has brought."""
+        """Handle the characters of one read."""
         for character in _SEQUENCE.sub("", typed):
             if self.note is None:
                 self._command(character)
             else:
-                self._into_note(self.note, character)
+                self._edit_note(self.note, character)
 
     def _command(self, character: str) -> None:
         if character == "q":
-            self._desk.stop("stopped by the operator (q)")
+            self._control.stop("stopped by the operator (q)")
         elif character == "!":
-            self._desk.stop("operator: zero field (!)", zero=True)
+            self._control.stop("operator: zero field (!)", zero=True)
         elif character == " ":
-            self._desk.ask("hold")
+            self._control.toggle_hold()
         elif character == "m":
             self._marks += 1
-            self._desk.ask("mark", str(self._marks))
+            self._control.request(Action.MARK, str(self._marks))
         elif character == "n":
             self.note = ""
 
-    def _into_note(self, note: str, character: str) -> None:
+    def _edit_note(self, note: str, character: str) -> None:
         if character in _ENTER:
             self.note = None
             if note.strip():
-                self._desk.ask("note", note.strip())
+                self._control.request(Action.NOTE, note.strip())
         elif character == _ESCAPE:
             self.note = None
         elif character in _RUBOUT:
@@ -79,37 +82,37 @@ class KeyBoard:
 
 
 @contextmanager
-def listening(desk: Desk) -> Iterator[tuple[KeyBoard, Callable[[], None]] | None]:
-    """Read keys for the length of the context; None where stdin is no terminal. It is left as it was found.
+def keyboard_of(control: RunControl) -> Iterator[tuple[Keyboard, Callable[[], None]] | None]:
+    """Context in which keys are read; None if stdin is no terminal. The terminal is left as it was found.
 
-    The function that comes with the keys leaves it at once, in any thread.
+    The function that comes with the keyboard leaves the terminal at once, from any thread.
     """
     descriptor = _terminal()
     if descriptor is None:
         yield None
         return
-    board = KeyBoard(desk)
+    keyboard = Keyboard(control)
     with _Terminal(descriptor) as terminal:
         over = threading.Event()
-        reader = threading.Thread(target=_read, args=(terminal, board.take, over), name="keys", daemon=True)
+        reader = threading.Thread(target=_read, args=(terminal, keyboard.take, over), name="keys", daemon=True)
         reader.start()
         try:
-            yield board, terminal.leave
+            yield keyboard, terminal.leave
         finally:
             over.set()
-            reader.join(2 * _LOOK_S)
+            reader.join(2 * _POLL_S)
 
 
 def _terminal() -> int | None:
     try:
         descriptor = sys.stdin.fileno()
         return descriptor if os.isatty(descriptor) else None
-    except (AttributeError, OSError, ValueError):  # no stdin at all, or one that a test has put there
+    except (AttributeError, OSError, ValueError):  # no stdin, or one without a descriptor
         return None
 
 
 class _Terminal:
-    """Keys without Enter and without echo while we are in the foreground, and as it was otherwise."""
+    """Hands over keys without Enter and without echo while this process is in the foreground."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
@@ -125,31 +128,31 @@ class _Terminal:
         self.leave()
 
     def leave(self) -> None:
-        """As it was found, for good: the end of the run, or Ctrl-Z, which ends it."""
+        """Restore the terminal for good: at the end of the run, or at Ctrl-Z, which ends it."""
         with self._lock:
             self._left = True
-            self._give_back()
+            self._restore()
 
     def take_over(self) -> bool:
-        """Have it hand over keys; False where it is not ours just now. Again after every look: a shell may differ."""
+        """Make it hand over keys; False in the background. Called before every read: a shell may have restored it."""
         with self._lock:
-            if self._left or not self._ours():
+            if self._left or not self._in_foreground():
                 return False
-            with contextlib.suppress(termios.error), _not_stopped_for_it():
+            with contextlib.suppress(termios.error), _sigttou_blocked():
                 now = termios.tcgetattr(self.descriptor)
                 if now[tty.LFLAG] & termios.ICANON:
                     self._found = now
                     tty.setcbreak(self.descriptor, termios.TCSANOW)
             return True
 
-    def _give_back(self) -> None:
-        # TCSANOW: to wait until a frozen terminal has shown everything would be to wait for ever.
-        if self._found is not None and self._ours():
-            with contextlib.suppress(termios.error), _not_stopped_for_it():
+    def _restore(self) -> None:
+        # TCSANOW, because TCSADRAIN waits for ever on a frozen terminal.
+        if self._found is not None and self._in_foreground():
+            with contextlib.suppress(termios.error), _sigttou_blocked():
                 termios.tcsetattr(self.descriptor, termios.TCSANOW, self._found)
 
-    def _ours(self) -> bool:
-        """Whether we are in the foreground; in the background a look at the terminal would stop the run."""
+    def _in_foreground(self) -> bool:
+        """Whether this process is in the foreground; in the background, reading the terminal would stop the run."""
         try:
             return os.tcgetpgrp(self.descriptor) == os.getpgrp()
         except OSError:
@@ -157,22 +160,22 @@ class _Terminal:
 
 
 def _read(terminal: _Terminal, take: Callable[[str], None], over: threading.Event) -> None:
-    # Whoever sends us to the background between two lines of this must not stop the run by it.
+    # A shell may send this process to the background between any two lines; that must not stop the run.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTIN, signal.SIGTTOU})
     decoder = codecs.getincrementaldecoder("utf-8")("replace")
     while not over.is_set():
         if not terminal.take_over():
-            over.wait(_LOOK_S)
+            over.wait(_POLL_S)
             continue
         try:
-            ready, _, _ = select.select([terminal.descriptor], [], [], _LOOK_S)
+            ready, _, _ = select.select([terminal.descriptor], [], [], _POLL_S)
             if not ready or over.is_set():
                 continue
             typed = os.read(terminal.descriptor, 1024)
         except OSError:
             if not os.isatty(terminal.descriptor):
-                return  # it has vanished; SIGHUP tells the run
-            over.wait(_LOOK_S)
+                return  # it is closed; SIGHUP ends the run
+            over.wait(_POLL_S)
             continue
         if not typed:
             return
@@ -180,8 +183,8 @@ def _read(terminal: _Terminal, take: Callable[[str], None], over: threading.Even
 
 
 @contextmanager
-def _not_stopped_for_it() -> Iterator[None]:
-    """Between our look and the change the shell may have taken the terminal back: then the change must not stop us."""
+def _sigttou_blocked() -> Iterator[None]:
+    """A change of the terminal must not stop this process if the shell has just sent it to the background."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})
     try:
         yield

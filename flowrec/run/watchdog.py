@@ -1,13 +1,13 @@
-"""Takes the field away when the control loop no longer steers: a thread of its own beside the loop.
+"""Watchdog of the control loop: a thread that switches the field off when no tick ends any more.
 
-The loop sends its commands through the guard. When no tick ends for a stated time while a field is on, or when anybody
-asks for it, the guard calls `rig.zero()` in its own thread and lets no field pass afterwards. It works while the main
-thread waits or computes in C, as long as that code releases the interpreter's lock: drivers called through ctypes.CDLL
-or cffi, NumPy, OpenCV and file access do. Python can not help where C code keeps the lock (ctypes.PyDLL, an extension
-that does not release it), nor where the process is stopped or gone (SIGKILL, SIGSTOP, a crash of the interpreter):
-hardware needs a guardian in a process of its own for these.
+The loop sends its commands through the watchdog. When no tick ends for a stated time while a field is on, or when
+anybody asks for it, the watchdog calls `rig.zero()` in its own thread and lets no field pass afterwards. It works while
+the main thread waits or computes in C, as long as that code releases the interpreter's lock: drivers called through
+ctypes.CDLL or cffi, NumPy, OpenCV and file access do. It can not work while C code keeps the lock (ctypes.PyDLL, an
+extension that does not release it), nor when the process is stopped or gone (SIGKILL, SIGSTOP, a crash of the
+interpreter): for these, hardware needs a watchdog in another process.
 
-No method but `field_off` and `wait_off` ever waits.
+Only `field_off` and `wait_off` wait.
 """
 
 from __future__ import annotations
@@ -23,37 +23,38 @@ from flowrec.errors import RigError
 from flowrec.messages import Currents
 from flowrec.system.realtime_priority import first_of_all
 
-ZERO_PATIENCE_S = 2.0  # for zero() to succeed, with all its repetitions; then its failure is the end of the run
+ZERO_PATIENCE_S = 2.0  # time for zero() to succeed, with all its repetitions; then the run fails
 _RETRY_S = 0.02
 _POLL_S = 0.002
-_IDLE_S = 0.5  # between looks where there is no timer
+_IDLE_S = 0.5  # between checks without a timer
 
 
 class Coils(Protocol):
-    """What the guard needs of a rig; see run.Rig."""
+    """The part of rigs.rig.Rig that the watchdog needs."""
 
     def apply(self, currents: Currents) -> None: ...
 
     def zero(self) -> None: ...
 
 
-class Guard:
+class Watchdog:
     """Between the loop and the coils.
 
     Parameters
     ----------
-    rig : its `zero` is called in the guard's thread only, where no signal handler of Python runs.
-    timeout_s : for how long no tick may end while a field is on; None: no timer, the field goes when it is asked for.
-    tripped : told the reason when the field is taken away; called in any thread, must return at once.
-    alarm : takes one line for a person; called in a thread of its own.
+    rig : its `zero` is called in the watchdog's thread only, where no signal handler of Python runs.
+    timeout_s : longest time without the end of a tick while a field is on; None: no timer, the field is switched off on
+        request only.
+    tripped : called with the reason when the field is switched off; in any thread, must return at once.
+    alarm : called with one line for a person, in a thread of its own.
     clock : monotonic time in s.
 
     Attributes
     ----------
-    reason : why the field was taken away; empty as long as it was not.
-    hung : the timer did it.
+    reason : why the field was switched off; empty while it was not.
+    hung : whether the timer did it.
     failures : how often zero() has raised.
-    ticked_s : when the last tick ended, by `clock`.
+    ticked_s : time of the end of the last tick, by `clock`.
     """
 
     def __init__(
@@ -74,19 +75,19 @@ class Guard:
         self._tripped = tripped
         self._alarm = alarm
         self._error: Exception | None = None
-        # Shared by the loop, the guard's thread and those who trip it, without a lock that a stuck loop could hold.
-        # Each flag is one attribute, set before it is acted on: `_latched` before zero(), `_energised` before a field
-        # is sent. So a command that is under way when the guard trips is followed by a zero(), whoever comes first.
-        self._energised = self._latched = self._over = self._told = False
+        # Shared by the loop, the watchdog's thread and those who trip it, without a lock that a stuck loop could hold.
+        # Each flag is one attribute, set before it takes effect: `_latched` before zero(), `_energised` before a field
+        # is sent. So a command that is under way when the watchdog trips is followed by a zero() in either order.
+        self._energised = self._latched = self._over = self._reported = False
         self._numbers = itertools.count(1)
-        self._asked = self._zeroed = 0  # numbers of the last request for zero(), and of the last one that was fulfilled
+        self._requested = self._zeroed = 0  # numbers of the last request for zero(), and of the last fulfilled one
         self._wake = threading.Event()
         self._thread: threading.Thread | None = None
 
     # ---- for the loop
 
     def apply(self, currents: Currents) -> None:
-        """Send a command to the coils; after the field was taken away none passes that would bring it back."""
+        """Send a command to the coils; after the field was switched off, none that would bring it back."""
         field = currents.amplitude_mt > 0.0
         if field and self._latched:
             return
@@ -100,13 +101,13 @@ class Guard:
             self.take_away()
 
     def tick_ended(self) -> None:
-        """The loop has done all of a tick."""
+        """Note that the loop has completed a tick."""
         self.ticked_s = self.clock()
 
     @contextmanager
-    def running(self) -> Iterator[Guard]:
-        """Watch for the length of the context; to be entered before the rig."""
-        self._thread = threading.Thread(target=self._watch, name="guard", daemon=True)
+    def running(self) -> Iterator[Watchdog]:
+        """Context in which the thread runs; to be entered before the rig."""
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
         try:
             yield self
@@ -117,7 +118,7 @@ class Guard:
                 self._thread = None
 
     def field_off(self) -> None:
-        """Take the field away and wait until it is; an exception of a signal handler is raised when that is done.
+        """Switch the field off and wait until it is; an exception of a signal handler is raised when that is done.
 
         Raises
         ------
@@ -129,49 +130,49 @@ class Guard:
         while not self.off and self.clock() < end_s:
             try:
                 time.sleep(_POLL_S)
-            except BaseException as error:  # noqa: BLE001  Ctrl-C in a program of the user's: raised below
+            except BaseException as error:  # noqa: BLE001  Ctrl-C in a user's program: raised below
                 interrupted = error
         if not self.off:
-            raise RigError(f"the coils may still carry a field: {self.trouble}; switch the amplifiers off by hand")
+            raise RigError(f"the coils may still carry a field: {self.failure}; switch the amplifiers off by hand")
         if interrupted is not None:
             raise interrupted
 
-    # ---- for anybody, from any thread
+    # ---- for every thread
 
     def trip(self, reason: str) -> None:
-        """Take the field away at once and end the run; returns at once."""
+        """Switch the field off at once and end the run; returns at once."""
         self.reason = self.reason or reason
         self.take_away()
         self._tripped(reason)
 
     def take_away(self) -> None:
-        """Have zero() called as soon as the guard's thread runs; no field passes from now on."""
+        """Request zero() from the watchdog's thread; no field passes from now on."""
         self._latched = True
         if self._thread is not None:  # before and after, nothing is driven
-            self._asked = next(self._numbers)
+            self._requested = next(self._numbers)
             self._wake.set()
 
     @property
     def off(self) -> bool:
         """Whether every request for zero() is fulfilled."""
-        return self._zeroed == self._asked
+        return self._zeroed == self._requested
 
     def wait_off(self, timeout_s: float) -> bool:
-        """Whether every request for zero() is fulfilled, or is within so many seconds."""
+        """Wait until every request for zero() is fulfilled, at most so many seconds; whether it is."""
         end_s = self.clock() + timeout_s
         while not self.off and self.clock() < end_s:
             time.sleep(_POLL_S)
         return self.off
 
     @property
-    def trouble(self) -> str:
-        """What zero() has to say for itself, where it failed."""
+    def failure(self) -> str:
+        """How zero() fails."""
         return f"zero() raised {self.failures} times: {self._error}" if self._error else "zero() does not return"
 
     # ---- the thread
 
-    def look(self) -> float:
-        """Take the field away if it is time to. Returns for how long there is nothing to do, in s."""
+    def check(self) -> float:
+        """Switch the field off if it is time to. Returns the time until the next check, in s."""
         left_s = _IDLE_S
         if self.timeout_s is not None and not self._latched:
             left_s = self.timeout_s
@@ -180,30 +181,30 @@ class Guard:
             if left_s <= 0.0:
                 self.hung = True
                 self.trip(f"guard: no tick for {self.timeout_s:g} s")
-        asked = self._asked
-        if self._zeroed == asked:
+        requested = self._requested
+        if self._zeroed == requested:
             return max(left_s, 0.0)
         try:
             self._rig.zero()
-        except Exception as error:  # noqa: BLE001  whatever a driver raises, it is tried again
+        except Exception as error:  # noqa: BLE001  whatever a driver raises, zero() is called again
             self.failures += 1
             self._error = error
             if self.failures == 1:
-                self._say(f"the coils' zero() failed ({error!r}); it is repeated every {1e3 * _RETRY_S:.0f} ms")
+                self._warn(f"the coils' zero() failed ({error!r}); it is repeated every {1e3 * _RETRY_S:.0f} ms")
             return _RETRY_S
-        self._zeroed = asked
-        if (self.hung or self.failures) and not self._told:
-            self._told = True
+        self._zeroed = requested
+        if (self.hung or self.failures) and not self._reported:
+            self._reported = True
             after = f" after {self.failures} failures of zero()" if self.failures else ""
-            self._say(f"{self.reason or 'the run ends'}: the field is off{after}")
+            self._warn(f"{self.reason or 'the run ends'}: the field is off{after}")
         return left_s
 
     def _watch(self) -> None:
-        # Before the loop itself, which may be what uses all of the processor.
+        # At a higher priority than the loop, which may be what uses all of the processor.
         with first_of_all(2):
             while not self._over or not self.off:
-                self._wake.wait(self.look())
+                self._wake.wait(self.check())
                 self._wake.clear()
 
-    def _say(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         threading.Thread(target=self._alarm, args=(text,), name="alarm", daemon=True).start()

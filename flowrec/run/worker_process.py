@@ -1,4 +1,4 @@
-"""The slow stages in a process of their own: the parent's end, and the process itself.
+"""The worker of a live run: a process for the slow stages, as the parent sees it, and the process itself.
 
 It is no pool of multiprocessing: such a pool makes Python wait at exit for unfinished work, delays its parent while it
 starts, and receives the Ctrl-C that is meant for the run.
@@ -16,31 +16,34 @@ import sys
 import tempfile
 import threading
 import traceback
+from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, BinaryIO
 
 from flowrec.errors import FlowrecError
-from flowrec.messages import FlowField, Route, Tick
+from flowrec.messages import Tick
 from flowrec.pipeline import Pipeline
-from flowrec.run.jobs import warm_up, work
+from flowrec.planning import warm_up
+from flowrec.run.workers import Result, Results, ordered, work
 from flowrec.system import child_process
-
-Result = FlowField | Route
+from flowrec.topics import WORKER_FIELDS
 
 _NAME = "the process that solves and plans"
-_LOG_BYTES = 65_536  # of what the process printed, the last part is kept
+_LOG_BYTES = 65_536  # the last part of what the process printed
 _JOIN_S = 1.0
 
 
-class WorkProcess:
-    """Takes orders, one after the other; no method but `close` ever blocks the caller.
+class ProcessWorker:
+    """Does orders one after the other in another process; only `close` blocks the caller.
 
-    What the process prints is kept in memory; it is written to a log file, named in the error, when the process fails.
+    What the process prints is kept in memory. If the process fails, it is written to a log file that the error names.
     """
 
     def __init__(self, pipeline: Pipeline) -> None:
-        # The only objects that the threads share: queues, which lock themselves, and `_printed`, which the receiver
-        # reads after the thread that fills it has ended.
+        self._fills: deque[str] = deque()  # fields of Tick that the results to come go to
+        # The threads share only these queues, which lock themselves, and `_printed`, which the receiver reads after the
+        # thread that fills it has ended.
         self._results: queue.SimpleQueue[Result | Exception] = queue.SimpleQueue()
         self._orders: queue.SimpleQueue[Pipeline | Tick | None] = queue.SimpleQueue()
         self._printed = b""
@@ -60,21 +63,28 @@ class WorkProcess:
             ) from error
         self._threads = [
             threading.Thread(target=target, name="work process", daemon=True)
-            for target in (self._keep_printed, self._send, self._receive)
+            for target in (self._collect_output, self._send, self._receive)
         ]
         for thread in self._threads:
             thread.start()
 
     def submit(self, order: Tick) -> None:
         """Start on an order as soon as those before it are done."""
-        self._orders.put(order)
+        mission, name = ordered(order)
+        needed = {field: getattr(order, field) for field in WORKER_FIELDS[name].reads}
+        self._orders.put(Tick(order.stamp_ns, mission=mission, **needed))
+        self._fills.append(name)
 
-    def result(self) -> Result | None:
-        """That of the oldest order whose result was not taken yet; None while it is worked on.
+    def due(self, stamp_ns: int) -> Results:
+        """The result of the oldest order, once it is there, to be adopted on the tick of this stamp.
 
-        Raises what the work has raised; FlowrecError where the process has ended, was stopped by a signal, or its
-        answer can not be read.
+        Raises what the work has raised; FlowrecError if the process has ended, was stopped by a signal, or its answer
+        can not be read.
         """
+        result = self._result() if self._fills else None
+        return {} if result is None else {self._fills.popleft(): replace(result, stamp_ns=stamp_ns)}
+
+    def _result(self) -> Result | None:
         try:
             result = self._results.get_nowait()
         except queue.Empty:
@@ -89,7 +99,7 @@ class WorkProcess:
         return result
 
     def close(self) -> None:
-        """End it at once, and with it the threads and pipes."""
+        """End the process at once, its threads and pipes."""
         self._process.kill()
         self._process.wait()
         self._orders.put(None)
@@ -97,21 +107,20 @@ class WorkProcess:
             thread.join(_JOIN_S)
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
             assert pipe is not None
-            with contextlib.suppress(OSError):  # a part of an order that nobody reads any more
+            with contextlib.suppress(OSError):  # the unread part of an order
                 pipe.close()
 
     def _is_stopped(self) -> bool:
-        try:
-            state = os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT)
-        except ChildProcessError:  # it has ended; the receiver says so
-            return False
-        return state is not None
+        if sys.platform != "win32":  # where no signal stops a process
+            with contextlib.suppress(ChildProcessError):  # it has ended; the receiver reports that
+                return os.waitid(os.P_PID, self._process.pid, os.WSTOPPED | os.WNOHANG | os.WNOWAIT) is not None
+        return False
 
-    def _keep_printed(self) -> None:
+    def _collect_output(self) -> None:
         pipe = self._process.stderr
         assert pipe is not None
-        while said := os.read(pipe.fileno(), _LOG_BYTES):
-            self._printed = (self._printed + said)[-_LOG_BYTES:]
+        while output := os.read(pipe.fileno(), _LOG_BYTES):
+            self._printed = (self._printed + output)[-_LOG_BYTES:]
 
     def _send(self) -> None:
         pipe = self._process.stdin
@@ -121,9 +130,9 @@ class WorkProcess:
                 pipe.write(pickle.dumps(order, pickle.HIGHEST_PROTOCOL))
                 pipe.flush()
         except OSError:
-            pass  # it has ended; the receiver says so
+            pass  # it has ended; the receiver reports that
         except Exception as error:  # noqa: BLE001  the mission must not wait for an order that was never sent
-            self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_told(error)})"))
+            self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_described(error)})"))
 
     def _receive(self) -> None:
         pipe = self._process.stdout
@@ -135,7 +144,7 @@ class WorkProcess:
             self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._cause()}); {self._log()}"))
         except BaseException as error:  # noqa: BLE001  whatever it is, the mission must not wait for ever
             self._results.put(
-                FlowrecError(f"{_NAME} gave an answer that can not be read ({_told(error)}); {self._log()}")
+                FlowrecError(f"{_NAME} gave an answer that can not be read ({_described(error)}); {self._log()}")
             )
 
     def _cause(self) -> str:
@@ -146,7 +155,7 @@ class WorkProcess:
         return f"killed by {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
     def _log(self) -> str:
-        """Write the log file; the half of an error that says where it is."""
+        """Write the log file; the end of an error text that names it."""
         if self._process.poll() is not None:
             self._threads[0].join(_JOIN_S)
         if not self._printed:
@@ -160,7 +169,7 @@ class WorkProcess:
         return f"see {name} for what it printed"
 
 
-def _told(error: BaseException) -> str:
+def _described(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
@@ -175,7 +184,7 @@ def _answer(pipeline: Pipeline, order: Tick) -> bytes:
             pickle.loads(sent)  # noqa: S301 - an exception may be written without complaint and not be readable
             if isinstance(error, Exception):
                 return sent
-        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_told(error)})"), pickle.HIGHEST_PROTOCOL)
+        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_described(error)})"), pickle.HIGHEST_PROTOCOL)
 
 
 def _serve(orders: BinaryIO, results: BinaryIO) -> None:
@@ -194,7 +203,7 @@ def _listen(orders: BinaryIO, put: Callable[[Any], None]) -> None:
         while True:
             put(pickle.load(orders))  # noqa: S301 - from our own parent
     except (OSError, EOFError):
-        os._exit(0)  # in the midst of its work, for nobody waits for that any more
+        os._exit(0)  # in the midst of its work, because nobody waits for the result any more
     except BaseException:  # noqa: BLE001  an order that can not be read
         traceback.print_exc()
         os._exit(1)
@@ -202,7 +211,7 @@ def _listen(orders: BinaryIO, put: Callable[[Any], None]) -> None:
 
 if __name__ == "__main__":
     private = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever a library prints must not get in between
+    os.dup2(2, 1)  # what a library prints must not get between the results
     try:
         _serve(sys.stdin.buffer, private)
     except (BrokenPipeError, EOFError):

@@ -21,7 +21,8 @@ from flowrec.config import load_config
 from flowrec.errors import RigError
 from flowrec.pipeline import Inputs
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.loop import LockstepWorker, run
+from flowrec.run.loop import run
+from flowrec.run.workers import LockstepWorker
 from flowrec.session import Session
 from flowrec.session_writer import session_writer
 from flowrec.store import SessionReader, recover

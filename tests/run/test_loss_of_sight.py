@@ -17,7 +17,7 @@ from flowrec.config import load_config
 from flowrec.errors import RigError
 from flowrec.messages import Applied, Currents, Event, Frame
 from flowrec.pipeline import Inputs
-from flowrec.rigs.frame_checks import Arrivals
+from flowrec.rigs.frame_checks import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.store import SessionReader
 from tests.conftest import SMALL
@@ -64,15 +64,14 @@ def empty(now: Inputs, _before: Inputs) -> Inputs:
 
 
 def test_an_image_with_one_pixel_changed_is_a_new_one() -> None:
-    arrivals = Arrivals((64, 48))
     image = np.full((64, 48), 9, np.uint8)
     changed = image.copy()
     changed[13, 5] += 1
-    since = []
-    for stamp, each in enumerate((image, image.copy(), changed, changed.copy())):
-        applied = Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
-        since.append(arrivals.check(Inputs(stamp, Frame(stamp, stamp, each), applied)).applied.image_since_ns)
-    assert since == [0, 0, 2, 2]
+    arriving = [
+        Inputs(stamp, Frame(stamp, stamp, each), Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)))
+        for stamp, each in enumerate((image, image.copy(), changed, changed.copy()))
+    ]
+    assert [each.applied.image_since_ns for each in checked_images(iter(arriving), (64, 48))] == [0, 0, 2, 2]
 
 
 def wrong_image(image: np.ndarray) -> Fault:

@@ -18,31 +18,34 @@ from flowrec.commands import replay as again
 from flowrec.commands.auto_recovery import look_after
 from flowrec.commands.interactive import Unattended
 from flowrec.config import load_config
+from flowrec.enums import Action
 from flowrec.errors import SessionError
 from flowrec.messages import OperatorEvent, Tick
-from flowrec.run.control import Desk
-from flowrec.run.disk_monitor import DiskWatch, refuse_below
-from flowrec.run.keyboard import KeyBoard
+from flowrec.run.control import RunControl
+from flowrec.run.disk_monitor import DiskMonitor, refuse_below
+from flowrec.run.keyboard import Keyboard
 from flowrec.store import SessionReader
 from flowrec.units import seconds
 from tests.conftest import HANG_S, SMALL
 
 
-class Scripted(Desk):
+class Scripted(RunControl):
     """An operator who does things at certain times of the session."""
 
     def __init__(self, script: tuple[tuple[float, str, str], ...]) -> None:
         super().__init__()
         self.left = list(script)
 
-    def next(self, stamp_ns: int, held: bool) -> OperatorEvent | None:
+    def next_event(self, stamp_ns: int, held: bool) -> OperatorEvent | None:
         while self.left and seconds(stamp_ns) >= self.left[0][0]:
             _, action, text = self.left.pop(0)
             if action == "zero":
                 self.stop(text, zero=True)
+            elif action == "hold":
+                self.toggle_hold()
             else:
-                self.ask(action, text)
-        return super().next(stamp_ns, held)
+                self.request(Action(action), text)
+        return super().next_event(stamp_ns, held)
 
 
 def flown(path: Path, *script: tuple[float, str, str], sets: tuple[str, ...] = ()):  # type: ignore[no-untyped-def]
@@ -142,13 +145,13 @@ class Asked:
 
     @classmethod
     def by(cls, *typed: str) -> list[tuple[str, str]]:
-        desk = Desk()
-        board = KeyBoard(desk)
+        run_control = RunControl()
+        board = Keyboard(run_control)
         for piece in typed:
             board.take(piece)
         events = []
-        while desk.pending:
-            event = desk.next(len(events), held=("pause", "") in events)
+        while run_control.pending:
+            event = run_control.next_event(len(events), held=("pause", "") in events)
             assert event is not None
             events.append((event.action, event.text))
         return events
@@ -166,13 +169,13 @@ def test_keys_become_events_in_order_and_notes_are_typed_without_being_obeyed() 
 
 def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_last(tmp_path: Path) -> None:
     left, written, told = [5_000_000_000], [0], []
-    watch = DiskWatch(tmp_path, lambda: written[0], 1.0, told.append, lambda _folder: left[0])
-    assert not watch.look()
+    watch = DiskMonitor(tmp_path, lambda: written[0], 1.0, told.append, lambda _folder: left[0])
+    assert not watch.sample()
     written[0] = 100_000_000
-    assert not watch.look()
+    assert not watch.sample()
     assert watch.text.startswith("disk 5 GB left, ")
     left[0] = 900_000_000
-    assert watch.look()
+    assert watch.sample()
     assert told == [f"disk floor: 0.9 GB left on {tmp_path}"]
     with pytest.raises(SessionError, match="disk_floor_gb"):
         refuse_below(1.0, tmp_path, lambda _folder: 900_000_000)
@@ -184,21 +187,21 @@ def test_a_disk_that_runs_low_ends_a_run_in_good_order_with_status_3(
 ) -> None:
     left, watches = [2_000_000_000], []
 
-    class Low(DiskWatch):
+    class Low(DiskMonitor):
         """Looks when a tick comes, not once a second: the mission may be over by then."""
 
         def __init__(self, *words, **more) -> None:  # type: ignore[no-untyped-def]
             super().__init__(*words, **more, free=lambda _folder: left[0])
             watches.append(self)
 
-    class Filling(Desk):
-        def next(self, stamp_ns: int, held: bool) -> OperatorEvent | None:
+    class Filling(RunControl):
+        def next_event(self, stamp_ns: int, held: bool) -> OperatorEvent | None:
             if seconds(stamp_ns) >= 1.0 and left[0] > 900_000_000:
                 left[0] = 900_000_000
-                assert watches[0].look()
-            return super().next(stamp_ns, held)
+                assert watches[0].sample()
+            return super().next_event(stamp_ns, held)
 
-    monkeypatch.setattr(verb, "DiskWatch", Low)
+    monkeypatch.setattr(verb, "DiskMonitor", Low)
     recorded = verb.record(
         load_config(None, [*SMALL, "camera.rate_hz=30"]), tmp_path / "low.mcap", control=Unattended(Filling())
     )

@@ -1,4 +1,4 @@
-"""The guard on a clock that only the test moves: when the field goes, that it stays away, that zero() is repeated."""
+"""The watchdog on a clock that only the test moves: when the field goes, that it stays away, repeated zero()."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 
 from flowrec.errors import RigError
 from flowrec.messages import Currents
-from flowrec.run.control import RAMP_PATIENCE_S, Desk, Interrupted
-from flowrec.run.watchdog import ZERO_PATIENCE_S, Guard
+from flowrec.run.control import RAMP_PATIENCE_S, Interrupted, RunControl
+from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
 
 
 class Driver:
@@ -50,66 +50,66 @@ def until(happened: Callable[[], bool]) -> None:
         time.sleep(0.001)
 
 
-def guarded(driver: Driver, **more: object) -> Guard:
-    """A guard whose thread the test is: it has begun, and `look` is called by hand."""
-    guard = Guard(driver, 0.5, clock=driver.clock, **more)  # type: ignore[arg-type]
-    guard._thread = threading.current_thread()
-    return guard
+def guarded(driver: Driver, **more: object) -> Watchdog:
+    """A watchdog whose thread the test is: it has begun, and `look` is called by hand."""
+    watchdog = Watchdog(driver, 0.5, clock=driver.clock, **more)  # type: ignore[arg-type]
+    watchdog._thread = threading.current_thread()
+    return watchdog
 
 
 def test_a_loop_that_hangs_loses_its_field_after_the_stated_time_and_not_before() -> None:
     driver, told = Driver(), []
-    guard = guarded(driver, tripped=told.append)
-    guard.apply(field(4.0))
+    watchdog = guarded(driver, tripped=told.append)
+    watchdog.apply(field(4.0))
     for _ in range(5):
         driver.now_s += 0.45
-        assert guard.look() == pytest.approx(0.05)
-        guard.tick_ended()
+        assert watchdog.check() == pytest.approx(0.05)
+        watchdog.tick_ended()
     driver.now_s += 0.499
-    guard.look()
+    watchdog.check()
     assert ("zero", 0.0) not in driver.log
-    assert not guard.reason
+    assert not watchdog.reason
     driver.now_s += 0.002
-    guard.look()
+    watchdog.check()
     assert driver.log == [("apply", 4.0), ("zero", 0.0)]
-    assert guard.hung
-    assert guard.off
+    assert watchdog.hung
+    assert watchdog.off
     assert told == ["guard: no tick for 0.5 s"]
     driver.now_s += 60.0
-    guard.look()
+    watchdog.check()
     assert len(driver.log) == 2
 
 
 def test_without_a_field_no_tick_is_missed_and_the_time_begins_with_the_field() -> None:
     driver = Driver()
-    guard = guarded(driver)
-    guard.apply(field(0.0))
+    watchdog = guarded(driver)
+    watchdog.apply(field(0.0))
     driver.now_s += 20.0  # the first tick of an installation compiles
-    guard.look()
-    guard.apply(field(1.0))
-    assert guard.look() == pytest.approx(0.5)
+    watchdog.check()
+    watchdog.apply(field(1.0))
+    assert watchdog.check() == pytest.approx(0.5)
     driver.now_s += 0.4
-    guard.apply(field(0.0))
+    watchdog.apply(field(0.0))
     driver.now_s += 20.0
-    guard.look()
-    assert not guard.reason
+    watchdog.check()
+    assert not watchdog.reason
 
 
 def test_a_tick_that_ends_late_brings_no_field_back_and_a_command_under_way_is_followed_by_a_zero() -> None:
     driver = Driver()
-    guard = guarded(driver)
+    watchdog = guarded(driver)
 
     def trip() -> None:
-        guard.trip("enough")
-        guard.look()  # zero() while the driver is still at work on the command
+        watchdog.trip("enough")
+        watchdog.check()  # zero() while the driver is still at work on the command
 
     driver.in_apply = trip
-    guard.apply(field(4.0))
-    guard.look()
+    watchdog.apply(field(4.0))
+    watchdog.check()
     assert driver.log == [("apply", 4.0), ("zero", 0.0), ("zero", 0.0)]
     driver.in_apply = lambda: None
-    guard.apply(field(4.0))
-    guard.apply(field(0.0))
+    watchdog.apply(field(4.0))
+    watchdog.apply(field(0.0))
     assert driver.log[3:] == [("apply", 0.0)]
 
 
@@ -122,14 +122,14 @@ def test_a_zero_that_raises_is_repeated_until_it_works_and_a_person_is_told() ->
             raise OSError("no answer")
 
     driver.in_zero = refuse
-    guard = guarded(driver, alarm=alarms.append)
-    guard.trip("enough")
+    watchdog = guarded(driver, alarm=alarms.append)
+    watchdog.trip("enough")
     for _ in range(4):
-        assert guard.look() <= 0.02
-        assert not guard.off
-    guard.look()
-    assert guard.off
-    assert guard.failures == 4
+        assert watchdog.check() <= 0.02
+        assert not watchdog.off
+    watchdog.check()
+    assert watchdog.off
+    assert watchdog.failures == 4
     assert [event for event, _ in driver.log] == ["refused"] * 5 + ["zero"]
     until(lambda: len(alarms) == 2)
     assert "no answer" in alarms[0]
@@ -144,12 +144,12 @@ def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repea
         raise OSError("no answer")
 
     driver.in_zero = refuse
-    guard = Guard(driver, clock=driver.clock)
-    with guard.running(), pytest.raises(RigError, match=r"zero\(\) raised \d+ times: no answer.*by hand"):
-        guard.field_off()
+    watchdog = Watchdog(driver, clock=driver.clock)
+    with watchdog.running(), pytest.raises(RigError, match=r"zero\(\) raised \d+ times: no answer.*by hand"):
+        watchdog.field_off()
     assert driver.now_s > 100.0 + ZERO_PATIENCE_S
     driver.in_zero = lambda: None
-    until(lambda: guard.off)
+    until(lambda: watchdog.off)
     assert driver.log == [("zero", 0.0)]
 
 
@@ -162,10 +162,10 @@ def test_ctrl_c_while_zero_is_at_work_comes_after_it() -> None:
             time.sleep(0.015)
 
     driver.in_zero = slow
-    guard = Guard(driver)
-    with guard.running():
+    watchdog = Watchdog(driver)
+    with watchdog.running():
         try:
-            guard.field_off()
+            watchdog.field_off()
         except KeyboardInterrupt:
             driver.log.append(("left", 0.0))
         with contextlib.suppress(KeyboardInterrupt):
@@ -175,54 +175,54 @@ def test_ctrl_c_while_zero_is_at_work_comes_after_it() -> None:
 
 def test_the_loop_is_left_in_the_blocks_it_has_marked_and_nowhere_else() -> None:
     driver = Driver()
-    desk = Desk(driver.clock)
-    desk.ticking = True
-    desk.stop("enough")
-    with desk.interruptible:
-        assert not desk.leave_now  # there is time for a ramp
+    control = RunControl(driver.clock)
+    control.ticking = True
+    control.stop("enough")
+    with control.interruptible:
+        assert not control.must_interrupt  # there is time for a ramp
     driver.now_s += 5.1
-    desk.interrupt()
-    with desk.left_when_late():
-        assert desk.stuck
-        with desk.interruptible:
-            desk.interrupt()
+    control.interrupt()
+    with control.interrupted_when_overdue():
+        assert control.stuck
+        with control.interruptible:
+            control.interrupt()
         pytest.fail("the loop was not left")
-    desk.interrupt()
-    assert desk.unless_stopped(desk.interrupt, "otherwise") == "otherwise"
-    with pytest.raises(Interrupted), desk.interruptible:
-        desk.interrupt()
-    desk.interruptible.__enter__()
+    control.interrupt()
+    assert control.unless_stopped(control.interrupt, "otherwise") == "otherwise"
+    with pytest.raises(Interrupted), control.interruptible:
+        control.interrupt()
+    control.interruptible.__enter__()
     with pytest.raises(Interrupted):
-        desk.interrupt()
-    desk.interrupt()  # nothing raises again before the block is left
+        control.interrupt()
+    control.interrupt()  # nothing raises again before the block is left
 
 
 def test_a_stop_that_is_late_takes_the_field_away_after_0_8_s_and_leaves_the_loop_after_1_1_s() -> None:
     driver = Driver()
-    desk = Desk(driver.clock)
-    desk.ticking = True
-    desk.stop("enough")
-    told = desk.next(1, held=False)
+    control = RunControl(driver.clock)
+    control.ticking = True
+    control.stop("enough")
+    told = control.next_event(1, held=False)
     assert told is not None and told.action == "stop"
     driver.now_s += 0.79
-    assert desk.next(2, held=False) is None
+    assert control.next_event(2, held=False) is None
     driver.now_s += 0.02
-    told = desk.next(3, held=False)
+    told = control.next_event(3, held=False)
     assert told is not None and told.action == "zero"
-    with desk.interruptible:
+    with control.interruptible:
         driver.now_s += 0.28
-        assert not desk.leave_now
+        assert not control.must_interrupt
         driver.now_s += 0.02
-        assert desk.leave_now
+        assert control.must_interrupt
 
 
 def test_a_late_zero_keeps_the_reason_of_the_guard() -> None:
     driver = Driver()
-    desk = Desk(driver.clock)
-    desk.stop("stopped by SIGINT: Ctrl-C")
-    desk.stop("guard: no tick for 0.5 s", zero=True)
+    control = RunControl(driver.clock)
+    control.stop("stopped by SIGINT: Ctrl-C")
+    control.stop("guard: no tick for 0.5 s", zero=True)
     driver.now_s += RAMP_PATIENCE_S + 0.1
-    event = desk.next(7, held=False)
+    event = control.next_event(7, held=False)
     assert event is not None
     assert (event.action, event.text) == ("zero", "guard: no tick for 0.5 s")
-    assert desk.overdue
+    assert control.overdue

@@ -21,8 +21,8 @@ from flowrec.config import load_config
 from flowrec.errors import FlowrecError
 from flowrec.messages import Mission, Tick
 from flowrec.pipeline import Pipeline
-from flowrec.run.jobs import work
-from flowrec.run.worker_process import WorkProcess
+from flowrec.run.worker_process import ProcessWorker
+from flowrec.run.workers import work
 from tests.conftest import HANG_S, SMALL, until
 
 # Found by this process and by its child: stages that fail in every way in which an answer can fail.
@@ -83,32 +83,32 @@ def order() -> Tick:
 @pytest.fixture
 def working(
     pipeline: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., WorkProcess]]:
+) -> Iterator[Callable[..., ProcessWorker]]:
     """A process whose solver fails in the ways named, one for each order; none: the real one."""
     (tmp_path / "hurdles.py").write_text(textwrap.dedent(HURDLES))
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with ExitStack() as stack:
 
-        def start(*ways: str) -> WorkProcess:
+        def start(*ways: str) -> ProcessWorker:
             if ways:
                 import hurdles  # type: ignore[import-not-found]
-            process = WorkProcess(replace(pipeline, solver=hurdles.Stage(*ways)) if ways else pipeline)
+            process = ProcessWorker(replace(pipeline, solver=hurdles.Stage(*ways)) if ways else pipeline)
             stack.callback(process.close)
             return process
 
         yield start
 
 
-def answer(process: WorkProcess) -> Any:
+def answer(process: ProcessWorker) -> Any:
     """The next result, or what was raised instead of one; None where it hangs."""
     end = time.monotonic() + HANG_S
     try:
-        while (result := process.result()) is None and time.monotonic() < end:
+        while not (results := process.due(0)) and time.monotonic() < end:
             time.sleep(0.02)
     except Exception as error:  # noqa: BLE001
         return error
-    return result
+    return results.get("assumed")
 
 
 def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(pipeline, order, working) -> None:
@@ -118,6 +118,7 @@ def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(
     assert answer(process).same_as(work(pipeline, order))
     assert answer(process).request == 1
     os.kill(process._process.pid, signal.SIGKILL)
+    process.submit(order)
     error = answer(process)
     assert isinstance(error, FlowrecError)
     assert "ended unasked (killed by SIGKILL)" in str(error)
@@ -126,7 +127,7 @@ def test_orders_are_answered_as_at_home_and_a_process_that_is_killed_is_told_of(
 def test_a_process_that_is_stopped_while_the_mission_waits_for_it_is_told_of(order, working) -> None:
     process = working("sleeps")
     process.submit(order)
-    assert process.result() is None
+    assert process.due(0) == {}
     os.kill(process._process.pid, signal.SIGSTOP)
     assert "was stopped by a signal" in str(answer(process))
 
