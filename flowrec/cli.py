@@ -190,8 +190,8 @@ def view(
     from flowrec.session import files_behind
     from flowrec.system.outputs import PICTURE, check_output
     from flowrec.terminal import say
-    from flowrec.view import open_viewer
-    from flowrec.view import screenshot as take
+    from flowrec.view.screenshot import screenshot as take
+    from flowrec.view.viewer import open_viewer
 
     if session.suffix == ".rrd" and not session.exists():
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")

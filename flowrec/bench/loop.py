@@ -30,7 +30,7 @@ from flowrec.run.workers import LockstepWorker
 from flowrec.session_writer import session_header
 from flowrec.store import SessionWriter, WriterOptions
 from flowrec.terminal import progress, table
-from flowrec.view import LiveView
+from flowrec.view.live import LiveView
 
 RATE_HZ = 60.0
 ROUNDS = 2

@@ -14,7 +14,8 @@ from flowrec.session import Session, files_behind, input_blamed
 from flowrec.store import files_of
 from flowrec.system.outputs import RRD, check_output
 from flowrec.terminal import progress, say
-from flowrec.view import Scene, is_made_from, write_rrd
+from flowrec.view.rrd_file import is_made_from, write_rrd
+from flowrec.view.scene import Scene
 
 
 def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:

@@ -43,7 +43,7 @@ from flowrec.terminal import say, table, warn
 from flowrec.units import seconds
 
 if TYPE_CHECKING:
-    from flowrec.view import LiveView
+    from flowrec.view.live import LiveView
 
 # Of the 2 s that a run may take to end: the rest is for the coils (run_control.py) and for Python itself.
 CLOSE_PATIENCE_S = 0.5  # for images that still wait to be written
@@ -256,7 +256,7 @@ def record(
         if view in ("spawn", "serve"):
             # Late: importing Rerun takes a second, and most runs do without.
             from flowrec.commands.export import scene_of
-            from flowrec.view import LiveView
+            from flowrec.view.live import LiveView
 
             live = stack.enter_context(LiveView(scene_of(resolved, chip, pipeline, path), view))
             say(live.message)

@@ -1,8 +1,16 @@
-"""The names of everything that is logged, shown by blueprint.py and read by people in the viewer."""
+"""The logged entities: their names, which people read in the viewer, what they look like, and how they are logged."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import rerun as rr
+from numpy.typing import NDArray
 from rerun import new_entity_path
+
+from flowrec.view import colours
+from flowrec.view.colours import Rgb
 
 SESSION_TIME = "session time"
 FRAME = "frame"
@@ -48,7 +56,105 @@ SIGHT = "run/sight"
 EVENTS = "run/events"
 OPERATOR = "run/operator"
 
+points = rr.Radius.ui_points  # a width on the screen, at any zoom
 
-def under(prefix: str, entity: str) -> str:
-    """The entity's full path, escaped as Rerun wants it; `prefix` is '', 'recorded' or 'replayed'."""
+
+@dataclass(frozen=True, slots=True)
+class Style:
+    """How one of up to two sessions in a view is distinguished from the other."""
+
+    word: str
+    path: Rgb
+    robot: Rgb
+    width: float  # the recorded one is wide and below, so that both are visible where they coincide
+    label_fraction: float  # position of the label along the path
+
+
+_STYLES = {
+    "": Style("", colours.CYAN, colours.ORANGE, 1.4, 0.06),
+    "recorded": Style("recorded ", colours.ORANGE, colours.ORANGE, 2.6, 0.06),
+    "replayed": Style("replayed ", colours.CYAN, colours.CYAN, 1.2, 0.25),
+}
+
+
+def entity_path(prefix: str, entity: str) -> str:
+    """The entity's full path, escaped for Rerun; `prefix` is '', 'recorded' or 'replayed'."""
     return new_entity_path([part for part in (prefix, *entity.split("/")) if part])
+
+
+class EntityLogger:
+    """Logs the entities of one session below `prefix`: '', 'recorded' or 'replayed'."""
+
+    def __init__(self, stream: rr.RecordingStream, prefix: str) -> None:
+        self.stream = stream
+        self.prefix = prefix
+        self.style = _STYLES[prefix]
+        self._paths: dict[str, str] = {}
+
+    def log(self, entity: str, *components: rr.AsComponents, static: bool = False) -> None:
+        """Log the components of an entity at the present time, or (static) for all times."""
+        path = self._paths.get(entity)
+        if path is None:
+            path = self._paths[entity] = entity_path(self.prefix, entity)
+        self.stream.log(path, components[0], *components[1:], static=static)
+
+    def log_styles(self) -> None:
+        """Log what never changes of moving entities, so that each tick logs only their positions."""
+        style, replayed = self.style, self.prefix == "replayed"
+        colour = style.robot if self.prefix else colours.WHITE
+        name = [f"{style.word}reference"]
+        for entity, components in (
+            (TRAIL, rr.LineStrips2D.from_fields(colors=(*style.robot, 150), radii=points(1.0), draw_order=24.0)),
+            (ROBOT, rr.LineStrips2D.from_fields(radii=points(style.width), draw_order=30.0 + replayed)),
+            (ROBOT_LABEL, rr.Points2D.from_fields(radii=points(0.0), show_labels=True)),
+            (
+                REFERENCE,
+                rr.Points2D.from_fields(
+                    colors=colours.YELLOW, radii=points(3.5), labels=name, show_labels=False, draw_order=28.0
+                ),
+            ),
+            (COMMAND, rr.Arrows2D.from_fields(colors=colour, radii=points(1.6), draw_order=29.0)),
+        ):
+            self.log(entity, components, static=True)
+
+    def log_series(self) -> None:
+        """Log names and colours of all plotted lines. A single line of two sessions is named after its session."""
+        replayed = self.prefix == "replayed"
+        own = self.style.path if self.prefix else colours.YELLOW
+        pale = colours.BLUE if replayed else colours.YELLOW
+        truth = {} if replayed else {"truth": colours.GREEN}  # the same in both
+        lines: dict[str, dict[str, Rgb]] = {
+            CURRENT: {"x (A)": colours.RED, "y (A)": colours.GREEN, "z (A)": colours.BLUE},
+            FREQUENCY: {"frequency (Hz)": own},
+            HEADING: {"heading (°)": own},
+            TRACKING_ERROR: {"tracking error (µm)": own},
+            ESTIMATE_ERROR: {"estimate error (µm)": own},
+            NIS: {"NIS": own},
+            NIS_MEAN: {"mean NIS (2: all noise is stated right)": colours.WHITE},
+            PULSATION: {"pulsation (% of the flow)": own},
+            VOLTAGE: {"x (V)": colours.RED, "y (V)": colours.GREEN, "z (V)": colours.BLUE},
+            FLOW_SPEED: {"observer": self.style.path, "map": pale} | truth,
+            FLOW_COMPONENTS: {
+                "vx observer": colours.CYAN,
+                "vx map": colours.BLUE,
+                "vy observer": colours.YELLOW,
+                "vy map": colours.ORANGE,
+            },
+            TIMING: {
+                "track (ms)": colours.CYAN,
+                "observe (ms)": colours.PURPLE,
+                "control (ms)": colours.YELLOW,
+                "sinks (ms)": colours.BLUE,
+                "total (ms)": colours.WHITE,
+            },
+        }
+        for entity, named in lines.items():
+            single = bool(self.prefix) and len(named) == 1
+            names = [self.prefix] if single else [self.style.word + name for name in named]
+            series = rr.SeriesLines(names=names, colors=list(named.values()), widths=[1.5] * len(named))
+            self.log(entity, series, static=True)
+
+
+def label(at: NDArray[Any], text: str, colour: Rgb) -> rr.Points2D:
+    """A word just below a point (2,) of the picture plane, readable at any zoom."""
+    return rr.Points2D([at], labels=[text], show_labels=True, colors=colour, radii=points(0.0))

@@ -1,20 +1,26 @@
-"""Watching a run while it happens, without ever making it wait.
+"""Live view of a run that never makes the run wait, and the process that serves it.
 
-`write` puts a tick into a bounded queue and returns. A thread takes what is there, a few times a second, and hands it
-through a pipe to a process of its own, which owns Rerun (feed.py). Only that thread can block, on a viewer that is
-stopped or slow; then the queue drops its oldest ticks. Latest state is never lost with them: what is handed over is
-the difference between the last tick that went through and the tick that goes next.
+`write` appends a tick to a bounded queue and returns. A thread sends what has accumulated, some times per second,
+through a pipe to a process that owns Rerun (`python -m flowrec.view.live`). Only that thread can block, on a viewer
+that is stopped or slow; then the queue drops its oldest ticks. The latest state is not lost with them, because each
+tick is sent as the difference from the last one that was sent.
+
+The process hosts a server on the loopback interface to which any number of viewers connect, so a viewer that was closed
+can be opened again. It ends with the pipe, so it never outlives the run.
 """
 
 from __future__ import annotations
 
 import contextlib
 import pickle
+import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections import deque
+from collections.abc import Set as AbstractSet
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -27,18 +33,22 @@ from flowrec.view import viewer
 from flowrec.view.scene import Scene
 
 Mode = Literal["spawn", "serve"]
+Batch = tuple[int, list[dict[str, Any]]]  # step of the preview image, and the changes of each tick
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
 _CLOSE_S = 2.5  # for the last ticks to be shown
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
 _FIELDS = tuple(field.name for field in fields(Tick))
+_SERVER_MEMORY = "256MB"  # kept for viewers that connect later
+_FLUSH_S = 0.5  # for the last ticks to reach the viewers
+_WITHOUT = "the run goes on without"
 
 
 class LiveView:
     """A sink that shows the run in Rerun: `spawn` opens a window, `serve` waits for viewers on this machine.
 
-    Whatever becomes of the viewer, `write` neither waits nor raises. `message` is one line for the operator.
+    Whatever happens to the viewer, `write` neither waits nor raises.
     """
 
     def __init__(self, scene: Scene, mode: Mode = "spawn", port: int | None = None, max_hz: float = 20.0) -> None:
@@ -46,24 +56,24 @@ class LiveView:
         self._period_s = 1.0 / max_hz
         self._queue: deque[Tick] = deque(maxlen=_QUEUE_TICKS)
         self._frame: Frame | None = None  # the latest, with its image
-        self._dropped = 0
-        self._gone = False
+        self.dropped = 0  # ticks that were not shown, because the view could not keep up or has ended
+        self._ended = False
         self._closing = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
         self._port = viewer.free_port() if port is None else port
-        window = mode == "spawn" and viewer.has_display()
         with tempfile.NamedTemporaryFile(prefix="flowrec-view-", suffix=".log", delete=False) as log:
             self._log = Path(log.name)
-        self._message = self._start(window, mode)
-        self._thread = threading.Thread(target=self._hand_over, name="live view", daemon=True)
+        self._message = self._start(mode)
+        self._thread = threading.Thread(target=self._send_all, name="live view", daemon=True)
         self._thread.start()
 
-    def _start(self, window: bool, mode: Mode) -> str:
-        """Start the feed; what to tell the operator."""
+    def _start(self, mode: Mode) -> str:
+        """Start the process; the message for the operator."""
         if viewer.executable() is None:
-            self._gone = True
-            return "no live view: Rerun's viewer is not installed (pip install rerun-sdk); the run goes on without"
-        command = child_process.command("flowrec.view.feed", str(self._port), "window" if window else "serve")
+            self._ended = True
+            return f"no live view: Rerun's viewer is not installed (pip install rerun-sdk); {_WITHOUT}"
+        window = mode == "spawn" and viewer.has_display()
+        command = child_process.command(__name__, str(self._port), "window" if window else "serve")
         try:
             with self._log.open("wb") as log:
                 self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -75,8 +85,8 @@ class LiveView:
                     env=child_process.environment(),
                 )
         except OSError as error:
-            self._gone = True
-            return f"no live view: its process does not start ({error.strerror or error}); the run goes on without"
+            self._ended = True
+            return f"no live view: its process does not start ({error.strerror or error}); {_WITHOUT}"
         how = f"rerun --connect {self.url}"
         if window:
             return f"live view: a window opens; another one: {how}"
@@ -86,50 +96,46 @@ class LiveView:
     @property
     def message(self) -> str:
         """One line for the operator: how to open the view, or why there is none."""
-        if self._process is not None and self._gone and not self._closing.is_set():
-            said = [line for line in self._log_text().splitlines() if line.strip()]
-            return f"the live view ended ({said[-1] if said else 'it was killed'}); the run goes on without"
-        return self._message
+        if self._process is None or not self._ended or self._closing.is_set():
+            return self._message
+        log = self._log.read_text(errors="replace") if self._log.exists() else ""
+        lines = [line for line in log.splitlines() if line.strip()]
+        return f"the live view ended ({lines[-1] if lines else 'it was killed'}); {_WITHOUT}"
 
     @property
     def url(self) -> str:
         """What a viewer on this machine connects to."""
-        return f"rerun+http://{viewer.LOOPBACK}:{self._port}/proxy"
+        return viewer.url(self._port)
 
     @property
     def pid(self) -> int | None:
         """The process that owns Rerun."""
         return None if self._process is None else self._process.pid
 
-    @property
-    def dropped(self) -> int:
-        """Ticks that were not shown, because the view could not keep up or is gone."""
-        return self._dropped
-
     def write(self, tick: Tick) -> None:
         """Take one tick; a few microseconds."""
-        if self._gone:
-            self._dropped += 1
+        if self._ended:
+            self.dropped += 1
             return
         if tick.frame is not None:
-            self._frame = tick.frame  # before the queue: the thread looks for the image of the tick it takes last
+            self._frame = tick.frame  # before the queue: the thread looks for the image of the tick that it takes last
             tick = replace(tick, frame=Frame(tick.frame.stamp_ns, tick.frame.index, _NO_IMAGE))
         if len(self._queue) == _QUEUE_TICKS:
-            self._dropped += 1
+            self.dropped += 1
         self._queue.append(tick)
 
-    def close(self, patience_s: float = _CLOSE_S) -> None:
-        """Show what is left, for a moment, and let go. A window stays open."""
+    def close(self, timeout_s: float = _CLOSE_S) -> None:
+        """Show the last ticks within a time limit, then end the process. A window stays open."""
         if self._closing.is_set():
             return
         self._closing.set()
-        end = time.monotonic() + patience_s
-        self._thread.join(patience_s)
+        end = time.monotonic() + timeout_s
+        self._thread.join(timeout_s)
         process = self._process
         if process is not None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(max(end - time.monotonic(), 0.0))
-            process.kill()  # SIGKILL also ends a stopped process, and that frees the thread from its pipe
+            process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
             process.wait()
             self._thread.join(1.0)
         self._log.unlink(missing_ok=True)
@@ -140,37 +146,34 @@ class LiveView:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    # ---- the thread
-
-    def _hand_over(self) -> None:
+    def _send_all(self) -> None:
+        """Send the scene, then batches of ticks, until the view is closed or its process ends: the thread."""
         if self._process is None or self._process.stdin is None:
             return
         pipe = self._process.stdin
         sent = Tick()
         try:
-            pickle.dump(self._scene, pipe, pickle.HIGHEST_PROTOCOL)
-            pipe.flush()
-            while not self._gone:
-                last = self._closing.wait(self._period_s)
-                if last or self._queue:
+            _send(pipe, self._scene)
+            while not self._ended:
+                closing = self._closing.wait(self._period_s)
+                if closing or self._queue:
                     batch, sent = self._batch(sent)
-                    pickle.dump(batch, pipe, pickle.HIGHEST_PROTOCOL)
-                    pipe.flush()
+                    _send(pipe, batch)
                 elif self._process.poll() is not None:
                     break
-                if last:
+                if closing:
                     break
-        except OSError:  # the process is gone
+        except OSError:  # the process has ended
             pass
         finally:
-            self._gone = True
-            self._dropped += len(self._queue)
+            self._ended = True
+            self.dropped += len(self._queue)
             self._queue.clear()
             with contextlib.suppress(OSError):
                 pipe.close()
 
-    def _batch(self, sent: Tick) -> tuple[tuple[int, list[dict[str, Any]]], Tick]:
-        """All ticks that wait, each as what changed, the last with its image; and the last tick itself."""
+    def _batch(self, sent: Tick) -> tuple[Batch, Tick]:
+        """All ticks in the queue, each as its changes, the last with its image; and the last tick itself."""
         changes: list[dict[str, Any]] = []
         step = 1
         while self._queue:
@@ -185,8 +188,57 @@ class LiveView:
             changes[-1]["frame"] = Frame(frame.stamp_ns, frame.index, frame.image[::step, ::step])
         return (step, changes), sent
 
-    def _log_text(self) -> str:
+
+def _send(pipe: Any, what: object) -> None:
+    pickle.dump(what, pipe, pickle.HIGHEST_PROTOCOL)
+    pipe.flush()
+
+
+def serve() -> None:
+    """Show what arrives at stdin, first the scene, then batches: the process."""
+    import rerun as rr  # here, so that a run does not import it
+
+    from flowrec.view.blueprint import blueprint
+    from flowrec.view.logger import TickLogger
+    from flowrec.view.rrd_file import describe, open_stream
+
+    port, window = int(sys.argv[1]), sys.argv[2] == "window"
+    source = sys.stdin.buffer
+    scene: Scene = pickle.load(source)  # noqa: S301 - from our own parent
+    stream = open_stream(scene)
+    present: AbstractSet[str] = frozenset()
+    with socket.socket() as trial:  # Rerun reports a taken port only in its log
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            return self._log.read_text(errors="replace")
+            trial.bind((viewer.LOOPBACK, port))
         except OSError:
-            return ""
+            sys.exit(f"port {port} is taken by another program")
+    stream.set_sinks(
+        rr.GrpcServerSink(bind_ip=viewer.LOOPBACK, port=port, server_memory_limit=_SERVER_MEMORY),
+        default_blueprint=blueprint(scene, present=present),
+    )
+    describe(stream, scene)
+    if window:
+        viewer.open_window("--connect", viewer.url(port))
+    logger = TickLogger(stream, scene)
+    tick = Tick()
+    while True:
+        try:
+            step, changes_of_ticks = pickle.load(source)  # noqa: S301
+        except (EOFError, pickle.UnpicklingError):  # the run ended, or was killed while it wrote
+            break
+        logger.image_step = step
+        for changes in changes_of_ticks:
+            tick = replace(tick, **changes)
+            logger.log(tick)
+        if logger.present != present:
+            # Something is shown for the first time: its view is added to the layout.
+            present = frozenset(logger.present)
+            stream.send_blueprint(blueprint(scene, present=present))
+    stream.flush(timeout_sec=1.0)
+    time.sleep(_FLUSH_S)
+    stream.disconnect()
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,4 +1,4 @@
-"""A session as one .rrd file: a cache for looking, the MCAP is the archive."""
+"""A session as one .rrd file: a cache for the viewer; the archive is the MCAP file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from flowrec.view.scene import Scene
 APPLICATION = "flowrec"
 _PROGRESS_EVERY = 20  # ticks
 _MAGIC = b"RRF"
-_HEAD_BYTES = 1024  # with the names of application and recording, as they are
+_HEAD_BYTES = 1024  # contains the names of application and recording as plain text
 
 
 def write_rrd(
@@ -33,16 +33,16 @@ def write_rrd(
     inputs: Iterable[Path] = (),
     overwrite: bool = False,
 ) -> None:
-    """Write ticks, with the replayed ones beside them if given; a file of this name appears when it is whole.
+    """Write ticks, and replayed ones beside them if given; a file of this name appears when it is complete.
 
     Parameters
     ----------
     inputs, overwrite : as of `flowrec.system.outputs.check_output`.
-    progress : called now and then with the session time in s that is done, counted from the first tick.
+    progress : called from time to time with the session time in s since the first tick.
 
     Raises
     ------
-    SessionError : the file cannot be written; OutputError where it may not be.
+    SessionError : the file can not be written; OutputError if it may not be.
     """
     with new_file(Path(path), RRD, inputs=inputs, overwrite=overwrite) as part:
         stream = open_stream(scene)
@@ -55,7 +55,7 @@ def write_rrd(
 
 
 def is_made_from(path: Path, key: str) -> bool:
-    """Whether a file is an .rrd that flowrec made of the session with this key (see Scene)."""
+    """Whether a file is an .rrd that flowrec made from the session with this key (see Scene)."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -66,7 +66,7 @@ def is_made_from(path: Path, key: str) -> bool:
 
 def open_stream(scene: Scene) -> rr.RecordingStream:
     """A stream that carries the title and properties of a scene and flowrec's own timelines only."""
-    # A viewer takes recordings of one name for one, so the name is new each time; its first half says of what it is.
+    # A viewer merges recordings of the same name, so the name is unique; its first half identifies the session.
     stream = rr.RecordingStream(APPLICATION, recording_id=f"{scene.key}-{secrets.token_hex(8)}")
     rr.set_log_time_enabled(False, recording=stream)
     rr.set_log_tick_enabled(False, recording=stream)
@@ -74,7 +74,7 @@ def open_stream(scene: Scene) -> rr.RecordingStream:
 
 
 def describe(stream: rr.RecordingStream, scene: Scene) -> None:
-    """Send what people read in the properties of a recording."""
+    """Send the name and the properties that the viewer lists with a recording."""
     stream.send_recording_name(scene.title)
     if scene.properties:
         stream.send_property("session", rr.AnyValues(drop_untyped_nones=True, **scene.properties))
@@ -98,7 +98,7 @@ def _log_all(
         first_ns = stamp_ns if first_ns is None else first_ns
         if again:
             assert replayed is not None
-            # Replayed ticks may come without frames, but happened on a recorded one.
+            # Replayed ticks may have no frame, but belong to a recorded one.
             replayed.log(tick, frame_index=index)
         else:
             index = tick.frame.index if tick.frame is not None else index
@@ -108,7 +108,7 @@ def _log_all(
     present = set(recorded.present)
     if replayed is not None:
         present |= {f"replayed {what}" for what in replayed.present}
-    # Last, when it is known which views have something to show. Rerun takes it wherever in the file it comes.
+    # Last, when it is known which views are not empty. Rerun accepts it anywhere in the file.
     stream.send_blueprint(blueprint(scene, replay, present))
 
 

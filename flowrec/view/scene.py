@@ -1,7 +1,7 @@
-"""What stays the same during a session, and where it lies in a picture.
+"""What does not change during a session, and where it is in a picture.
 
-All pictures share one plane: the camera's pixels as Rerun draws them. Rerun counts from the corner of the first
-pixel, flowrec from its centre; the half pixel between the two is added here and nowhere else.
+All pictures share one plane: the camera's pixels as Rerun draws them. Rerun counts from the corner of the first pixel,
+flowrec from its centre; the half pixel between the two is added here and nowhere else.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _HALF_PX = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where the pixels of an image lie in the picture plane: x = offset + scale * column, from pixel corners."""
+    """Position of an image in the picture plane: x = offset + scale * column, from pixel corners."""
 
     scale: float
     offset: tuple[float, float]
@@ -28,7 +28,7 @@ class Placement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is looked at. The properties are shown to people with the recording, the key names the session."""
+    """What is shown. The properties are listed with the recording, the key identifies the session."""
 
     chip: Chip
     calibration: Calibration
@@ -36,7 +36,7 @@ class Scene:
     title: str
     properties: dict[str, str] = field(default_factory=dict)
     image_px: tuple[int, int] | None = None  # width and height of the camera's image; None: as the chip
-    windows: bool = False  # whether most images are black but for a window around the robot
+    windows: bool = False  # whether most images are black except for a region around the robot
     key: str = ""
 
     def to_plane(self, points_um: ArrayLike) -> NDArray[np.float64]:
@@ -47,19 +47,19 @@ class Scene:
         """A length in um in the picture plane."""
         return length_um / self.calibration.um_per_px
 
-    def mask_placement(self, um_per_px: float) -> Placement:
-        """Where an image on the chip's mask lies."""
-        scale = um_per_px / self.calibration.um_per_px
+    def mask_placement(self) -> Placement:
+        """Position of an image on the pixels of the chip's mask."""
+        scale = self.length_px(self.chip.um_per_px)
         x, y = self.to_plane((0.0, 0.0))  # of the centre of the mask's first pixel
         return Placement(scale, (float(x) - _HALF_PX * scale, float(y) - _HALF_PX * scale))
 
     def preview_placement(self, step: int) -> Placement:
-        """Where a camera image lies of which only each `step`-th row and column was kept."""
+        """Position of a camera image of which only each `step`-th row and column is shown."""
         return Placement(float(step), (_HALF_PX * (1 - step), _HALF_PX * (1 - step)))
 
     def chip_bounds(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom of the chip's mask in the picture plane."""
-        placement = self.mask_placement(self.chip.um_per_px)
+        placement = self.mask_placement()
         (left, top), (h, w) = placement.offset, self.chip.mask.shape
         return left, top, left + w * placement.scale, top + h * placement.scale
 

@@ -1,4 +1,4 @@
-"""A picture of the viewer, with no screen needed: for people far from one, and for tests."""
+"""A picture of the viewer without a screen: for people without one, and for tests."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from flowrec.view.entities import SESSION_TIME
 
 _T = TypeVar("_T")
 
-_LOG_TIME = "message_log_time"  # what Rerun calls the session clock of a bare .mcap
+_LOG_TIME = "message_log_time"  # Rerun's name for the session clock of an .mcap
 _START_S = 20.0
 _LOAD_S = 60.0
 _SETTLE_S = 1.0  # images are decoded and plots laid out over some frames
-_NOTICES_S = 4.5  # until the viewer's greetings have left the upper right corner
+_NOTICES_S = 4.5  # until the viewer's notices have disappeared
 
 
 def screenshot(
@@ -38,14 +38,14 @@ def screenshot(
     *,
     overwrite: bool = False,
 ) -> list[str]:
-    """Save what the viewer shows of a file (.rrd or .mcap) at a session time, at the end without one.
+    """Save what the viewer shows of a file (.rrd or .mcap) at a session time, by default at its end.
 
-    Returns the problems that the views report, one line each; of a file in order there are none.
+    Returns the problems that the views report, one line each; normally none.
 
     Raises
     ------
-    FlowrecError : there is no viewer, or it has no graphics to draw with, or does not read the file; OutputError where
-        the picture may not be written.
+    FlowrecError : there is no viewer, no graphics driver, or the viewer does not read the file; OutputError if the
+        picture may not be written.
     """
     path = Path(path).resolve()
     if not path.exists():
@@ -75,7 +75,7 @@ def screenshot(
 
 
 def _start_unix_ns(path: Path) -> int:
-    """Unix time of session time 0; 0 for a file of another program, whose times are as they are."""
+    """Unix time of session time 0; 0 for a file of another program, whose times are not changed."""
     try:
         with SessionMetadata(path) as head:
             return head.source.start_unix_ns
@@ -85,7 +85,7 @@ def _start_unix_ns(path: Path) -> int:
 
 @contextlib.contextmanager
 def _headless(size: tuple[int, int]) -> Iterator[tuple[ViewerClient, float]]:
-    """A viewer without a window, and when it began."""
+    """A viewer without a window, and the time at which it was started."""
     with tempfile.TemporaryDirectory(prefix="flowrec-view-") as folder:
         log = Path(folder, "viewer.log")
         port = viewer.free_port()
@@ -109,11 +109,11 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple[ViewerClient, float]]:
 
 
 def _connected(port: int, process: subprocess.Popen[bytes]) -> ViewerClient | None:
-    """A client, once the viewer draws."""
+    """A client, once the viewer responds."""
     if process.poll() is not None:
         raise ConnectionError
     try:
-        client = ViewerClient.connect(f"rerun+http://{viewer.LOOPBACK}:{port}/proxy")
+        client = ViewerClient.connect(viewer.url(port))
         client.get_state()
     except ConnectionError:
         return None
@@ -121,13 +121,13 @@ def _connected(port: int, process: subprocess.Popen[bytes]) -> ViewerClient | No
 
 
 def _loaded(client: ViewerClient) -> ViewerState | None:
-    """What the viewer shows, once nothing is on its way any more."""
+    """The state of the viewer, once nothing is loading."""
     state = client.get_state()
     return state if not state.loading and any(recording.timelines for recording in state.recordings) else None
 
 
 def _until(done: Callable[[], _T | None], limit_s: float) -> _T | None:
-    """The first result that is not None, within a time."""
+    """The first result that is not None, within a time limit."""
     end = time.monotonic() + limit_s
     while time.monotonic() < end:
         result = done()
@@ -138,11 +138,11 @@ def _until(done: Callable[[], _T | None], limit_s: float) -> _T | None:
 
 
 def _why(log: Path) -> str:
-    """The viewer's last words."""
-    said = log.read_text(errors="replace")
-    if "render context" in said or "adapter" in said:
+    """The reason that the viewer's log states."""
+    text = log.read_text(errors="replace")
+    if "render context" in text or "adapter" in text:
         return (
             "it has no graphics to draw with: install a driver, or `apt install mesa-vulkan-drivers` for a software one"
         )
-    lines = [line for line in said.splitlines() if line.strip()]
-    return lines[-1] if lines else "it says nothing"
+    lines = [line for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else "its log is empty"

@@ -1,4 +1,4 @@
-"""Where Rerun's viewer is, whether there is a screen for it, and how it is started: bound to this machine only."""
+"""Rerun's viewer: where it is, whether there is a screen for it, and its start, bound to this machine only."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from pathlib import Path
 
 LOOPBACK = "127.0.0.1"  # Rerun's own default is every interface
 _ENVIRONMENT = {
-    "RERUN_APP_ONLY": "true",  # started by a program: it asks no questions on its first run
-    # It reports nothing about its use to tel.rerun.io: CI turns the analytics off, whatever the user's own setting is.
+    "RERUN_APP_ONLY": "true",  # no questions on its first run
+    # No report of its use to tel.rerun.io: CI turns the analytics off, whatever the user's own setting is.
     "CI": "true",
     "FORCE_RERUN_ANALYTICS": "false",
     "TELEMETRY_ENABLED": "false",
-    # No variable turns off its question to api.github.com for a newer version. A proxy that is not there does; what it
-    # loads and the loopback need none.
+    # No variable turns off its request to api.github.com for a newer version. A proxy that does not exist does; files
+    # and the loopback interface need none.
     "ALL_PROXY": f"http://{LOOPBACK}:9",
     "NO_PROXY": "",
 }
@@ -48,16 +48,21 @@ def has_display() -> bool:
 
 
 def free_port() -> int:
-    """A port on which nothing listens just now."""
+    """A port on which nothing listens at present."""
     with socket.socket() as trial:
         trial.bind((LOOPBACK, 0))
         return int(trial.getsockname()[1])
 
 
-def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[bytes]:
-    """Start the viewer with its server on the loopback only, in a session of its own.
+def url(port: int) -> str:
+    """What a viewer on this machine connects to."""
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
-    Ctrl-C in the terminal does not reach it, so it can outlive the run and still show its end.
+
+def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[bytes]:
+    """Start the viewer with its server on the loopback interface only, in a session of its own.
+
+    Ctrl-C in the terminal does not reach it, so it can outlive the run and show its end.
 
     Raises
     ------
@@ -81,16 +86,21 @@ def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[byt
             output.close()
 
 
+def open_window(*arguments: str) -> None:
+    """Start the viewer with a window that outlives this process; raises OSError as `start`."""
+    process = start(["--port", "auto", "--hide-welcome-screen", *arguments])
+    process.returncode = 0  # so that a process that is not waited for is not reported as a leak
+
+
 def open_viewer(path: Path | str) -> str:
-    """Open a file in the viewer's window; '' when that was done, else one line that says how to see it."""
+    """Open a file in the viewer's window; '' on success, else one line that says how to see it."""
     path = Path(path)
     if executable() is None:
         return f"{path}: Rerun's viewer is not installed here; `pip install rerun-sdk`, then `rerun {path}`"
     if not has_display():
         return f"{path}: no screen here; copy the file and open it with `rerun {path.name}`"
     try:
-        viewer = start(["--port", "auto", "--hide-welcome-screen", str(path.resolve())])
+        open_window(str(path.resolve()))
     except OSError as error:
         return f"{path}: Rerun's viewer does not start ({error.strerror or error}); try `rerun {path}`"
-    viewer.returncode = 0  # It stays open after us, and that is no leak.
     return ""

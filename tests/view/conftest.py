@@ -13,7 +13,7 @@ from flowrec import messages as m
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
 from flowrec.robot import Robot
-from flowrec.view import Scene
+from flowrec.view.scene import Scene
 
 H, W, UM_PER_PX = 256, 320, 4.0
 CAMERA_UM_PER_PX = 2.0

@@ -17,7 +17,9 @@ import pytest
 from rerun.chunk import RrdReader
 
 from flowrec.messages import Frame, Tick
-from flowrec.view import LiveView, Scene, viewer
+from flowrec.view import viewer
+from flowrec.view.live import LiveView
+from flowrec.view.scene import Scene
 from tests.conftest import HANG_S, until
 
 LISTENING = "0A"

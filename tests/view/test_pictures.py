@@ -13,10 +13,11 @@ import rerun as rr
 from flowrec.chip.registration import Calibration
 from flowrec.flow import sample
 from flowrec.messages import FlowField, Tick
-from flowrec.view import Scene, colours, maps
-from flowrec.view.arrows import arrow_grid, flow_arrows
+from flowrec.view import colours, maps
 from flowrec.view.colours import Scale
 from flowrec.view.logger import TickLogger
+from flowrec.view.maps import arrow_grid, flow_arrows
+from flowrec.view.scene import Scene
 
 
 class Record:
@@ -88,7 +89,7 @@ def test_a_map_of_the_time_to_go_tells_far_from_unreachable(scene: Scene, ticks:
     logger.log(Tick(0, route=replace(route, time_to_go_s=time_s)))
     seen = record.map("/plan/time\\ to\\ go/map")
     assert (seen[~fluid] == colours.SOLID).all()
-    assert (seen[:, -20:][fluid[:, -20:]] == colours.NO_WAY).all()
+    assert (seen[:, -20:][fluid[:, -20:]] == colours.UNREACHABLE).all()
     assert "time to go" in logger.present
     row = int(np.argmax(fluid[:, :-20].sum(1)))
     assert seen[row, -30].astype(int).sum() > seen[row, 10].astype(int).sum()  # lighter is farther
@@ -148,7 +149,7 @@ def test_the_branches_of_a_narrow_network_all_have_arrows(scene: Scene) -> None:
 
 def test_pictures_of_any_resolution_lie_on_each_other(scene: Scene) -> None:
     turned = replace(scene, calibration=Calibration(0.7, (30.0, -12.0)))
-    place = turned.mask_placement(4.0)
+    place = turned.mask_placement()
     column_row = np.array([10.0, 20.0])  # a pixel of the mask, whose centre Rerun counts half a pixel further
     assert np.allclose(turned.to_plane(4.0 * column_row), (column_row + 0.5) * place.scale + place.offset)
     preview = turned.preview_placement(3)

@@ -13,7 +13,8 @@ from rerun.chunk import RrdReader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
-from flowrec.view import Scene, write_rrd
+from flowrec.view.rrd_file import write_rrd
+from flowrec.view.scene import Scene
 
 
 class File:

@@ -10,8 +10,11 @@ import pytest
 
 from flowrec.errors import FlowrecError
 from flowrec.messages import Tick
-from flowrec.view import Scene, open_viewer, screenshot, viewer, write_rrd
-from flowrec.view.screenshot import screenshot as take
+from flowrec.view import viewer
+from flowrec.view.rrd_file import write_rrd
+from flowrec.view.scene import Scene
+from flowrec.view.screenshot import screenshot
+from flowrec.view.viewer import open_viewer
 from tests.conftest import until
 
 
@@ -86,8 +89,8 @@ def test_a_screenshot_of_nothing_or_without_a_viewer_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(FlowrecError, match="no such file"):
-        take(tmp_path / "none.rrd", tmp_path / "shot.png")
+        screenshot(tmp_path / "none.rrd", tmp_path / "shot.png")
     (tmp_path / "some.rrd").touch()
     monkeypatch.setattr(viewer, "executable", lambda: None)
     with pytest.raises(FlowrecError, match="pip install rerun-sdk"):
-        take(tmp_path / "some.rrd", tmp_path / "shot.png")
+        screenshot(tmp_path / "some.rrd", tmp_path / "shot.png")
