@@ -30,7 +30,7 @@ from flowrec.methods import Methods
 from flowrec.planning import PLANNERS, Planner, SurveyPlanner
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
-from flowrec.rig_settings import Camera, CameraSettings, Safety, Simulated
+from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Safety, Simulated
 from flowrec.robot import Robot, RobotSettings
 from flowrec.system.toml_file import parse_toml, read_toml
 from flowrec.vision import Tracker
@@ -90,7 +90,7 @@ class Start:
 class Config:
     """A whole run, one section per room."""
 
-    rig: Literal["simulated"] = "simulated"
+    rig: Annotated[str, RIGS] = SIMULATED
     duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None  # None: until the mission is finished
     chip: ChipSettings = field(default_factory=ChipSettings)
     robot: RobotSettings = field(default_factory=RobotSettings)

@@ -19,10 +19,9 @@ from flowrec.errors import UnreachableError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
-from flowrec.rig_settings import Camera
+from flowrec.rig_settings import SIMULATED, Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
 
-SIMULATED = "simulated"
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
@@ -80,13 +79,12 @@ def _narrowed(kind: type[_Section], settings: Any, **changed: Any) -> _Section:
 
 def _refuse_unmeasured(config: Config) -> None:
     """Only a simulated robot and camera can be made to fit the chip."""
-    rig: str = config.rig
     given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
     missing = [key for key, value in given.items() if value is None]
-    if rig != SIMULATED and missing:
+    if config.rig != SIMULATED and missing:
         raise UsageError(
-            f"rig = {rig!r}: {', '.join(missing)} not given; measure them and set each: only the simulated rig's robot "
-            "and camera are made to fit the chip"
+            f"rig = {config.rig!r}: {', '.join(missing)} not given; measure them and set each: only the simulated rig's "
+            "robot and camera are made to fit the chip"
         )
 
 

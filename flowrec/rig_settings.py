@@ -6,8 +6,14 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
+from flowrec.methods import Method, Methods
 from flowrec.ranges import OneOf, Range, Seed, Share
 
+SIMULATED = "simulated"
+# `of(pipeline, config, duration_s, realtime)` of a row's class makes the rig, a rigs.rig.Rig.
+RIGS = Methods(
+    "rig", Method(SIMULATED, "flowrec.rigs.simulated.rig:SimulatedRig", "a simulated microscope, coils and robot")
+)
 _Rate = Annotated[float, Range(0.1, 5e3)]
 _Scale = Annotated[float, Range(1e-3, 1e3)]
 

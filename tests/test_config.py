@@ -18,6 +18,7 @@ from flowrec.commands.record import Recorded, prepare
 from flowrec.config import Config, config_from_toml, load_config, to_toml, with_sets
 from flowrec.errors import FlowrecError, UnreachableError, UsageError
 from flowrec.resolve import resolve
+from flowrec.rig_settings import RIGS
 from flowrec.store import SessionReader
 
 
@@ -141,6 +142,13 @@ def test_a_goal_in_another_channel_is_unreachable() -> None:
     with pytest.raises(FlowrecError, match="lies in another channel") as caught:
         resolve(config, replace(chip, mask=mask))
     assert caught.value.exit_status == 1
+
+
+def test_an_unknown_rig_is_an_error_that_names_the_rigs_of_the_table() -> None:
+    with pytest.raises(UsageError, match="rig = 'bench': must be one of simulated; the nearest is simulated"):
+        load_config(None, ["rig=bench"])
+    for row in RIGS.values():
+        assert hasattr(row.load(), "of")
 
 
 def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> None:

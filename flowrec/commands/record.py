@@ -26,7 +26,8 @@ from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
-from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.rig_settings import RIGS
+from flowrec.rigs.rig import Rig
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.loop import RunReport, Sink, run
 from flowrec.run.watchdog import Watchdog
@@ -227,7 +228,7 @@ def record(
     if view == "rrd":
         check_output(path.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
     fields = field_of_session(Path(resolved.start.field), chip) if resolved.start.field else {}
-    rig = SimulatedRig.of(pipeline, resolved, resolved.duration_s, realtime)
+    rig: Rig = RIGS[resolved.rig].load().of(pipeline, resolved, resolved.duration_s, realtime)
     folder, floor_gb = path.resolve().parent, resolved.recording.disk_floor_gb
     control = control if control is not None else Unattended()
     run_control = control.run_control

@@ -1,4 +1,4 @@
-"""The rig of a replay: everything arrives as it did, nothing is sent."""
+"""The rig of a replay: the inputs of a session arrive again, no command is sent."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from flowrec.store import SessionReader
 
 
 class RecordedRig:
-    """Plays a session's inputs. Worker results of fields in `recompute` are left out: the replay makes its own.
+    """Yields a session's inputs. Results of the worker in fields of `recompute` are left out: the replay makes its own.
 
-    `recorded` is the recorded tick that belongs to the inputs last yielded, for comparing.
+    `recorded` is the recorded tick of the inputs yielded last, for comparison.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class RecordedRig:
             before = tick
 
     def apply(self, currents: Currents) -> None:
-        """Recorded coils hear nothing."""
+        """Do nothing: there are no coils."""
 
     def zero(self) -> None:
-        """Recorded coils hear nothing."""
+        """Do nothing: there are no coils."""

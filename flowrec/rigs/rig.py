@@ -1,4 +1,4 @@
-"""What the loop needs of a rig, and the table of rigs."""
+"""What the loop needs of a rig. The table of rigs is in rig_settings.py, because the configuration names one."""
 
 from __future__ import annotations
 

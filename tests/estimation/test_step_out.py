@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import flowrec.commands.record as verb
 from flowrec.commands import replay
 from flowrec.commands.record import record
 from flowrec.config import Config, load_config
@@ -111,7 +110,7 @@ def test_upstream_a_robot_that_steps_out_below_what_was_stated_is_slowed_down_an
             weak = replace(config.robot, step_out_hz=0.7 * config.robot.max_speed_um_s / config.robot.um_per_rev)  # type: ignore[operator]
             return SimulatedRig.of(pipeline, replace(config, robot=weak), *more)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(verb, "SimulatedRig", Made)
+    monkeypatch.setattr("flowrec.rigs.simulated.rig.SimulatedRig", Made)
     sets = ["mission.phases=navigate", "mission.start=[6000, 2620]", "mission.goal=inlet"]
     done = record(load_config(None, [*SMALL, *sets]), tmp_path / "s.mcap")
     assert (done.report.outcome, done.report.contacts) == ("reached", 0), done.report.note

@@ -24,6 +24,7 @@ from flowrec.commands import record as verb
 from flowrec.errors import RigError
 from flowrec.messages import Currents
 from flowrec.pipeline import Inputs
+from flowrec.rigs.simulated import rig as simulated
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run import loop
 from tests.conftest import SMALL
@@ -177,7 +178,7 @@ def main(kind: str, out: str, log_path: str, *sets: str) -> None:
         signal.signal(one, signal.SIG_DFL)
     log = Log(Path(log_path))
     LoggedRig.log = staticmethod(log)
-    verb.SimulatedRig = RIGS.get(kind, LoggedRig)  # type: ignore[misc]
+    simulated.SimulatedRig = RIGS.get(kind, LoggedRig)  # type: ignore[misc]
     step, record, ticks = loop.step, verb.record, iter(range(1 << 30))
 
     def failing(*arguments: object) -> object:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flowrec.rig_settings import Simulated
-from flowrec.rigs.simulated.swimmer import Swimmer
+from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.robot import Robot
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import flowrec.commands.record as verb
 from flowrec.commands import replay
 from flowrec.commands.record import Recorded, record
 from flowrec.config import load_config
@@ -93,7 +92,7 @@ def flown(
             rigs.append(rig)
             return rig
 
-    monkeypatch.setattr(verb, "SimulatedRig", Made)
+    monkeypatch.setattr("flowrec.rigs.simulated.rig.SimulatedRig", Made)
     try:
         done: Recorded | RigError = record(load_config(None, [*SMALL, "duration_s=11", *sets]), path)
     except RigError as error:

@@ -169,7 +169,7 @@ def test_record_as_a_function_leaves_signals_alone_and_zeroes_on_ctrl_c(
 
     logged = staticmethod(lambda event, amplitude_mt=0.0: log.append((event, amplitude_mt)))
     monkeypatch.setattr(LoggedRig, "log", logged, raising=False)
-    monkeypatch.setattr(verb, "SimulatedRig", Rig)
+    monkeypatch.setattr("flowrec.rigs.simulated.rig.SimulatedRig", Rig)
     with pytest.raises(KeyboardInterrupt):
         verb.record(load_config(None, SMALL), tmp_path / "cut.mcap")
     told = log[log.index(("cause", 0.0)) :]

@@ -102,7 +102,7 @@ def test_the_folder_that_numba_was_told_is_used_and_what_nobody_has_used_for_lon
 
 def test_kernels_take_from_other_files_only_what_the_key_of_the_cache_knows() -> None:
     known = {path.relative_to(PACKAGE.parent).with_suffix("").as_posix().replace("/", ".") for path in kernel_files()}
-    assert {"flowrec.planning.kernels", "flowrec.vision.disc_fit", "flowrec.rigs.simulated.swimmer"} <= known
+    assert {"flowrec.planning.kernels", "flowrec.vision.disc_fit", "flowrec.rigs.simulated.bodies"} <= known
     for name in sorted(known - {"flowrec.system.numba_setup"}):
         module = importlib.import_module(name)
         assert module.__file__ is not None

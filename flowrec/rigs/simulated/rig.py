@@ -1,8 +1,8 @@
-"""The simulated rig: a microscope, coils and a robot in a flow that is not quite the assumed one.
+"""The simulated rig: a microscope, coils and a robot in a flow that differs from the assumed one.
 
-It knows what no stage may know, and says it only in `truth` and `true_field`. Everything is drawn from the seed and
-from what is applied: same seed, same commands, same bytes, however long the loop takes. In real time stamps are made
-as for a real camera, from its own clock and from when its frames arrive.
+Only `truth` and `true_field` hold what no stage may know. Everything derives from the seed and from the commands: same
+seed, same commands, same bytes, whatever the loop takes. In real time, stamps are made as for a real camera, from its
+own clock and from the arrival of its frames.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.ranges import check_ranges
 from flowrec.rig_settings import Camera, Simulated
-from flowrec.rigs.simulated.camera_clock import CameraClock
-from flowrec.rigs.simulated.debris import Debris
+from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
-from flowrec.rigs.simulated.swimmer import Swimmer
 from flowrec.robot import Robot
 from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _COILS = 3
+_SKEW_PPM = 50.0  # of a crystal, at most
+_STARTED_S = 3600.0  # ago, at most
 
 
 def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
-    """The chip with the boundary values and the viscosity that really hold, drawn from the seed.
+    """The chip with the true boundary values and viscosity, drawn from the seed.
 
     Each inlet speed times 1 +- (a third of inlet_speed_error to all of it), the viscosity times 1 +-
     viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across the chip;
@@ -49,7 +49,7 @@ def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
     inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
     draws = rng.uniform(-1.0, 1.0, len(inlet))
     viscosity = chip.viscosity_mpa_s * (1.0 + simulated.viscosity_error * float(rng.uniform(-1.0, 1.0)))
-    # Never by chance almost right: an assumption that needs no refinement shows nothing.
+    # At least a third of the error, because an almost correct assumption would leave nothing to refine.
     wrong = np.sign(draws) * (1.0 + 2.0 * np.abs(draws)) / 3.0
     values = chip.boundary_values * np.where(inlet, 1.0 + simulated.inlet_speed_error * wrong, 1.0)
     changed = chip.with_boundary(values, viscosity)
@@ -61,21 +61,42 @@ def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
     return chip.with_boundary(values, viscosity)
 
 
+class _CameraClock:
+    """The camera's clock: ns since it was switched on, slightly too fast or too slow; and the delays of its frames."""
+
+    def __init__(self, simulated: Simulated) -> None:
+        rng = np.random.default_rng([simulated.seed, 6])
+        drawn_ppm, started_s = float(rng.uniform(-_SKEW_PPM, _SKEW_PPM)), float(rng.uniform(0.0, _STARTED_S))
+        skew_ppm = drawn_ppm if simulated.clock_skew_ppm is None else simulated.clock_skew_ppm
+        self._rate = 1.0 + 1e-6 * skew_ppm
+        self._started = round(started_s * NS_PER_S)
+        self._jitter_s = simulated.arrival_jitter_s
+        self._rng = rng
+
+    def device(self, world_ns: int) -> int:
+        """Its count."""
+        return self._started + round(self._rate * world_ns)
+
+    def delay_s(self) -> float:
+        """Delay of the next frame beyond that of the earliest ones."""
+        return self._jitter_s * float(self._rng.standard_exponential())
+
+
 class SimulatedRig:
-    """Camera, coils and the world between them. A context manager; `inputs()` yields frames, `apply()` takes currents.
+    """Camera, coils and the world between them; see rigs.rig.Rig.
 
     Parameters
     ----------
-    chip, calibration : the chip as it is assumed, and where the camera looks at it
-    robot : resolved (no None); its delay is from `apply` to motion
-    start_um : (2,) where the robot's centre is on the first frame
-    duration_s : None goes on for ever
-    realtime : pace the frames to the host's clock and stamp them by the camera's, fitted to it; none is skipped, a late
-        one is just late
-    true_field : a flow to use instead of solving for one, for tests and for known flows
-    coils : how strong the field is beside the full one, and the currents it takes; None: always full, as commanded
+    chip, calibration : the assumed chip, and the camera's view of it.
+    robot : its delay is from `apply` to motion.
+    start_um : (2,) centre of the robot on the first frame.
+    duration_s : None: without end.
+    realtime : pace the frames to the host's clock and stamp them by the camera's clock, fitted to it; no frame is
+        skipped.
+    true_field : a flow to use instead of a solved one.
+    coils : the relation of field and currents; None: always the full field, with the commanded currents.
 
-    Raises RigError or ChipError for settings that no world can be made of.
+    Raises RigError, ChipError or UsageError for settings that do not describe a world.
     """
 
     @classmethod
@@ -87,7 +108,7 @@ class SimulatedRig:
         realtime: bool = False,
         true_field: FlowField | None = None,
     ) -> SimulatedRig:
-        """The rig of a run: its resolved configuration's camera, world, robot, start and coils, on its chip."""
+        """The rig of a resolved configuration."""
         return cls(
             pipeline.chip,
             config.robot,
@@ -131,13 +152,13 @@ class SimulatedRig:
         self._delay_ns = nanoseconds(robot.delay_s if simulated.delay_s is None else simulated.delay_s)
         self._now_ns = 0
         self._coils = coils
-        # What the coils were told last and where their field is; what is on its way: (stamp of its effect, command).
+        # The command in effect and the state of its field; commands on their way, as (stamp of their effect, command).
         self._acting: Currents | None = None
         self._rotation = FieldState()
         self._coming: list[tuple[int, Currents]] = []
         self._latest: Currents | None = None
-        # Set by zero(), in any thread: one attribute, which the loop's thread looks at whenever the world goes on. A
-        # lock would be held by a loop that is interrupted.
+        # Set by zero(), in any thread: one attribute, which the loop's thread reads before every step of the world. A
+        # lock could be held by an interrupted loop.
         self._cut = False
 
     def __enter__(self) -> SimulatedRig:
@@ -148,14 +169,14 @@ class SimulatedRig:
         self.zero()
 
     def apply(self, currents: Currents) -> None:
-        """Send a command; the field changes when the delay is over. The same message again is no new command."""
+        """Send a command; the field changes after the delay. The same message again is no new command."""
         if currents is self._latest or (self._cut and currents.amplitude_mt > 0.0):
             return
         self._latest = currents
         self._coming.append((self._now_ns + self._delay_ns, currents))
 
     def zero(self) -> None:
-        """Take the field away at once, and let none come back until the rig is entered again."""
+        """Switch the field off at once, until the rig is entered again."""
         self._cut = True
 
     def inputs(self) -> Iterator[Inputs]:
@@ -170,7 +191,7 @@ class SimulatedRig:
         for n in range(moving.stop, len(debris.points_um)):
             microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))
         debris.drift(0.0)  # compiles, so that the second frame is not late
-        camera_clock, host_clock, fit = CameraClock(self._simulated), DeviceClock(), None
+        camera_clock, host_clock, fit = _CameraClock(self._simulated), DeviceClock(), None
         began_ns: int | None = None
         index = 0
         while index < self._frames:
@@ -191,7 +212,7 @@ class SimulatedRig:
             )
             arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
             if self._realtime:
-                # An image is there when its exposure is over. The first one, with all that it takes, sets the clock.
+                # An image arrives after its exposure. The first one, with all its preparation, sets the clock.
                 over_ns = nanoseconds(0.5 * self._camera.exposure_s)
                 began_ns = time.monotonic_ns() - over_ns if began_ns is None else began_ns
                 time.sleep(max(0.0, seconds(began_ns + arrival_ns + over_ns - time.monotonic_ns())))
@@ -221,7 +242,7 @@ class SimulatedRig:
         return self._field
 
     def _advance(self, swimmer: Swimmer, until_ns: int) -> NDArray[np.float64]:
-        """Let the world go on to a stamp, switching the field exactly when commands arrive. Returns the turns (2,)."""
+        """Advance the world to a stamp; the field changes exactly when commands take effect. Returns the turns (2,)."""
         turns = np.zeros(2)
         now = self._now_ns
         while True:

@@ -1,8 +1,9 @@
-"""The robot's body in the simulated world: rolling, carried by the flow, jittering, stopped by walls.
+"""What moves in the simulated flow: the robot, and particles that a tracker must not follow.
 
-xdot = u(f) (cos phi, sin phi) + v(x), the paper's kinematics, with the true flow at the robot's centre: no lag of a
-finite sphere behind the fluid. What the controller can not know is added: a rolling direction and speed that
-wander (Ornstein-Uhlenbeck, forgotten within a second) and a random walk of the position.
+The robot moves by xdot = u(f) (cos phi, sin phi) + v(x), the paper's kinematics, with the true flow at its centre: a
+finite sphere does not lag behind the fluid. Added is what the controller can not know: a rolling direction and a speed
+that wander (Ornstein-Uhlenbeck process, correlation time one second), and a random walk of the position. Particles
+drift with the flow or lie still.
 """
 
 from __future__ import annotations
@@ -13,25 +14,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.chip.chip import Chip
+from flowrec.interpolation import bilinear
 from flowrec.rig_settings import Simulated
 from flowrec.robot import Robot
 from flowrec.system.numba_setup import compiled
 
 _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 4 um at 1000 um/s
-_MEMORY_S = 1.0  # of the wander
-
-
-@compiled
-def bilinear(raster: NDArray[np.float32], x: float, y: float) -> float:
-    """Value of a raster (h, w) at pixel coordinates, held constant beyond its outermost pixel centres."""
-    height, width = raster.shape
-    x = min(max(x, 0.0), width - 1.0)
-    y = min(max(y, 0.0), height - 1.0)
-    i, j = min(int(x), width - 2), min(int(y), height - 2)
-    a, b = x - i, y - j
-    top = (1 - a) * raster[j, i] + a * raster[j, i + 1]
-    bottom = (1 - a) * raster[j + 1, i] + a * raster[j + 1, i + 1]
-    return float((1 - b) * top + b * bottom)
+_CORRELATION_S = 1.0  # of the wander
 
 
 @compiled
@@ -61,7 +51,7 @@ def _swim(
         free = bilinear(clearance, x / um_per_px, y / um_per_px)
         if free < radius:
             touched += 1
-            # Pushed out along the slope of the distance: what was normal to the wall is lost, it slides along.
+            # Pushed out along the gradient of the clearance: the robot slides along the wall.
             for _ in range(4):
                 i, j = x / um_per_px, y / um_per_px
                 gx = bilinear(clearance, i + 0.5, j) - bilinear(clearance, i - 0.5, j)
@@ -78,7 +68,7 @@ def _swim(
 
 
 class Swimmer:
-    """Position and wall contacts of the one robot. `clearance_um` (h, w) from pixel centres to walls."""
+    """Position and wall contacts of the robot. `clearance_um` (h, w): from pixel centres to walls."""
 
     def __init__(
         self,
@@ -113,7 +103,7 @@ class Swimmer:
         return self._strength(self._time_s) * np.array([bilinear(self._vx, x, y), bilinear(self._vy, x, y)])
 
     def _strength(self, time_s: float) -> float:
-        """Of the pulsating flow as a share of the steady one."""
+        """Pulsating flow divided by the steady one."""
         pulse = self._simulated
         return 1.0 + pulse.pulsation_share * math.sin(2.0 * math.pi * pulse.pulsation_hz * time_s)
 
@@ -126,24 +116,24 @@ class Swimmer:
         return float(bilinear(self._clearance, x, y)) - self._robot.radius_um
 
     def advance(self, duration_s: float, frequency_hz: float, heading_rad: float, strength: float) -> None:
-        """Move on for a while under a constant field, as strong as the full one or a share of it.
+        """Move for a duration under a constant field whose amplitude is `strength` times the full one.
 
-        The torque goes with the field, so the robot steps out at that share of the frequency; without a field it
-        only drifts.
+        The torque is proportional to the amplitude, so the robot steps out at `strength` times the frequency. Without a
+        field it only drifts.
         """
         if self.gone or duration_s <= 0:
             return
         self._time_s += duration_s
         steps = max(4, math.ceil(duration_s / _SUBSTEP_S))
         dt = duration_s / steps
-        keep = math.exp(-duration_s / _MEMORY_S)
-        self._wander = keep * self._wander + math.sqrt(1 - keep**2) * self._rng.standard_normal(2)
+        decay = math.exp(-duration_s / _CORRELATION_S)
+        self._wander = decay * self._wander + math.sqrt(1 - decay**2) * self._rng.standard_normal(2)
         noise = self._rng.standard_normal((steps, 2)) * (self._simulated.position_noise_um * math.sqrt(dt))
         speed = strength * self._robot.rolled_speed_um_s(frequency_hz / strength) if strength > 0 else 0.0
         speed *= 1.0 + self._simulated.speed_noise * self._wander[1]
         heading = heading_rad + self._simulated.heading_noise_rad * self._wander[0]
         touched, free = self._run(speed * math.cos(heading), speed * math.sin(heading), dt, noise)
-        # One contact lasts until the robot has come off the wall by a twentieth of its radius.
+        # A contact ends when the robot is off the wall by a twentieth of its radius.
         if touched and not self._touching:
             self.contacts += 1
         self._touching = bool(touched) or (self._touching and free < 1.05 * self._robot.radius_um)
@@ -168,3 +158,81 @@ class Swimmer:
         )
         self.position_um = np.array([x, y])
         return touched, free
+
+
+@compiled
+def _drift(
+    points: NDArray[np.float64],
+    vx: NDArray[np.float32],
+    vy: NDArray[np.float32],
+    clearance: NDArray[np.float32],
+    um_per_px: float,
+    dt: float,
+    lost: NDArray[np.bool_],
+) -> None:
+    """Move points (n, 2) in um with the flow by dt in two steps; `lost` (n,) becomes True outside the fluid."""
+    height, width = vx.shape
+    for n in range(points.shape[0]):
+        for _ in range(2):
+            i, j = points[n, 0] / um_per_px, points[n, 1] / um_per_px
+            points[n, 0] += 0.5 * dt * bilinear(vx, i, j)
+            points[n, 1] += 0.5 * dt * bilinear(vy, i, j)
+        i, j = points[n, 0] / um_per_px, points[n, 1] / um_per_px
+        lost[n] = not (-0.5 <= i <= width - 0.5 and -0.5 <= j <= height - 0.5) or bilinear(clearance, i, j) < 0.0
+
+
+class Debris:
+    """`points_um` (n, 2), `radii_um` (n,) and `darkness` (n,) from 0 to 1; the last `still` of them never move."""
+
+    def __init__(
+        self,
+        chip: Chip,
+        count: int,
+        robot_radius_um: float,
+        velocity_um_s: NDArray[np.float32],
+        clearance_um: NDArray[np.float32],
+        seed: int,
+    ) -> None:
+        self._rng = np.random.default_rng([seed, 2])
+        self.still = count // 6
+        total = count + self.still
+        self.radii_um = robot_radius_um * self._rng.uniform(0.3, 0.7, total)
+        self.darkness = self._rng.uniform(0.15, 0.45, total)
+        # Room for the largest particle: one that overlaps a wall would look wrong.
+        rows, columns = np.nonzero(chip.mask & (clearance_um > 0.7 * robot_radius_um))
+        if not len(rows):
+            rows, columns = np.nonzero(chip.mask)
+        chosen = self._rng.integers(0, len(rows), total)
+        places = np.stack((columns[chosen], rows[chosen]), -1) + self._rng.uniform(-0.5, 0.5, (total, 2))
+        self.points_um = places * chip.um_per_px
+        self._chip = chip
+        self._inlets = [o for o in chip.openings if o.kind == "inlet"]
+        self._vx = np.ascontiguousarray(velocity_um_s[..., 0])
+        self._vy = np.ascontiguousarray(velocity_um_s[..., 1])
+        self._clearance = clearance_um
+        self._lost = np.zeros(count, np.bool_)
+
+    def drift(self, dt_s: float) -> None:
+        """Move all by dt; a particle that has left the chip enters again at an inlet."""
+        moving = len(self.points_um) - self.still
+        _drift(
+            self.points_um[:moving],
+            self._vx,
+            self._vy,
+            self._clearance,
+            self._chip.um_per_px,
+            dt_s,
+            self._lost,
+        )
+        for n in np.flatnonzero(self._lost).tolist():
+            inlet = self._inlets[int(self._rng.integers(len(self._inlets)))]
+            # More enter where the inflow is faster: the mean of three uniform draws is nearly a parabola.
+            along = inlet.first + (inlet.width_px - 1) * float(self._rng.random(3).mean())
+            height, width = self._chip.mask.shape
+            place = {
+                "left": (0.0, along),
+                "right": (width - 1.0, along),
+                "top": (along, 0.0),
+                "bottom": (along, height - 1.0),
+            }[inlet.side]
+            self.points_um[n] = np.array(place) * self._chip.um_per_px
