@@ -77,7 +77,7 @@ def draw_plan(path: Path, examples: list[tuple[World, Trip, dict[str, Route]]], 
         ax.imshow(
             np.where(mask, np.linalg.norm(world.flow.velocity_um_s, axis=-1), np.nan), cmap="Greys_r", vmin=0, vmax=1
         )
-        for method, route in routes.items():
+        for method, route in reversed(routes.items()):  # time_field on top
             if route.reachable:
                 label = f"{method} {route.arrival_s[-1]:.1f} s"
                 ax.plot(*(route.waypoints_um / px).T, color=colour[method], linewidth=1.4, label=label)

@@ -11,10 +11,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.bench.cavity import cavity_case
-from flowrec.bench.channel import bend_case, oblique_case, straight_case
-from flowrec.bench.cylinder import cylinder_case
+from flowrec.bench.exact_flows import bend_case, oblique_case, straight_case
 from flowrec.bench.harness import Quick, Results, peak_mb
+from flowrec.bench.published_flows import cavity_case, cylinder_case
 from flowrec.chip.builtin import straight
 from flowrec.chip.chip import Chip, Walls
 from flowrec.chip.io import without_pockets
@@ -27,62 +26,32 @@ from flowrec.terminal import table
 Pattern = Literal["vessels", "posts"]
 _PITCH_PX, _RADIUS_PX = 32, 13  # of the posts
 
-# Title, and the columns by key of a row; the JSON has all keys.
-_TABLES: dict[str, tuple[str, dict[str, str]]] = {
+# Title, and the keys of a row that are printed; the JSON has all keys.
+_TABLES = {
     "channel": (
         "Plane Poiseuille flow along the pixels",
-        {"width_px": "px", "k": "k", "profile_error_percent": "profile %", "resistance_error_percent": "resistance %"},
+        ("width_px", "k", "profile_error_percent", "resistance_error_percent"),
     ),
     "oblique": (
-        "Plane Poiseuille flow at an angle to the pixels, drawn as a mask",
-        {
-            "walls": "walls",
-            "width_px": "px",
-            "k": "k",
-            "mean_resistance_error_percent": "resistance %, mean",
-            "largest_resistance_error_percent": "largest",
-            "mean_undecided_percent": "undetermined by the mask %, mean",
-            "largest_undecided_percent": "largest",
-        },
+        "Plane Poiseuille flow at an angle to the pixels, drawn as a mask; undecided: by the mask",
+        (
+            *("walls", "width_px", "k", "mean_resistance_error_percent", "largest_resistance_error_percent"),
+            *("mean_undecided_percent", "largest_undecided_percent"),
+        ),
     ),
-    "bend": (
-        "Flow around a bend between two circles",
-        {"width_px": "px", "k": "k", "resistance_error_percent": "resistance %"},
-    ),
+    "bend": ("Flow around a bend between two circles", ("width_px", "k", "resistance_error_percent")),
     "cavity": (
         "Lid-driven cavity: deviation from Ghia, Ghia and Shin, in units of the lid speed",
-        {
-            "reynolds": "Re",
-            "cells": "cells",
-            "u_largest": "u largest",
-            "u_rms": "u rms",
-            "v_largest": "v largest",
-            "v_rms": "v rms",
-        },
+        ("reynolds", "cells", "u_largest", "u_rms", "v_largest", "v_rms"),
     ),
     "cylinder": (
         "Cylinder in a channel, Re 20 (Schaefer-Turek 2D-1), drawn as a mask",
-        {
-            "px_per_diameter": "px",
-            "k": "k",
-            "unknowns": "unknowns",
-            "drag_error_percent": "drag %",
-            "lift_error_percent": "lift %",
-            "pressure_difference_pa_error_percent": "pressure %",
-        },
+        (
+            *("px_per_diameter", "k", "unknowns", "drag_error_percent", "lift_error_percent"),
+            "pressure_difference_pa_error_percent",
+        ),
     ),
-    "speed": (
-        "Speed and memory",
-        {
-            "pattern": "mask",
-            "side_px": "px",
-            "k": "k",
-            "unknowns": "unknowns",
-            "cold_s": "cold s",
-            "warm_s": "warm s",
-            "peak_memory_mb": "MB",
-        },
-    ),
+    "speed": ("Time and memory", ("pattern", "side_px", "k", "unknowns", "cold_s", "warm_s", "peak_memory_mb")),
 }
 
 
@@ -194,8 +163,10 @@ def show(results: Results) -> None:
     def text(value: Any) -> str:
         return f"{value:.3g}" if isinstance(value, float) else str(value)
 
-    for case, (title, columns) in _TABLES.items():
-        rows = [row for row in results["rows"] if row["case"] == case]
-        table(title, tuple(columns.values()), [tuple(text(row[key]) for key in columns) for row in rows])
-    summary = results["summary"].items()
-    table("Summary", ("", "value"), [(key.replace("_", " "), text(value)) for key, value in summary])
+    def heading(key: str) -> str:
+        return key.replace("_percent", " %").replace("_", " ")
+
+    for case, (title, keys) in _TABLES.items():
+        rows = [tuple(text(row[key]) for key in keys) for row in results["rows"] if row["case"] == case]
+        table(title, tuple(heading(key) for key in keys), rows)
+    table("Summary", ("", "value"), [(heading(key), text(value)) for key, value in results["summary"].items()])

@@ -1,4 +1,4 @@
-"""Trips through made-up vessels, and the time that nobody can beat on them: what planners are measured by."""
+"""Trips through random vessels, and the least time that they can take: the reference for planners."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from flowrec.robot import Robot
 
 SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it
 UM_PER_PX = 20.0
-FINER = 8  # the reference's pixels per pixel side: time_field looks at four of them at most
+FINER = 8  # pixels of the reference per pixel side; time_field uses at most four
 _EIGHT = np.ones((3, 3), np.int64)
 Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """A chip, the flow through it with a peak of 1 um/s, and a robot of SPEED_UM_S that fits through."""
+    """A chip, its flow scaled to a peak of 1 um/s, and a robot of SPEED_UM_S that fits through."""
 
     name: str
     chip: Chip
@@ -46,7 +46,7 @@ class World:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trip:
-    """From higher to lower pressure: downstream as it is, upstream the other way round."""
+    """Two points: downstream is from the upper to the lower one, by pressure."""
 
     upper_um: Points
     lower_um: Points
@@ -57,7 +57,7 @@ class Trip:
 
 
 def worlds(side_px: int, seed: int = 0) -> Iterator[World]:
-    """Made-up vessels, one after the other, those that are no use left out."""
+    """Random vessel networks without end, except those in which the flow can not be computed."""
     while True:
         rng = np.random.default_rng([seed, side_px, 0x7219])
         seed += 1
@@ -69,36 +69,24 @@ def worlds(side_px: int, seed: int = 0) -> Iterator[World]:
         if len(openings) < 2:
             continue
         inlet = int(np.argmax([opening.width_px for opening in openings]))
-        openings = [
-            replace(opening, kind="inlet", value=100.0)
-            if number == inlet
-            else replace(opening, kind="outlet", value=0.0)
-            for number, opening in enumerate(openings)
-        ]
+        openings = [replace(opening, kind="outlet", value=0.0) for opening in openings]
+        openings[inlet] = replace(openings[inlet], kind="inlet", value=100.0)
         chip = Chip(f"vessels {seed - 1}", mask, UM_PER_PX, tuple(openings), 1.0, 1000.0)
-        made = _world(chip, k=1 if side_px > 128 else 2)
+        made = world_of(chip, k=1 if side_px > 128 else 2)
         if made is not None:
             yield made
-
-
-def magnified(world: World) -> World | None:
-    """The same chip as a camera of twice the resolution sees it; the robot is as big as before, in um."""
-    mask = world.chip.mask.repeat(2, axis=0).repeat(2, axis=1)
-    openings = tuple(replace(o, first=2 * o.first, last=2 * o.last + 1) for o in world.chip.openings)
-    chip = replace(world.chip, mask=mask, openings=openings, um_per_px=0.5 * world.chip.um_per_px)
-    made = _world(chip, k=1)
-    return None if made is None else replace(made, robot=world.robot)
 
 
 def worlds_of(folder: Path) -> Iterator[World]:
-    """The vessel cases of a folder, by their assumed boundary values."""
+    """The vessel cases of a folder with their assumed boundary values."""
     for path in sorted(folder.glob("*.npz")):
-        made = _world(replace(read_vessel_case(path), name=path.stem), k=2)
+        made = world_of(replace(read_vessel_case(path), name=path.stem), k=2)
         if made is not None:
             yield made
 
 
-def _world(chip: Chip, k: int) -> World | None:
+def world_of(chip: Chip, k: int) -> World | None:
+    """The world of a chip; None if its flow can not be computed."""
     try:
         field = FlowSolver(k).solve(chip)
     except FlowrecError:
@@ -109,15 +97,15 @@ def _world(chip: Chip, k: int) -> World | None:
     return World(chip.name, chip, flow, robot)
 
 
-def draw_trip(world: World, rng: np.random.Generator, least_share: float = 0.4) -> Trip | None:
-    """Two places with room for the robot, at least a share of the chip's size apart; None where none is found."""
+def draw_trip(world: World, rng: np.random.Generator) -> Trip | None:
+    """Two points with room for the robot, connected, 0.4 of the chip's size apart or more; None if there are none."""
     space = open_space(world.chip, world.flow, world.robot.radius_um, 0.5 * world.robot.radius_um)
     parts = label(space.free, _EIGHT)[0]
     rows, columns = np.nonzero(space.free)
     for _ in range(400 if len(rows) else 0):
         a, b = (int(k) for k in rng.integers(len(rows), size=2))
         apart = np.hypot(rows[a] - rows[b], columns[a] - columns[b])
-        if parts[rows[a], columns[a]] != parts[rows[b], columns[b]] or apart < least_share * max(space.free.shape):
+        if parts[rows[a], columns[a]] != parts[rows[b], columns[b]] or apart < 0.4 * max(space.free.shape):
             continue
         pressure = world.flow.pressure_pa
         if pressure[rows[a], columns[a]] < pressure[rows[b], columns[b]]:
@@ -130,9 +118,9 @@ def draw_trip(world: World, rng: np.random.Generator, least_share: float = 0.4) 
 def best_time(
     world: World, field: FlowField, start_um: Points, goal_um: Points, speed_um_s: float, finer: int = FINER
 ) -> tuple[float, float]:
-    """Travel time of the best path on a finer grid, and that grid's own time to go: both close to the optimum.
+    """Travel time of the best path on a finer grid, and the time to go on that grid: both are close to the optimum.
 
-    Flow and clearance are the same bilinear ones, looked at more closely. inf where there is no way.
+    Flow and clearance are interpolated bilinearly. inf if there is no route.
     """
     space = open_space(world.chip, field, world.robot.radius_um, 0.5 * world.robot.radius_um)
     px = space.um_per_px

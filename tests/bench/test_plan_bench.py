@@ -3,9 +3,9 @@ import itertools
 import numpy as np
 import pytest
 
-from flowrec.bench.drive import drive
 from flowrec.bench.plan import FULL, measure, show
-from flowrec.bench.trips import SPEED_UM_S, best_time, draw_trip, magnified, worlds
+from flowrec.bench.reserves import drive
+from flowrec.bench.trips import SPEED_UM_S, best_time, draw_trip, worlds
 from flowrec.errors import UsageError
 from tests.planning.worlds import PX, chip_of, field_of, open_water, robot
 
@@ -39,14 +39,6 @@ def test_the_least_time_on_a_finer_grid_is_what_a_finer_grid_still_finds():
         ends = trip.ends("up")
         two, four = (best_time(world, world.field(0.9), *ends, SPEED_UM_S, finer)[0] for finer in (2, 4))
         assert four == pytest.approx(two, rel=0.02)
-
-
-def test_a_magnified_world_has_the_same_flow_and_the_same_times():
-    world, trip = next(drawn())
-    twice = magnified(world)
-    times = [FULL.plan(w.field(0.5), *trip.ends("down"), w.chip, w.robot).arrival_s[-1] for w in (world, twice)]
-    assert twice.chip.mask.shape == (256, 256)
-    assert times[1] == pytest.approx(times[0], rel=0.08)
 
 
 @pytest.mark.parametrize("flow", [(0.0, 0.0), (40.0, 30.0), (-60.0, 0.0)])

@@ -2,8 +2,7 @@ import json
 
 import pytest
 
-from flowrec.bench.cavity import cavity_case
-from flowrec.bench.cylinder import cylinder_case
+from flowrec.bench.published_flows import cavity_case, cylinder_case
 from flowrec.bench.solver import measure, show
 
 

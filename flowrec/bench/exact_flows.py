@@ -1,4 +1,4 @@
-"""Channels whose flow is known: straight along the pixels, straight at an angle to them, and around a bend."""
+"""Flows with an exact solution: a channel along the pixels, a channel at an angle to them, and a bend."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _UM_PER_PX, _SPEED_UM_S, _MARGIN_PX = 10.0, 100.0, 2
 
 
 def straight_case(width_px: int, k: int) -> dict[str, Any]:
-    """Errors of the profile (relative L2, pixel averages) and of the resistance 12 mu Q / w^3."""
+    """Errors of the profile (relative L2 norm of pixel averages) and of the resistance 12 mu Q / w^3."""
     length = 3 * width_px + 8
     mask = np.zeros((width_px + 2 * _MARGIN_PX, length), bool)
     mask[_MARGIN_PX:-_MARGIN_PX] = True
@@ -41,8 +41,8 @@ def straight_case(width_px: int, k: int) -> dict[str, Any]:
 def oblique_case(width_px: int, k: int, walls: Walls, angles_deg: tuple[float, ...]) -> dict[str, Any]:
     """Largest and mean absolute error of the resistance over angles between channel and pixels.
 
-    `undecided` is how far the resistances of all channels that would be drawn as the same mask lie from their middle:
-    a straight wall of slope p / q is known to 1 / (2 sqrt(p^2 + q^2)) pixels only.
+    `undecided` is half the range of the resistances of all channels with the same mask, which determines the position
+    of a straight wall of slope p / q only to 1 / (2 sqrt(p^2 + q^2)) pixels.
     """
     found = [_oblique(float(width_px), angle, k, walls) for angle in angles_deg]
     errors, undecided = [abs(error) for error, _ in found], [share for _, share in found]
@@ -58,7 +58,7 @@ def oblique_case(width_px: int, k: int, walls: Walls, angles_deg: tuple[float, .
 
 
 def bend_case(k: int) -> dict[str, Any]:
-    """Error of the resistance of a quarter of a ring whose walls are given as circles, not as a mask.
+    """Error of the resistance of a quarter of a ring whose walls are exact circles, not a mask.
 
     Stokes flow along circles: u = G / (2 mu) (r ln r + B r + C / r) for a pressure that grows by G per radian, with B
     and C such that u = 0 on both walls.
@@ -96,10 +96,10 @@ def _slope_pa_m(width_px: float) -> float:
 
 
 def _oblique(width: float, angle_deg: float, k: int, walls: Walls) -> tuple[float, float]:
-    """Relative error of the resistance of a channel that crosses the mask, and what the mask leaves open of it."""
+    """Relative error of the resistance of a channel across the mask, and how far the mask leaves it undetermined."""
     angle, length = np.radians(angle_deg), 80
     rows, columns = np.mgrid[: int(length * np.tan(angle)) + 24, :length].astype(float)
-    # Off the pixels' symmetry, as a real channel is.
+    # Not symmetric to the pixels, as in a real image.
     rows, columns = rows - rows.mean() + 0.27, columns - columns.mean() + 0.13
     across = rows * np.cos(angle) - columns * np.sin(angle)
     along = columns * np.cos(angle) + rows * np.sin(angle)
@@ -116,5 +116,5 @@ def _oblique(width: float, angle_deg: float, k: int, walls: Walls) -> tuple[floa
     inside, outside = across[mask], across[~mask]
     narrowest = inside.max() - inside.min()
     widest = outside[outside > inside.max()].min() - outside[outside < inside.min()].max()
-    # The resistance goes with the third power of the width.
+    # The resistance is proportional to the inverse third power of the width.
     return fall / _slope_pa_m(width) - 1.0, 1.5 * float(widest - narrowest) / width
