@@ -11,7 +11,6 @@ from mcap.records import ChunkIndex
 
 from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.store.codec import message_stamp
 from flowrec.store.digest import FileDigest
 from flowrec.store.mcap_format import Record
 from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
@@ -188,7 +187,7 @@ class _Reading:
                 fault = f"{BY_FIELD[name].path} in the chunk at byte {offset}: {wrong}"
                 found.first_undecodable = found.first_undecodable or fault
                 continue
-            stamp_ns = message_stamp(message)
+            stamp_ns = message.stamp_ns
             found.stamps_backwards[name] += stamp_ns < self._last_stamp_ns.get(name, stamp_ns)
             self._last_stamp_ns[name] = stamp_ns
             self._see(name, record.log_ns, message)

@@ -12,6 +12,8 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 import zstandard
@@ -21,8 +23,8 @@ from flowrec.errors import SessionError
 from flowrec.messages import Frame
 from flowrec.store.channels import FRAMES, GROUPS, SLOTS, STATE
 from flowrec.store.channels import VIEW as VIEW_GROUP
-from flowrec.store.codec import Payload, codec_of, encode_record, message_stamp
-from flowrec.store.digest import message_digest, sum_digests
+from flowrec.store.codec import Payload, codec_of, encode_record
+from flowrec.store.digest import message_digest
 from flowrec.store.frame_encodings import FrameEncoding
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGE_HEAD, RECORD_HEAD
 from flowrec.store.roi import WindowCutter
@@ -40,25 +42,17 @@ _MEMORY_BYTES = 1 << 18  # of a new chunk
 _REUSED_BYTES = 32 << 20  # larger memory is released after a chunk
 _LARGE_BYTES = 1 << 16  # numpy copies larger parts, because it releases the interpreter lock
 
+_size_of = attrgetter("size")
 Sink = Callable[[list["SealedChunk"]], None]
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelIndex:
-    """Where the messages of one channel are in a chunk: log time and offset in turn; and their digest (digest.py)."""
+class ChannelIndex(NamedTuple):
+    """The messages of one channel in a chunk: number, the sum of their digests and their MessageIndex record."""
 
     channel: int
-    entries: array[int]
+    messages: int
     digest: int
-
-    def __len__(self) -> int:
-        return len(self.entries) // 2
-
-    def record(self) -> bytes:
-        """As an MCAP MessageIndex; mcap's own takes 4 us for each message."""
-        data = np.array(self.entries, "<u8").tobytes()
-        body = _INDEX_HEAD.pack(self.channel, len(data)) + data
-        return RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body
+    record: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +90,7 @@ class ChunkBuilder:
         self.size = 0  # bytes before compression
         self._memory = bytearray(_MEMORY_BYTES)
         self._index: dict[int, array[int]] = {}
-        self._digests: dict[int, int] = {}
+        self._digests: Counter[int] = Counter()
         self._first_ns = self._last_ns = 0
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL) if compressed else None
 
@@ -108,7 +102,7 @@ class ChunkBuilder:
         index = self._index.get(channel)
         if index is None:
             index = self._index[channel] = array("Q")
-        index.extend((log_ns, self.size))
+        index.extend((log_ns, self.size))  # as in a MessageIndex
         body_at = self.size + RECORD_HEAD.size
         payload_at = body_at + MESSAGE_HEAD.size
         end = payload_at + sum(map(len, payload))
@@ -126,8 +120,7 @@ class ChunkBuilder:
             else:
                 np.copyto(np.frombuffer(self._memory, np.uint8, len(part), at), np.frombuffer(part, np.uint8))
             at += len(part)
-        digest = message_digest(sequence, log_ns, memoryview(self._memory)[payload_at:end])
-        self._digests[channel] = sum_digests(self._digests.get(channel, 0), digest)
+        self._digests[channel] += message_digest(sequence, log_ns, memoryview(self._memory)[payload_at:end])
         self.size = end
 
     def seal(self) -> SealedChunk:
@@ -141,13 +134,21 @@ class ChunkBuilder:
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=self.size,
             indexes=[
-                ChannelIndex(channel, entries, self._digests[channel]) for channel, entries in self._index.items()
+                ChannelIndex(channel, len(entries) // 2, self._digests[channel], _index_record(channel, entries))
+                for channel, entries in self._index.items()
             ],
         )
-        self.size, self._index, self._digests = 0, {}, {}
+        self.size, self._index, self._digests = 0, {}, Counter()
         if len(self._memory) > _REUSED_BYTES and self._compressor:
             self._memory = bytearray(_MEMORY_BYTES)  # a flow field comes once a minute
         return chunk
+
+
+def _index_record(channel: int, entries: array[int]) -> bytes:
+    """An MCAP MessageIndex; mcap's own takes 4 us for each message."""
+    data = np.array(entries, "<u8").tobytes()
+    body = _INDEX_HEAD.pack(channel, len(data)) + data
+    return RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body
 
 
 class ChunkEncoder:
@@ -179,7 +180,7 @@ class ChunkEncoder:
     @property
     def size(self) -> int:
         """Bytes in chunks that are not sealed yet, before compression."""
-        return sum(builder.size for builder in self._builders.values())
+        return sum(map(_size_of, self._builders.values()))
 
     def add(self, entry: Entry) -> None:
         """Encode the messages of one tick; hand on the chunks that are full.
@@ -196,7 +197,7 @@ class ChunkEncoder:
             else:
                 codec = codec_of(type(message))
             sequence, payload = encode_record(message, codec, self._start_unix_ns)
-            self._append(BY_FIELD[field].path, entry.stamp_ns, message_stamp(message), payload, sequence)
+            self._append(BY_FIELD[field].path, entry.stamp_ns, message.stamp_ns, payload, sequence)
         for path, stamp_ns, payload in self._views.of(entry.messages):
             self._append(path, entry.stamp_ns, stamp_ns, payload, None)
         full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]

@@ -14,13 +14,13 @@ import math
 import operator
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from flowrec.declarations import Message, MessageField, message_fields
+from flowrec.declarations import MessageField, message_fields
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
 from flowrec.store.schema import ARRAY_DATA, Schema, array_schema, foxglove_schema, schema_of
@@ -28,7 +28,6 @@ from flowrec.units import NS_PER_S
 
 Payload = tuple[bytes | memoryview, ...]
 
-_M = TypeVar("_M", bound=Message)
 _UNCOPIED_BYTES = 1 << 14  # a larger array bypasses protobuf when it is written
 _LARGE_BYTES = 1 << 16  # in a larger message arrays bypass protobuf when it is read
 _FIELDS_LIMIT = 64  # a message with more fields is left to protobuf as a whole
@@ -43,10 +42,6 @@ _EVENT_NAME = "flowrec"
 _OPERATOR_NAME = "operator."
 
 
-def _no_sequence(_message: Any) -> None:
-    return None
-
-
 @dataclass(frozen=True, slots=True)
 class Codec:
     """How one message type is stored.
@@ -56,18 +51,15 @@ class Codec:
     schema : protobuf schema of the payload.
     encode : message -> parts of the payload, in order; large arrays are not copied.
     decode : payload, MCAP sequence -> message.
-    sequence : message -> the MCAP sequence that it must have; None where the writer counts.
+    sequence : message -> the MCAP sequence that it must have; None: the writer counts.
+    has_unix_time : the schema is one of foxglove's, whose `timestamp` is Unix time; flowrec's own have stamps.
     """
 
     schema: Schema
     encode: Callable[[Any], Payload]
     decode: Callable[[bytes | memoryview, int], Any]
-    sequence: Callable[[Any], int | None] = _no_sequence
-
-    @property
-    def has_unix_time(self) -> bool:
-        """Whether the schema is one of foxglove's, whose `timestamp` is Unix time."""
-        return self.schema.name.startswith("foxglove.")
+    sequence: Callable[[Any], int] | None = None
+    has_unix_time: bool = False
 
 
 _CODECS: dict[type[Any], Codec] = {}
@@ -90,32 +82,31 @@ def codec_of(message_type: type[Any]) -> Codec:
     return codec
 
 
-def encode_record(message: Message, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
+def encode_record(message: Any, codec: Codec, start_unix_ns: int = 0) -> tuple[int | None, Payload]:
     """The MCAP sequence that a message must have, if any, and the parts of its payload.
 
-    `start_unix_ns` is the Unix time at which the session clock is 0: foxglove's schemas hold Unix time, flowrec's own
-    the session clock.
+    `start_unix_ns` is the Unix time at which the session clock is 0.
 
     Raises
     ------
     SessionError : a value does not fit the message's declaration, such as an int beyond 64 bit.
     """
     if start_unix_ns and codec.has_unix_time:
-        message = replace(message, stamp_ns=message_stamp(message) + start_unix_ns)  # type: ignore[type-var]
+        message = replace(message, stamp_ns=message.stamp_ns + start_unix_ns)
     try:
+        sequence = codec.sequence(message) if codec.sequence is not None else None
         try:
-            return codec.sequence(message), codec.encode(message)
+            return sequence, codec.encode(message)
         except UnicodeEncodeError:
             # A lone surrogate from a terminal must not end a run: it is stored as an escape sequence.
-            return codec.sequence(message), codec.encode(_without_surrogates(message))
+            return sequence, codec.encode(_without_surrogates(message))
     except (TypeError, ValueError, OverflowError) as error:
-        kind, stamp_ns = type(message).__name__, message_stamp(message)
-        raise SessionError(f"a {kind} at {stamp_ns} ns can not be stored: {error}") from error
+        raise SessionError(f"a {type(message).__name__} at {message.stamp_ns} ns can not be stored: {error}") from error
 
 
 def decode(
-    message_type: type[_M], codec: Codec, payload: bytes | memoryview, sequence: int = 0, start_unix_ns: int = 0
-) -> _M:
+    message_type: type[Any], codec: Codec, payload: bytes | memoryview, sequence: int = 0, start_unix_ns: int = 0
+) -> Any:
     """One message from its payload.
 
     Parameters
@@ -129,18 +120,12 @@ def decode(
     SessionError : the payload is no such message.
     """
     try:
-        message: _M = codec.decode(payload, sequence)
+        message = codec.decode(payload, sequence)
         if start_unix_ns and codec.has_unix_time:
-            message = replace(message, stamp_ns=message_stamp(message) - start_unix_ns)  # type: ignore[type-var]
+            message = replace(message, stamp_ns=message.stamp_ns - start_unix_ns)
     except (DecodeError, ValueError, TypeError, OverflowError) as error:
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
     return message
-
-
-def message_stamp(message: Message) -> int:
-    """The stamp that every message type has, in ns."""
-    stamp: int = message.stamp_ns  # type: ignore[attr-defined]
-    return stamp
 
 
 def timestamp(stamp_ns: int) -> dict[str, int]:
@@ -188,7 +173,7 @@ def detached(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int,
     return {number: memoryview(bytes(view)) if copy else view for number, view in fields.items()}
 
 
-def _without_surrogates(message: _M) -> _M:
+def _without_surrogates(message: Any) -> Any:
     changes = {}
     for form in message_fields(type(message)):
         value = getattr(message, form.name)
@@ -308,7 +293,7 @@ def _event_codec() -> Codec:
             level = parsed.name.removeprefix(f"{_EVENT_NAME}.")
         return Event(stamp_of(parsed), level, parsed.message)
 
-    return Codec(schema, encode, decode)
+    return Codec(schema, encode, decode, has_unix_time=True)
 
 
 def _operator_codec() -> Codec:
@@ -324,7 +309,7 @@ def _operator_codec() -> Codec:
         action = parsed.name.removeprefix(_OPERATOR_NAME)
         return OperatorEvent(stamp_of(parsed), action, parsed.message.removeprefix(f"{action}: "))
 
-    return Codec(schema, encode, decode)
+    return Codec(schema, encode, decode, has_unix_time=True)
 
 
 def _log(schema: Schema, stamp_ns: int, level: int, text: str, name: str) -> Payload:

@@ -34,14 +34,14 @@ _FAULTS_LIMIT, _TEXT_LIMIT = 40, 200  # a made-up file may name any number of to
 
 
 def message_digest(sequence: int, log_ns: int, payload: bytes | memoryview) -> int:
-    """What one message adds to the digest of its topic; `log_ns` as in the file."""
+    """What one message adds to the sum of its topic; `log_ns` as in the file."""
     hashed = hashlib.sha256(_MESSAGE.pack(sequence, log_ns))
     hashed.update(payload if len(payload) < _LARGE_BYTES else _LARGE.pack(len(payload), zlib.crc32(payload)))
     return int.from_bytes(hashed.digest(), "little")
 
 
 def head_digest(record: Metadata | Attachment) -> int:
-    """What one record outside the chunks adds to the digest of the head; 0 where it is none of flowrec's."""
+    """What one record outside the chunks adds to the sum of the head; 0 where it is none of flowrec's."""
     if isinstance(record, Metadata):
         if record.name == DIGEST or not record.name.startswith(_PREFIX):
             return 0
@@ -54,15 +54,18 @@ def head_digest(record: Metadata | Attachment) -> int:
     return int.from_bytes(hashed.digest(), "little")
 
 
-def sum_digests(*digests: int) -> int:
-    """The digest of several things together."""
-    return sum(digests) % _MODULUS
-
-
 def digest_record(head: int, topics: Iterable[tuple[str, int, int]]) -> Metadata:
-    """The record of a file's digest: of its head, and name, number of messages and digest of each topic."""
-    of_topics = {topic: f"{count} {digest:064x}" for topic, count, digest in topics if count}
-    return Metadata(DIGEST, {_HEAD: f"{head:064x}", **of_topics})
+    """The record of a file's digest: sum of its head, and name, number of messages and sum of each topic."""
+    of_topics = {topic: _topic_text(count, total) for topic, count, total in topics if count}
+    return Metadata(DIGEST, {_HEAD: _text(head), **of_topics})
+
+
+def _text(total: int) -> str:
+    return f"{total % _MODULUS:064x}"
+
+
+def _topic_text(count: int, total: int) -> str:
+    return f"{count} {_text(total)}" if count else "0"
 
 
 @dataclass(slots=True)
@@ -81,8 +84,8 @@ class FileDigest:
         for record in records:
             assert isinstance(record.payload, memoryview)
             self.counts[record.channel] += 1
-            digest = message_digest(record.sequence, record.log_ns + self.start_unix_ns, record.payload)
-            self.sums[record.channel] = sum_digests(self.sums[record.channel], digest)
+            log_ns = record.log_ns + self.start_unix_ns
+            self.sums[record.channel] += message_digest(record.sequence, log_ns, record.payload)
 
     def faults(self, file: SessionMetadata) -> list[str] | None:
         """What differs from the digest that a finished file contains, as text without advice; None: it contains none.
@@ -93,24 +96,23 @@ class FileDigest:
         if recorded is None:
             # Files of the first release have neither a digest nor a start.
             return ["the digest that was recorded is missing"] if self.start_unix_ns and file.outcome else None
-        found: dict[str, tuple[int, int]] = {}
-        # The channels of flowrec have a role.
+        counts: Counter[str] = Counter()
+        sums: Counter[str] = Counter()
         ours: set[str] = set()
         for number, channel in file.channels.items():
-            count, total = found.get(channel.topic, (0, 0))
-            count, total = count + self.counts[number], sum_digests(total, self.sums[number])
-            found[channel.topic] = count, total
-            if "role" in channel.metadata:
+            counts[channel.topic] += self.counts[number]
+            sums[channel.topic] += self.sums[number]
+            if "role" in channel.metadata:  # flowrec has declared it
                 ours.add(channel.topic)
         faults = []
         if not _head_matches(file, recorded.get(_HEAD)):
             faults.append("configuration, chip, origin or outcome are not those that were recorded")
-        for topic in sorted((recorded.keys() | {topic for topic in ours if found[topic][0]}) - {_HEAD}):
-            count, total = found.get(topic, (0, 0))
-            if recorded.get(topic, "0") == (f"{count} {total:064x}" if count else "0"):
+        for topic in sorted((recorded.keys() | {topic for topic in ours if counts[topic]}) - {_HEAD}):
+            expected, found = recorded.get(topic, "0"), _topic_text(counts[topic], sums[topic])
+            if found == expected:
                 continue
-            expected = recorded.get(topic, "0").split(" ")[0]
-            numbers = f", {count} where {expected} were recorded" if expected != str(count) else ""
+            count, expected_count = found.split(" ")[0], expected.split(" ")[0]
+            numbers = f", {count} where {expected_count} were recorded" if expected_count != count else ""
             faults.append(printable(f"the messages of {topic} are not those that were recorded{numbers}"[:_TEXT_LIMIT]))
         more = len(faults) - _FAULTS_LIMIT
         return faults if more <= 0 else [*faults[:_FAULTS_LIMIT], f"and so on, {more} more"]
@@ -120,10 +122,10 @@ def _head_matches(file: SessionMetadata, recorded: str | None) -> bool:
     total = 0
     try:
         for index in file.metadata:
-            total = sum_digests(total, head_digest(Metadata(index.name, file.source.metadata(index))))
+            total += head_digest(Metadata(index.name, file.source.metadata(index)))
         for place in file.attachments:
             if is_header_file(place.name):
-                total = sum_digests(total, head_digest(file.source.attachment_at(place.offset, place.length)))
+                total += head_digest(file.source.attachment_at(place.offset, place.length))
     except SessionError:  # damage, of which the reader says more
         return False
-    return recorded == f"{total:064x}"
+    return recorded == _text(total)

@@ -22,9 +22,9 @@ from flowrec.store.image_codec import PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.schema_check import SessionContents
+from flowrec.store.write_queue import NewMessages
 from flowrec.topics import BY_FIELD
 
-NewMessages = dict[str, Any]  # by field of Tick
 Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 _CACHED_MESSAGES = 64  # of restored states
 _STATE_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
@@ -115,7 +115,7 @@ class FileReader:
         """Close the file; forgotten readers close it when they are collected."""
         self._source.close()
 
-    def _message(self, record: Record) -> Message | None:
+    def _message(self, record: Record) -> Any:
         if isinstance(record.payload, Message):
             return record.payload
         try:
@@ -139,11 +139,10 @@ class FileReader:
             frame = self.contents.decode(record)
         except SessionError:
             return record
-        assert isinstance(frame, Frame)
         sound = not shape_error(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
         return record._replace(payload=frame) if sound else record
 
-    def _restored(self, record: Record) -> Message | None:
+    def _restored(self, record: Record) -> Any:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (self.path, record.channel, record.log_ns)
         message = self._cache.pop(key, None) or self._message(record)

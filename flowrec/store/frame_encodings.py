@@ -74,7 +74,7 @@ def _raw_image() -> Codec:
             raise ValueError(f"an image of {shape[1]} x {shape[0]} {parsed.encoding!r} in {len(data)} bytes")
         return Frame(stamp_of(parsed), sequence, np.frombuffer(data, np.uint8).reshape(shape))
 
-    return Codec(schema, encode, decode, _sequence)
+    return Codec(schema, encode, decode, _sequence, has_unix_time=True)
 
 
 def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> Codec:
@@ -92,7 +92,7 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
         parsed = schema.wire.FromString(rest)
         return Frame(stamp_of(parsed), sequence, decode_image(found.get(_COMPRESSED_IMAGE_DATA, parsed.data)))
 
-    return Codec(schema, encode, decode, _sequence)
+    return Codec(schema, encode, decode, _sequence, has_unix_time=True)
 
 
 def _shape(frame: Frame) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -63,6 +63,20 @@ class Summary:
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     statistics: Statistics | None = None
+
+    def count(self, counts: Mapping[int, int], chunks: int, first_ns: int, last_ns: int) -> None:
+        """Set the statistics: messages by channel, number of chunks and their times."""
+        self.statistics = Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(counts),
+            chunk_count=chunks,
+            message_count=sum(counts.values()),
+            message_end_time=last_ns,
+            message_start_time=first_ns,
+            metadata_count=len(self.metadata),
+            schema_count=len(self.schemas),
+        )
 
     def to_session_clock(self, start_unix_ns: int) -> None:
         """Turn the Unix times of the chunks into stamps of a session that started at `start_unix_ns`.

@@ -29,12 +29,11 @@ from mcap.records import (
     Metadata,
     MetadataIndex,
     Schema,
-    Statistics,
     SummaryOffset,
 )
 
-from flowrec.store.digest import digest_record, head_digest, sum_digests
-from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, bytes_of
+from flowrec.store.digest import digest_record, head_digest
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, Summary, bytes_of
 from flowrec.system.locks import open_new
 
 if TYPE_CHECKING:
@@ -56,10 +55,7 @@ class McapWriter:
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self.size = 0
         self._crc = 0
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
-        self._attachments: list[AttachmentIndex] = []
-        self._metadata: list[MetadataIndex] = []
+        self._summary = Summary()
         self._chunks = bytearray()  # their indexes as in the summary: a long run has millions
         self._chunk_count = 0
         self._counts: Counter[int] = Counter()
@@ -76,22 +72,25 @@ class McapWriter:
         """Write a record outside the chunks."""
         data = bytes_of(record)
         if isinstance(record, Schema):
-            self._schemas.append(record)
+            self._summary.schemas[record.id] = record
         elif isinstance(record, Channel):
-            self._channels.append(record)
+            self._summary.channels[record.id] = record
         else:
             if isinstance(record, Metadata):
-                self._metadata.append(MetadataIndex(self.size, len(data), record.name))
+                self._summary.metadata.append(MetadataIndex(self.size, len(data), record.name))
             else:
                 times, size = (record.log_time, record.create_time), len(record.data)
                 place = AttachmentIndex(self.size, len(data), *times, size, record.name, record.media_type)
-                self._attachments.append(place)
-            self._head_digest = sum_digests(self._head_digest, head_digest(record))
+                self._summary.attachments.append(place)
+            self._head_digest += head_digest(record)
         self._append(data)
 
     def add_digest(self) -> None:
         """Write the digest of all that was added; it is the last metadata record."""
-        topics = [(channel.topic, self._counts[channel.id], self._digests[channel.id]) for channel in self._channels]
+        topics = [
+            (channel.topic, self._counts[channel.id], self._digests[channel.id])
+            for channel in self._summary.channels.values()
+        ]
         self.add(digest_record(self._head_digest, topics))
 
     def add_chunks(self, chunks: Iterable[SealedChunk]) -> None:
@@ -105,11 +104,11 @@ class McapWriter:
             length, offsets = len(head) + len(chunk.data), {}
             at += length
             for index in chunk.indexes:
-                buffers.append(index.record())
+                buffers.append(index.record)
                 offsets[index.channel] = at
-                at += len(buffers[-1])
-                self._counts[index.channel] += len(index)
-                self._digests[index.channel] = sum_digests(self._digests[index.channel], index.digest)
+                at += len(index.record)
+                self._counts[index.channel] += index.messages
+                self._digests[index.channel] += index.digest
             first_ns, last_ns = chunk.message_start_time, chunk.message_end_time
             self._chunks += bytes_of(
                 ChunkIndex(
@@ -133,25 +132,17 @@ class McapWriter:
         """Write data end, summary and footer; then the file is complete."""
         self._append(bytes_of(DataEnd(data_section_crc=self._crc)))
         start = self.size
-        statistics = Statistics(
-            attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
-            channel_message_counts=self._counts,
-            chunk_count=self._chunk_count,
-            message_count=self._counts.total(),
-            message_end_time=self._last_ns,
-            message_start_time=self._first_ns,
-            metadata_count=len(self._metadata),
-            schema_count=len(self._schemas),
-        )
+        listed = self._summary
+        listed.count(self._counts, self._chunk_count, self._first_ns, self._last_ns)
+        assert listed.statistics is not None
         summary, offsets = bytearray(), bytearray()
         for opcode, group in (
-            (Opcode.SCHEMA, bytes_of(*self._schemas)),
-            (Opcode.CHANNEL, bytes_of(*self._channels)),
-            (Opcode.STATISTICS, bytes_of(statistics)),
+            (Opcode.SCHEMA, bytes_of(*listed.schemas.values())),
+            (Opcode.CHANNEL, bytes_of(*listed.channels.values())),
+            (Opcode.STATISTICS, bytes_of(listed.statistics)),
             (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, bytes_of(*self._attachments)),
-            (Opcode.METADATA_INDEX, bytes_of(*self._metadata)),
+            (Opcode.ATTACHMENT_INDEX, bytes_of(*listed.attachments)),
+            (Opcode.METADATA_INDEX, bytes_of(*listed.metadata)),
         ):
             if group:
                 offsets += bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema
 
 from flowrec.errors import SessionError
 from flowrec.store.mcap_format import (
@@ -78,13 +78,11 @@ class Scan:
             if opcode == Opcode.CHUNK:
                 self._add_chunk(source, visit, offset, length)
             elif opcode == Opcode.SCHEMA:
-                schema: Schema = source.record(offset, length, Opcode.SCHEMA, Schema.read)
                 with source.parsing(offset):
-                    declare(self.summary.schemas, schema)
+                    declare(self.summary.schemas, source.record(offset, length, Opcode.SCHEMA, Schema.read))
             elif opcode == Opcode.CHANNEL:
-                channel: Channel = source.record(offset, length, Opcode.CHANNEL, Channel.read)
                 with source.parsing(offset):
-                    declare(self.summary.channels, channel)
+                    declare(self.summary.channels, source.record(offset, length, Opcode.CHANNEL, Channel.read))
             elif opcode == Opcode.METADATA:
                 metadata: Metadata = source.record(offset, length, Opcode.METADATA, Metadata.read)
                 self.summary.metadata.append(MetadataIndex(offset, length, metadata.name))
@@ -119,17 +117,9 @@ class Scan:
         for channel in list(summary.channels.values()):
             if channel.schema_id not in summary.schemas:
                 del summary.channels[channel.id]
-        summary.statistics = Statistics(
-            attachment_count=len(summary.attachments),
-            channel_count=len(summary.channels),
-            channel_message_counts=self.counts,
-            chunk_count=len(summary.chunks),
-            message_count=self.counts.total(),
-            message_end_time=max((chunk.message_end_time for chunk in summary.chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in summary.chunks), default=0),
-            metadata_count=len(summary.metadata),
-            schema_count=len(summary.schemas),
-        )
+        first_ns = min((chunk.message_start_time for chunk in summary.chunks), default=0)
+        last_ns = max((chunk.message_end_time for chunk in summary.chunks), default=0)
+        summary.count(self.counts, len(summary.chunks), first_ns, last_ns)
 
     def _add_chunk(self, source: McapReader, visit: Visit | None, offset: int, length: int) -> None:
         content = source.content(offset, length)

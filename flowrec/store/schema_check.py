@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Any
 
 from google.protobuf import descriptor_pb2
 
-from flowrec.declarations import Message, defaulted_fields
+from flowrec.declarations import defaulted_fields
 from flowrec.errors import SessionError
 from flowrec.store.channels import FRAME_PATH, message_codec
 from flowrec.store.codec import Codec, decode
@@ -44,7 +45,7 @@ class SessionContents(SessionMetadata):
                 self.frame_encoding = channel.metadata.get("encoding", "")
                 self.region = region_from(channel.metadata)
 
-    def decode(self, record: Record) -> Message:
+    def decode(self, record: Record) -> Any:
         """The message in a record of a known topic.
 
         Raises

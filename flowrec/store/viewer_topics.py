@@ -24,12 +24,11 @@ from flowrec.store.codec import Payload, byte_field_head, timestamp
 from flowrec.store.schema import foxglove_schema
 from flowrec.units import NS_PER_S
 
-_UINT8, _FLOAT32 = 1, 7  # foxglove.PackedElementField.NumericType
+_GRID_DATA = 9  # number of the field that holds the values
 # The robot is drawn as a ring: a single point of Rerun's default size is hidden by the path.
 _RING_POINTS, _RING_UM = 24, 60.0
 _RING_RGBA = (255, 64, 32, 255)
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
-_COLOURS = ("red", "green", "blue", "alpha")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +40,14 @@ class ViewerTopic:
     path, schema : of the topic; the schema is one of foxglove's.
     input : what it is derived from: robot, route, assumed or refined.
     source : the same, in words, for the channel's metadata.
-    make : message, Unix time in ns, highest speed of the colour scale in um/s -> payload.
+    make : message, highest speed of the colour scale in um/s -> payload without its timestamp.
     """
 
     path: str
     schema: str
     input: str
     source: str
-    make: Callable[[Any, int, float], Payload]
+    make: Callable[[Any, float], Payload]
 
 
 class ViewerTopics:
@@ -78,8 +77,9 @@ class ViewerTopics:
                 if view.input == source:
                     # Numbers that can not be drawn are no error here.
                     with np.errstate(all="ignore"):
-                        payload = view.make(message, message.stamp_ns + self._start_unix_ns, self.top_um_s or 1.0)
-                    yield view.path, message.stamp_ns, payload
+                        payload = view.make(message, self.top_um_s or 1.0)
+                    stamp_ns = message.stamp_ns
+                    yield view.path, stamp_ns, (_timestamp(stamp_ns + self._start_unix_ns), *payload)
 
     def _inputs(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, Estimate | Track | Route | FlowField]]:
         robot = messages.get("estimate") or messages.get("track")
@@ -97,70 +97,60 @@ class ViewerTopics:
                 yield name, field
 
 
-def _serialized(name: str, **values: Any) -> bytes:
-    data: bytes = foxglove_schema(name).wire(**values).SerializeToString()
-    return data
-
-
-@functools.lru_cache(maxsize=4)  # both views of the robot are of the same moment
+@functools.lru_cache(maxsize=4)  # several views are of the same moment
 def _timestamp(unix_ns: int) -> bytes:
-    """The field `timestamp`, which has the same number in PoseInFrame and PointCloud."""
-    return _serialized("PoseInFrame", timestamp=timestamp(unix_ns))
+    """The field `timestamp`, which has the same number in all schemas; foxglove's class refuses times out of range."""
+    data: bytes = foxglove_schema("PoseInFrame").wire(timestamp=timestamp(unix_ns)).SerializeToString()
+    return data
 
 
 def _pose(x_um: float, y_um: float) -> fg.Pose:
     return fg.Pose(position=fg.Vector3(x=x_um, y=y_um, z=0.0), orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
 
 
-def _robot_pose(robot: Estimate | Track, unix_ns: int, _top_um_s: float) -> Payload:
-    x_um, y_um = robot.position_um.tolist()
-    return (_timestamp(unix_ns), fg.PoseInFrame(pose=_pose(x_um, y_um)).encode())
+def _robot_pose(robot: Estimate | Track, _top_um_s: float) -> Payload:
+    return (fg.PoseInFrame(pose=_pose(float(robot.position_um[0]), float(robot.position_um[1]))).encode(),)
 
 
-def _robot_ring(robot: Estimate | Track, unix_ns: int, top_um_s: float) -> Payload:
+def _robot_ring(robot: Estimate | Track, top_um_s: float) -> Payload:
     # `pose` has the same number in both schemas, and protobuf merges messages that follow each other.
-    return (*_robot_pose(robot, unix_ns, top_um_s), _ring())
+    return (*_robot_pose(robot, top_um_s), _ring())
 
 
 @functools.cache
 def _ring() -> bytes:
     """The points about the robot; the first one is the robot itself."""
-    colours = [{"name": name, "offset": 12 + place, "type": _UINT8} for place, name in enumerate(_COLOURS)]
     angle = np.arange(_RING_POINTS) * (2.0 * np.pi / _RING_POINTS)
     points = np.zeros(1 + _RING_POINTS, [("at", "<f4", 3), ("colour", "u1", 4)])
     points["at"][1:, 0], points["at"][1:, 1] = _RING_UM * np.cos(angle), _RING_UM * np.sin(angle)
     points["colour"] = _RING_RGBA
+    colours = [
+        fg.PackedElementField(name=name, offset=12 + place, type=fg.PackedElementFieldNumericType.Uint8)
+        for place, name in enumerate(("red", "green", "blue", "alpha"))
+    ]
     fields = _float_fields("x", "y", "z") + colours
-    return _serialized("PointCloud", point_stride=points.itemsize, fields=fields, data=points.tobytes())
+    return fg.PointCloud(point_stride=points.itemsize, fields=fields, data=points.tobytes()).encode()
 
 
-def _path(route: Route, unix_ns: int, _top_um_s: float) -> Payload:
-    poses = [_pose(x, y) for x, y in route.waypoints_um.tolist()]
-    return (_serialized("PosesInFrame", timestamp=timestamp(unix_ns)), fg.PosesInFrame(poses=poses).encode())
+def _path(route: Route, _top_um_s: float) -> Payload:
+    return (fg.PosesInFrame(poses=[_pose(x, y) for x, y in route.waypoints_um.tolist()]).encode(),)
 
 
-def _path_points(route: Route, unix_ns: int, _top_um_s: float) -> Payload:
+def _path_points(route: Route, _top_um_s: float) -> Payload:
     points = np.zeros((len(route.waypoints_um), 3), "<f4")
     points[:, :2] = route.waypoints_um
-    return _with_data(
-        "PointCloud",
-        points,
-        timestamp=timestamp(unix_ns),
-        pose=_pose_fields(0.0),
-        point_stride=12,
-        fields=_float_fields("x", "y", "z"),
-    )
+    fields, data = _float_fields("x", "y", "z"), points.tobytes()
+    return (fg.PointCloud(pose=_pose(0.0, 0.0), point_stride=12, fields=fields, data=data).encode(),)
 
 
-def _preview(field: FlowField, unix_ns: int, top_um_s: float) -> Payload:
+def _preview(field: FlowField, top_um_s: float) -> Payload:
     speed = _speed_um_s(field)
     solid = speed == 0.0
     speed *= 255.0 / top_um_s
     grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
     colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
     colours[solid] = 0
-    png = cv2.imencode(".png", colours)[1]
-    return _with_data("CompressedImage", png, timestamp=timestamp(unix_ns), format="png")
+    return (fg.CompressedImage(data=cv2.imencode(".png", colours)[1].tobytes(), format="png").encode(),)
 
 
 def _speed_um_s(field: FlowField) -> NDArray[np.float32]:
@@ -171,34 +161,24 @@ def _speed_um_s(field: FlowField) -> NDArray[np.float32]:
     return speed
 
 
-def _grid(field: FlowField, unix_ns: int, _top_um_s: float) -> Payload:
+def _grid(field: FlowField, _top_um_s: float) -> Payload:
     width, size_um = field.velocity_um_s.shape[1], field.um_per_px
-    return _with_data(
-        "Grid",
-        np.ascontiguousarray(field.velocity_um_s, "<f4"),
-        timestamp=timestamp(unix_ns),
-        pose=_pose_fields(-0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
+    grid = fg.Grid(
+        pose=_pose(-0.5 * size_um, -0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
         column_count=width,
-        cell_size={"x": size_um, "y": size_um},
+        cell_size=fg.Vector2(x=size_um, y=size_um),
         row_stride=8 * width,
         cell_stride=8,
         fields=_float_fields("vx", "vy"),
     )
+    # Fields are large: the values follow uncopied.
+    data = field.velocity_um_s.astype("<f4", copy=False).reshape(-1).view(np.uint8).data
+    return (grid.encode() + byte_field_head(_GRID_DATA, len(data)), data)
 
 
-def _pose_fields(xy_um: float) -> dict[str, dict[str, float]]:
-    return {"position": {"x": xy_um, "y": xy_um}, "orientation": {"w": 1.0}}
-
-
-def _with_data(name: str, data: NDArray[Any], **values: Any) -> Payload:
-    """A message with a field `data` that is not copied: protobuf makes three copies, and fields are large."""
-    view = data.reshape(-1).view(np.uint8).data
-    number = foxglove_schema(name).wire.DESCRIPTOR.fields_by_name["data"].number
-    return (_serialized(name, **values) + byte_field_head(number, len(view)), view)
-
-
-def _float_fields(*names: str) -> list[dict[str, Any]]:
-    return [{"name": name, "offset": 4 * place, "type": _FLOAT32} for place, name in enumerate(names)]
+def _float_fields(*names: str) -> list[fg.PackedElementField]:
+    float32 = fg.PackedElementFieldNumericType.Float32
+    return [fg.PackedElementField(name=name, offset=4 * place, type=float32) for place, name in enumerate(names)]
 
 
 VIEWER_TOPICS = (

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from flowrec.declarations import Message
 from flowrec.store.roi import Window
 from flowrec.units import NS_PER_S
 
-NewMessages = dict[str, Message]  # the new messages of one tick by field of Tick, in the order of the topic table
+NewMessages = dict[str, Any]  # the new messages of one tick by field of Tick, in the order of the topic table
 
 # One in 2, 4, 8 and 16 images is kept when the queue is filled to these ratios.
 _DECIMATE_ABOVE = (0.5, 0.625, 0.75, 0.875)
@@ -56,7 +55,7 @@ class WriteQueue:
         self._changed = threading.Condition()
         self._closed = self._abandoned = False
         self._flushed_ns = -1
-        self._flush_wanted = False
+        self.flush_wanted = False  # somebody waits for a flush
 
     @property
     def fill(self) -> float:
@@ -76,20 +75,15 @@ class WriteQueue:
         """Block until the operating system has the ticks up to a stamp, or until the queue is abandoned."""
         with self._changed:
             if self._flushed_ns < stamp_ns:
-                self._flush_wanted = True
+                self.flush_wanted = True
                 self._changed.notify_all()
                 self._changed.wait_for(lambda: self._abandoned or self._flushed_ns >= stamp_ns)
-
-    @property
-    def flush_wanted(self) -> bool:
-        """Whether somebody waits for that."""
-        return self._flush_wanted
 
     def flushed(self, stamp_ns: int) -> None:
         """Note that the operating system has the ticks up to a stamp."""
         if stamp_ns > self._flushed_ns:  # set by this thread alone
             with self._changed:
-                self._flushed_ns, self._flush_wanted = stamp_ns, False
+                self._flushed_ns, self.flush_wanted = stamp_ns, False
                 self._changed.notify_all()
 
     def put(self, entry: Entry, image: Entry | None = None) -> None:
@@ -105,7 +99,7 @@ class WriteQueue:
     def take(self, timeout_s: float | None) -> Entry | None:
         """The next entry; None after the timeout, when all is taken and a flush is wanted, or at the end."""
         with self._changed:
-            self._changed.wait_for(lambda: self._state or self._images or self._closed or self._flush_wanted, timeout_s)
+            self._changed.wait_for(lambda: self._state or self._images or self._closed or self.flush_wanted, timeout_s)
             lane = self._state or self._images
             return lane.popleft() if lane else None
 
