@@ -1,6 +1,7 @@
 """Trained weights: damaged files, what they are worth, and their name in a session."""
 
 import pickle
+from pathlib import Path
 
 import pytest
 import torch
@@ -64,3 +65,15 @@ def test_a_session_names_the_weights_that_its_flow_came_from(twin):
 
     assert facts("refine.pi_unet.start=fvm")["weights.pi_unet"] == weights.sha256(weights.SHIPPED["vessels"])
     assert "weights.pi_unet" not in facts("refine.pi_unet.weights=none", "refine.pi_unet.start=fvm")
+
+
+def test_weights_that_are_a_pickle_are_refused_unopened(tmp_path):
+    class Harm:
+        def __reduce__(self):
+            return (Path.touch, (tmp_path / "owned",))
+
+    path = tmp_path / "weights.safetensors"
+    path.write_bytes(pickle.dumps(Harm()))
+    with pytest.raises(FlowError, match="not a sound safetensors file"):
+        weights.read_weights(path, None)
+    assert not (tmp_path / "owned").exists()

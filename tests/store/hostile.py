@@ -1,0 +1,91 @@
+"""What the tests of made-up files share: a small session put together wrongly, with every checksum right."""
+
+import struct
+import zlib
+from dataclasses import replace
+
+import pytest
+
+from flowrec.errors import SessionError, printable
+from flowrec.store import SessionReader, recover
+from flowrec.store.channels import SLOTS
+from tests.store.drafts import (
+    small_draft,
+    text,
+)
+
+_CHUNK_OPCODE = 6
+
+
+DRAFT = small_draft()
+
+
+STATE = SLOTS["/robot/estimate"].channel
+
+
+FRAMES = SLOTS["/camera/frame"].channel
+
+
+def file_of(tmp_path, draft):
+    path = tmp_path / "hostile.mcap"
+    path.write_bytes(draft.build())
+    return path
+
+
+def refused(path, match):
+    """Reading says so in one line."""
+
+    def read():
+        with SessionReader(path) as reader:
+            _ = reader.header
+            for _tick in reader.ticks():
+                pass
+
+    with pytest.raises(SessionError, match=match) as error:
+        read()
+    assert str(error.value) == printable(str(error.value)) and str(path) in str(error.value)
+
+
+def with_piece(holding, change):
+    """The draft with its first chunk of a channel changed."""
+    pieces = list(DRAFT.pieces)
+    number = next(i for i, piece in enumerate(pieces) if any(sent.channel == holding for sent in piece.messages))
+    pieces[number] = change(pieces[number])
+    return replace(DRAFT, pieces=tuple(pieces))
+
+
+def with_message(holding, change):
+    """The draft with the first message of a channel changed, and packed again."""
+
+    def changed(piece):
+        first = next(sent for sent in piece.messages if sent.channel == holding)
+        return replace(piece, messages=tuple(change(sent) if sent is first else sent for sent in piece.messages))
+
+    return with_piece(holding, changed)
+
+
+def with_head(opcode, body):
+    """The draft with one more record in its head, before the first of its kind."""
+    head = list(DRAFT.head)
+    head.insert(next(i for i, part in enumerate(head) if part[0] == opcode), (opcode, body))
+    return replace(DRAFT, head=tuple(head))
+
+
+def with_index(change):
+    return replace(DRAFT, change_index=change)
+
+
+def attached(name, data):
+    body = struct.pack("<QQ", 0, 0) + text(name) + text("text/plain") + struct.pack("<Q", len(data)) + data
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def saved(path, tmp_path):
+    out = tmp_path / "saved.mcap"
+    out.unlink(missing_ok=True)
+    return recover(path, out)
+
+
+def packed_map(pairs):
+    data = b"".join(text(key) + text(value) for key, value in pairs.items())
+    return struct.pack("<I", len(data)) + data
