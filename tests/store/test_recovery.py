@@ -24,7 +24,7 @@ from flowrec.store.split import PartFile
 from flowrec.system.locks import is_growing
 from flowrec.topics import TOPICS
 from tests.store.made_up import HEADER, ticks_of
-from tests.store.test_trouble import KILLED, names_in
+from tests.store.test_damage import KILLED, names_in
 
 TICKS = list(ticks_of(40, shape=(8, 8)))
 OUTPUTS = [topic.field for topic in TOPICS if topic.role is Role.OUTPUT]

@@ -17,9 +17,9 @@ from flowrec.store import SessionReader, SessionWriter, Snapshot, WriterOptions,
 from flowrec.store.paths import snapshot_path
 from flowrec.units import NS_PER_S
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
-from tests.store.test_disk import slow_disk
-from tests.store.test_splitting import messages_in, same
-from tests.store.test_trouble import names_in
+from tests.store.test_damage import names_in
+from tests.store.test_durability import slow_disk
+from tests.store.test_split import messages_in, same
 
 QUIET = [replace(tick, operator=None) for tick in ticks_of(600)]  # 10 s
 ABOUT = Snapshot(before_s=2.0, after_s=1.0)

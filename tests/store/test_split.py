@@ -29,8 +29,8 @@ from flowrec.store.scan import scan
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
-from tests.store.test_disk import GatedDisk, slow_disk
-from tests.store.test_trouble import names_in
+from tests.store.test_damage import names_in
+from tests.store.test_durability import GatedDisk, slow_disk
 
 TICKS = list(ticks_of(120, shape=(96, 96)))
 APPLIED = SLOTS["/coils/applied"].channel
