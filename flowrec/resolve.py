@@ -11,7 +11,8 @@ from scipy.ndimage import label
 
 from flowrec.chip import check_point, median_width_um
 from flowrec.chip.chip import Chip
-from flowrec.chip.places import named_opening, opening_point_um
+from flowrec.chip.clearance import opening_point_um
+from flowrec.chip.openings import named_opening
 from flowrec.config import Config, ResolvedConfig, check_config
 from flowrec.control import Coils
 from flowrec.control.mission import Place, PlacedMission, Point

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from flowrec.bench.exact_flows import bend_case, oblique_case, straight_case
 from flowrec.bench.harness import Quick, Results, peak_mb
 from flowrec.bench.published_flows import cavity_case, cylinder_case
-from flowrec.chip.builtin import straight
 from flowrec.chip.chip import Chip, Walls
 from flowrec.chip.io import without_pockets
 from flowrec.chip.openings import find_openings, guess_inlets
-from flowrec.chip.vessels import vessels
+from flowrec.chip.synthetic import straight, vessels
 from flowrec.flow import FlowSolver
 from flowrec.flow.newton_solver import system
 from flowrec.terminal import table

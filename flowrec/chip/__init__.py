@@ -1,10 +1,8 @@
-"""The chip: where fluid is, where it comes in and goes out, how far the walls are."""
+"""The chip: where fluid is, where it enters and leaves, how far the walls are."""
 
-from flowrec.chip.chip import Chip, Opening
+from flowrec.chip.chip import Chip, ChipSettings, Opening
 from flowrec.chip.clearance import check_point, clearance_um, median_width_um, nearest_fluid
-from flowrec.chip.io import chip_files, chip_from_files
-from flowrec.chip.load import load_chip
-from flowrec.chip.settings import ChipSettings
+from flowrec.chip.io import chip_files, chip_from_files, load_chip
 
 __all__ = [
     "Chip",

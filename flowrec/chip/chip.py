@@ -1,16 +1,39 @@
-"""What a chip is: fluid pixels, their size, the openings and the fluid that is assumed to flow through them."""
+"""What a chip is: fluid pixels, their size, the openings and the assumed fluid; and the settings that choose one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowrec.ranges import Range, Seed
+
 Side = Literal["left", "right", "top", "bottom"]
 Kind = Literal["inlet", "outlet"]
 Walls = Literal["smooth", "pixel"]
+WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ChipSettings:
+    """Section [chip] of a configuration: a built-in chip by name, or a file; None keeps the value of that chip."""
+
+    name: str = "bifurcation"  # bifurcation, straight, vessels
+    path: str = ""  # instead of the name: *.png (*.toml beside it), *.toml (*.png beside it) or *.npz vessel case
+    seed: Seed = 0  # of the vessels
+    um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None  # needed for a PNG that has no TOML
+    walls: Walls | None = None
+    # channel depth, for the depth-averaged friction; 0: two-dimensional
+    depth_um: Annotated[float, Range(0.0, 1e5)] | None = None
+    viscosity_mpa_s: Annotated[float, Range(1e-3, 1e5)] | None = None
+    density_kg_m3: Annotated[float, Range(1.0, 3e4)] | None = None
+    # mean speed of the fastest inlet; the others keep their ratio to it
+    inlet_speed_um_s: Annotated[float, Range(0.0, 1e7)] | None = None
+    # Openings that are inlets, all others outlets at 0 Pa: "left:0" is the first on the left from the top,
+    # "top:1" the second on the top from the left, "left" every one on the left.
+    inlets: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +54,7 @@ class Opening:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chip:
-    """Mask and assumed boundary values. Everything downstream (flow, planning, simulation) starts from one."""
+    """Mask and assumed boundary values, from which flow, planning and simulation start."""
 
     name: str
     mask: NDArray[np.bool_]  # (h, w) True in fluid

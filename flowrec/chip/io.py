@@ -1,10 +1,10 @@
-"""A chip as two files: a PNG mask and, beside it, a TOML of the same stem.
+"""Chips from settings and files. A chip is two files: a PNG mask and, beside it, a TOML of the same stem.
 
-    um_per_px = 20.0          # wanted; everything below may be left out
+    um_per_px = 20.0          # required; everything below may be left out
     viscosity_mpa_s = 1.0     # 1.0
     density_kg_m3 = 1000.0    # 1000
     depth_um = 100.0          # left out: two-dimensional
-    walls = "smooth"          # "smooth": the outline behind the pixels; "pixel": the pixels themselves
+    walls = "smooth"          # "smooth": a smooth contour through the pixels; "pixel": their edges
     fluid = "bright"          # "bright": fluid is >= 128; "dark": fluid is < 128
     name = "y_junction"       # the stem of the file
     inlet_speed_um_s = 200.0  # of inlets that are found, not listed
@@ -25,7 +25,7 @@ import difflib
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -35,18 +35,68 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from flowrec.chip.chip import Chip, Kind, Opening, Side, Walls
-from flowrec.chip.openings import DEFAULT_INLET_UM_S, check_openings, find_openings, guess_inlets
+from flowrec.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls
+from flowrec.chip.openings import (
+    DEFAULT_INLET_UM_S,
+    border,
+    check_chip,
+    find_openings,
+    guess_inlets,
+    name_inlets,
+    set_inlet_speed,
+)
+from flowrec.chip.synthetic import bifurcation, straight, vessels
+from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import ChipError
 from flowrec.system.toml_file import parse_toml
 
-MIN_SIDE_PX = 8
 MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
 _PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
-WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
-_NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um", "inlet_speed_um_s")
+BUILT_IN: Mapping[str, Callable[[ChipSettings], Chip]] = {
+    "bifurcation": lambda _: bifurcation(),
+    "straight": lambda _: straight(),
+    "vessels": lambda settings: vessels(settings.seed),
+}
+_NUMBERS = {  # by key, the value where the TOML has none
+    "um_per_px": None,
+    "viscosity_mpa_s": WATER_MPA_S,
+    "density_kg_m3": WATER_KG_M3,
+    "depth_um": None,
+    "inlet_speed_um_s": DEFAULT_INLET_UM_S,
+}
 CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "opening")
 _OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
+
+
+def load_chip(settings: ChipSettings) -> Chip:
+    """The chip that the settings name, with the values that they give instead of its own.
+
+    Raises ChipError, in one line, if no flow can be computed on it.
+    """
+    where = settings.path or settings.name
+    if settings.path:
+        chip = _read_chip(Path(settings.path), settings.um_per_px)
+    elif settings.name in BUILT_IN:
+        chip = BUILT_IN[settings.name](settings)
+    else:
+        near = difflib.get_close_matches(settings.name, BUILT_IN, 1, 0.0)[0]
+        raise ChipError(
+            f"no built-in chip {settings.name!r}, did you mean {near!r}? A chip of your own is given by chip.path"
+        )
+    given = {
+        key: value
+        for key in ("um_per_px", "walls", "viscosity_mpa_s", "density_kg_m3", "depth_um")
+        if (value := getattr(settings, key)) is not None
+    }
+    chip = replace(chip, **given)
+    if settings.depth_um == 0.0:
+        chip = replace(chip, depth_um=None)
+    if settings.inlets:
+        chip = replace(chip, openings=name_inlets(chip.openings, settings.inlets, where))
+    if settings.inlet_speed_um_s is not None:
+        chip = replace(chip, openings=set_inlet_speed(chip.openings, settings.inlet_speed_um_s))
+    check_chip(chip, where)
+    return without_pockets(chip)
 
 
 def chip_files(chip: Chip) -> tuple[bytes, str]:
@@ -80,31 +130,26 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
     _refuse_unknown(table, CHIP_KEYS, where)
-    number = {key: _number(table, key, where) for key in _NUMBERS}
-    scale = number["um_per_px"] if um_per_px is None else um_per_px
-    if scale is None:
+    number: dict[str, Any] = {key: _number(table, key, where, default) for key, default in _NUMBERS.items()}
+    if um_per_px is not None:
+        number["um_per_px"] = um_per_px
+    if number["um_per_px"] is None:
         raise ChipError(f"{where}: no um_per_px; set chip.um_per_px or put it into a TOML of the same name")
     mask = _mask(png_bytes, _choice(table, "fluid", ("bright", "dark"), where) or "bright", where)
     if "opening" in table:
         openings = _listed(table["opening"], where)
     else:
-        openings = find_openings(mask)
-        if openings:
-            speed = number["inlet_speed_um_s"]
-            openings = tuple(
-                replace(o, value=DEFAULT_INLET_UM_S if speed is None else speed) if o.kind == "inlet" else o
-                for o in guess_inlets(openings)
-            )
+        openings = guess_inlets(find_openings(mask), number["inlet_speed_um_s"])
     name = table.get("name", Path(where).stem)
     if not isinstance(name, str):
         raise ChipError(f"{where}: name = {name!r} is no text; put it in quotes")
     chip = Chip(
         name,
         mask,
-        scale,
+        number["um_per_px"],
         openings,
-        WATER_MPA_S if number["viscosity_mpa_s"] is None else number["viscosity_mpa_s"],
-        WATER_KG_M3 if number["density_kg_m3"] is None else number["density_kg_m3"],
+        number["viscosity_mpa_s"],
+        number["density_kg_m3"],
         number["depth_um"],
         cast(Walls, _choice(table, "walls", get_args(Walls), where) or "smooth"),
     )
@@ -112,42 +157,24 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
     return chip
 
 
-def check_chip(chip: Chip, where: str) -> None:
-    """Raise ChipError unless a flow can be computed on the chip."""
-    height, width = chip.mask.shape
-    if height < MIN_SIDE_PX or width < MIN_SIDE_PX:
-        raise ChipError(
-            f"{where}: the mask is {width} x {height} pixels; at least {MIN_SIDE_PX} x {MIN_SIDE_PX} needed"
-        )
-    if not chip.mask.any():
-        raise ChipError(f'{where}: no fluid in the mask; is it the other way round? (fluid = "dark" in its TOML)')
-    if chip.mask.all():
-        raise ChipError(f'{where}: no wall in the mask; is it the other way round? (fluid = "dark" in its TOML)')
-    for key in ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um"):
-        value = getattr(chip, key)
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ChipError(f"{where}: {key} = {value:g}; it must be more than zero")
-    check_openings(chip.mask, chip.openings, where)
-
-
 def without_pockets(chip: Chip) -> Chip:
     """The chip with all fluid filled that no opening reaches through the sides of pixels; its mask is read-only."""
     labels, _ = label(chip.mask)
-    height, width = chip.mask.shape
-    reached = set()
-    for o in chip.openings:
-        row, column = {"left": (o.first, 0), "right": (o.first, width - 1)}.get(o.side, (0, o.first))
-        reached.add(int(labels[height - 1 if o.side == "bottom" else row, column]))
-    mask = np.isin(labels, sorted(reached))
+    mask = np.isin(labels, [border(labels, opening.side)[opening.first] for opening in chip.openings])
     mask.flags.writeable = False
     return replace(chip, mask=mask)
 
 
-def read_png_chip(path: Path, um_per_px: float | None = None) -> Chip:
-    """The chip of a PNG and, where there is one, the TOML of the same stem; either path will do."""
-    png, toml = path.with_suffix(".png"), path.with_suffix(".toml")
-    if path.suffix.lower() == ".png":
-        png = path
+def _read_chip(path: Path, um_per_px: float | None) -> Chip:
+    """The chip of a vessel case, or of a PNG and, if there is one, the TOML of the same stem; either path will do."""
+    kind = path.suffix.lower()
+    if kind == ".npz":
+        return read_vessel_case(path)
+    if kind not in (".png", ".toml"):
+        raise ChipError(
+            f"{path}: a chip is a .png with a .toml beside it, or a vessel case .npz; convert it to one of these"
+        )
+    png, toml = path if kind == ".png" else path.with_suffix(".png"), path.with_suffix(".toml")
     try:
         data = png.read_bytes()
         text = toml.read_text(encoding="utf-8") if toml.exists() or path == toml else ""
@@ -187,8 +214,8 @@ def _refuse_unknown(table: Mapping[str, Any], known: tuple[str, ...], where: str
             raise ChipError(f"{where}: unknown key {key}; did you mean {near}?")
 
 
-def _number(table: Mapping[str, Any], key: str, where: str) -> float | None:
-    value = table.get(key)
+def _number(table: Mapping[str, Any], key: str, where: str, default: float | None) -> float | None:
+    value = table.get(key, default)
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -221,8 +248,8 @@ def _listed(tables: Any, where: str) -> tuple[Opening, ...]:
         key, other = ("speed_um_s", "pressure_pa") if kind == "inlet" else ("pressure_pa", "speed_um_s")
         if other in table:
             raise ChipError(f"{here}: an {kind} has no {other}; give {key}")
-        value = _number(table, key, here)
-        if value is None and kind == "inlet":
+        value = _number(table, key, here, None if kind == "inlet" else 0.0)
+        if value is None:
             raise ChipError(f"{here}: an inlet needs speed_um_s, its mean inward speed")
-        openings.append(Opening(cast(Side, side), ends[0], ends[1], cast(Kind, kind), value or 0.0))
+        openings.append(Opening(cast(Side, side), ends[0], ends[1], cast(Kind, kind), value))
     return tuple(openings)

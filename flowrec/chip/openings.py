@@ -1,16 +1,17 @@
 """Openings: the runs of fluid on the border of a mask, and which of them are taken for inlets.
 
-Rule where nothing is said: the widest opening on the left is the inlet; where the left has none, the widest of all
-(of equal ones the first, in the order left, right, top, bottom and along the side). All others are outlets at 0 Pa.
-Runs shorter than three pixels are channels grazed by the border and stay closed, as does the shorter of two runs
-that meet in a corner pixel: both are one hole in the border, and an opening lies on one side.
-A border pixel of fluid without an opening is a wall.
+Default: the widest opening on the left is the inlet; where the left has none, the widest of all (of equal ones the
+first, in the order left, right, top, bottom and along the side). All others are outlets at 0 Pa. Runs shorter than
+three pixels are channels that only touch the border and stay closed, as does the shorter of two runs that meet in a
+corner pixel: both are one hole in the border, and an opening lies on one side. A border pixel of fluid without an
+opening is a wall.
 """
 
 from __future__ import annotations
 
 import difflib
 import itertools
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -18,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.chip.chip import Chip, Opening, Side
+from flowrec.chip.chip import Chip, Kind, Opening, Side
 from flowrec.errors import ChipError
 
 SIDES: tuple[Side, ...] = ("left", "right", "top", "bottom")
-MIN_OPENING_PX = 3
+MIN_SIDE_PX, MIN_OPENING_PX = 8, 3
 DEFAULT_INLET_UM_S = 200.0
 
 
@@ -32,52 +33,44 @@ def border(image: NDArray[Any], side: Side) -> NDArray[Any]:
     return line
 
 
-def border_runs(mask: NDArray[np.bool_], side: Side) -> list[tuple[int, int]]:
+def fluid_runs(line: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """First and last pixel of each run of fluid along a side."""
-    steps = np.diff(np.concatenate(([0], border(mask, side).astype(np.int8), [0])))
+    steps = np.diff(np.concatenate(([0], line.astype(np.int8), [0])))
     return list(zip(np.flatnonzero(steps == 1).tolist(), (np.flatnonzero(steps == -1) - 1).tolist(), strict=True))
 
 
 def run_around(line: NDArray[np.bool_], middle: int) -> tuple[int, int] | None:
-    """First and last of the fluid around a pixel of a side, None where that is solid."""
-    if not (0 <= middle < len(line) and line[middle]):
-        return None
-    solid = np.flatnonzero(~line)
-    first = int(solid[solid < middle].max(initial=-1)) + 1
-    last = int(solid[solid > middle].min(initial=len(line))) - 1
-    return first, last
+    """First and last pixel of the run of fluid around a pixel of a side; None if that is solid."""
+    return next(((first, last) for first, last in fluid_runs(line) if first <= middle <= last), None)
 
 
-def _meet(a: Opening, b: Opening, shape: tuple[int, ...]) -> bool:
-    """Two runs on different sides share the pixel in the corner."""
-    last = {"left": shape[0] - 1, "right": shape[0] - 1, "top": shape[1] - 1, "bottom": shape[1] - 1}
-    if {a.side, b.side} not in ({"left", "top"}, {"left", "bottom"}, {"right", "top"}, {"right", "bottom"}):
-        return False
-    at_a = a.last == last[a.side] if b.side in ("bottom", "right") else a.first == 0
-    at_b = b.last == last[b.side] if a.side in ("bottom", "right") else b.first == 0
-    return at_a and at_b
+def _end_pixels(opening: Opening, shape: tuple[int, ...]) -> set[tuple[int, int]]:
+    """(row, column) of the first and the last pixel of an opening of a mask of `shape`."""
+    far = {"left": 0, "top": 0, "right": shape[1] - 1, "bottom": shape[0] - 1}[opening.side]
+    ends = (opening.first, opening.last)
+    return {(end, far) if opening.side in ("left", "right") else (far, end) for end in ends}
 
 
 def find_openings(mask: NDArray[np.bool_]) -> tuple[Opening, ...]:
-    """Every opening of a mask, all as outlets at 0 Pa. () where there is none."""
+    """Every opening of a mask, all as outlets at 0 Pa."""
     found = [
         Opening(side, first, last, "outlet", 0.0)
         for side in SIDES
-        for first, last in border_runs(mask, side)
+        for first, last in fluid_runs(border(mask, side))
         if last - first + 1 >= MIN_OPENING_PX
     ]
     closed: set[Opening] = set()
     for a, b in itertools.combinations(found, 2):
-        if _meet(a, b, mask.shape):
+        if _end_pixels(a, mask.shape) & _end_pixels(b, mask.shape):
             closed.add(min(b, a, key=lambda opening: opening.width_px))
     return tuple(opening for opening in found if opening not in closed)
 
 
-def guess_inlets(openings: tuple[Opening, ...]) -> tuple[Opening, ...]:
-    """The rule above, with the inlet at the default speed."""
+def guess_inlets(openings: tuple[Opening, ...], speed_um_s: float = DEFAULT_INLET_UM_S) -> tuple[Opening, ...]:
+    """The openings with the inlet of the default rule, at a mean inward speed; () of none."""
     left = [opening for opening in openings if opening.side == "left"]
-    inlet = max(left or openings, key=lambda opening: opening.width_px)
-    return tuple(replace(o, kind="inlet", value=DEFAULT_INLET_UM_S) if o is inlet else o for o in openings)
+    inlet = max(left or openings, key=lambda opening: opening.width_px, default=None)
+    return tuple(replace(o, kind="inlet", value=speed_um_s) if o is inlet else o for o in openings)
 
 
 def opening_names(openings: Iterable[Opening]) -> tuple[str, ...]:
@@ -101,12 +94,46 @@ def name_inlets(openings: tuple[Opening, ...], inlets: Iterable[str], where: str
             near = difflib.get_close_matches(wanted, names, 1, 0.0)[0]
             raise ChipError(f"{where}: no opening {wanted!r}; it has {', '.join(names)}. Did you mean {near!r}?")
         chosen |= fitting
-    return tuple(
-        (o if o.kind == "inlet" else replace(o, kind="inlet", value=DEFAULT_INLET_UM_S))
-        if name in chosen
-        else (o if o.kind == "outlet" else replace(o, kind="outlet", value=0.0))
-        for name, o in zip(names, openings, strict=True)
-    )
+    kinds: list[Kind] = ["inlet" if name in chosen else "outlet" for name in names]
+    return tuple(map(_as_kind, openings, kinds))
+
+
+def _as_kind(opening: Opening, kind: Kind) -> Opening:
+    """The opening as an inlet or an outlet, with the default value unless it is of that kind already."""
+    value = DEFAULT_INLET_UM_S if kind == "inlet" else 0.0
+    return opening if opening.kind == kind else replace(opening, kind=kind, value=value)
+
+
+def named_opening(chip: Chip, name: str) -> Opening:
+    """The opening called `inlet` or `outlet` (the widest of its kind), or `inlet:1` (counted in the chip's order).
+
+    Raises ChipError for any other name.
+    """
+    kind, _, number = name.partition(":")
+    found = [opening for opening in chip.openings if opening.kind == kind]
+    if not found or (number and (not number.isdigit() or int(number) >= len(found))):
+        kinds = [opening.kind for opening in chip.openings]
+        counts = ", ".join(f"{kind}:0 to :{kinds.count(kind) - 1}" for kind in sorted(set(kinds)))
+        raise ChipError(f"place {name!r} is not on chip {chip.name!r}; it has {counts}, or give a point as x,y in um")
+    return found[int(number)] if number else max(found, key=lambda opening: opening.width_px)
+
+
+def check_chip(chip: Chip, where: str) -> None:
+    """Raise ChipError unless a flow can be computed on the chip."""
+    height, width = chip.mask.shape
+    if height < MIN_SIDE_PX or width < MIN_SIDE_PX:
+        raise ChipError(
+            f"{where}: the mask is {width} x {height} pixels; at least {MIN_SIDE_PX} x {MIN_SIDE_PX} needed"
+        )
+    if not chip.mask.any():
+        raise ChipError(f'{where}: no fluid in the mask; is it the other way round? (fluid = "dark" in its TOML)')
+    if chip.mask.all():
+        raise ChipError(f'{where}: no wall in the mask; is it the other way round? (fluid = "dark" in its TOML)')
+    for key in ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um"):
+        value = getattr(chip, key)
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise ChipError(f"{where}: {key} = {value:g}; it must be more than zero")
+    check_openings(chip.mask, chip.openings, where)
 
 
 def check_openings(mask: NDArray[np.bool_], openings: tuple[Opening, ...], where: str) -> None:
@@ -117,7 +144,7 @@ def check_openings(mask: NDArray[np.bool_], openings: tuple[Opening, ...], where
         if not 0 <= opening.first <= opening.last < len(line):
             raise ChipError(f"{where}: {what} is not within 0-{len(line) - 1}; pixels count from 0, first to last")
         if not line[opening.first : opening.last + 1].all():
-            runs = ", ".join(f"{a}-{b}" for a, b in border_runs(mask, opening.side)) or "none"
+            runs = ", ".join(f"{a}-{b}" for a, b in fluid_runs(line)) or "none"
             raise ChipError(f"{where}: {what} lies on a wall; the fluid on that side is at {runs}")
         if not np.isfinite(opening.value):
             raise ChipError(f"{where}: {what} has no finite speed or pressure; give speed_um_s or pressure_pa")

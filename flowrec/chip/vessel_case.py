@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip, Opening, Side
-from flowrec.chip.io import check_chip
+from flowrec.chip.openings import check_chip
 from flowrec.errors import ChipError
 from flowrec.messages import Observations
 

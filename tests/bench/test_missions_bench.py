@@ -12,7 +12,7 @@ from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import paired, wilson
 from flowrec.bench.missions import World, chip_of, compared, fly, optimum_s, summary
 from flowrec.chip import load_chip
-from flowrec.chip.settings import ChipSettings
+from flowrec.chip.chip import ChipSettings
 from flowrec.errors import UsageError
 from tests.planning.worlds import channel, field_of, open_water, robot
 from tests.planning.worlds import chip_of as made_up

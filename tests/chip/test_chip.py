@@ -19,8 +19,8 @@ from flowrec.chip import (
     median_width_um,
     nearest_fluid,
 )
+from flowrec.chip.clearance import opening_point_um
 from flowrec.chip.openings import find_openings, guess_inlets
-from flowrec.chip.places import opening_point_um
 from flowrec.errors import ChipError
 from flowrec.flow import FlowSolver
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from flowrec.chip import ChipSettings, clearance_um, load_chip
-from flowrec.chip.places import opening_point_um
+from flowrec.chip.clearance import opening_point_um
 from flowrec.flow import FlowSolver, sample
 from flowrec.interpolation import bilinear
 from flowrec.planning import SurveyPlanner

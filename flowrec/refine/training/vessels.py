@@ -17,8 +17,8 @@ from scipy.ndimage import binary_dilation, binary_erosion, label
 from scipy.sparse.csgraph import dijkstra
 
 from flowrec.chip.chip import Chip, Opening
-from flowrec.chip.draw import draw_channel, smooth_curve
 from flowrec.chip.openings import border, find_openings, run_around
+from flowrec.chip.synthetic import draw_channel, smooth_curve
 from flowrec.chip.vessel_case import NOISES, SHARES
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
