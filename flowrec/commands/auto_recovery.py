@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
 import os
 import signal
@@ -17,8 +16,8 @@ from pathlib import Path
 from flowrec.errors import FlowrecError
 from flowrec.store import recover
 from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX
-from flowrec.system import child_process
-from flowrec.system.locks import is_growing
+from flowrec.system.locks import is_growing, try_lock
+from flowrec.system.processes import child_command, child_environment
 from flowrec.terminal import say, warn
 
 _REMAINS = SUFFIX + PARTIAL_SUFFIX
@@ -96,13 +95,13 @@ def _recover_apart(path: Path, limit_s: float) -> tuple[Path, str]:
     """
     try:
         process = subprocess.Popen(  # noqa: S603 - our own module
-            child_process.command("flowrec.commands.auto_recovery", str(path.resolve())),
+            child_command("flowrec.commands.auto_recovery", str(path.resolve())),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,  # Ctrl-C ends this process, and then this one ends that one
-            env=child_process.environment(),
+            env=child_environment(),
         )
     except OSError as error:
         raise FlowrecError(f"{path}: recovering it does not start ({error.strerror or error})") from error
@@ -150,11 +149,8 @@ def _alone_in(folder: Path) -> Iterator[bool]:
         return
     try:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            alone = True
-        except BlockingIOError:
-            alone = False
-        except OSError:  # a file system without locks
+            alone = try_lock(descriptor, exclusive=True)
+        except OSError:  # a file system that can not lock folders
             alone = True
         yield alone
     finally:

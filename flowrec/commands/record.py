@@ -39,7 +39,7 @@ from flowrec.store import SessionWriter, is_snapshot, runs_in
 from flowrec.store.paths import run_files, run_path
 from flowrec.summary import Figures, as_text, finite, rows_for_people
 from flowrec.system.outputs import MCAP, RRD, check_output
-from flowrec.system.realtime_priority import first_of_all
+from flowrec.system.processes import realtime_priority
 from flowrec.terminal import say, table, warn
 from flowrec.units import seconds
 
@@ -268,7 +268,7 @@ def record(
             worker = Preloaded(worker, fields)
         disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
         # A run that does not keep real time never waits: it would keep a core for itself.
-        priority = first_of_all() if realtime else nullcontext(enter_result=False)
+        priority = realtime_priority() if realtime else nullcontext(enter_result=False)
         with control.shown(writer, disk) as show, priority as first:
 
             def on_tick(tick: Tick) -> None:

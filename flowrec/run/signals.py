@@ -30,7 +30,7 @@ from typing import Any
 
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
-from flowrec.system.realtime_priority import first_of_all
+from flowrec.system.processes import realtime_priority
 from flowrec.system.stderr import said_within
 
 assert sys.platform != "win32"  # there is no SIGHUP, SIGTSTP or pthread_kill
@@ -110,7 +110,7 @@ class Signals:
     # ---- the thread
 
     def _listen(self, pipe: int) -> None:
-        with first_of_all(2):  # as the watchdog
+        with realtime_priority(2):  # as the watchdog
             while True:
                 ready, _, _ = select.select([pipe], [], [], _POLL_S)
                 for number in os.read(pipe, 64) if ready else b"":

@@ -26,7 +26,7 @@ from flowrec.messages import Tick
 from flowrec.pipeline import Pipeline
 from flowrec.planning import warm_up
 from flowrec.run.workers import Result, Results, ordered, work
-from flowrec.system import child_process
+from flowrec.system.processes import child_command, child_environment
 from flowrec.topics import WORKER_FIELDS
 
 _NAME = "the process that solves and plans"
@@ -50,12 +50,12 @@ class ProcessWorker:
         self._orders.put(pipeline)
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own module
-                child_process.command("flowrec.run.worker_process"),
+                child_command("flowrec.run.worker_process"),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 start_new_session=True,  # Ctrl-C and a closed terminal end the run, and then the run ends this
-                env=child_process.environment(),
+                env=child_environment(),
             )
         except OSError as error:
             raise FlowrecError(

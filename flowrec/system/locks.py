@@ -1,21 +1,29 @@
-"""Which process writes a file: an exclusive lock (flock) of the open file, from its first byte to its last.
+"""Locks (flock) that tell which process writes a file: an exclusive one from its first byte to its last.
 
-Who only asks takes a shared lock for some microseconds; a writer waits for that, and refuses a file of another writer.
-On a file system without locks nobody can tell that a file is being written; everything else holds there as well.
+A process that only asks takes a shared lock for some microseconds; a writer waits for that, and refuses the file of
+another writer. On a file system without locks, and on a system without flock (Windows), every lock is granted: nobody
+can tell there that a file is being written, and everything else holds as well.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
+import sys
 import time
 from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
 
-_PATIENCE_S = 2.0  # for those who only ask
+try:
+    import fcntl
+except ImportError:  # Windows
+    HAS_LOCKS = False
+else:
+    HAS_LOCKS = True
+
+_TIMEOUT_S = 2.0  # for processes that only ask
 _PAUSE_S = 1e-3
 _WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)  # what such a file system answers
 
@@ -97,32 +105,39 @@ def is_growing(path: Path) -> bool:
     """Whether a living process is writing this file."""
     try:
         with FileIO(path, "r") as file:
-            return not _locked(file.fileno(), fcntl.LOCK_SH)
+            return not try_lock(file.fileno(), exclusive=False)
     except OSError:
         return False
 
 
-def _take(descriptor: int) -> None:
-    """Take the exclusive lock, after those who only ask."""
-    end_s = time.monotonic() + _PATIENCE_S
-    while not _locked(descriptor, fcntl.LOCK_EX):
-        # A shared lock is refused by a writer alone.
-        if not _locked(descriptor, fcntl.LOCK_SH) or time.monotonic() > end_s:
-            raise BlockingIOError(errno.EWOULDBLOCK, "another process has locked it")
-        fcntl.flock(descriptor, fcntl.LOCK_UN)
-        time.sleep(_PAUSE_S)
+def try_lock(descriptor: int, *, exclusive: bool) -> bool:
+    """Try to lock an open file or directory; False if another process has a lock that excludes this one.
 
-
-def _locked(descriptor: int, kind: int) -> bool:
-    """Try to take a lock; False where another process has one that excludes it."""
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError as error:
-        if error.errno not in _WITHOUT_LOCKS:
-            raise
+    Raises
+    ------
+    OSError : the file can not be locked.
+    """
+    if sys.platform != "win32" and HAS_LOCKS:
+        try:
+            fcntl.flock(descriptor, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            if error.errno not in _WITHOUT_LOCKS:
+                raise
     return True
+
+
+def _take(descriptor: int) -> None:
+    """Take the exclusive lock, after processes that only ask."""
+    end_s = time.monotonic() + _TIMEOUT_S
+    while not try_lock(descriptor, exclusive=True):
+        # Only a writer refuses a shared lock.
+        if not try_lock(descriptor, exclusive=False) or time.monotonic() > end_s:
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process has locked it")
+        if sys.platform != "win32":
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
+        time.sleep(_PAUSE_S)
 
 
 def _is_at(file: FileIO, path: Path) -> bool:

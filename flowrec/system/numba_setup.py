@@ -63,7 +63,7 @@ def _cache_folder() -> str:
                 _remove_unused(place)
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             found = folder.lstat()
-            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != _user_id() or found.st_mode & 0o022:
                 continue  # somebody else could write code there that this process runs
             tempfile.TemporaryFile(dir=folder).close()
             os.utime(folder)
@@ -80,7 +80,15 @@ def _places() -> Iterator[Path]:
         home = os.path.expanduser("~/.cache")  # noqa: PTH111 - which raises nothing where there is no home
     if os.path.isabs(home):  # noqa: PTH117
         yield Path(home, "flowrec")
-    yield Path(tempfile.gettempdir(), f"flowrec-{os.getuid()}")
+    yield Path(tempfile.gettempdir(), f"flowrec-{_user_id()}")
+
+
+def _user_id() -> int:
+    """Number of the user; 0 on Windows, where files have none."""
+    number = 0
+    if sys.platform != "win32":
+        number = os.getuid()
+    return number
 
 
 def _remove_unused(place: Path) -> None:

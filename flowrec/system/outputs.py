@@ -9,6 +9,7 @@ import contextlib
 import errno
 import os
 import secrets
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -142,12 +143,13 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
 
 
 def sync_directory(directory: Path) -> None:
-    """Have the disk keep names that were given or taken in a directory."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    """Have the disk keep names that were given or taken in a directory; Windows has no such call."""
+    if sys.platform != "win32":
+        descriptor = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _same(output: Path, other: Path) -> bool:

@@ -28,7 +28,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from flowrec.messages import Frame, Tick
-from flowrec.system import child_process
+from flowrec.system.processes import child_command, child_environment
 from flowrec.view import viewer
 from flowrec.view.scene import Scene
 
@@ -73,7 +73,7 @@ class LiveView:
             self._ended = True
             return f"no live view: Rerun's viewer is not installed (pip install rerun-sdk); {_WITHOUT}"
         window = mode == "spawn" and viewer.has_display()
-        command = child_process.command(__name__, str(self._port), "window" if window else "serve")
+        command = child_command(__name__, str(self._port), "window" if window else "serve")
         try:
             with self._log.open("wb") as log:
                 self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -82,7 +82,7 @@ class LiveView:
                     stdout=log,
                     stderr=log,
                     start_new_session=True,  # Ctrl-C ends the run, and then the run ends this
-                    env=child_process.environment(),
+                    env=child_environment(),
                 )
         except OSError as error:
             self._ended = True

@@ -33,7 +33,7 @@ from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.schema import Schema
-from flowrec.system.realtime_priority import first_of_all
+from flowrec.system.processes import realtime_priority
 from flowrec.terminal import progress, table
 from flowrec.topics import BY_FIELD
 from tests.perf.store_writers import frames_given, poses_given
@@ -292,7 +292,7 @@ def _stall_ms(put: Callable[[int], Any], rate_hz: float, duration_s: float) -> d
     thread.start()
     late_s = []
     try:
-        with first_of_all():
+        with realtime_priority():
             end = time.perf_counter() + duration_s
             due = time.perf_counter() + _PERIOD_S
             while due < end:

@@ -25,7 +25,7 @@ from flowrec.declarations import Image
 from flowrec.messages import Frame, OperatorEvent, Tick
 from flowrec.run.loop import Sink
 from flowrec.store import SessionWriter, Snapshot, Split, WriterOptions
-from flowrec.system.realtime_priority import first_of_all
+from flowrec.system.processes import realtime_priority
 from flowrec.terminal import progress
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
@@ -80,7 +80,7 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
             writer = _writer(kind, path)
             sinks: list[Sink] = [LargeCamera(images, ring, writer)]
             cpu_s = time.process_time()
-            with first_of_all() as first:
+            with realtime_priority() as first:
                 timings = paced_run(prepared, config, pipeline, sinks, partial(_queue_of, writer))
             cpu_s = time.process_time() - cpu_s
             if writer is not None:

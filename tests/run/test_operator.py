@@ -271,7 +271,7 @@ def test_a_recovery_that_hears_no_signal_is_killed(
         "import pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
         f"time.sleep(20); pathlib.Path({str(ended)!r}).touch()"
     )
-    monkeypatch.setattr("flowrec.system.child_process.command", lambda *_: [sys.executable, "-c", deaf])
+    monkeypatch.setattr("flowrec.commands.auto_recovery.child_command", lambda *_: [sys.executable, "-c", deaf])
     monkeypatch.setattr("flowrec.commands.auto_recovery._PATIENCE_S", 2.0)
     monkeypatch.setattr("flowrec.commands.auto_recovery._TIDY_S", 0.1)
     assert look_after(tmp_path) == {}

@@ -5,7 +5,7 @@ import threading
 
 import pytest
 
-from flowrec.system.realtime_priority import first_of_all
+from flowrec.system.processes import realtime_priority
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="a matter of Linux")
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="a
 def test_only_the_loop_itself_is_in_real_time_and_only_while_it_runs():
     policies = []
     before = os.sched_getscheduler(0)
-    with first_of_all() as granted:
+    with realtime_priority() as granted:
         during = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
         thread = threading.Thread(target=lambda: policies.append(os.sched_getscheduler(0)))
         thread.start()
@@ -28,5 +28,5 @@ def test_where_it_is_not_allowed_the_run_goes_on_as_it_is(monkeypatch):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    with first_of_all() as granted:
+    with realtime_priority() as granted:
         assert not granted

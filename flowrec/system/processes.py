@@ -1,0 +1,48 @@
+"""Processes of flowrec: how a child is started, and real-time (SCHED_FIFO) priority for the control loop."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+# Above every ordinary thread, below those of the kernel and of sound and field-bus servers, which ask for more.
+_PRIORITY = 1
+
+
+def child_command(module: str, *words: str) -> list[str]:
+    """The command that runs a module of flowrec as a program, with the same interpreter."""
+    return [sys.executable, "-P", "-m", module, *words]
+
+
+def child_environment() -> dict[str, str]:
+    """Environment of a child: it finds modules where this process does, except in the working directory.
+
+    There a file of the user, such as filterpy.py, would shadow a library. If flowrec itself is imported from the
+    working directory (a checkout), that stays.
+    """
+    home = str(Path(__file__).resolve().parents[2])
+    here = Path.cwd()
+    kept = [place for place in sys.path if place and (place == home or Path(place).resolve() != here)]
+    return os.environ | {"PYTHONPATH": os.pathsep.join(kept if home in kept else [home, *kept])}
+
+
+@contextmanager
+def realtime_priority(priority: int = _PRIORITY) -> Iterator[bool]:
+    """Run this thread with real-time priority where that is allowed; yields whether it is.
+
+    For loops that wait for a camera; one that never waits would occupy a core. Threads and processes that are started
+    meanwhile are ordinary ones. Linux allows it to root and within the limit `rtprio` (/etc/security/limits.conf);
+    on other systems nothing is changed.
+    """
+    with ExitStack() as stack:
+        granted = False
+        if sys.platform == "linux":
+            with suppress(OSError):
+                before = os.sched_getscheduler(0), os.sched_getparam(0)
+                os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+                stack.callback(os.sched_setscheduler, 0, *before)
+                granted = True
+        yield granted
