@@ -1,4 +1,4 @@
-"""The command line: thin verbs, late imports, errors in one line.
+"""The command line: one function a verb, which parses, calls and prints. Late imports; errors in one line.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
@@ -6,18 +6,23 @@ Exit status: 0 done, 1 failed (also when the goal is unreachable, found before t
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
 import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperCommand, TyperOption
 
 import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
 from flowrec.errors import FlowrecError, printable
+from flowrec.units import amounts
 
 app = typer.Typer(
     name="flowrec",
@@ -30,12 +35,32 @@ app = typer.Typer(
 app.add_typer(bench, name="bench")
 
 DEFAULT_REFINE = "pi_unet"
+# Options of replay that choose a method, and the table of its methods.
+METHODS = {
+    "refine": "flowrec.refine.refiner:REFINERS",
+    "plan": "flowrec.planning.planner:PLANNERS",
+    "observer": "flowrec.estimation.observer:OBSERVERS",
+    "controller": "flowrec.control.controller:CONTROLLERS",
+}
 
 View = Literal["spawn", "serve", "rrd", "none"]
+SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
 RrdOut = Annotated[
     Path | None,
     typer.Option(help="Where to write the .rrd; by default beside the session, over an .rrd of that session only."),
 ]
+
+
+class _HelpWithMethods(TyperCommand):
+    """A verb whose help names the methods of its options; the tables are imported when the help is printed."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        for parameter in self.params:
+            if isinstance(parameter, TyperOption) and parameter.name in METHODS:
+                module, _, table = METHODS[parameter.name].partition(":")
+                rows = getattr(importlib.import_module(module), table).values()
+                parameter.help = f"{parameter.help} " + "; ".join(f"{row.name}: {row.summary}" for row in rows) + "."
+        super().format_help(ctx, formatter)
 
 
 def _version(asked: bool) -> None:
@@ -82,26 +107,26 @@ def record(
         read_toml(config)  # a file that is none is refused before the imports below, which take a second
     from flowrec.config import load_config, to_toml
 
-    typed = {
-        "rig": ("--rig", rig),
-        "mission.goal": ("--goal", None if goal is None else _point(goal)),
-        "simulated.seed": ("--seed", seed),
-        "duration_s": ("--duration", duration),
-        **_pieces(split, snapshot),
-    }
-    given = {key: (flag, value) for key, (flag, value) in typed.items() if value is not None}
-    settings = [*(sets or []), *(f"{key}={value}" for key, (_, value) in given.items())]
-    chosen = load_config(config, settings, {key: flag for key, (flag, _) in given.items()})
+    settings, flags = _settings(
+        [
+            ("--rig", rig, lambda name: {"rig": name}, "simulated"),
+            ("--goal", goal, _goal, "1200,800"),
+            ("--seed", seed, lambda number: {"simulated.seed": number}, "1"),
+            ("--duration", duration, lambda time_s: {"duration_s": time_s}, "60"),
+            ("--split", split, _split, "2GB,10min"),
+            ("--snapshot", snapshot, _snapshot, "30s,10s"),
+        ]
+    )
+    chosen = load_config(config, [*(sets or []), *settings], flags)
     from flowrec.commands.interactive import AtTerminal
     from flowrec.commands.record import prepare, print_summary
-    from flowrec.commands.record import record as run_record
     from flowrec.system.stderr import said_within
 
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return
-    read = [config] if config is not None else []
-    recorded = run_record(chosen, out, view, realtime, overwrite, AtTerminal(), read)
+    inputs = [config] if config is not None else []
+    recorded = flowrec.record(chosen, out, view, realtime, overwrite, AtTerminal(), inputs)
 
     def summarize() -> None:
         if as_json:
@@ -120,14 +145,14 @@ def record(
     raise typer.Exit(recorded.exit_status)
 
 
-@app.command()
+@app.command(cls=_HelpWithMethods)
 def replay(
-    session: Annotated[Path, typer.Argument(help="Session to replay (.mcap).")],
+    session: SessionFile,
     refine: Annotated[
-        str | None, typer.Option(metavar="[METHOD]", help=f"Refine the flow anew; alone: {DEFAULT_REFINE}.")
+        str | None, typer.Option(metavar="[METHOD]", help=f"Refine the flow again; alone: {DEFAULT_REFINE}.")
     ] = None,
     plan: Annotated[str | None, typer.Option(metavar="METHOD", help="Plan with another planner.")] = None,
-    observer: Annotated[str | None, typer.Option(metavar="NAME", help="Observe with another filter.")] = None,
+    observer: Annotated[str | None, typer.Option(metavar="NAME", help="Estimate with another observer.")] = None,
     controller: Annotated[str | None, typer.Option(metavar="NAME", help="Control with another law.")] = None,
     sets: Sets = None,
     from_s: Annotated[float | None, typer.Option("--from", metavar="TIME", help="Resume at this second.")] = None,
@@ -186,7 +211,6 @@ def view(
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session and open it in Rerun."""
-    from flowrec.commands.export import export as write
     from flowrec.session import files_behind
     from flowrec.system.outputs import PICTURE, check_output
     from flowrec.terminal import say
@@ -197,9 +221,9 @@ def view(
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     if screenshot is not None:
         check_output(screenshot, PICTURE, inputs=files_behind(session), overwrite=overwrite)
-    rrd = session if session.suffix == ".rrd" else write(session, out, overwrite)
+    rrd = session if session.suffix == ".rrd" else flowrec.export(session, out, overwrite)
     if as_json:
-        typer.echo(_rrd_told(session, rrd))
+        typer.echo(_rrd_json(session, rrd))
     if screenshot is not None:
         for problem in take(rrd, screenshot, time_s=time, overwrite=overwrite):
             say(problem)
@@ -212,22 +236,20 @@ def view(
 
 @app.command()
 def export(
-    session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
+    session: SessionFile,
     out: RrdOut = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the .rrd of a session without opening it."""
-    from flowrec.commands.export import export as write
-
-    rrd = write(session, out, overwrite)
+    rrd = flowrec.export(session, out, overwrite)
     if as_json:
-        typer.echo(_rrd_told(session, rrd))
+        typer.echo(_rrd_json(session, rrd))
 
 
 @app.command()
 def info(
-    session: Annotated[Path, typer.Argument(help="Session (.mcap).")],
+    session: SessionFile,
     as_json: AsJson = False,
 ) -> None:
     """What a session is: how it ended, how long, what is in it, where it comes from."""
@@ -249,8 +271,6 @@ def list_directory(
     as_json: AsJson = False,
 ) -> None:
     """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
-    from dataclasses import asdict
-
     from flowrec.commands.info import list_sessions
 
     rows = list_sessions(directory)
@@ -286,14 +306,13 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
-    from flowrec.commands.check import check as judge
     from flowrec.commands.check import files_to_check
     from flowrec.terminal import progress
 
     nbytes = sum(file.stat().st_size for file in files_to_check(session) if file.is_file())
     try:
         with progress(f"reading {session.name}", max(nbytes, 1)) as done:
-            verdict = judge(session, done)
+            verdict = flowrec.check(session, done)
     except FlowrecError as error:
         if not as_json:
             raise
@@ -319,8 +338,6 @@ def recover(
     as_json: AsJson = False,
 ) -> None:
     """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
-    from dataclasses import asdict
-
     from flowrec.store import recover_run
     from flowrec.terminal import say
 
@@ -336,8 +353,8 @@ def recover(
 
 @app.command()
 def compare(
-    first: Annotated[Path, typer.Argument(help="Session (.mcap).")],
-    second: Annotated[Path, typer.Argument(help="Session to compare it with.")],
+    first: SessionFile,
+    second: SessionFile,
     as_json: AsJson = False,
 ) -> None:
     """Compare two sessions, every message of every tick; exit status 3 where they differ."""
@@ -349,11 +366,10 @@ def compare(
             typer.echo(printable(line))
         if comparison.first is not None:
             typer.echo(printable(f"first difference: {comparison.first}"))
-        same = "identical" if comparison.identical else "the same within tolerance"
-        typer.echo(
-            f"{comparison.ticks} ticks: "
-            + (same if comparison.same else f"{comparison.different_ticks} of them differ")
-        )
+        conclusion = "identical" if comparison.identical else "the same within tolerance"
+        if not comparison.same:
+            conclusion = comparison.other_numerics or f"{comparison.different_ticks} of them differ"
+        typer.echo(f"{comparison.ticks} ticks: {conclusion}")
     raise typer.Exit(0 if comparison.same else 3)
 
 
@@ -376,47 +392,54 @@ def calibrate(
         verb.show(fit, out)
 
 
-def _rrd_told(session: Path, rrd: Path) -> str:
-    """What was written of a session, as JSON."""
+def _rrd_json(session: Path, rrd: Path) -> str:
     return json.dumps({"session": str(session), "rrd": str(rrd), "bytes": rrd.stat().st_size})
 
 
-def _pieces(split: str | None, snapshot: str | None) -> dict[str, tuple[str, float]]:
-    """`--split` and `--snapshot` as settings: flag and value by key."""
-    from flowrec.units import amounts
-
-    settings: dict[str, tuple[str, float]] = {}
-    try:
-        if split is not None:
-            asked = amounts(split)
-            if len(asked["s"]) > 1 or len(asked["mb"]) > 1:
-                raise ValueError("one size, one time, or both")
-            for unit, values in asked.items():
-                settings |= {f"recording.split_{unit}": ("--split", value) for value in values}
-    except ValueError as error:
-        raise typer.BadParameter(f"{error}; as in --split 2GB,10min", param_hint="--split") from error
-    try:
-        if snapshot is not None:
-            asked = amounts(snapshot)
-            if asked["mb"] or not 1 <= len(asked["s"]) <= 2:
-                raise ValueError("the time before and, if 10 s is not it, the time after")
-            keys = ("recording.snapshot_before_s", "recording.snapshot_after_s")
-            settings |= {key: ("--snapshot", value) for key, value in zip(keys, asked["s"], strict=False)}
-    except ValueError as error:
-        raise typer.BadParameter(f"{error}; as in --snapshot 30s,10s", param_hint="--snapshot") from error
-    return settings
+def _split(text: str) -> dict[str, float]:
+    """`2GB`, `10min` or both, as settings."""
+    asked = amounts(text)
+    if max(map(len, asked.values())) > 1:
+        raise ValueError("one size, one time, or both")
+    return {f"recording.split_{unit}": values[0] for unit, values in asked.items() if values}
 
 
-def _point(text: str) -> str:
-    """`1200,800` as a TOML pair; a name stays a name."""
-    parts = text.split(",")
+def _snapshot(text: str) -> dict[str, float]:
+    """`30s,10s` as settings: the time before and, if given, the time after."""
+    asked = amounts(text)
+    if asked["mb"] or not 1 <= len(asked["s"]) <= 2:
+        raise ValueError("the time before and, if 10 s is not it, the time after")
+    keys = ("recording.snapshot_before_s", "recording.snapshot_after_s")
+    return dict(zip(keys, asked["s"], strict=False))
+
+
+def _goal(text: str) -> dict[str, str]:
+    """`1200,800` as a setting, a TOML pair; a name stays a name."""
     try:
-        numbers = [float(part) for part in parts]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        return text
+        return {"mission.goal": text}
     if len(numbers) != 2:
-        raise typer.BadParameter(f"{text!r}: a point is two numbers in um, as in --goal 1200,800", param_hint="--goal")
-    return f"[{numbers[0]}, {numbers[1]}]"
+        raise ValueError(f"{text!r}: a point is two numbers in um")
+    return {"mission.goal": str(numbers)}
+
+
+def _settings(
+    given: Iterable[tuple[str, Any, Callable[[Any], Mapping[str, Any]], str]],
+) -> tuple[list[str], dict[str, str]]:
+    """Options of `record` as `key=value`, and the option that set each key: (option, value, parser, example)."""
+    settings: list[str] = []
+    flags: dict[str, str] = {}
+    for flag, value, parse, example in given:
+        if value is None:
+            continue
+        try:
+            found = parse(value)
+        except ValueError as error:
+            raise typer.BadParameter(f"{error}; as in {flag} {example}", param_hint=flag) from error
+        settings += [f"{key}={setting}" for key, setting in found.items()]
+        flags |= dict.fromkeys(found, flag)
+    return settings, flags
 
 
 def with_default_refine(words: list[str]) -> list[str]:
@@ -435,8 +458,16 @@ def main() -> None:
     """Entry point: run the command line, turn our errors into one line and an exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # the locale's encoding may not have every character
+    # click's class, which typer has in its own package since 0.29.
+    usage_error: Any = typer.BadParameter.__base__
     try:
-        app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec")
+        sys.exit(app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec", standalone_mode=False) or 0)
+    except usage_error as error:
+        message = printable(error.format_message()).rstrip(".")
+        if message:  # else the help has been printed
+            verb = error.ctx.command_path if error.ctx is not None else "flowrec"
+            sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")
+        sys.exit(error.exit_code)
     except FlowrecError as error:
         sys.stderr.write(f"flowrec: {error}\n")
         sys.exit(error.exit_status)

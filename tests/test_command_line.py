@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import sys
@@ -12,7 +13,7 @@ from typer.testing import CliRunner
 
 from flowrec import terminal
 from flowrec.bench import plan
-from flowrec.cli import app, main
+from flowrec.cli import METHODS, app, main
 
 SESSIONS = Path(__file__).parents[1] / "sessions"
 
@@ -41,6 +42,35 @@ def test_help_is_asked_for_in_short(words: list[str]) -> None:
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0
     assert "Show this message" in done.output
+
+
+def test_the_help_of_replay_names_every_method_of_every_stage() -> None:
+    shown = CliRunner().invoke(app, ["replay", "--help"], env={"COLUMNS": "200"}).output
+    for target in METHODS.values():
+        module, _, table = target.partition(":")
+        for name in getattr(importlib.import_module(module), table):
+            assert f"{name}: " in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["record", "--nosuch"], "--nosuch"),
+        (["replay"], "SESSION"),
+        (["nosuch"], "nosuch"),
+        (["record", "--split", "3"], "as in --split 2GB,10min"),
+        (["record", "--goal", "1,2,3"], "a point is two numbers in um; as in --goal 1200,800"),
+        (["replay", "a.mcap", "--verify", "--refly"], "--verify only compares"),
+    ],
+)
+def test_wrong_usage_is_told_in_one_line_that_names_the_help(
+    words: list[object], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words, monkeypatch) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("flowrec: ")
+    assert said in line
+    assert line.endswith("--help")
 
 
 def test_a_shell_can_complete_the_verbs() -> None:

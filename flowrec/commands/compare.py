@@ -42,7 +42,7 @@ class Side:
     name: str
     recorded: Fields = field(default_factory=lambda: _ALL)
     copy: bool = False
-    numerics: str = str(NUMERICS_VERSION)
+    numerics: str = field(default_factory=lambda: str(NUMERICS_VERSION))
 
     @classmethod
     def of(cls, word: str, session: Session) -> Side:
