@@ -1,6 +1,6 @@
-"""One session clock, and what other clocks say beside it."""
+"""The session clock, and the other clocks of a run relative to it."""
 
-from flowrec.clocks.clock_monitor import ClockWatch, read_clocks
+from flowrec.clocks.clock_monitor import ClockMonitor, read_clocks
 from flowrec.clocks.device_clock import DeviceClock, Fit
 
-__all__ = ["ClockWatch", "DeviceClock", "Fit", "read_clocks"]
+__all__ = ["ClockMonitor", "DeviceClock", "Fit", "read_clocks"]

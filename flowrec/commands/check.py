@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flowrec.chip import chip_from_files
-from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_told, faults_of, skew_ppm
+from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_summary, irregular_frames, skew_ppm
 from flowrec.commands.check_tally import GAP_PERIODS, Tally
 from flowrec.commands.verdict import Finding, Gap, Verdict
 from flowrec.config import ResolvedConfig, config_from_toml
@@ -225,14 +225,14 @@ class _FileCheck:
         verdict, found, clocks = self.verdict, self.found, self.tally.clocks
         last = clocks.last
         if last is not None and last.rate:
-            verdict.fact("camera", camera_told(last, clocks.late_s, clocks.latest_s))
+            verdict.fact("camera", camera_summary(last, clocks.late_s, clocks.latest_s))
             if last.unit or (last.known and abs(skew_ppm(last)) > CRYSTAL_PPM):
                 verdict.odd(
                     "clocks",
                     f"a count of the camera's clock is {last.rate:.6g} ns, which no crystal is off by; stamps are "
                     "corrected by the fit",
                 )
-        for what, count in faults_of(last) if last is not None else ():
+        for what, count in irregular_frames(last) if last is not None else ():
             verdict.odd("clocks", f"{count} frames {what}")
         for stamp_ns, set_s in clocks.wall_set[:_LISTED]:
             at_s = seconds(stamp_ns - found.first_ns)

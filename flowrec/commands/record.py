@@ -16,7 +16,7 @@ import numpy as np
 
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
-from flowrec.clocks import ClockWatch
+from flowrec.clocks import ClockMonitor
 from flowrec.commands.auto_recovery import look_after
 from flowrec.commands.interactive import Unattended
 from flowrec.config import Config, ResolvedConfig
@@ -234,7 +234,7 @@ def record(
     run_control = control.run_control
     watchdog = Watchdog(rig, timeout_s, partial(run_control.stop, zero=True), warn)
     witness = Witness()
-    clocks = ClockWatch()
+    clocks = ClockMonitor()
     low: list[str] = []
     opened: list[SessionWriter] = []
 

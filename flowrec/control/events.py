@@ -9,12 +9,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from flowrec.enums import Action, Alarm, Level, Outcome
 from flowrec.messages import Event, Health, Tick
 from flowrec.units import seconds
 
-Line = tuple[str, str]  # text and level; "" leaves the level as it is
-_SUCCESS = ("reached", "survey complete", "refine complete", "plan complete")
-_OPERATOR = {"mark": "mark", "note": "note", "zero": "field to zero at once"}  # the mission reports other commands
+Line = tuple[str, Level | None]  # text and level; None leaves the level as it is
+# The mission reports other commands.
+_OPERATOR: dict[str, str] = {Action.MARK: "mark", Action.NOTE: "note", Action.ZERO: "field to zero at once"}
 
 
 def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | None:
@@ -31,28 +32,28 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
     ]
     if not lines:
         return None
-    level = next((level for _, level in reversed(lines) if level), "info")
-    return Event(tick.stamp_ns, level, "; ".join(text for text, _ in lines))
+    level = next((level for _, level in reversed(lines) if level is not None), Level.INFO)
+    return Event(tick.stamp_ns, level.value, "; ".join(text for text, _ in lines))
 
 
 def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
     """Fields and routes that are used from this tick on."""
     if tick.assumed is not None and tick.assumed is not last.assumed:
         peak = float(np.linalg.norm(tick.assumed.velocity_um_s, axis=-1).max())
-        yield f"assumed flow adopted ({tick.assumed.method}), peak {peak:.0f} um/s", ""
+        yield f"assumed flow adopted ({tick.assumed.method}), peak {peak:.0f} um/s", None
     if tick.refined is not None and tick.refined is not last.refined:
         note = f": {tick.refined.note}" if tick.refined.note else ""
-        yield f"refined flow adopted ({tick.refined.method}){note}", ""
+        yield f"refined flow adopted ({tick.refined.method}){note}", None
     route = tick.route
     if route is None or route is last.route:
         return
     if not route.reachable:
-        yield f"no route ({route.method}): {route.reason}", "warning"
+        yield f"no route ({route.method}): {route.reason}", Level.WARNING
         return
     length = float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
-    yield f"route adopted ({route.method}): {length / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", ""
+    yield f"route adopted ({route.method}): {length / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None
     if needs_time_to_go and route.method != "survey" and route.time_to_go_s is None:
-        yield "no time to go is known from here: the route is followed as by control.method = vector", "warning"
+        yield "no time to go is known from here: the route is followed as by control.method = vector", Level.WARNING
 
 
 def _sight(last: Tick, tick: Tick) -> Iterator[Line]:
@@ -61,7 +62,7 @@ def _sight(last: Tick, tick: Tick) -> Iterator[Line]:
         return
     if any(each.applied is not None and each.applied.repeats_image for each in (last, tick)):
         return
-    yield ("robot seen", "info") if tick.track.seen else ("robot lost from view", "warning")
+    yield ("robot seen", Level.INFO) if tick.track.seen else ("robot lost from view", Level.WARNING)
 
 
 def _health(before: Health | None, health: Health | None) -> Iterator[Line]:
@@ -70,21 +71,24 @@ def _health(before: Health | None, health: Health | None) -> Iterator[Line]:
         return
     was = set() if before is None else set(before.alarm.split("; ")) - {""}
     now = set(health.alarm.split("; ")) - {""}
-    texts = {
-        "nis": f"the robot is moved by what the observer does not know (NIS {health.nis:.1f}, should be 2)",
-        "pulsation": f"the flow pulsates at {health.pulsation_hz:.1f} Hz by {health.pulsation_share:.0%}",
-        "tracking": f"the robot is out of sight on {health.lost_share:.0%} of the frames",
+    texts: dict[str, str] = {
+        Alarm.NIS: f"the robot is moved by what the observer does not know (NIS {health.nis:.1f}, should be 2)",
+        Alarm.PULSATION: f"the flow pulsates at {health.pulsation_hz:.1f} Hz by {health.pulsation_share:.0%}",
+        Alarm.TRACKING: f"the robot is out of sight on {health.lost_share:.0%} of the frames",
     }
     for text in [texts[name] for name in sorted(now - was)] + [f"alarm over: {name}" for name in sorted(was - now)]:
-        yield text, "warning" if now else ""
+        yield text, Level.WARNING if now else None
     was_hz = before.limit_hz if before is not None else None
     if health.limit_hz is None and was_hz is not None:
-        yield f"no step-out: at {was_hz:.1f} Hz the robot rolls no better; the flow is not that of the map", "warning"
+        yield (
+            f"no step-out: at {was_hz:.1f} Hz the robot rolls no better; the flow is not that of the map",
+            Level.WARNING,
+        )
     elif health.limit_hz is not None and health.limit_hz != was_hz:
         rolled, expected = health.rolled_before_um_s
         yield (
             f"step-out: the robot rolls {rolled / expected:.0%} of what it should; limited to {health.limit_hz:.1f} Hz",
-            "warning",
+            Level.WARNING,
         )
 
 
@@ -92,8 +96,8 @@ def _operator(last: Tick, tick: Tick) -> Iterator[Line]:
     """What the operator did."""
     event = tick.operator
     if event is not None and event is not last.operator and event.action in _OPERATOR:
-        text = f": {event.text}" if event.text and event.action != "zero" else ""
-        yield f"operator: {_OPERATOR[event.action]}{text}", ""
+        text = f": {event.text}" if event.text and event.action != Action.ZERO else ""
+        yield f"operator: {_OPERATOR[event.action]}{text}", None
 
 
 def _mission(last: Tick, tick: Tick) -> Iterator[Line]:
@@ -102,18 +106,19 @@ def _mission(last: Tick, tick: Tick) -> Iterator[Line]:
     if mission is None:
         return
     for text in _hold(last, tick):
-        yield text, "warning" if mission.swept else ""
+        yield text, Level.WARNING if mission.swept else None
     if before is not None and not mission.finished and mission.blind_since_ns != before.blind_since_ns:
         if mission.blind_since_ns is None:
-            yield "robot in sight again: the mission goes on", ""
+            yield "robot in sight again: the mission goes on", None
         else:
-            yield f"{mission.blind}: the robot is held", "warning"
+            yield f"{mission.blind}: the robot is held", Level.WARNING
     if before is not None and mission.field_off and not before.field_off:
-        yield f"{mission.blind}: field off", "error"
+        yield f"{mission.blind}: field off", Level.ERROR
     if before is None or mission.phase != before.phase:
         state = mission.outcome if mission.finished else mission.phase
         note = f" ({mission.note})" if mission.note else ""
-        yield f"mission: {state}{note}", "warning" if mission.finished and mission.outcome not in _SUCCESS else ""
+        failed = mission.finished and not Outcome(mission.outcome).completes_mission
+        yield f"mission: {state}{note}", Level.WARNING if failed else None
 
 
 def _hold(last: Tick, tick: Tick) -> Iterator[str]:

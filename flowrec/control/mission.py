@@ -11,13 +11,14 @@ from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
+from flowrec.enums import Action, Outcome, Phase, WorkOrder
 from flowrec.messages import Applied, Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
 from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
-Phase = Literal["survey", "refine", "plan", "navigate"]
-PHASES: tuple[Phase, ...] = get_args(Phase)
+PhaseName = Literal["survey", "refine", "plan", "navigate"]
+PHASES: tuple[PhaseName, ...] = get_args(PhaseName)
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Point = tuple[Coordinate, Coordinate]
 Place = Point | str
@@ -50,7 +51,12 @@ class _Frame:
 
     def result(self, mission: Mission) -> FlowField | Route | None:
         """The result that the mission waits for, once it has arrived."""
-        results = {"solve": self.assumed, "refine": self.refined, "survey_route": self.route, "route": self.route}
+        results: dict[str, FlowField | Route | None] = {
+            WorkOrder.SOLVE: self.assumed,
+            WorkOrder.REFINE: self.refined,
+            WorkOrder.SURVEY_ROUTE: self.route,
+            WorkOrder.ROUTE: self.route,
+        }
         result = results.get(mission.wanted)
         return result if result is not None and result.request == mission.request else None
 
@@ -63,7 +69,7 @@ class MissionStateMachine:
     points (x, y) in um on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
     """
 
-    phases: tuple[Phase, ...] = PHASES
+    phases: tuple[PhaseName, ...] = PHASES
     start: Place = "inlet"
     goal: Place = "outlet"
     goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
@@ -127,10 +133,10 @@ class MissionStateMachine:
         has_field = now.assumed is not None  # of an earlier session
         return Mission(
             stamp_ns=now.now_ns,
-            phase="start",
+            phase=Phase.START.value,
             since_ns=now.now_ns,
             request=0 if has_field else 1,
-            wanted="" if has_field else "solve",
+            wanted="" if has_field else WorkOrder.SOLVE.value,
             requested_ns=now.now_ns,
             start_um=np.asarray(self.start, np.float64),
             goal_um=np.asarray(self.goal, np.float64),
@@ -145,12 +151,12 @@ class MissionStateMachine:
         A held mission does not advance, whatever it waits for, and its time limits are suspended.
         """
         command, since_ns = now.command, mission.held_since_ns
-        if command in ("stop", "zero"):
+        if command in (Action.STOP, Action.ZERO):
             note = now.operator.text if now.operator is not None else ""
-            return _finish(mission, now, "stopped", note or f"operator: {command}")
-        if command == "pause" and since_ns is None:
+            return _finish(mission, now, Outcome.STOPPED, note or f"operator: {command}")
+        if command == Action.PAUSE and since_ns is None:
             return replace(mission, stamp_ns=now.now_ns, held_since_ns=now.now_ns)
-        if command == "resume" and since_ns is not None:
+        if command == Action.RESUME and since_ns is not None:
             held_ns = mission.held_ns + now.now_ns - since_ns
             return replace(mission, stamp_ns=now.now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
         return mission
@@ -159,16 +165,16 @@ class MissionStateMachine:
         """The end of a run whose robot was not found, or not seen for too many frames."""
         if now.track.seen:
             return None
-        if previous.phase == "start":
+        if previous.phase == Phase.START:
             if _elapsed_s(previous, now) > self.find_limit_s:
                 note = (
                     f"no robot seen in the image for {self.find_limit_s:g} s; is it in view (camera.um_per_px), "
                     "and of the size in robot.radius_um?"
                 )
-                return _finish(previous, now, "not found", note)
+                return _finish(previous, now, Outcome.NOT_FOUND, note)
         elif now.track.lost_frames > self.lost_limit_frames:
             why = f"{previous.blind}, " if previous.blind else "robot not seen in "
-            return _finish(previous, now, "lost", f"{why}{now.track.lost_frames} frames")
+            return _finish(previous, now, Outcome.LOST, f"{why}{now.track.lost_frames} frames")
         return None
 
     def _without_sight(self, previous: Mission, now: _Frame) -> Mission:
@@ -188,7 +194,7 @@ class MissionStateMachine:
         if applied.repeats_image:
             why = f"the camera repeats one image since {seconds(applied.image_since_ns):.1f} s"
         if unseen_s >= self.zero_after_s + self.find_limit_s:
-            return _finish(previous, now, "lost", why)
+            return _finish(previous, now, Outcome.LOST, why)
         if unseen_s >= self.zero_after_s and not previous.field_off:
             since_ns = now_ns if previous.blind_since_ns is None else previous.blind_since_ns
             return replace(previous, stamp_ns=now_ns, blind_since_ns=since_ns, blind=why, field_off=True)
@@ -199,30 +205,32 @@ class MissionStateMachine:
     def _advance(self, previous: Mission, now: _Frame, result: FlowField | Route | None) -> Mission:
         """The next state when no work is pending, or its result has just arrived."""
         phase, route = previous.phase, now.route
-        if not now.track.seen and phase != "start":
+        if not now.track.seen and phase != Phase.START:
             return previous  # nothing begins while the robot is out of sight
-        if phase == "start":
+        if phase == Phase.START:
             if isinstance(result, Route):  # of the survey
                 if result.reachable:
-                    return _transition(previous, now, "survey", result.reason)
-                return self._next_phase("survey", previous, now, f"no survey: {result.reason}")
+                    return _transition(previous, now, Phase.SURVEY, result.reason)
+                return self._next_phase(Phase.SURVEY, previous, now, f"no survey: {result.reason}")
             if not now.track.seen:
                 return replace(previous, stamp_ns=now.now_ns, wanted="") if previous.wanted else previous
-            if "survey" in self.phases:
-                return _order(previous, now, "start", "survey_route")
-            return self._next_phase("survey", previous, now)
-        if phase == "refine":
-            return self._next_phase("refine", previous, now)
-        if phase == "plan":
+            if Phase.SURVEY in self.phases:
+                return _order(previous, now, Phase.START, WorkOrder.SURVEY_ROUTE)
+            return self._next_phase(Phase.SURVEY, previous, now)
+        if phase == Phase.REFINE:
+            return self._next_phase(Phase.REFINE, previous, now)
+        if phase == Phase.PLAN:
             assert isinstance(result, Route)
             if not result.reachable:
-                return _finish(previous, now, "unreachable", result.reason)
-            return self._next_phase("plan", previous, now, result.reason)
+                return _finish(previous, now, Outcome.UNREACHABLE, result.reason)
+            return self._next_phase(Phase.PLAN, previous, now, result.reason)
         assert route is not None
-        if phase == "survey":
+        if phase == Phase.SURVEY:
             late = _elapsed_s(previous, now) > self._time_limit_s(self.survey_limit_s, route)
             if late or _at_end(now, route):
-                return self._next_phase("survey", previous, now, "survey cut short by its time limit" if late else "")
+                return self._next_phase(
+                    Phase.SURVEY, previous, now, "survey cut short by its time limit" if late else ""
+                )
             return previous
         return self._navigate(previous, now, route)
 
@@ -234,29 +242,35 @@ class MissionStateMachine:
         """At the goal, too late, too far off the route, or still on the way."""
         tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius_um
         if math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
-            return _finish(previous, now, "reached")
+            return _finish(previous, now, Outcome.REACHED)
         limit_s = self._time_limit_s(self.navigate_limit_s, route)
         if _elapsed_s(previous, now) > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
-            return _finish(previous, now, "timeout", note)
+            return _finish(previous, now, Outcome.TIMEOUT, note)
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
         if now.demand is None or not now.demand.error_um > limit_um:
             return previous
         if previous.request >= self.orders_limit:
             note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
-            return _finish(previous, now, "gave up", note)
+            return _finish(previous, now, Outcome.GAVE_UP, note)
         return _order(
-            previous, now, "plan", "route", f"blown {now.demand.error_um:.0f} um off the route: planning anew"
+            previous,
+            now,
+            Phase.PLAN,
+            WorkOrder.ROUTE,
+            f"blown {now.demand.error_um:.0f} um off the route: planning anew",
         )
 
     def _next_phase(self, done: Phase, previous: Mission, now: _Frame, note: str = "") -> Mission:
         """Enter the first selected phase after `done`, or end the run."""
-        selected = {*self.phases, "plan"} if "navigate" in self.phases else set(self.phases)
-        phase = next((phase for phase in PHASES[PHASES.index(done) + 1 :] if phase in selected), None)
-        if phase is None:
-            return _finish(previous, now, f"{done} complete", note)
-        wanted = {"refine": "refine", "plan": "route"}.get(phase)
-        return _order(previous, now, phase, wanted, note) if wanted else _transition(previous, now, phase, note)
+        selected: set[str] = {*self.phases, Phase.PLAN} if Phase.NAVIGATE in self.phases else set(self.phases)
+        name = next((name for name in PHASES[PHASES.index(done.value) + 1 :] if name in selected), None)
+        if name is None:
+            return _finish(previous, now, Outcome(f"{done} complete"), note)
+        phase, orders = Phase(name), {"refine": WorkOrder.REFINE, "plan": WorkOrder.ROUTE}
+        if name in orders:
+            return _order(previous, now, phase, orders[name], note)
+        return _transition(previous, now, phase, note)
 
 
 def _held(previous: Mission, now: _Frame) -> Mission:
@@ -287,37 +301,37 @@ def _at_end(now: _Frame, route: Route) -> bool:
 
 
 def _transition(
-    previous: Mission, now: _Frame, phase: str, note: str = "", wanted: str = "", **changes: Any
+    previous: Mission, now: _Frame, phase: Phase, note: str = "", wanted: WorkOrder | None = None, **changes: Any
 ) -> Mission:
     """The mission in a phase, which begins now unless it is the present one."""
     new = phase != previous.phase
     return replace(
         previous,
         stamp_ns=now.now_ns,
-        phase=phase,
+        phase=phase.value,
         since_ns=now.now_ns if new else previous.since_ns,
         held_ns=0 if new else previous.held_ns,
-        wanted=wanted,
+        wanted=wanted.value if wanted is not None else "",
         note=note,
         **changes,
     )
 
 
-def _order(previous: Mission, now: _Frame, phase: str, wanted: str, note: str = "") -> Mission:
+def _order(previous: Mission, now: _Frame, phase: Phase, wanted: WorkOrder, note: str = "") -> Mission:
     """The mission in a phase that waits for a new work order."""
     request, start_um = previous.request + 1, now.estimate.position_um
     return _transition(previous, now, phase, note, wanted, request=request, requested_ns=now.now_ns, start_um=start_um)
 
 
-def _finish(previous: Mission, now: _Frame, outcome: str, note: str = "") -> Mission:
+def _finish(previous: Mission, now: _Frame, outcome: Outcome, note: str = "") -> Mission:
     """The finished mission."""
     return _transition(
         previous,
         now,
-        "done",
+        Phase.DONE,
         note,
         finished=True,
-        outcome=outcome,
+        outcome=outcome.value,
         held_since_ns=None,
         swept=False,
         blind_since_ns=None,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol
 
-from flowrec.clocks import ClockWatch
+from flowrec.clocks import ClockMonitor
 from flowrec.enums import Action, Outcome
 from flowrec.messages import OperatorEvent, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step, with_inputs
@@ -73,7 +73,7 @@ def run(
     on_tick: Callable[[Tick], None] | None = None,
     queue_state: Callable[[], tuple[float, int]] = lambda: (0.0, 0),
     live: bool = True,
-    clocks: ClockWatch | None = None,
+    clocks: ClockMonitor | None = None,
     watchdog: Watchdog | None = None,
 ) -> RunReport:
     """Run until the rig ends, the mission is finished and the coils are at zero, or `control` stops the run.
@@ -107,7 +107,7 @@ def run(
     def reject() -> None:
         report.passed_over += 1
         if clocks is not None:
-            clocks.pass_over()
+            clocks.count_skipped()
 
     with ExitStack() as stack:
         # Reader and writer threads need the interpreter for moments only; at the default of 5 ms each of their turns
@@ -159,7 +159,7 @@ def run(
             )
             recorded = replace(tick, timing=timing, truth=inputs.truth, true_field=inputs.true_field)
             if clocks is not None:
-                recorded = replace(recorded, clocks=clocks.see(tick.stamp_ns, inputs.clock))
+                recorded = replace(recorded, clocks=clocks.update(tick.stamp_ns, inputs.clock))
             _write(sinks, recorded)
             watch.lap("sinks")
             sinks_ms = watch.ms["sinks"]

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.clocks import ClockWatch, DeviceClock, read_clocks
+from flowrec.clocks import ClockMonitor, DeviceClock, read_clocks
 from flowrec.commands.check import check
 from flowrec.commands.info import facts_for_people, info
 from flowrec.commands.record import prepare
@@ -44,12 +44,12 @@ class TwoClocks:
 
 def test_a_wall_clock_that_is_set_is_told_at_once_and_with_its_size():
     clocks = TwoClocks()
-    watch = ClockWatch(clocks)
+    watch = ClockMonitor(clocks)
     said = []
     for n in range(100):
         clocks.now_ns = n * S // 20
         clocks.wall_off_ns += {37: -3600 * S, 61: 2 * S}.get(n, 50)  # besides, it is slewed by 1 ppm
-        message = watch.see(n * S // 20, None)
+        message = watch.update(n * S // 20, None)
         if not said or message is not said[-1]:
             said.append(message)
     jumps = [message for before, message in itertools.pairwise(said) if message.wall_jumps > before.wall_jumps]
@@ -88,7 +88,7 @@ def flown(path, rig_of=Stumbling, watch=None, **more):
     rig = rig_of.of(pipeline, config, config.duration_s)
     for name, value in more.items():
         setattr(rig, name, value)
-    clocks = watch or ClockWatch()
+    clocks = watch or ClockMonitor()
     with session_writer(path, config, chip) as writer:
         report = run(pipeline, rig, LockstepWorker(pipeline, 0.5), [writer], clocks=clocks)
         writer.close({"outcome": report.outcome, **clocks.outcome()})
@@ -119,13 +119,13 @@ def test_a_rig_that_stays_back_in_time_ends_the_run_because_nobody_steers(tmp_pa
 def test_wall_clocks_set_in_a_run_are_in_its_verdict_and_nothing_else_changes(tmp_path):
     calm, troubled = TwoClocks(), TwoClocks()
 
-    class Set(ClockWatch):
-        def see(self, stamp_ns, fit):
+    class Set(ClockMonitor):
+        def update(self, stamp_ns, fit):
             troubled.now_ns = stamp_ns
             troubled.wall_off_ns -= 7200 * S * (stamp_ns == S)
-            return super().see(stamp_ns, fit)
+            return super().update(stamp_ns, fit)
 
-    flown(tmp_path / "a.mcap", SimulatedRig, ClockWatch(calm))
+    flown(tmp_path / "a.mcap", SimulatedRig, ClockMonitor(calm))
     flown(tmp_path / "b.mcap", SimulatedRig, Set(troubled))
     verdict = check(tmp_path / "b.mcap")
     assert [finding.text for finding in verdict.findings] == [
@@ -171,17 +171,17 @@ time_t time(time_t *to) {
 CHILD = """
 import sys, time
 from dataclasses import replace
-from flowrec.clocks import ClockWatch
+from flowrec.clocks import ClockMonitor
 from flowrec.store import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 
-watch = ClockWatch()
+watch = ClockMonitor()
 tick = next(ticks_of(1, shape=(64, 64)))
 with SessionWriter(sys.argv[1], HEADER) as writer:
     for number in range(100_000):
         now = time.monotonic_ns()
         frame, applied = replace(tick.frame, stamp_ns=now, index=number), replace(tick.applied, stamp_ns=now)
-        track, clocks = replace(tick.track, stamp_ns=now), watch.see(now, None)
+        track, clocks = replace(tick.track, stamp_ns=now), watch.update(now, None)
         writer.write(replace(tick, stamp_ns=now, frame=frame, applied=applied, track=track, clocks=clocks))
         time.sleep(0.01)
 """

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.estimation import Kalman, Observer, Trimmed, observe, smooth
+from flowrec.errors import UsageError
+from flowrec.estimation import Kalman, Observer, Sampler, Trimmed, observe, smooth
+from flowrec.estimation.sampler import SAMPLERS
 from flowrec.messages import Applied, Observations, Track
 from flowrec.robot import Robot
 
@@ -106,3 +108,16 @@ def test_the_last_smoothed_frame_is_the_filters():
     np.testing.assert_allclose(smoothed.flow_um_s[-1], estimate.flow_um_s, rtol=1e-9)
     np.testing.assert_allclose(smoothed.position_um[-1], estimate.position_um, rtol=1e-9)
     np.testing.assert_allclose(smoothed.covariance[-1], estimate.covariance[:4, :4], rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", list(SAMPLERS))
+def test_any_treatment_keeps_observations_finite_and_no_more_of_them(method):
+    _, observed = survey()
+    treated = Sampler(method=method).treat(observed)
+    assert 0 < len(treated.std_um_s) <= len(observed.std_um_s)
+    assert np.isfinite(treated.flow_um_s).all() and (treated.std_um_s > 0.0).all()
+
+
+def test_a_treatment_that_is_not_in_the_table_is_an_error():
+    with pytest.raises(UsageError, match=r"sampler\.method = 'trim': must be one of .*; the nearest is trimmed"):
+        Sampler(method="trim").treat(survey()[1])
