@@ -84,8 +84,8 @@ def _refuse_unmeasured(config: Config) -> None:
     missing = [key for key, value in given.items() if value is None]
     if config.rig != SIMULATED and missing:
         raise UsageError(
-            f"rig = {config.rig!r}: {', '.join(missing)} not given; measure them and set each: only the simulated rig's "
-            "robot and camera are made to fit the chip"
+            f"rig = {config.rig!r}: {', '.join(missing)} not given; measure them and set each: only the robot and the "
+            "camera of the simulated rig are made to fit the chip"
         )
 
 

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from flowrec.enums import Level, Phase
 from flowrec.errors import printable
 from flowrec.system.stderr import Outlet
 from flowrec.units import seconds
@@ -28,6 +29,7 @@ _PATIENCE_S = 2.0  # without a tick, then a person wants to know why
 _PERIOD_S = 0.12
 _GOODBYE_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000
+_COLOURS: dict[str, str] = {Level.WARNING: "yellow", Level.ERROR: "red"}
 _STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
 _NOTE_SHOWN = 60  # characters of a long note, from its end
 
@@ -126,7 +128,7 @@ class StatusLine:
         import numpy as np
 
         mission, timing = tick.mission, tick.timing
-        phase = mission.phase if mission is not None else "start"
+        phase = mission.phase if mission is not None else Phase.START
         wait = f" ({mission.wanted.replace('_', ' ')} ...)" if mission is not None and mission.wanted else ""
         arrivals, latencies = list(self._arrivals), list(self._latency_ms)
         span = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0.0
@@ -150,7 +152,7 @@ class StatusLine:
 
 
 def _print(event: Event) -> None:
-    colour = {"warning": "yellow", "error": "red"}.get(event.level, "cyan")
+    colour = _COLOURS.get(event.level, "cyan")
     text = escape(printable(event.text))
     console.print(f"[dim]{seconds(event.stamp_ns):8.2f} s[/dim]  [{colour}]{text}[/{colour}]", soft_wrap=True)
 

@@ -14,6 +14,7 @@ from flowrec.commands.check_tally import GAP_PERIODS, Tally
 from flowrec.commands.verdict import Finding, Gap, Verdict
 from flowrec.config import ResolvedConfig, config_from_toml
 from flowrec.declarations import Role
+from flowrec.enums import Outcome
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
 from flowrec.store.audit import audit
@@ -111,7 +112,7 @@ class _FileCheck:
         verdict, found = self.verdict, self.found
         how = found.outcome.get("outcome", "")
         note = found.outcome.get("note") or found.outcome.get("reason", "")
-        why = f" ({note})" if note and how != "cut" else ""  # findings report a cut
+        why = f" ({note})" if note and how != Outcome.CUT else ""  # findings report a cut
         verdict.figures |= {"outcome": how, "note": note}
         verdict.fact("outcome", (how or "not recorded") + why)
         if not found.finished:
@@ -122,10 +123,10 @@ class _FileCheck:
                 verdict.bad("end", f"it {fault}; `flowrec recover {found.path}` saves what is whole")
         elif not how:
             verdict.odd("end", "how the run ended was not recorded")
-        elif how == "failed":
+        elif how == Outcome.FAILED:
             verdict.odd("end", f"the run failed: {note or 'for a reason that was not recorded'}")
         source = found.outcome.get("recovered_from")
-        if source is not None and how == "cut":
+        if source is not None and how == Outcome.CUT:
             verdict.odd("end", f"it was recovered from {source}; {note}")
         elif source is not None:
             verdict.fact("recovered", f"from {source}, without a loss")
@@ -342,7 +343,7 @@ def _compare_ends(run: Verdict, name: str, before: _FileCheck, after: _FileCheck
     if not was.is_same_run(now):
         run.bad("parts", f"{name} has another head (configuration, chip or origin) than the part before")
     outcome = before.found.outcome
-    if before.found.finished and not is_continued(outcome) and outcome.get("outcome") != "cut":
+    if before.found.finished and not is_continued(outcome) and outcome.get("outcome") != Outcome.CUT:
         run.odd("parts", f"{name} goes on although the part before says that the run ended with it")
     # An image that was dropped may be in one of them only; no stage reads truths and timings.
     read = {topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {"frame"}

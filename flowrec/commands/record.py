@@ -20,6 +20,7 @@ from flowrec.clocks import ClockMonitor
 from flowrec.commands.auto_recovery import look_after
 from flowrec.commands.interactive import Unattended
 from flowrec.config import Config, ResolvedConfig
+from flowrec.enums import Outcome, Phase
 from flowrec.errors import SessionError, UnreachableError, UsageError
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Demand, FlowField, Route, Tick
@@ -82,7 +83,7 @@ class Recorded:
 
 
 # Ends that are what was asked for.
-GOOD_ENDS = ("reached", "survey complete", "refine complete", "plan complete", "stopped", "time over")
+GOOD_ENDS = {*(each for each in Outcome if each.completes_mission), Outcome.STOPPED, Outcome.TIME_OVER}
 
 
 class Witness:
@@ -97,7 +98,7 @@ class Witness:
     def write(self, tick: Tick) -> None:
         self.true_field = tick.true_field or self.true_field
         demand = tick.demand
-        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != "navigate":
+        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
             return
         self._last = demand
         if math.isfinite(demand.error_um):
@@ -158,7 +159,7 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
     reason = too_swift(chip, field, start, start, robot.radius_um, course_error)
     if reason:
         raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
-    if {"plan", "navigate"} & set(config.mission.phases):
+    if {Phase.PLAN, Phase.NAVIGATE} & set(config.mission.phases):
         goal = np.asarray(config.mission.goal, np.float64)
         reason = no_room(chip, field, start, goal, robot)
         reason = reason or too_swift(chip, field, start, goal, robot.radius_um, course_error)
@@ -335,7 +336,9 @@ def _closed_beside(opened: list[SessionWriter], reason: str) -> str:
 
     def close() -> None:
         with suppress(SessionError):  # what is there stays in the partial file
-            writer.close({"outcome": "failed", "note": f"{reason}; the main thread did not answer"}, CLOSE_PATIENCE_S)
+            writer.close(
+                {"outcome": Outcome.FAILED, "note": f"{reason}; the main thread did not answer"}, CLOSE_PATIENCE_S
+            )
 
     thread = threading.Thread(target=close, name="give up", daemon=True)
     thread.start()
@@ -407,11 +410,16 @@ def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Fig
         "ticks": report.ticks,
     }
     last = report.last
-    if last.mission is not None and last.route is not None and last.route.reachable and last.mission.phase == "done":
+    if (
+        last.mission is not None
+        and last.route is not None
+        and last.route.reachable
+        and last.mission.phase == Phase.DONE
+    ):
         facts["planner"] = last.route.method
         facts["route_length_um"] = length_um(last.route)
         facts["planned_s"] = float(last.route.arrival_s[-1])
-        if last.mission.outcome == "reached":
+        if last.mission.outcome == Outcome.REACHED:
             facts["navigation_s"] = seconds(last.mission.since_ns - last.route.stamp_ns)
     if true_field is not None:
         facts["contacts"] = report.contacts

@@ -13,6 +13,7 @@ from flowrec.control.delay_compensation import append_demand, corrected_flow, pr
 from flowrec.control.tracking_laws import Reference, Situation, TrackingLaw, limit_length, speed_ratio
 from flowrec.control.trajectory import follow
 from flowrec.control.wall_barrier import wall_barrier
+from flowrec.enums import Phase
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
 from flowrec.methods import Method, Methods
 from flowrec.ranges import PositiveShare, Range
@@ -20,7 +21,7 @@ from flowrec.robot import Robot
 from flowrec.units import seconds
 
 Vector = NDArray[np.float64]
-_FOLLOWING = ("survey", "navigate")
+_FOLLOWING = (Phase.SURVEY, Phase.NAVIGATE)
 _LEAST_SPEED = 0.02  # of the robot's limit: a demand below it is zero while the robot is not seen
 
 _LAWS = "flowrec.control.tracking_laws:"

@@ -21,6 +21,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from flowrec.declarations import MessageField, message_fields
+from flowrec.enums import Level
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
 from flowrec.store.schema import ARRAY_DATA, Schema, array_schema, foxglove_schema, schema_of
@@ -36,7 +37,7 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
 _SHORT_VECTOR, _LONG_VECTOR = 64, 1 << 16
 
 # Levels of foxglove.Log by Event.level; a level that is not listed is kept in the name.
-_LEVELS = {"debug": 1, "info": 2, "warning": 3, "error": 4, "fatal": 5}
+_LEVELS: dict[str, int] = {"debug": 1, Level.INFO: 2, Level.WARNING: 3, Level.ERROR: 4, "fatal": 5}
 _LEVEL_NAMES = {number: name for name, number in _LEVELS.items()}
 _EVENT_NAME = "flowrec"
 _OPERATOR_NAME = "operator."
@@ -302,7 +303,7 @@ def _operator_codec() -> Codec:
 
     def encode(event: OperatorEvent) -> Payload:
         text, name = f"{event.action}: {event.text}", _OPERATOR_NAME + event.action
-        return _log(schema, event.stamp_ns, _LEVELS["info"], text, name)
+        return _log(schema, event.stamp_ns, _LEVELS[Level.INFO], text, name)
 
     def decode(payload: bytes | memoryview, _sequence: int) -> OperatorEvent:
         parsed = schema.wire.FromString(payload)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.store.mcap_reader import UnfinishedError
 from flowrec.store.paths import PARTIAL_SUFFIX, part_number, part_path, partial_path, parts, run_files
@@ -186,4 +187,4 @@ def continuity_fault(file: RunFile, number: int, before: RunFile | None) -> str 
 
 def is_continued(outcome: Mapping[str, str]) -> bool:
     """Whether a part says that the run is continued in another."""
-    return "continued" in (outcome.get("outcome"), outcome.get("ended_as"))
+    return Outcome.CONTINUED in (outcome.get("outcome"), outcome.get("ended_as"))

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
 from flowrec.store.frame_encodings import ENCODINGS
@@ -303,11 +304,11 @@ def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Map
     recorded = {key: value for key, value in reader.outcome.items() if key not in ("ticks", "dropped_frames")}
     marks = {"recovered_from": reader.path.name, "frames_dropped": str(dropped)}
     if not lost:
-        return {"outcome": "ended", **recorded, **marks}
+        return {"outcome": Outcome.ENDED, **recorded, **marks}
     if "outcome" in recorded:
         marks["ended_as"] = recorded["outcome"]
     until_s = seconds(end_ns - reader.first_ns)
-    return {**recorded, **marks, "outcome": "cut", "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
+    return {**recorded, **marks, "outcome": Outcome.CUT, "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
 
 
 def _refuse_if_taken(target: Path) -> None:
@@ -338,5 +339,5 @@ def _end_of_run(path: Path, last: SessionReader, part: Part) -> Recovered:
     lost = f"everything after {last.path.name}"
     with SessionWriter(target, header, WriterOptions(block=True)) as writer:
         writer.write(replace(last.tick_before(last.last_ns), stamp_ns=last.last_ns))
-        writer.close({"outcome": "cut", "note": f"lost: {lost}", "recovered_from": last.path.name})
+        writer.close({"outcome": Outcome.CUT, "note": f"lost: {lost}", "recovered_from": last.path.name})
     return Recovered(target, 0, 0.0, lost=lost)

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from flowrec.enums import Action, Level, Outcome
 from flowrec.messages import Drops, Event, OperatorEvent
 from flowrec.store.async_file_writer import AsyncFileWriter
 from flowrec.store.channels import FRAMES
@@ -179,7 +180,7 @@ class RingBuffer:
         if entry.ticks:
             snapshot = self._snapshot
             if snapshot is not None and entry.stamp_ns > snapshot.until_ns:
-                self._end({"outcome": "snapshot", "note": snapshot.events[0], **snapshot.summary})
+                self._end({"outcome": Outcome.SNAPSHOT, "note": snapshot.events[0], **snapshot.summary})
             elif snapshot is None and self._is_full(entry.stamp_ns):
                 self._cut()
         self._router.add(entry)
@@ -328,9 +329,9 @@ class RingBuffer:
     def _event_in(self, entry: Entry) -> str:
         """The event in this entry that a snapshot is taken for, as text; empty: none."""
         event, operator, drops = map(entry.messages.get, ("event", "operator", "drops"))
-        if isinstance(operator, OperatorEvent) and operator.action in ("mark", "note"):
+        if isinstance(operator, OperatorEvent) and operator.action in (Action.MARK, Action.NOTE):
             return f"{operator.action}: {operator.text}".rstrip(": ")
-        if isinstance(event, Event) and event.level in ("warning", "error"):
+        if isinstance(event, Event) and event.level in (Level.WARNING, Level.ERROR):
             return event.text
         if isinstance(drops, Drops):
             dropped = drops.by_backlog + drops.by_camera

@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
 from flowrec.store.paths import part_path
@@ -306,7 +307,7 @@ class Parts:
     def _finish_after_failure(self, place: OpenSegment[PartFile], reason: str) -> None:
         place.counters.dropped_frames += place.awaited
         part, is_last = place.segment, place is self._router.current
-        outcome = {"outcome": "failed", "reason": reason} if is_last else self._continued(part)
+        outcome = {"outcome": Outcome.FAILED, "reason": reason} if is_last else self._continued(part)
         part.finish({**outcome, **place.counters.summary(self.options.encoding)})
         self.files.append(part.path)
 
@@ -334,7 +335,7 @@ class Parts:
         return PartFile(self, number, path, header, first)
 
     def _continued(self, part: PartFile) -> dict[str, str]:
-        return {"outcome": "continued", "next": part_path(self._path, part.number + 1).name}
+        return {"outcome": Outcome.CONTINUED, "next": part_path(self._path, part.number + 1).name}
 
     def _collect_finished(self, *, wait: bool) -> None:
         while self._finishing and (wait or self._finishing[0][1].done()):

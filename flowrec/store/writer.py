@@ -16,6 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from flowrec.declarations import Message, array_fields
+from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.messages import Drops, Frame, Tick, Track
 from flowrec.store.channels import FRAME_PATH
@@ -205,7 +206,7 @@ class SessionWriter:
         self._thread.join()
         try:
             if self._failure is None:
-                self._finish(outcome or {"outcome": "ended"}, waiting, why)
+                self._finish(outcome or {"outcome": Outcome.ENDED}, waiting, why)
         except Exception as error:  # noqa: BLE001  raised below, as those of the thread
             self._failure = error
         finally:
@@ -224,7 +225,7 @@ class SessionWriter:
         stopped = isinstance(error, KeyboardInterrupt)
         reason = f"{type(error).__name__}: {error}".rstrip(": ")
         try:
-            self.close({"outcome": "stopped" if stopped else "failed", "reason": reason}, why=reason)
+            self.close({"outcome": Outcome.STOPPED if stopped else Outcome.FAILED, "reason": reason}, why=reason)
         except SessionError as second:
             if str(second) != str(error):  # the first one matters more
                 error.add_note(str(second))
