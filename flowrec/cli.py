@@ -119,7 +119,8 @@ def record(
     )
     chosen = load_config(config, [*(sets or []), *settings], flags)
     from flowrec.commands.interactive import AtTerminal
-    from flowrec.commands.record import prepare, print_summary
+    from flowrec.commands.record import prepare
+    from flowrec.commands.run_summary import print_summary
     from flowrec.system.stderr import said_within
 
     if dry_run:

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from flowrec.commands.record import Recorded, record
+from flowrec.commands.record import record
+from flowrec.commands.run_summary import Recorded
 from flowrec.config import load_config
 
 # A shell that starts the tests in the background has SIGINT ignored, and so would all that they start.

@@ -14,7 +14,8 @@ import pytest
 import flowrec
 from flowrec.chip import load_chip
 from flowrec.cli import main
-from flowrec.commands.record import Recorded, prepare
+from flowrec.commands.record import prepare
+from flowrec.commands.run_summary import Recorded
 from flowrec.config import Config, config_from_toml, load_config, to_toml, with_sets
 from flowrec.errors import FlowrecError, UnreachableError, UsageError
 from flowrec.resolve import resolve

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -19,96 +18,40 @@ from flowrec.chip.chip import Chip
 from flowrec.clocks import ClockMonitor
 from flowrec.commands.auto_recovery import look_after
 from flowrec.commands.interactive import Unattended
+from flowrec.commands.run_summary import GOOD_ENDS, Recorded, RunStatistics, figures_of, files_text
 from flowrec.config import Config, ResolvedConfig
 from flowrec.enums import Outcome, Phase
 from flowrec.errors import SessionError, UnreachableError, UsageError
-from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import Demand, FlowField, Route, Tick
+from flowrec.messages import FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
 from flowrec.rig_settings import RIGS
 from flowrec.rigs.rig import Rig
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
-from flowrec.run.loop import RunReport, Sink, run
+from flowrec.run.loop import Sink, run
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import LockstepWorker, Preloaded, Worker
 from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
-from flowrec.store import SessionWriter, is_snapshot, runs_in
+from flowrec.store import SessionWriter, runs_in
 from flowrec.store.paths import run_files, run_path
-from flowrec.summary import Figures, as_text, finite, rows_for_people
+from flowrec.summary import as_text, finite
 from flowrec.system.outputs import MCAP, RRD, check_output
 from flowrec.system.processes import realtime_priority
-from flowrec.terminal import say, table, warn
-from flowrec.units import seconds
+from flowrec.terminal import say, warn
 
 if TYPE_CHECKING:
     from flowrec.view.live import LiveView
 
 # Of the 2 s that a run may take to end: the rest is for the coils (run_control.py) and for Python itself.
-CLOSE_PATIENCE_S = 0.5  # for images that still wait to be written
-VIEW_PATIENCE_S = 0.2  # for a viewer to show the last of it
-_GIVE_UP_S = 1.0  # for a file to be closed beside a thread that is stuck
+CLOSE_TIMEOUT_S = 0.5  # for images that still wait to be written
+VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last of it
+_GIVE_UP_TIMEOUT_S = 1.0  # for a file to be closed beside a thread that is stuck
 _LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
 
 View = Literal["spawn", "serve", "rrd", "none"]
-
-
-@dataclass(frozen=True, slots=True)
-class Recorded:
-    """What a finished recording is known by."""
-
-    path: Path  # of the run, also where it is in several files
-    report: RunReport
-    facts: Figures  # numbers with their units in the keys
-    files: tuple[Path, ...] = ()  # in order; none where a run was to be kept around events, and none came
-
-    @property
-    def sessions(self) -> tuple[Path, ...]:
-        """What can be given to other verbs: the run, or each of its snapshots."""
-        return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
-
-    derived: Mapping[str, float] = field(default_factory=dict)  # settings that nobody gave, by key
-    lost: str = ""  # why there is less of it than was wanted
-    stopped: bool = False  # by somebody who does not want to wait
-
-    @property
-    def exit_status(self) -> int:
-        """0 reached its end, 1 did not, 3 was cut short for want of room."""
-        if self.lost:
-            return 3
-        return 0 if self.report.outcome in GOOD_ENDS else 1
-
-
-# Ends that are what was asked for.
-GOOD_ENDS = {*(each for each in Outcome if each.completes_mission), Outcome.STOPPED, Outcome.TIME_OVER}
-
-
-class Witness:
-    """A sink that keeps what the summary tells: the true flow, and the distance to the reference while navigating."""
-
-    def __init__(self) -> None:
-        self.true_field: FlowField | None = None
-        self._square_um2 = 0.0
-        self._count = 0
-        self._last: Demand | None = None
-
-    def write(self, tick: Tick) -> None:
-        self.true_field = tick.true_field or self.true_field
-        demand = tick.demand
-        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
-            return
-        self._last = demand
-        if math.isfinite(demand.error_um):
-            self._square_um2 += demand.error_um**2
-            self._count += 1
-
-    @property
-    def rms_um(self) -> float:
-        """Root mean square distance to the reference, NaN when nothing was navigated."""
-        return math.sqrt(self._square_um2 / self._count) if self._count else math.nan
 
 
 def prepare(asked: Config) -> tuple[ResolvedConfig, Chip, Pipeline]:
@@ -219,7 +162,7 @@ def record(
     ------
     FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
     """
-    inputs = (*inputs, *_named_by(config))
+    inputs = (*inputs, *_files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
     resolved, chip, pipeline = prepare(config)
@@ -234,7 +177,7 @@ def record(
     control = control if control is not None else Unattended()
     run_control = control.run_control
     watchdog = Watchdog(rig, timeout_s, partial(run_control.stop, zero=True), warn)
-    witness = Witness()
+    statistics = RunStatistics()
     clocks = ClockMonitor()
     low: list[str] = []
     opened: list[SessionWriter] = []
@@ -245,14 +188,14 @@ def record(
 
     with ExitStack() as stack:
         # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
-        stack.enter_context(control.armed(watchdog, lambda: _closed_beside(opened, run_control.reason)))
+        stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
         writer = stack.enter_context(
             session_writer(
                 path, resolved, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
             )
         )
         opened.append(writer)
-        sinks: list[Sink] = [writer, witness]
+        sinks: list[Sink] = [writer, statistics]
         live: LiveView | None = None
         worker: Worker
         if view in ("spawn", "serve"):
@@ -274,7 +217,7 @@ def record(
 
             def on_tick(tick: Tick) -> None:
                 show(tick)
-                _say_remarks(writer)
+                _report_remarks(writer)
 
             report = run(
                 pipeline,
@@ -287,9 +230,9 @@ def record(
                 clocks=clocks,
                 watchdog=watchdog,
             )
-        facts = facts_of(chip, report, witness.true_field)
+        facts = figures_of(chip, report, statistics.true_field)
         if resolved.control.method != "policy":  # which has no reference to be off
-            facts["tracking_error_um"] = finite(witness.rms_um)
+            facts["tracking_error_um"] = finite(statistics.tracking_error_um)
         facts["frames_dropped"] = writer.dropped_frames
         if control.note:
             facts["note_not_finished"] = control.note
@@ -297,10 +240,10 @@ def record(
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
-        writer.close(outcome, CLOSE_PATIENCE_S if run_control.reason else None, why=bad)
-        _say_remarks(writer)
+        writer.close(outcome, CLOSE_TIMEOUT_S if run_control.reason else None, why=bad)
+        _report_remarks(writer)
         if live is not None and run_control.reason:
-            live.close(VIEW_PATIENCE_S)
+            live.close(VIEW_TIMEOUT_S)
     facts["frames_dropped"] = writer.dropped_frames  # more may have been, for want of time
     files = tuple(writer.files)
     recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason))
@@ -325,7 +268,7 @@ def _guard_timeout_s(config: ResolvedConfig) -> float:
     return timeout_s
 
 
-def _closed_beside(opened: list[SessionWriter], reason: str) -> str:
+def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:
     """Close the file beside a main thread that is stuck; returns what a person is to know of it.
 
     In the thread of the signals. The writer is not in use: where the main thread is stuck in it, this does not wait.
@@ -337,18 +280,18 @@ def _closed_beside(opened: list[SessionWriter], reason: str) -> str:
     def close() -> None:
         with suppress(SessionError):  # what is there stays in the partial file
             writer.close(
-                {"outcome": Outcome.FAILED, "note": f"{reason}; the main thread did not answer"}, CLOSE_PATIENCE_S
+                {"outcome": Outcome.FAILED, "note": f"{reason}; the main thread did not answer"}, CLOSE_TIMEOUT_S
             )
 
     thread = threading.Thread(target=close, name="give up", daemon=True)
     thread.start()
-    thread.join(_GIVE_UP_S)
+    thread.join(_GIVE_UP_TIMEOUT_S)
     if writer.partial_path.exists():
         return f"flowrec recover {writer.partial_path} makes a session of what was recorded"
-    return f"the file is whole: {files_told(writer.path, tuple(writer.files))}"
+    return f"the file is whole: {files_text(writer.path, tuple(writer.files))}"
 
 
-def _named_by(config: Config) -> list[Path]:
+def _files_of(config: Config) -> list[Path]:
     """The files that a configuration names, and what belongs to them."""
     files: list[Path] = []
     chip = Path(config.chip.path)
@@ -359,22 +302,9 @@ def _named_by(config: Config) -> list[Path]:
     return files
 
 
-def _say_remarks(writer: SessionWriter) -> None:
+def _report_remarks(writer: SessionWriter) -> None:
     while writer.remarks:
         say(writer.remarks.popleft())
-
-
-def files_told(path: Path, files: tuple[Path, ...]) -> str:
-    """Which files a run is in, and how large they are."""
-    if not files:
-        return "none: no mark, note, warning or loss of images, and a good end"
-    size = f"{sum(file.stat().st_size for file in files) / 1e6:.1f} MB"
-    if files == (path,):
-        return f"{path} ({size})"
-    kind = "snapshots" if is_snapshot(files[0]) else "parts"
-    if len(files) == 1:
-        return f"{files[0]} ({size})"
-    return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
 
 
 def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
@@ -393,58 +323,3 @@ def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
         )
     refuse_below(config.recording.disk_floor_gb, path.resolve().parent)
     return path
-
-
-def length_um(route: Route) -> float:
-    """Length of a route in um."""
-    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
-
-
-def facts_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
-    """What a run came to, in the order in which a person wants it; flow errors are shares of the true flow."""
-    facts: Figures = {
-        "outcome": report.outcome,
-        "note": report.note,
-        "duration_s": report.duration_s,
-        "wall_s": report.wall_s,
-        "ticks": report.ticks,
-    }
-    last = report.last
-    if (
-        last.mission is not None
-        and last.route is not None
-        and last.route.reachable
-        and last.mission.phase == Phase.DONE
-    ):
-        facts["planner"] = last.route.method
-        facts["route_length_um"] = length_um(last.route)
-        facts["planned_s"] = float(last.route.arrival_s[-1])
-        if last.mission.outcome == Outcome.REACHED:
-            facts["navigation_s"] = seconds(last.mission.since_ns - last.route.stamp_ns)
-    if true_field is not None:
-        facts["contacts"] = report.contacts
-        for name, field in (("assumed", last.assumed), ("refined", last.refined)):
-            if field is not None:
-                facts[f"{name}_method"] = field.method
-                facts[f"{name}_flow_error"] = finite(float(relative_rmse(field, true_field, chip.mask).v))
-    if last.observations is not None:
-        facts["observations"] = len(last.observations.position_um)
-    return facts
-
-
-def print_summary(recorded: Recorded) -> None:
-    """The table at the end of a run and what to do next."""
-    files = ("file", files_told(recorded.path, recorded.files))
-    table("Session", ("", "value"), [*rows_for_people(recorded.facts), files])
-    sessions = recorded.sessions
-    if recorded.lost:
-        say(
-            f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
-        )
-    elif recorded.exit_status and sessions:
-        say(
-            f"flowrec: the mission ended {recorded.report.outcome}: {recorded.report.note}; "
-            f"see flowrec view {sessions[-1]}"
-        )
-    if sessions:
-        say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")

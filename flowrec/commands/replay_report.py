@@ -12,8 +12,8 @@ from typing import Self
 import numpy as np
 
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.record import length_um
 from flowrec.commands.replay import Change, Replayed, planned_from, replay
+from flowrec.commands.run_summary import length_um
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
 from flowrec.flow.sampling import relative_rmse

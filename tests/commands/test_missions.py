@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from flowrec.commands import replay as verb
-from flowrec.commands.record import GOOD_ENDS, Recorded, record
+from flowrec.commands.record import record
 from flowrec.commands.replay_report import refly, report
+from flowrec.commands.run_summary import GOOD_ENDS, Recorded
 from flowrec.config import load_config
 from flowrec.store import SessionReader
 from tests.conftest import SMALL

@@ -10,8 +10,9 @@ import pytest
 
 from flowrec.commands import replay as verb
 from flowrec.commands.compare import compare
-from flowrec.commands.record import Recorded, record
+from flowrec.commands.record import record
 from flowrec.commands.replay import Change
+from flowrec.commands.run_summary import Recorded
 from flowrec.config import load_config
 from flowrec.errors import SessionError, UsageError
 from flowrec.estimation import Observer

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from flowrec.commands import replay
-from flowrec.commands.record import Recorded, record
+from flowrec.commands.record import record
+from flowrec.commands.run_summary import Recorded
 from flowrec.config import load_config
 from flowrec.errors import RigError
 from flowrec.messages import Applied, Currents, Event, Frame

@@ -1,0 +1,147 @@
+"""The result of `flowrec record`: files, figures, exit status, and the table at the end of a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from flowrec.chip.chip import Chip
+from flowrec.enums import Outcome, Phase
+from flowrec.flow.sampling import relative_rmse
+from flowrec.messages import Demand, FlowField, Route, Tick
+from flowrec.run.loop import RunReport
+from flowrec.store import is_snapshot
+from flowrec.summary import Figures, finite, rows_for_people
+from flowrec.terminal import say, table
+from flowrec.topics import FLOW_FIELDS
+from flowrec.units import seconds
+
+# The mission has done what it was asked for, or was ended on purpose.
+GOOD_ENDS = frozenset(
+    outcome for outcome in Outcome if outcome.completes_mission or outcome in (Outcome.STOPPED, Outcome.TIME_OVER)
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The result of a recording.
+
+    Attributes
+    ----------
+    path : of the run, also where it is in several files.
+    report : how the loop went.
+    facts : figures, with the unit in the key.
+    files : in order; none if only the time around events was to be recorded, and there was no event.
+    derived : settings that were derived because they were not given, by key.
+    lost : why the run was ended early by the disk monitor; '' if it was not.
+    stopped : a person or a signal ended it.
+    """
+
+    path: Path
+    report: RunReport
+    facts: Figures
+    files: tuple[Path, ...] = ()
+    derived: Mapping[str, float] = field(default_factory=dict)
+    lost: str = ""
+    stopped: bool = False
+
+    @property
+    def sessions(self) -> tuple[Path, ...]:
+        """What other verbs can open: the run, or each of its snapshots."""
+        return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
+
+    @property
+    def exit_status(self) -> int:
+        """0 reached its end, 1 did not, 3 was ended early by the disk monitor."""
+        if self.lost:
+            return 3
+        return 0 if self.report.outcome in GOOD_ENDS else 1
+
+
+class RunStatistics:
+    """A sink that keeps the true flow and the distance to the reference while navigating, for the figures."""
+
+    def __init__(self) -> None:
+        self.true_field: FlowField | None = None
+        self._square_um2 = 0.0
+        self._count = 0
+        self._last: Demand | None = None
+
+    def write(self, tick: Tick) -> None:
+        self.true_field = tick.true_field or self.true_field
+        demand = tick.demand
+        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
+            return
+        self._last = demand
+        if math.isfinite(demand.error_um):
+            self._square_um2 += demand.error_um**2
+            self._count += 1
+
+    @property
+    def tracking_error_um(self) -> float:
+        """Root mean square distance to the reference, NaN if nothing was navigated."""
+        return math.sqrt(self._square_um2 / self._count) if self._count else math.nan
+
+
+def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
+    """The figures of a run in the order of the table; flow errors are relative to the true flow."""
+    figures: Figures = {
+        "outcome": report.outcome,
+        "note": report.note,
+        "duration_s": report.duration_s,
+        "wall_s": report.wall_s,
+        "ticks": report.ticks,
+    }
+    last = report.last
+    mission, route = last.mission, last.route
+    if mission is not None and route is not None and route.reachable and mission.phase == Phase.DONE:
+        figures["planner"] = route.method
+        figures["route_length_um"] = length_um(route)
+        figures["planned_s"] = float(route.arrival_s[-1])
+        if mission.outcome == Outcome.REACHED:
+            figures["navigation_s"] = seconds(mission.since_ns - route.stamp_ns)
+    if true_field is not None:
+        figures["contacts"] = report.contacts
+        for name in FLOW_FIELDS:
+            flow: FlowField | None = getattr(last, name)
+            if flow is not None:
+                figures[f"{name}_method"] = flow.method
+                figures[f"{name}_flow_error"] = finite(float(relative_rmse(flow, true_field, chip.mask).v))
+    if last.observations is not None:
+        figures["observations"] = len(last.observations.position_um)
+    return figures
+
+
+def length_um(route: Route) -> float:
+    """Length of a route in um."""
+    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
+
+
+def files_text(path: Path, files: tuple[Path, ...]) -> str:
+    """Which files a run is in, and how large they are."""
+    if not files:
+        return "none: no mark, note, warning or loss of images, and a good end"
+    size = f"{sum(file.stat().st_size for file in files) / 1e6:.1f} MB"
+    if len(files) == 1:
+        return f"{files[0]} ({size})"
+    kind = "snapshots" if is_snapshot(files[0]) else "parts"
+    return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
+
+
+def print_summary(recorded: Recorded) -> None:
+    """Print the table at the end of a run, and what to do next."""
+    files = ("file", files_text(recorded.path, recorded.files))
+    table("Session", ("", "value"), [*rows_for_people(recorded.facts), files])
+    sessions, report = recorded.sessions, recorded.report
+    if recorded.lost:
+        say(
+            f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
+        )
+    elif recorded.exit_status and sessions:
+        say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
+    if sessions:
+        say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")
