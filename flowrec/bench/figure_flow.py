@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """One case. Velocities are (h, w, 2) in um/s, y points down."""
+    """One case. Velocities are (h, w, 2) in um/s, drawn in mm/s; y points down."""
 
     name: str
     mask: NDArray[np.bool_]  # (h, w)
@@ -63,7 +63,6 @@ def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
 def _case(figure: SubFigure, picture: Picture, errors: dict[str, float]) -> None:
     """Two rows of maps: speeds above, the observations and the errors below."""
     axes = figure.subplots(2, len(picture.fields) + 1, squeeze=False)
-    picture, unit = _in_readable_units(picture)
     speed_top = float(np.percentile(_length(picture.truth)[picture.mask], 99.5))
     misses = {name: _length(field - picture.truth) for name, field in picture.fields.items()}
     # With a scale up to the error of the worst method the others would be all white.
@@ -84,7 +83,7 @@ def _case(figure: SubFigure, picture: Picture, errors: dict[str, float]) -> None
     for ax, miss in zip(axes[1, 1:], misses.values(), strict=True):
         wrong = _show(ax, miss, picture.mask, ERRORS, error_top)
         ax.scatter(x, y, s=1.2, c=OBSERVED, linewidths=0.0)
-    for row, (mappable, label) in enumerate(((speeds, f"speed |v| ({unit})"), (wrong, f"error |v − v*| ({unit})"))):
+    for row, (mappable, label) in enumerate(((speeds, "speed |v| (mm/s)"), (wrong, "error |v − v*| (mm/s)"))):
         bar = figure.colorbar(mappable, ax=list(axes[row]), extend="max", shrink=0.86, aspect=18, pad=0.01)
         bar.set_label(label, fontsize=9, color=INK)
         bar.ax.tick_params(labelsize=8, color=INK, labelcolor=INK)
@@ -125,15 +124,6 @@ def _strip(ax: Axes, methods: list[str], rows: list[dict[str, Any]], drawn: str)
     ax.set_xlim(-0.5, len(methods) - 0.2)
 
 
-def _in_readable_units(picture: Picture) -> tuple[Picture, str]:
-    """mm/s if a speed in um/s has more than three digits."""
-    if float(_length(picture.truth).max()) < 2000.0:
-        return picture, "µm/s"
-    fields = {name: field * MM_PER_UM for name, field in picture.fields.items()}
-    truth, flow = picture.truth * MM_PER_UM, picture.flow_um_s * MM_PER_UM
-    return replace(picture, truth=truth, fields=fields, flow_um_s=flow), "mm/s"
-
-
 def _show(ax: Axes, image: NDArray[np.floating], mask: NDArray[np.bool_], colours: str, top: float) -> Any:
     """An image (h, w) of the fluid; solid is grey."""
     ax.set_facecolor(SOLID)
@@ -162,5 +152,5 @@ def _arrow_places(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def _length(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Of (..., 2)."""
-    return np.asarray(np.linalg.norm(vectors, axis=-1))
+    """Of (..., 2) in um/s, in mm/s."""
+    return np.asarray(MM_PER_UM * np.linalg.norm(vectors, axis=-1))

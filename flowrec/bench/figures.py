@@ -74,9 +74,8 @@ def draw_plan(path: Path, examples: list[tuple[World, Trip, dict[str, Route]]], 
     for ax, (world, trip, routes) in zip(above.subplots(1, 2, squeeze=False)[0], examples, strict=False):
         mask, px = world.chip.mask, world.chip.um_per_px
         ax.set_facecolor(SOLID)
-        ax.imshow(
-            np.where(mask, np.linalg.norm(world.flow.velocity_um_s, axis=-1), np.nan), cmap="Greys_r", vmin=0, vmax=1
-        )
+        speed = np.linalg.norm(world.flow.velocity_um_s, axis=-1)
+        ax.imshow(np.where(mask, speed, np.nan), cmap="Greys_r", vmin=0, vmax=1)
         for method, route in reversed(routes.items()):  # time_field on top
             if route.reachable:
                 label = f"{method} {route.arrival_s[-1]:.1f} s"
@@ -179,8 +178,8 @@ def draw_missions(path: Path, results: dict[str, Any]) -> None:
     axes = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
     for ax, known in zip(axes, maps, strict=True):
         for way, label, colour, shift in (
-            ("down", "with the flow", _PALETTE[2], -0.16),
-            ("up", "against it", _PALETTE[0], 0.16),
+            ("down", "with the flow", "#0072b2", -0.16),
+            ("up", "against it", "#d55e00", 0.16),
         ):
             mine = [row for row in rows if row["map"] == known and row["way"] == way]
             for seed in sorted({row["seed"] for row in mine}):
@@ -208,12 +207,6 @@ def draw_missions(path: Path, results: dict[str, Any]) -> None:
         ax.set_ylim(0.9, _LARGEST_RATIO)
     axes[0].set_ylabel("arrival time / least time in the true flow", fontsize=9, color=INK)
     axes[0].legend(fontsize=8, frameon=False, loc="upper left")
-    figure.suptitle(
-        f"{results['seeds']} worlds, inlet flows {100 * results['world']['flow_error']:g} % off; bars: medians, "
-        "lines: one trip; × failed, ▮ touched a wall",
-        fontsize=8.5,
-        color=INK,
-        x=0.01,
-        ha="left",
-    )
+    text = f"{results['seeds']} worlds, inlet flows {100 * results['world']['flow_error']:g} % off; bars: medians, "
+    figure.suptitle(f"{text}lines: one trip; × failed, ▮ touched a wall", fontsize=8.5, color=INK, x=0.01, ha="left")
     figure.savefig(path)

@@ -20,7 +20,7 @@ import numpy as np
 import typer
 
 from flowrec.bench.figure_flow import Picture, draw, median_case
-from flowrec.bench.harness import Cases, FigureFile, Names, Results, chosen, peak_mb, vessel_cases
+from flowrec.bench.harness import Cases, FigureFile, Names, Results, chosen, peak_mb, print_rows, vessel_cases
 from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
 from flowrec.errors import FlowError, FlowrecError
 from flowrec.estimation import Trimmed
@@ -30,7 +30,7 @@ from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Observations
 from flowrec.refine import PiUnet, Refiner
 from flowrec.refine.training.vessels import draw_mask, make_case, with_mask_error
-from flowrec.terminal import progress, say, table
+from flowrec.terminal import progress, say
 
 RANDOM_CASES = 10
 
@@ -178,11 +178,8 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
         within = float((np.abs(field.velocity_um_s - true)[chip.mask] <= 2.0 * std).mean())
         stated = float(np.sqrt((std.astype(np.float64) ** 2).sum() / (true[chip.mask] ** 2).sum()))
     return {
-        "case": case.stem,
-        "method": method,
-        "rmse_vx": error.vx,
-        "rmse_vy": error.vy,
-        "rmse_v": error.v,
+        **{"case": case.stem, "method": method},
+        **{"rmse_vx": error.vx, "rmse_vy": error.vy, "rmse_v": error.v},
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "seconds_update": seconds_update,
@@ -250,20 +247,14 @@ def _field_path(fields: Path, case: Path, method: str) -> Path:
 def show(results: Results) -> None:
     """Print Table I; the seconds of an update and the single cases are in the JSON."""
     cases = {row["case"] for row in results["rows"]}
-    table(
+    components = {name: f"{{rmse_{name}_mean:.3f}}±{{rmse_{name}_std:.3f}}" for name in ("vx", "vy", "v")}
+    print_rows(
         f"Relative RMSE over {len(cases)} cases, noise {results['noise']} %, {results['share']} % of the route seen",
-        ("method", "vx", "vy", "v", "worst v", "in 2 std", "s", "MB"),
-        [
-            (
-                method,
-                *(f"{line[f'{name}_mean']:.3f}±{line[f'{name}_std']:.3f}" for name in ("rmse_vx", "rmse_vy", "rmse_v")),
-                f"{line['worst']:.3f}",
-                "" if line["within_2_std"] is None else f"{100 * line['within_2_std']:.0f} %",
-                f"{line['median_seconds']:.{2 if line['median_seconds'] < 10.0 else 0}f}",
-                f"{line['peak_mb']:.0f}",
-            )
-            for method, line in results["summary"].items()
-        ],
+        [{"method": method, **line} for method, line in results["summary"].items()],
+        {
+            **{"method": "{method}", **components, "worst v": "{worst:.3f}", "in 2 std": "{within_2_std:.0%}"},
+            **{"s": "{median_seconds:.3g}", "MB": "{peak_mb:.0f}"},
+        },
     )
     for case, reason in results["left_out"].items():
         say(f"{case} left out, {reason}")

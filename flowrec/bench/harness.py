@@ -105,6 +105,19 @@ def _common(as_json: AsJson = False, out: JsonFile = None, overwrite: Overwrite 
     """Declares the options of every bench."""
 
 
+def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str]) -> None:
+    """Print a table: a format string of the row's keys by heading, as in {"RMSE": "{rmse_um:.1f}"}. None is "-"."""
+    from flowrec.terminal import table
+
+    def cell(template: str, row: Results) -> str:
+        try:
+            return template.format(**row)
+        except TypeError:  # None has no format
+            return "-"
+
+    table(title, tuple(columns), [tuple(cell(template, row) for template in columns.values()) for row in rows])
+
+
 def need_matplotlib() -> None:
     """Raise UsageError if matplotlib is not installed."""
     if importlib.util.find_spec("matplotlib") is None:
@@ -181,17 +194,11 @@ def paired(ratios: NDArray[np.float64]) -> Results:
     }
 
 
-def peak_mb() -> float:
-    """Largest memory of this process so far, in MB (Linux); NaN elsewhere. getrusage would count the parent's."""
-    return _status_mb("VmHWM")
+def peak_mb(key: str = "VmHWM") -> float:
+    """Largest memory of this process so far, in MB, or that now (`VmRSS`); NaN if not on Linux.
 
-
-def memory_mb() -> float:
-    """Memory of this process now, in MB (Linux); NaN elsewhere."""
-    return _status_mb("VmRSS")
-
-
-def _status_mb(key: str) -> float:
+    getrusage would count the memory of the parent process before the exec.
+    """
     status = Path("/proc/self/status")
     found = re.search(rf"{key}:\s+(\d+)", status.read_text(encoding="ascii")) if status.exists() else None
     return float(found[1]) / 1024.0 if found else float("nan")

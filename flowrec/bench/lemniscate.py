@@ -30,11 +30,11 @@ _UM_PER_PX = 50.0  # the vortex is linear, bilinear sampling of it exact
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """What is not as the laws would like it."""
+    """Disturbances of a run."""
 
     delay_s: float = 0.0  # from command to motion
     noise_um: float = 0.0  # one sigma of a measured position
-    map_error: float = 0.0  # the map is that much too strong
+    map_error: float = 0.0  # relative: the map is too strong by it
     step_out_um_s: float | None = None  # None: the robot follows every field
 
     def robot(self, v_max_um_s: float) -> Robot:
@@ -58,10 +58,10 @@ class Flight:
 
     time_s: NDArray[np.float64]  # (n,)
     position_um: NDArray[np.float64]  # (n, 2)
-    reference_um: NDArray[np.float64]  # (n, 2) where the robot should be
+    reference_um: NDArray[np.float64]  # (n, 2)
     progress_s: NDArray[np.float64]  # (n,)
     demand_um_s: NDArray[np.float64]  # (n, 2)
-    flow_miss_um_s: NDArray[np.float64]  # (n,) of the observer
+    flow_miss_um_s: NDArray[np.float64]  # (n,) error of the estimated flow
 
     @property
     def error_um(self) -> NDArray[np.float64]:
@@ -70,13 +70,13 @@ class Flight:
 
 
 def lemniscate(turns: int = 2) -> Route:
-    """The paper's reference, a turn in 40 s."""
+    """The reference of the paper: one lap in 40 s."""
     time = np.linspace(0.0, turns * PERIOD_S, turns * 4000 + 1)
     return Route(0, 1, "lemniscate", True, "", place_um(time), time)
 
 
 def place_um(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 2) where the reference is at some times."""
+    """(n, 2) position of the reference at times (n,)."""
     theta = 2.0 * np.pi * time_s / PERIOD_S
     spread = (1.0 + np.sin(theta) ** 2)[:, None]
     points = np.stack([A_UM * np.cos(theta), B_UM * np.sin(theta) * np.cos(theta)], -1) / spread
@@ -84,7 +84,7 @@ def place_um(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def vortex_map(error: float) -> FlowField:
-    """The vortex, too strong by a share."""
+    """The vortex with a relative error of its strength."""
     size = round(2 * CENTRE_UM / _UM_PER_PX) + 1
     y, x = np.mgrid[0:size, 0:size] * _UM_PER_PX - CENTRE_UM
     velocity = ((1.0 + error) * SPIN_PER_S * np.stack([-y, x], -1)).astype(np.float32)
@@ -93,11 +93,11 @@ def vortex_map(error: float) -> FlowField:
 
 
 def fly(controller: Controller, observer: Observer, robot: Robot, world: World, seed: int, turns: int = 2) -> Flight:
-    """Two turns of the lemniscate (80 s) by the true stages, from 600 um beside its start."""
+    """Two laps (80 s) of the Observer and Controller stages, from 600 um beside the start of the curve."""
     rng = np.random.default_rng([seed, 19])
     field, route = vortex_map(world.map_error), lemniscate(turns)
     mission = Mission(0, "navigate", 0, 1, "", 0, np.zeros(2), np.zeros(2), False, "", "")
-    z, acting, turned = complex(*_START_UM), 0j, 0j  # place, own velocity as commanded, revolutions since the frame
+    z, acting, turned = complex(*_START_UM), 0j, 0j  # position, commanded own velocity, revolutions
     coming: list[tuple[float, complex]] = []
     estimate: Estimate | None = None
     demand: Demand | None = None
@@ -108,16 +108,14 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
         track = Track(stamp, True, seen, 1.0, 0, 10.0, np.zeros(4))
         applied = Applied(stamp, 0.0, 0.0, 1.0, np.zeros(3), np.array([turned.real, turned.imag]))
         estimate = observer.estimate(estimate, track, applied, robot, field)
-        known = observer.uses_map
-        demand = controller.control(
-            demand, mission, route, estimate, field, robot, None, _UM_PER_PX, estimate_uses_map=known
-        )
+        inputs = (mission, route, estimate, field, robot, None, _UM_PER_PX)
+        demand = controller.control(demand, *inputs, estimate_uses_map=observer.uses_map)
         flow = 1j * SPIN_PER_S * z
         miss = math.hypot(estimate.flow_um_s[0] - flow.real, estimate.flow_um_s[1] - flow.imag)
-        rows.append((seconds(stamp), z.real, z.imag, *(demand.reference_um - CENTRE_UM), demand.progress_s, miss))
-        rows[-1] += (float(demand.velocity_um_s[0]), float(demand.velocity_um_s[1]))
+        reference_um, own_um_s = demand.reference_um - CENTRE_UM, demand.velocity_um_s
+        rows.append((seconds(stamp), z.real, z.imag, *reference_um, demand.progress_s, miss, *own_um_s))
         now, end = index / RATE_HZ, (index + 1) / RATE_HZ
-        coming.append((now + world.delay_s, complex(demand.velocity_um_s[0], demand.velocity_um_s[1])))
+        coming.append((now + world.delay_s, complex(*own_um_s)))
         turned = 0j
         while now < end:
             while coming and coming[0][0] <= now:
@@ -131,7 +129,7 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
 
 
 def _own(commanded: complex, robot: Robot) -> complex:
-    """The robot's own velocity: slower again beyond step-out."""
+    """The robot's own velocity, which falls beyond step-out."""
     speed = abs(commanded)
     return commanded / speed * robot.rolled_speed_um_s(speed / robot.um_per_rev) if speed > 0.0 else 0j
 

@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results
+from flowrec.bench.harness import Results, print_rows
 from flowrec.commands.export import scene_of
 from flowrec.commands.record import prepare
 from flowrec.commands.replay import Change, replay
@@ -146,18 +146,9 @@ def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] 
 
 def show(results: Results) -> None:
     """Print the results as tables."""
-    rows = [
-        (kind, f"{row['median_ms']:.2f}", f"{row['p99_ms']:.2f}", f"{row['hand_over_median_ms']:.3f}")
-        for kind, row in results["rows"].items()
-    ]
-    table("One tick at 640x512, 60 Hz", ("run", "median ms", "p99 ms", "hand-over ms"), rows)
-    ratio = results["recording_over_plain"]
-    table(
-        "Ratios",
-        ("", "value"),
-        [
-            ("recording on / off, median", f"{ratio['median_ms']:.2f}"),
-            ("recording on / off, p99", f"{ratio['p99_ms']:.2f}"),
-            ("replay, times real time at 60 Hz", f"{results['replay']['times_real_time_at_60_hz']:.1f}"),
-        ],
-    )
+    columns = {"run": "{run}", "median ms": "{median_ms:.2f}", "p99 ms": "{p99_ms:.2f}"}
+    rows = [{"run": kind, **row} for kind, row in results["rows"].items()]
+    print_rows("One tick at 640x512, 60 Hz", rows, columns | {"hand-over ms": "{hand_over_median_ms:.3f}"})
+    ratio, speed = results["recording_over_plain"], results["replay"]["times_real_time_at_60_hz"]
+    ratios = [(f"recording on / off, {name}", f"{ratio[f'{name}_ms']:.2f}") for name in ("median", "p99")]
+    table("Ratios", ("", "value"), [*ratios, ("replay, times real time at 60 Hz", f"{speed:.1f}")])

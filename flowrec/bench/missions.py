@@ -21,7 +21,7 @@ import typer
 from numpy.typing import NDArray
 
 from flowrec.bench.figures import draw_missions
-from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, vessel_cases, wilson
+from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, print_rows, vessel_cases, wilson
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.commands.record import refuse_adrift
@@ -37,7 +37,7 @@ from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
-from flowrec.terminal import progress, say, table
+from flowrec.terminal import progress, say
 from flowrec.units import seconds
 
 # The settings of a policy. `plain` is the null model: the shortest path, planned without the flow.
@@ -53,6 +53,7 @@ POLICIES |= {
     for name in CONTROLLERS
     if not any(f"control.method={name}" in sets for sets in POLICIES.values())
 }
+_DEFAULT_POLICIES = "policy,vector,paper,plain"
 # By direction and map. Upstream after a survey, the robot drifts down first and then swims back.
 TRIPS: dict[tuple[str, str], tuple[str, ...]] = {
     ("down", "surveyed"): (),
@@ -104,7 +105,7 @@ class Row:
 
 
 class MissionLog:
-    """A sink that collects what a row needs."""
+    """A sink that collects the data of a row."""
 
     def __init__(self) -> None:
         self.began: tuple[int, NDArray[np.float64], Route] | None = None  # stamp, true position, route
@@ -131,12 +132,8 @@ class MissionLog:
 
 def measure(
     seeds: Annotated[int, typer.Option(min=1, help="Worlds; every policy flies all of them, both ways.")] = 40,
-    cases: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz), besides the built-in chips.")
-    ] = None,
-    policies: Annotated[
-        str, typer.Option(metavar="A,B", help=f"Of {', '.join(POLICIES)}.")
-    ] = "policy,vector,paper,plain",
+    cases: Annotated[Path | None, typer.Option(metavar="DIR", help="Vessel cases besides the built-in chips.")] = None,
+    policies: Annotated[str, typer.Option(metavar="A,B", help=f"Of {', '.join(POLICIES)}.")] = _DEFAULT_POLICIES,
     flow_error: Annotated[float, typer.Option(help="Relative error of each inlet flow.")] = 0.1,
     outlet_error: Annotated[float, typer.Option(help="Same of outlet pressures, of the drop across the chip.")] = 0.0,
     latency: Annotated[
@@ -159,7 +156,7 @@ def measure(
     names = chosen("bench missions: no policy", policies, POLICIES)
     world = World(flow_error, outlet_error, latency, tuple(sets or ()))
     paths = [] if cases is None else vessel_cases(cases)
-    jobs_left = [
+    missions = [
         (seed, chip_of(seed, paths), way, known, policy, world)
         for seed in range(1, seeds + 1)
         for way, known in TRIPS
@@ -168,10 +165,11 @@ def measure(
     ]
     rows: list[Row] = []
     with (
-        progress("flying", len(jobs_left)) as done,
+        progress("flying", len(missions)) as done,
         ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as workers,
     ):
-        for row in workers.map(_fly, jobs_left, chunksize=4) if jobs > 1 else map(_fly, jobs_left):
+        columns = zip(*missions, strict=True)
+        for row in workers.map(fly, *columns, chunksize=4) if jobs > 1 else map(fly, *columns):
             rows.append(row)
             done(len(rows))
     results = {
@@ -215,10 +213,6 @@ def slowed(path: Path) -> tuple[str, ...]:
     )
 
 
-def _fly(job: tuple[int, tuple[str, ...], str, str, str, World]) -> Row:
-    return fly(*job)
-
-
 def fly(
     seed: int,
     chip_sets: tuple[str, ...],
@@ -252,12 +246,12 @@ def fly(
     rig = SimulatedRig.of(pipeline, config, true_field=truth)
     log = MissionLog()
     report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], on_tick=watch)
-    mission = report.last.mission
+    mission, outcome = report.last.mission, report.outcome
     assert mission is not None
-    outcome = report.outcome
-    taken_s = best_s = None
+    taken_s = best_s = planned_s = None
     if log.began is not None:
-        began_ns, start_um, _ = log.began
+        began_ns, start_um, route = log.began
+        planned_s = float(route.arrival_s[-1])
         tolerance_um = config.mission.goal_tolerance_um or config.robot.radius_um
         best_s = optimum_s(truth, start_um, mission.goal_um, tolerance_um, chip, config.robot)
         if outcome == "reached":
@@ -271,7 +265,7 @@ def fly(
         seconds=taken_s,
         optimum_s=best_s,
         ratio=taken_s / best_s if taken_s is not None and best_s else None,
-        planned_s=float(log.began[2].arrival_s[-1]) if log.began is not None else None,
+        planned_s=planned_s,
         rms_um=math.sqrt(float(np.mean(log.squared_um2))) if log.squared_um2 else None,
         replans=log.replans,
         latency_ms=1e3 * config.robot.delay_s,
@@ -362,44 +356,33 @@ def compared(rows: Sequence[Row], a: str, b: str) -> dict[str, Any]:
 
 def show(results: Results) -> None:
     """Print the summary by policy and the comparisons."""
-
-    def cell(proportion: dict[str, Any]) -> str:
-        low, high = proportion["wilson_95"]
-        return f"{proportion['count']} ({100 * low:.0f}-{100 * high:.0f} %)"
-
-    def ratios(ratio: dict[str, Any] | None) -> tuple[str, ...]:
-        if ratio is None:
-            return ("-",) * 4
-        within = f"{100 * ratio['within_10_percent']['share']:.0f} %"
-        return (*(f"{ratio[key]:.2f}" for key in ("median", "mean", "worst")), within)
-
-    counts = ("reached", "honest", "without_contact", "survey_without_contact")
-    table(
+    counts = {"reached": "reached", "predicted": "honest"}
+    counts |= {"no contact": "without_contact", "survey": "survey_without_contact"}
+    ratios = {name: f"{{ratio[{name}]:.2f}}" for name in ("median", "mean", "worst")}
+    print_rows(
         f"Missions over {results['seeds']} worlds, inlet flows {100 * results['world']['flow_error']:g} % off, Wilson "
         "95 % intervals in brackets; predicted: reached, or refused in advance",
-        ("policy", "n", "reached", "predicted", "no contact", "survey", "median", "mean", "worst", "< 1.1"),
-        [
-            (name, str(line["missions"]), *(cell(line[key]) for key in counts), *ratios(line["ratio"]))
-            for name, line in results["summary"].items()
-        ],
+        [{"policy": name, **line} for name, line in results["summary"].items()],
+        {
+            **{"policy": "{policy}", "n": "{missions}"},
+            **{
+                head: f"{{{key}[count]}} ({{{key}[wilson_95][0]:.0%}}-{{{key}[wilson_95][1]:.0%}})"
+                for head, key in counts.items()
+            },
+            **ratios,
+            "< 1.1": "{ratio[within_10_percent][share]:.0%}",
+        },
     )
     for name, line in results["summary"].items():
         for failure in line["failed"]:
             say(f"{name}: {failure}")
     if results["pairs"]:
-        table(
+        print_rows(
             "Time of one over time of the other on the same trips",
-            ("policies", "n", "mean ratio (95 %)", "faster", "sign test p", "Wilcoxon p"),
-            [
-                (
-                    name,
-                    str(pair["count"]),
-                    f"{pair['mean']:.3f} ({pair['interval_95'][0]:.3f} to {pair['interval_95'][1]:.3f})",
-                    f"{pair['less']} of {pair['count']}",
-                    f"{pair['sign_p']:.1g}",
-                    f"{pair['wilcoxon_p']:.1g}",
-                )
-                for name, pair in results["pairs"].items()
-                if pair["count"]
-            ],
+            [{"policies": name, **pair} for name, pair in results["pairs"].items() if pair["count"]],
+            {
+                **{"policies": "{policies}", "n": "{count}", "faster": "{less} of {count}"},
+                "mean ratio (95 %)": "{mean:.3f} ({interval_95[0]:.3f} to {interval_95[1]:.3f})",
+                **{"sign test p": "{sign_p:.1g}", "Wilcoxon p": "{wilcoxon_p:.1g}"},
+            },
         )

@@ -168,6 +168,7 @@ def measure(
         for number, case in enumerate(CASES):
             run = drive(case, seed)
             found, best_gain = estimates_of(case, run)
+            gains = {"luenberger": 1.0, "luenberger, best gain": best_gain}
             for name, (flow, estimates) in found.items():
                 nis = np.array([one.nis for one in estimates[len(estimates) // 2 :]])
                 has_nis = bool(np.isfinite(nis).any())
@@ -181,7 +182,7 @@ def measure(
                         "alarm": alarm,
                         "alarm_after_s": after_s,
                         "um_per_rev": estimates[-1].um_per_rev if estimates else None,
-                        "gain_per_s": {"luenberger": 1.0, "luenberger, best gain": best_gain}.get(name),
+                        "gain_per_s": gains.get(name),
                     }
                 )
             if case.name == DRAWN:
@@ -207,16 +208,8 @@ def recommend(path: Path) -> dict[str, Any]:
     tracks, applied = [tick.track for tick in ticks], [tick.applied for tick in ticks]
     fields = [tick.field for tick in ticks] if config.observer.uses_map else None
     tuned = tune(tracks, applied, config.robot, config.observer.kalman, fields)  # type: ignore[arg-type]
-    return {
-        "path": str(path),
-        "sets": tuned.sets,
-        "position_noise_um": tuned.position_noise_um,
-        "position_noise_from": tuned.source,
-        "rest_s": tuned.rest_s,
-        "agility": tuned.agility,
-        "nis": tuned.nis,
-        "nis_before": tuned.nis_before,
-    }
+    keys = ("sets", "position_noise_um", "rest_s", "agility", "nis", "nis_before")
+    return {"path": str(path), "position_noise_from": tuned.source, **{key: getattr(tuned, key) for key in keys}}
 
 
 def show(results: Results) -> None:

@@ -83,10 +83,8 @@ def cavity_case(cells: int, reynolds: int) -> dict[str, Any]:
     return {
         "reynolds": reynolds,
         "cells": cells,
-        "u_largest": float(np.abs(u_off).max()),
-        "u_rms": float(np.sqrt((u_off**2).mean())),
-        "v_largest": float(np.abs(v_off).max()),
-        "v_rms": float(np.sqrt((v_off**2).mean())),
+        **{f"{name}_largest": float(np.abs(off).max()) for name, off in (("u", u_off), ("v", v_off))},
+        **{f"{name}_rms": float(np.sqrt((off**2).mean())) for name, off in (("u", u_off), ("v", v_off))},
         "u_at_quarters": [float(u) for u in u_line(np.array([0.25, 0.5, 0.75]))],
     }
 

@@ -83,15 +83,10 @@ def summarised_routes(lines: Lines) -> Lines:
     for (setting, regime), some in _grouped(lines, "setting", "regime").items():
         planned = [line for line in some if np.isfinite(line["time_s"])]
         costs = [line["time_s"] / without[line["world"], regime] - 1.0 for line in planned]
-        summary.append(
-            {
-                "setting": setting,
-                "regime": regime,
-                "planned": len(planned) / max(len(some), 1),
-                "kept": sum(line["kept"] for line in planned) / max(len(planned), 1),
-                "cost_percent": 100.0 * float(np.mean(costs)) if costs else None,
-            }
-        )
+        kept = sum(line["kept"] for line in planned) / max(len(planned), 1)
+        cost_percent = 100.0 * float(np.mean(costs)) if costs else None
+        row = {"setting": setting, "regime": regime, "planned": len(planned) / len(some), "kept": kept}
+        summary.append(row | {"cost_percent": cost_percent})
     return summary
 
 
@@ -101,17 +96,9 @@ def summarised_policies(lines: Lines) -> Lines:
     for (setting, flow, regime), some in _grouped(lines, "setting", "flow", "regime").items():
         arrived = [line for line in some if np.isfinite(line["time_s"])]
         percent = [100.0 * line["least_s"] / line["time_s"] for line in arrived if line["least_s"]]
-        summary.append(
-            {
-                "setting": setting,
-                "flow": flow,
-                "regime": regime,
-                "runs": len(some),
-                "arrived": len(arrived),
-                "touched": sum(line["touches"] for line in some),
-                "mean_percent": float(np.mean(percent)) if percent else None,
-            }
-        )
+        mean_percent, touched = float(np.mean(percent)) if percent else None, sum(line["touches"] for line in some)
+        row = {"setting": setting, "flow": flow, "regime": regime, "runs": len(some), "arrived": len(arrived)}
+        summary.append(row | {"touched": touched, "mean_percent": mean_percent})
     return summary
 
 

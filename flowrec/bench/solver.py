@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.bench.exact_flows import bend_case, oblique_case, straight_case
-from flowrec.bench.harness import Quick, Results, peak_mb
+from flowrec.bench.harness import Quick, Results, peak_mb, print_rows
 from flowrec.bench.published_flows import cavity_case, cylinder_case
 from flowrec.chip.chip import Chip, Walls
 from flowrec.chip.io import without_pockets
@@ -20,7 +20,6 @@ from flowrec.chip.openings import find_openings, guess_inlets
 from flowrec.chip.synthetic import straight, vessels
 from flowrec.flow import FlowSolver
 from flowrec.flow.newton_solver import system
-from flowrec.terminal import table
 
 Pattern = Literal["vessels", "posts"]
 _PITCH_PX, _RADIUS_PX = 32, 13  # of the posts
@@ -159,13 +158,12 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def show(results: Results) -> None:
     """Print the results as tables."""
 
-    def text(value: Any) -> str:
-        return f"{value:.3g}" if isinstance(value, float) else str(value)
-
     def heading(key: str) -> str:
         return key.replace("_percent", " %").replace("_", " ")
 
     for case, (title, keys) in _TABLES.items():
-        rows = [tuple(text(row[key]) for key in keys) for row in results["rows"] if row["case"] == case]
-        table(title, tuple(heading(key) for key in keys), rows)
-    table("Summary", ("", "value"), [(heading(key), text(value)) for key, value in results["summary"].items()])
+        rows = [row for row in results["rows"] if row["case"] == case]
+        numbers = {key for key in keys if isinstance(rows[0][key], float)}
+        print_rows(title, rows, {heading(key): f"{{{key}{':.3g}' if key in numbers else '}'}" for key in keys})
+    summary = [{"name": heading(key), "value": value} for key, value in results["summary"].items()]
+    print_rows("Summary", summary, {"": "{name}", "value": "{value:.3g}"})

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from flowrec.bench.figures import draw_track
-from flowrec.bench.harness import FigureFile, Results
+from flowrec.bench.harness import FigureFile, Results, print_rows
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, Flight, World, fly, lemniscate
 from flowrec.control import Controller
 from flowrec.control.controller import CONTROLLERS
@@ -164,18 +164,11 @@ def show(results: Results) -> None:
         ("law", "ideal RMSE", "steady", "< 50 um, s", "all RMSE", "steady", "< 50 um, s"),
         [(name, *(cell for world in WORLDS for cell in cells(rows[name, world]))) for name in LAWS],
     )
-    table(
+    print_rows(
         "Step-out speed below that of the reference (all)",
-        ("law; pace of the reference", "step-out", "RMSE", "steady", "off the curve", "progress, %"),
-        [
-            (
-                row["law"],
-                row["world"].removeprefix("step-out at "),
-                f"{row['rmse_um']:.0f}",
-                f"{row['steady_um']:.1f}",
-                f"{row['off_curve_um']:.1f}",
-                f"{100 * row['progress']:.1f}",
-            )
-            for row in results["step_out"]
-        ],
+        results["step_out"],
+        {
+            **{"law; pace of the reference": "{law}", "world": "{world}", "RMSE": "{rmse_um:.0f}"},
+            **{"steady": "{steady_um:.1f}", "off the curve": "{off_curve_um:.1f}", "progress": "{progress:.1%}"},
+        },
     )

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from flowrec.bench.harness import memory_mb
+from flowrec.bench.harness import peak_mb
 from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
@@ -149,7 +149,7 @@ def soak(minutes: float, folder: Path | None = None, *, keeping: bool = False) -
                     mark = OperatorEvent(tick.stamp_ns, "mark", "")
                 writer.write(replace(tick, frame=replace(tick.frame, image=tick.frame.image.copy()), operator=mark))
                 if number % _SOAK_RATE_HZ == 0:
-                    mb.append(memory_mb())
+                    mb.append(peak_mb("VmRSS"))
                     done(number)
             dropped = writer.dropped_frames
         size = sum(file.stat().st_size for file in writer.files)
