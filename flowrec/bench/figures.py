@@ -27,6 +27,7 @@ _PALETTE = (
 )  # fmt: skip
 _AVERAGED_FRAMES = 31  # of the error curves of observers: one second, so that the curves can be distinguished
 _LEAST_ERROR_UM = 0.1  # of a logarithmic axis
+_WAYS = (("down", "with the flow", "#0072b2", -0.16), ("up", "against it", "#d55e00", 0.16))
 _LARGEST_RATIO = 3.0  # of arrival times in the figure; larger ones are drawn at the edge
 
 
@@ -177,10 +178,7 @@ def draw_missions(path: Path, results: dict[str, Any]) -> None:
     figure = new_figure(1.5 + 1.35 * len(policies) * len(maps), 4.4)
     axes = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
     for ax, known in zip(axes, maps, strict=True):
-        for way, label, colour, shift in (
-            ("down", "with the flow", "#0072b2", -0.16),
-            ("up", "against it", "#d55e00", 0.16),
-        ):
+        for way, label, colour, shift in _WAYS:
             mine = [row for row in rows if row["map"] == known and row["way"] == way]
             for seed in sorted({row["seed"] for row in mine}):
                 ratio = {row["policy"]: row["ratio"] for row in mine if row["seed"] == seed}
