@@ -109,7 +109,7 @@ def frames_of(config: ResolvedConfig) -> str:
     if chosen != "auto":
         return chosen
     if config.recording.region == "robot":
-        return "zstd"  # makes less of the black than delta in a fifth of its time (flowrec bench store)
+        return "zstd"  # makes less of the black than delta in a fifth of its time (python -m tests.perf.store)
     return encoding_for(camera.width_px, camera.height_px, camera.rate_hz)
 
 

@@ -51,7 +51,7 @@ def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
     """
     figure = new_figure(COLUMN_IN * (len(picture.fields) + 1) + 0.9, 2 * ROW_IN + STRIP_IN)
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.03, wspace=0.01, hspace=0.02)  # type: ignore[union-attr,call-arg]
-    above, below = figure.subfigures(2, 1, height_ratios=[2 * ROW_IN, STRIP_IN], hspace=0.04)
+    above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=[2 * ROW_IN, STRIP_IN], hspace=0.04)[:, 0]
     _case(above, picture, {row["method"]: row["rmse_v"] for row in rows if row["case"] == picture.name})
     _strip(below.subplots(), list(picture.fields), rows, picture.name)
     figure.savefig(path)

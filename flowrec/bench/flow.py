@@ -29,21 +29,16 @@ from flowrec.flow.linear_solver import clear_cache
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Observations
 from flowrec.refine import PiUnet, Refiner
+from flowrec.refine.refiner import REFINERS
 from flowrec.refine.training.vessels import draw_mask, make_case, with_mask_error
 from flowrec.terminal import progress, say
 
 RANDOM_CASES = 10
 
-# As in the paper, pi_unet starts from the solver's prediction (fvm, the null model: no refinement). `:printed` has
-# random weights and no other optimiser than the paper's.
-METHODS = {
-    "fvm": Refiner("fvm"),
-    "ni": Refiner("ni"),
-    "pinn": Refiner("pinn"),
-    "unet": Refiner("unet"),
+# The rows of REFINERS; fvm, no refinement, is the null model. As in the paper, pi_unet starts from the solver's field.
+# `:printed` has random weights and no other optimiser than the paper's.
+METHODS = {name: Refiner(name, pi_unet=PiUnet(start="fvm")) for name in REFINERS} | {
     "pi_unet:printed": Refiner("pi_unet", pi_unet=PiUnet(start="fvm", weights="none", finish="none")),
-    "assimilate": Refiner("assimilate"),
-    "pi_unet": Refiner("pi_unet", pi_unet=PiUnet(start="fvm")),
     "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
 }
 _INCREMENTAL = ("fvm", "assimilate")  # an update reuses earlier results; the others start again

@@ -98,11 +98,6 @@ class Row:
     radius_um: float = math.nan
     speed_limit_um_s: float = math.nan
 
-    @property
-    def trip(self) -> tuple[int, str, str]:
-        """What all policies have in common."""
-        return self.seed, self.way, self.map
-
 
 class MissionLog:
     """A sink that collects the data of a row."""
@@ -347,11 +342,10 @@ def _proportion(successes: int, count: int) -> dict[str, Any]:
 
 def compared(rows: Sequence[Row], a: str, b: str) -> dict[str, Any]:
     """Times of `a` over those of `b` on the trips on which both arrived."""
-    times = {(row.policy, row.trip): row.seconds for row in rows if row.seconds}
-    trips = sorted({row.trip for row in rows})
-    return paired(
-        np.array([times[a, trip] / times[b, trip] for trip in trips if (a, trip) in times and (b, trip) in times])
-    )
+    times = {(row.policy, (row.seed, row.way, row.map)): row.seconds for row in rows if row.seconds}
+    trips = sorted({trip for _, trip in times})
+    both = [trip for trip in trips if (a, trip) in times and (b, trip) in times]
+    return paired(np.array([times[a, trip] / times[b, trip] for trip in both]))
 
 
 def show(results: Results) -> None:

@@ -31,6 +31,7 @@ ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev
 LAPS = 2
 GAINS_PER_S = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0)  # tried of the Luenberger observer; that of the paper is 1
 MAP_SCALE = 1.1
+PULSATION_HZ = 1.0
 DRAWN = "10 um"
 
 Floats = NDArray[np.float64]
@@ -43,7 +44,6 @@ class Case:
     name: str
     noise_um: float = 10.0
     pulsation: float = 0.0  # amplitude, relative to the flow
-    pulsation_hz: float = 1.0
     gain: float = 1.0  # true um per revolution over the nominal value
     map_scale: float = MAP_SCALE  # of the map over the true flow
 
@@ -76,7 +76,7 @@ def drive(case: Case, seed: int = 0, laps: int = LAPS) -> Run:
 
     def flow(at: Floats) -> Floats:
         away = place_um(at) - CENTRE_UM
-        pulse = 1.0 + case.pulsation * np.sin(2 * np.pi * case.pulsation_hz * at)
+        pulse = 1.0 + case.pulsation * np.sin(2 * np.pi * PULSATION_HZ * at)
         return np.asarray(SPIN_PER_S * pulse[:, None] * np.stack([-away[:, 1], away[:, 0]], -1))
 
     place, true = place_um(time), flow(time)
@@ -222,11 +222,9 @@ def show(results: Results) -> None:
             return ""
         return f"{row['rmse_um_s']:.1f}" + ("" if row["nis"] is None else f" ({row['nis']:.2f})")
 
-    table(
-        "RMSE of the flow in um/s (and mean NIS)",
-        ("observer", *cases),
-        [(name, *(cell(rows.get((name, case))) for case in cases)) for name in dict.fromkeys(name for name, _ in rows)],
-    )
+    names = dict.fromkeys(name for name, _ in rows)
+    lines = [(name, *(cell(rows.get((name, case))) for case in cases)) for name in names]
+    table("RMSE of the flow in um/s (and mean NIS)", ("observer", *cases), lines)
     for (name, case), row in rows.items():
         if row["alarm"]:
             say(f"alarm in {case} by {name}: {row['alarm']} after {row['alarm_after_s']:.1f} s")
