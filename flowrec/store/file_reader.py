@@ -77,7 +77,7 @@ class FileReader:
         encoding = ENCODINGS.get(self.contents.frame_encoding)
         self._lossless = encoding is None or encoding.lossless
 
-    def news(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, NewMessages]]:
+    def new_messages(self, start_ns: int | None, *, with_frames: bool) -> Iterator[tuple[int, NewMessages]]:
         """Stamp and new messages of all ticks, or of those at and after `start_ns`."""
         size = _StateSize(self.path)
         for stamp_ns, records in itertools.groupby(self._records(start_ns, with_frames), key=_by_time):
@@ -219,7 +219,7 @@ class FileReader:
                 if field_name not in latest or latest[field_name].log_ns <= record.log_ns:
                     size.add(field_name, record)
                     latest[field_name] = record
-            if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # which is not kept for the sake of a few messages in it
+            if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # it is not kept in memory for a few messages in it
                 latest = {field: _detached(record) for field, record in latest.items()}
         return latest
 

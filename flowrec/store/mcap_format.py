@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, MetadataIndex, Schema, Statistics
+from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
     from flowrec.declarations import Message
@@ -155,15 +155,6 @@ def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
 def stream_of(data: bytes | memoryview) -> ReadDataStream:
     """What mcap's records parse themselves from."""
     return ReadDataStream(io.BytesIO(data))
-
-
-def bytes_of(*records: McapRecord) -> bytes:
-    """Records as they stand in the file."""
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return data
 
 
 def declare(known: dict[int, _Declared], record: _Declared) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -26,6 +27,7 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
+    McapRecord,
     Metadata,
     MetadataIndex,
     Schema,
@@ -33,7 +35,7 @@ from mcap.records import (
 )
 
 from flowrec.store.digest import digest_record, head_digest
-from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, Summary, bytes_of
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, Summary
 from flowrec.system.locks import open_new
 
 if TYPE_CHECKING:
@@ -66,11 +68,11 @@ class McapWriter:
 
     def start(self, profile: str, library: str) -> None:
         """Write magic and header."""
-        self._append(MAGIC, bytes_of(Header(profile=profile, library=library)))
+        self._append(MAGIC, _bytes_of(Header(profile=profile, library=library)))
 
     def add(self, record: Metadata | Attachment | Schema | Channel) -> None:
         """Write a record outside the chunks."""
-        data = bytes_of(record)
+        data = _bytes_of(record)
         if isinstance(record, Schema):
             self._summary.schemas[record.id] = record
         elif isinstance(record, Channel):
@@ -110,7 +112,7 @@ class McapWriter:
                 self._counts[index.channel] += index.messages
                 self._digests[index.channel] += index.digest
             first_ns, last_ns = chunk.message_start_time, chunk.message_end_time
-            self._chunks += bytes_of(
+            self._chunks += _bytes_of(
                 ChunkIndex(
                     chunk_length=length,
                     chunk_start_offset=start,
@@ -130,25 +132,25 @@ class McapWriter:
 
     def finish(self) -> None:
         """Write data end, summary and footer; then the file is complete."""
-        self._append(bytes_of(DataEnd(data_section_crc=self._crc)))
+        self._append(_bytes_of(DataEnd(data_section_crc=self._crc)))
         start = self.size
         listed = self._summary
         listed.count(self._counts, self._chunk_count, self._first_ns, self._last_ns)
         assert listed.statistics is not None
         summary, offsets = bytearray(), bytearray()
         for opcode, group in (
-            (Opcode.SCHEMA, bytes_of(*listed.schemas.values())),
-            (Opcode.CHANNEL, bytes_of(*listed.channels.values())),
-            (Opcode.STATISTICS, bytes_of(listed.statistics)),
+            (Opcode.SCHEMA, _bytes_of(*listed.schemas.values())),
+            (Opcode.CHANNEL, _bytes_of(*listed.channels.values())),
+            (Opcode.STATISTICS, _bytes_of(listed.statistics)),
             (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, bytes_of(*listed.attachments)),
-            (Opcode.METADATA_INDEX, bytes_of(*listed.metadata)),
+            (Opcode.ATTACHMENT_INDEX, _bytes_of(*listed.attachments)),
+            (Opcode.METADATA_INDEX, _bytes_of(*listed.metadata)),
         ):
             if group:
-                offsets += bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))
+                offsets += _bytes_of(SummaryOffset(opcode, start + len(summary), len(group)))
                 summary += group
         offset_start = start + len(summary)
-        footer = bytes_of(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0))
+        footer = _bytes_of(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=0))
         # The checksum covers all of the summary up to itself, the last four bytes of the footer.
         tail = bytes(summary + offsets) + footer[:-4]
         self._append(tail + zlib.crc32(tail).to_bytes(4, "little") + MAGIC)
@@ -179,6 +181,15 @@ class McapWriter:
                 done -= len(waiting.pop(0))
             if done:
                 waiting[0] = waiting[0][done:]
+
+
+def _bytes_of(*records: McapRecord) -> bytes:
+    """Records as they stand in the file."""
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
 
 
 def _chunk_head(chunk: SealedChunk) -> bytes:

@@ -114,9 +114,9 @@ class SessionReader:
                 continue
             # A file that is read from its beginning is compared with the counts in its index.
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
-            for stamp_ns, news in self._file(number).news(late_ns, with_frames=with_frames):
+            for stamp_ns, new in self._file(number).new_messages(late_ns, with_frames=with_frames):
                 if not number or stamp_ns > file.first_ns:
-                    tick = replace(tick, stamp_ns=stamp_ns, **news)
+                    tick = replace(tick, stamp_ns=stamp_ns, **new)
                     yield tick
 
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:

@@ -1,4 +1,4 @@
-"""Routes queued entries to segments of a run: parts of it (split.py), or pieces of the ring buffer.
+"""Routes queued entries to segments of a run: parts of it (split.py), or slices of the ring buffer.
 
 A run is cut at the boundaries of ticks. Images wait behind the state (write_queue.py), so when a segment ends at a
 tick, images of it may still be queued. Each tick announces its image; a segment stays open until every image that was
