@@ -282,3 +282,13 @@ def test_reading_can_be_broken_off_and_begun_again(session):
     first = next(iter(reader.ticks()))
     both = zip(reader.ticks(), reader.ticks(), strict=True)
     assert first.stamp_ns == TICKS[0].stamp_ns and all(one.stamp_ns == two.stamp_ns for one, two in both)
+
+
+def test_an_index_that_was_changed_without_its_checksum_is_refused(tmp_path, session):
+    content = bytearray(session.read_bytes())
+    at = content.rfind(b"/truth/robot")  # the last one is in the index, and any letter makes sense there
+    content[at + 8] ^= 1
+    path = tmp_path / "changed.mcap"
+    path.write_bytes(content)
+    with pytest.raises(SessionError, match="the checksum of the index is wrong"):
+        SessionReader(path)
