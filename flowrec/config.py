@@ -1,8 +1,7 @@
-"""Config: what a run is. TOML in and out, `--set key=value`, unknown keys refused with the nearest known one.
+"""Config: the settings of a run. TOML in and out, `--set key=value`, errors that name the nearest valid value.
 
-Every section is the frozen dataclass of the stage it sets, so a setting is declared once, where it is used.
-`resolve` fills what was left to fit the chip (None) and turns named places into points; a session carries the
-resolved configuration, so a replay needs nothing else.
+Every section is the frozen dataclass of the stage it sets, so a setting is declared once, where it is used. resolve.py
+makes a ResolvedConfig of it, on a chip; a session carries that one, so a replay needs nothing else.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ from flowrec.vision import Tracker
 
 @dataclass(frozen=True, slots=True)
 class Worker:
-    """How results of slow stages reach the loop."""
+    """When results of slow stages reach the loop."""
 
-    # A simulated run that does not keep real time adopts each result exactly this long after it was ordered, so
-    # that the same seed gives the same session; a live run adopts it on the first frame after it is done.
+    # A simulated run without --realtime adopts each result exactly this long after its order, so that the same seed
+    # gives the same session. A live run adopts it on the first frame after it is done.
     adopt_after_s: Annotated[float, Range(0.0, 3600.0)] = 0.5
 
 
@@ -49,46 +48,46 @@ class Worker:
 class Recording:
     """How a session is written."""
 
-    frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"  # auto: what the camera's rate allows
-    # at most this much of the end is lost when the process is killed, in wall or session time
+    frames: Literal["auto", "zstd", "raw", "png", "delta", "jpeg"] = "auto"  # auto: by the camera's data rate
+    # longest end of the session that is lost when the process is killed, in wall or session time
     flush_s: Annotated[float, Range(0.0, 3600.0)] = 0.5
     sync_s: Annotated[float, Range(0.0, 3600.0)] = 1.0  # the same when the power fails
-    # robot: of most images only what the tracker read, the rest black; replays with the same tracker stay exact
+    # robot: most images hold only what the tracker read, the rest is black; replays with the same tracker are exact
     region: Literal["whole", "robot"] = "whole"
-    # so often an image is whole even so, and whenever the robot was not in sight
+    # interval of whole images with region = robot; images without the robot are always whole
     full_every_s: Annotated[float, Range(0.0, 1e6)] = 10.0
-    region_pad_px: Annotated[int, Range(0, 10_000)] = 16  # kept around what the tracker read
-    leave_out: tuple[str, ...] = ()  # topics not to be recorded, as in ["/view/*", "/truth/*"]
-    # Waiting for the disk; a live run thins out its frames from the half of it on. None: two seconds of the camera's
-    # images, 256 MB at least and 1 GB at most: disks now and then stop for most of a second.
+    region_pad_px: Annotated[int, Range(0, 10_000)] = 16  # margin around what the tracker read
+    leave_out: tuple[str, ...] = ()  # topics that are not recorded, as in ["/view/*", "/truth/*"]
+    # Limit of the data that waits for the disk; from half of it on, a live run records fewer frames. None: two seconds
+    # of the camera's images, but 256 MB to 1 GB, because disks sometimes stop for most of a second.
     queue_mb: Annotated[float, Range(1e-3, 1e6)] | None = None
-    # A run in several files: each of about so many MB, or of so many seconds, or both; else it is in one.
+    # Size and duration after which a run continues in another file; None or 0: one file.
     split_mb: Annotated[float, Range(0.0, 1e9)] | None = None
     split_s: Annotated[float, Range(0.0, 1e7)] | None = None
-    # Nothing is written but what is around events: so many seconds before and after. None: everything is.
+    # Only this time before and after events is written. None: everything.
     snapshot_before_s: Annotated[float, Range(0.0, 1e6)] | None = None
     snapshot_after_s: Annotated[float, Range(0.0, 1e6)] = 10.0
-    # in memory; where it is too little, fewer seconds before the event are kept
+    # memory for the time before an event; if it is too small, less time is kept
     snapshot_mb: Annotated[float, Range(1e-3, 1e6)] = 1000.0
-    # with less than that left on the disk a run is ended in good order; 0: never
+    # free space below which a run is ended in good order; 0: never
     disk_floor_gb: Annotated[float, Range(0.0, 1e6)] = 1.0
-    recover_leftovers: bool = True  # make whole sessions of what killed runs have left in the same folder
+    recover_leftovers: bool = True  # recover what killed runs have left in the same folder
     operator: str = ""
     notes: str = ""
     sample: str = ""
-    anonymous: bool = False  # leave host, user, platform and local changes out of the file, to hand it on
+    anonymous: bool = False  # do not record host, user, platform and local changes
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a run starts from."""
+    """The start of a run."""
 
-    field: str = ""  # session whose flow field is taken over instead of solving: survey once, navigate often
+    field: str = ""  # session whose flow field is used instead of solving: survey once, navigate often
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """A whole run, one section per room."""
+    """All settings of a run, one section per stage."""
 
     rig: Annotated[str, RIGS] = SIMULATED
     duration_s: Annotated[float, Range(1e-3, 1e7)] | None = None  # None: until the mission is finished
@@ -128,13 +127,13 @@ _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where settings come from, for errors: the flag that was typed, or else the file."""
+    """Origin of settings, for errors: the typed flag or the file."""
 
     file: str
     flags: Mapping[str, str] = field(default_factory=dict)  # by key
 
     def __call__(self, *keys: str) -> str:
-        """The flag that set a key, a part of it or its section; the file where none did."""
+        """The flag that set a key, a part of it or its section; the file if none did."""
         for key in keys:
             for typed, flag in self.flags.items():
                 if f"{typed}.".startswith(f"{key}.") or f"{key}.".startswith(f"{typed}."):
@@ -145,7 +144,7 @@ class Origin:
 def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mapping[str, str] | None = None) -> Config:
     """Defaults, then the TOML file, then each `key=value` of `sets` (value as in TOML, or a bare word).
 
-    `flags` names the flags, by key, of settings that were not typed as `--set`.
+    `flags` holds the flag of each setting that was not typed as `--set`, by key.
 
     Raises
     ------
@@ -161,12 +160,13 @@ def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mappi
 def config_from_toml(text: str, where: str) -> ResolvedConfig:
     """The configuration of a session, as `to_toml` wrote it; `where` names its origin in errors.
 
-    A recording is readable whatever it was made with: ranges are checked only where sizes and scales depend on them.
+    A session is readable even with settings outside of their ranges. Only the sections that determine sizes and scales
+    are checked.
     """
     origin = Origin(where)
     try:
         config = _config_from(ResolvedConfig, parse_toml(text), origin)
-    except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
+    except (ValueError, RecursionError) as error:  # bad TOML, and absurd numbers and nesting
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
     for fault in faults(config):
         if fault.key.startswith(("chip.", "camera.", "robot.", "coils.")):
@@ -176,14 +176,14 @@ def config_from_toml(text: str, where: str) -> ResolvedConfig:
 
 
 def to_toml(config: Config) -> str:
-    """The whole configuration as TOML; settings that are None are left out."""
+    """The configuration as TOML, without the settings that are None."""
     return tomli_w.dumps(_without_none(asdict(config)))
 
 
 def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] | None = None) -> _AnyConfig:
     """The configuration with some `key=value` changed; `flags` as in `load_config`.
 
-    A recorded configuration may hold settings outside of their ranges; only what is changed is checked.
+    A recorded configuration may hold settings outside of their ranges; only the changed ones are checked.
     """
     tree = _without_none(asdict(config))
     origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
@@ -193,7 +193,7 @@ def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] 
 
 
 def calibration_of(config: ResolvedConfig, chip: Chip) -> Calibration:
-    """Camera pixels to chip coordinates: the chip is centred in the image."""
+    """Transform from camera pixels to chip coordinates: the chip is centred in the image."""
     camera = config.camera
     width_um, height_um = chip.size_um
     half = 0.5 * chip.um_per_px
@@ -210,7 +210,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def _value(text: str) -> Any:
-    """A value as TOML writes it; a bare word is a string, so that shells need no double quoting."""
+    """A value in TOML syntax; a bare word is a string, so that shells need no double quoting."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -218,7 +218,7 @@ def _value(text: str) -> Any:
 
 
 def _apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> dict[str, str]:
-    """Put each `key=value` into the tree; the keys, with the flag."""
+    """Put each `key=value` into the tree; returns the flag by key."""
     flags = {}
     for text in sets:
         key, equals, value = text.partition("=")
@@ -239,7 +239,7 @@ def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
 
 
 def _config_from(kind: type[_AnyConfig], tree: dict[str, Any], origin: Origin) -> _AnyConfig:
-    """The settings of a tree, each of its type; ranges are not looked at."""
+    """The configuration of a tree; types are checked, ranges are not."""
     phases = tree.get("mission", {}).get("phases") if isinstance(tree.get("mission", {}), dict) else None
     if isinstance(phases, str):
         tree["mission"]["phases"] = [phase.strip() for phase in phases.split(",") if phase.strip()]
@@ -253,12 +253,12 @@ def _config_from(kind: type[_AnyConfig], tree: dict[str, Any], origin: Origin) -
         key = ".".join(part for part in map(str, first["loc"]) if not part.startswith(("tuple", "str", "function")))
         if first["type"] == "missing":
             raise UsageError(f"{origin(key)}: {key} is missing; a session states it") from error
-        raise UsageError(f"{origin(key)}: {_not_of_its_type(key, first['input'], first['msg'].lower())}") from error
+        raise UsageError(f"{origin(key)}: {_type_error(key, first['input'], first['msg'].lower())}") from error
     return config
 
 
-def _not_of_its_type(key: str, value: Any, complaint: str) -> str:
-    """What is wrong with a value that has not the type of its key, with the nearest one that has."""
+def _type_error(key: str, value: Any, complaint: str) -> str:
+    """The error of a value that has not the type of its key, with the nearest valid value."""
     known = dict(_all_hints(Config, ""))
     while key not in known and "." in key:  # a place in a tuple
         key = key.rpartition(".")[0]
@@ -275,7 +275,7 @@ def _not_of_its_type(key: str, value: Any, complaint: str) -> str:
 
 
 def _names_of(hint: Any) -> list[str]:
-    """The names that a setting can take; none where it takes others things."""
+    """The names that a setting can take; empty if it takes other values."""
     if get_origin(hint) is Literal:
         return list(map(str, get_args(hint)))
     if isinstance(hint, Methods):
@@ -284,9 +284,9 @@ def _names_of(hint: Any) -> list[str]:
 
 
 def check_config(config: Config, origin: Origin | None = None, known: frozenset[Fault] = frozenset()) -> None:
-    """Raise UsageError, in one line, for settings outside of their ranges, and for settings that exclude each other.
+    """Raise UsageError, in one line, for a setting outside of its range and for settings that exclude each other.
 
-    `origin` tells where a key was set; faults in `known` are let pass.
+    `origin` gives the origin of a key; faults in `known` are accepted.
     """
     origin = origin or Origin("configuration")
     for fault in faults(config):
@@ -324,7 +324,7 @@ def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, origin:
 
 
 def _all_hints(section: type, prefix: str) -> Iterable[tuple[str, Any]]:
-    """Every key of the configuration, sections included, with its type."""
+    """Every key of the configuration with its type, sections included."""
     for key, inner in hints(section).items():
         yield prefix + key, inner
         if is_dataclass(inner) and isinstance(inner, type):

@@ -1,6 +1,6 @@
-"""One tick: a frame comes in, currents go out. One call per stage, in order, nothing hidden.
+"""One tick: a frame comes in, currents go out. One call per stage, in order.
 
-All state between ticks is the previous Tick, so the pipeline can be resumed anywhere (design: the one idea).
+The previous Tick is all the state between ticks, so the pipeline can resume at any tick.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Pipeline:
     refiner: Refiner
     survey: SurveyPlanner
     planner: Planner
-    # What a replay knows better: the observations up to a stamp, in place of the sampler's.
+    # In a replay with smoothing: the observations up to a stamp, instead of the sampler's.
     hindsight: Callable[[int], Observations] | None = None
 
 
@@ -103,7 +103,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
 
 
 def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
-    """From a point (2,) to the nearest wall, by the nearest pixel of the chip; 0 where the point is nowhere."""
+    """Distance from a point (2,) to the nearest wall, at the nearest pixel; 0 if the point is not finite."""
     if not np.isfinite(point_um).all():
         return 0.0
     height, width = p.clearance_um.shape
@@ -112,13 +112,13 @@ def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
 
 
 def _strength(coils: Coils, last: Tick) -> float:
-    """Share of its full amplitude that the field had in the tick before; all of it before there is any."""
+    """Amplitude of the field in the tick before, relative to the full one; 1 before the first."""
     full_mt = coils.amplitude_mt
     return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
 
 
 def _seen(p: Pipeline, previous: Track | None, inputs: Inputs) -> Track:
-    """Where the robot is, and when it was last seen. An image that repeats the one before tells neither."""
+    """Position of the robot, and when it was last seen. A repeated image counts as not seen."""
     if inputs.applied.repeats_image and previous is not None:
         return unseen(previous, inputs.stamp_ns)
     if inputs.frame is None:
@@ -149,9 +149,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     track = _seen(p, last.track, inputs)
     lap("track")
     estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow)
-    # The robot as it is felt, where the observer estimates how far it rolls per revolution.
+    # The robot with the estimated um_per_rev, if the observer estimates it.
     robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
-    # Runs recorded before step-out was looked for replay without it.
+    # Sessions recorded before step-out was monitored replay without it.
     looked = inputs.applied if inputs.applied.image_since_ns is not None else None
     wall_um = _wall_um(p, estimate.position_um)
     health = p.health.watch(last.health, last.estimate, estimate, flow, p.robot, looked, wall_um)

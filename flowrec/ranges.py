@@ -1,6 +1,6 @@
-"""The range of a setting, declared with it: `kp_per_s: Annotated[float, Range(0.0, 1000.0)] = 3.0`.
+"""Range of a setting, declared in its annotation: `kp_per_s: Annotated[float, Range(0.0, 1000.0)] = 3.0`.
 
-A number that is not finite lies in no range, unless the range itself ends there.
+NaN lies in no range; infinity only in a range that ends there.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Range:
         return f"from {shown(self.low)} to {shown(self.high)}"
 
     def nearest(self, value: Number) -> Number:
-        """The valid value nearest to another; the lower end for NaN."""
+        """The nearest valid value; the lower end for NaN."""
         return self.high if value > self.high else self.low
 
 
@@ -77,7 +77,7 @@ class Fault:
 
 
 def faults(settings: Any, prefix: str = "") -> Iterator[Fault]:
-    """The numbers of a settings dataclass, and of those inside it, that are outside of their ranges."""
+    """The numbers outside of their ranges in a settings dataclass and in those inside it."""
     section: type = type(settings)
     for key, hint in hints(section).items():
         value = getattr(settings, key)
@@ -90,7 +90,7 @@ def faults(settings: Any, prefix: str = "") -> Iterator[Fault]:
 
 
 def check_ranges(settings: Any, section: str) -> None:
-    """Raise UsageError, in one line, where a number of a section of the configuration is outside of its range."""
+    """Raise UsageError, in one line, if a number of a section of the configuration is outside of its range."""
     fault = next(faults(settings, f"{section}."), None)
     if fault is not None:
         raise UsageError(str(fault))
@@ -98,13 +98,13 @@ def check_ranges(settings: Any, section: str) -> None:
 
 @functools.cache
 def hints(section: type) -> dict[str, Any]:
-    """The types of a dataclass's fields, with their ranges."""
+    """The annotations of a dataclass's fields by name."""
     found = get_type_hints(section, include_extras=True)
     return {field.name: found[field.name] for field in fields(section)}
 
 
 def range_of(hint: Any) -> Range | None:
-    """The range that a type is annotated with, or a type inside of it (`... | None`, tuples)."""
+    """The range in an annotation or in a type inside it (`... | None`, tuples)."""
     for part in get_args(hint):
         found = part if isinstance(part, Range) else range_of(part)
         if found is not None:
@@ -113,7 +113,7 @@ def range_of(hint: Any) -> Range | None:
 
 
 def shown(number: Number) -> str:
-    """A number as people write it: 3, 0.55, 1e+06."""
+    """A number in its shortest form: 3, 0.55, 1e+06."""
     return str(number) if isinstance(number, int) else f"{number:g}"
 
 
