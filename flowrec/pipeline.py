@@ -71,7 +71,7 @@ class Pipeline:
     mission: MissionStateMachine
     controller: Controller
     coils: Coils
-    # The slow ones: run by work.py on order of the mission state machine.
+    # Slow stages: run/workers.py runs them when the mission orders it.
     solver: FlowSolver
     refiner: Refiner
     survey: SurveyPlanner
