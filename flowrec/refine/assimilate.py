@@ -25,10 +25,9 @@ from flowrec.flow.sampling import fluid_image
 from flowrec.flow.sensitivities import Remainder, Sensitivities
 from flowrec.messages import FlowField
 from flowrec.ranges import Range
-from flowrec.refine import mixture_regression
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.method import Problem
-from flowrec.refine.mixture_regression import Regression
+from flowrec.refine.mixture_regression import Model, Regression
 from flowrec.refine.observation_operator import Floats, ObservationOperator
 from flowrec.refine.prior import Prior, PriorSettings
 from flowrec.refine.report import report
@@ -106,19 +105,18 @@ class Assimilate(PriorSettings):
             + float(operator.std_um_s.max()) ** 2
             + 1e-9
         )
-        found = mixture_regression.fit(design, misfit, variance, outlier_variance)
-        moved = False
+        linear = Model(design, misfit, variance, outlier_variance)
+        found, moved = linear.fit(), False
         for _ in range(self.max_steps):
             remainder = expansion.approach(prior.offset(found.mean), remainder)
             nonlinear = expansion.pixels(remainder.flux)
+            linear = replace(linear, misfit=misfit - here.predict(nonlinear))
             if remainder.step <= self.tolerance:
                 break
             # The inlier probabilities are found again at the end only.
-            found = found.with_misfit(design, misfit - here.predict(nonlinear), variance)
-            moved = True
-        if moved:
-            found = mixture_regression.fit(design, misfit - here.predict(nonlinear), variance, outlier_variance)
-        residual = misfit - here.predict(nonlinear) - np.tensordot(found.mean, design, axes=1)
+            found, moved = linear.refit(found), True
+        found = linear.fit() if moved else found
+        residual = linear.residual(found.mean)
         return _Posterior(chip, model, found, remainder, nonlinear, (residual**2).sum(axis=1) / variance)
 
     def _field(self, best: _Posterior, wrong_mask: str, problem: Problem) -> FlowField:

@@ -86,6 +86,8 @@ class _LeastSquares:
         self.unknowns = len(self.which) + 2 * len(case.openings)
         self.place = np.full(3 * self.pixels, -1)
         self.place[self.which] = np.arange(len(self.which))
+        ones = np.ones(len(self.which))
+        self.embed = sp.csr_array((ones, (self.which, self.place[self.which])), shape=(3 * self.pixels, self.unknowns))
         self.start = np.concatenate([np.moveaxis(case.velocity, -1, 0).ravel(), case.pressure.ravel()])
         self.largest = max(float(np.abs(case.pressure).max()), 1.0)
         # Width of the channel, from which follows the residual per relative error of the speed: 12 / width^2.
@@ -133,9 +135,7 @@ class _LeastSquares:
 
     def _image(self, change: Floats) -> Floats:
         """(h, w, 3) velocity and pressure."""
-        full = self.start.copy()
-        full[self.which] += change[: len(self.which)]
-        return np.moveaxis(full.reshape(3, *self.fluid.shape), 0, -1)
+        return np.moveaxis((self.start + self.embed @ change).reshape(3, *self.fluid.shape), 0, -1)
 
     def _truncation(self) -> None:
         """Residuals of the initial field, as a matrix Z on its velocity and a rest r."""
@@ -153,19 +153,17 @@ class _LeastSquares:
 
     def _equations(self, speed: Floats, floor: float, change: Floats) -> tuple[sp.csr_array, Floats]:
         """Weighted continuity and momentum on the pixels inside, linearised around a change of the initial field."""
-        full = np.moveaxis(self._image(change), -1, 0).ravel()
+        full = self.start + self.embed @ change
         jacobian = self.physics.jacobian(_tensor(full.reshape(3, *self.fluid.shape)))
-        slope = (jacobian - self.drag)[:, self.which]
+        slope = ((jacobian - self.drag) @ self.embed).sorted_indices()
         residual = self._residual(full).ravel() - self.drag @ full - self.rest
         allowed = speed + floor
         momentum = self.channel**2 / 12.0 / (MOMENTUM * allowed)
         weight = np.stack([1.0 / (CONTINUITY * allowed), momentum, momentum])
         weight = (weight * (self.case.inside & self.fluid)).ravel()
         used = np.flatnonzero(weight > 0.0)
-        at_openings = sp.csr_array((len(used), self.unknowns - len(self.which)))
         slope, weight = slope[used], weight[used]
-        target = weight * (slope @ change[: len(self.which)] - residual[used])
-        return sp.hstack([sp.diags_array(weight) @ slope, at_openings]).tocsr(), target
+        return sp.diags_array(weight) @ slope, weight * (slope @ change - residual[used])
 
     def _prior(self, speed: Floats, floor: float) -> sp.csr_array:
         """Prior of the change: small and smooth, with the profiles at openings nearly as assumed."""

@@ -11,12 +11,13 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.errors import FlowError
+from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.case import Case
 from flowrec.refine.observation_operator import TAIL, Floats
 
@@ -72,19 +73,21 @@ def adam(
     return optimiser, schedule
 
 
-class FitSettings(Protocol):
-    """Settings that the methods with a U-Net share."""
+@dataclass(frozen=True, slots=True)
+class NetworkSettings:
+    """Settings of the fit of a U-Net to one case."""
 
-    @property
-    def observations(self) -> Literal["soft", "hard"]: ...
-    @property
-    def largest_work_mpx(self) -> float: ...
-    @property
-    def patience(self) -> int: ...
-    @property
-    def observation_weight(self) -> float: ...
-    @property
-    def device(self) -> Device: ...
+    observations: Literal["soft", "hard"] = "soft"  # hard: as in the paper, the pixel takes the measured value
+    # iterations times pixels in millions: larger fields get fewer iterations
+    largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 4.0
+    patience: Annotated[int, Range(1, 1_000_000)] = 25  # iterations without a better loss before it stops
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
+    observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
+    base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
+    device: Device = "cpu"
+    # More than one only on idle cores: torch's threads wait actively, and on two shared cores two are ten times slower.
+    threads: Threads = 1
+    seed: Seed = 0
 
 
 class FieldLoss:
@@ -94,7 +97,7 @@ class FieldLoss:
         self,
         inputs: NetworkInputs,
         case: Case,
-        settings: FitSettings,
+        settings: NetworkSettings,
         correct: Callable[[Tensor], tuple[Tensor, Tensor]],
     ) -> None:
         """`correct` gives velocity (1, 2, h, w) and pressure (1, 1, h, w) for an output (1, 3 or 5, h, w)."""

@@ -9,7 +9,7 @@ flow beside them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -76,10 +76,6 @@ class NetworkInputs:
             friction=number([case.friction for case in cases]),
         )
 
-    def turned(self, quarters: int, mirrored: bool) -> NetworkInputs:
-        """The same cases under one of the eight symmetries of a square."""
-        return NetworkInputs(**{f.name: turn(getattr(self, f.name), quarters, mirrored) for f in fields(self)})
-
     @property
     def largest(self) -> Tensor:
         """(n, 1, 1, 1) largest initial pressure: pressures reach hundreds of mu V / px."""
@@ -127,30 +123,10 @@ class NetworkInputs:
             change = change + self.walled * gain * self.velocity
         return self.velocity + change, self.pressure + pressure * self.largest * self.fluid
 
-    def std(self, output: Tensor) -> Tensor:
-        """(n, 1, h, w) standard deviation of each component, from a trained network's output (n, 5, h, w)."""
-        return (output[:, LOG_STD].clamp(-6.0, 2.0) - 2.0).exp() * (self.local_rms + LEAST_SPEED) * self.fluid
-
 
 def mean_around(image: Tensor) -> Tensor:
     """Mean over the window around each pixel."""
     return functional.avg_pool2d(image, WINDOW, stride=1, padding=WINDOW // 2)
-
-
-def turn(image: Tensor, quarters: int, mirrored: bool) -> Tensor:
-    """(n, c, h, w) turned by quarters, then mirrored left to right; two channels are a vector (x, y)."""
-    if image.shape[-1] == 1:
-        return image
-    vector = image.shape[1] == 2
-    for _ in range(quarters % 4):
-        image = torch.rot90(image, 1, (2, 3))  # a vector to the right (x) now points up (-y)
-        if vector:
-            image = torch.stack([image[:, 1], -image[:, 0]], dim=1)
-    if mirrored:
-        image = image.flip(3)
-        if vector:
-            image = image * torch.tensor([-1.0, 1.0]).to(image)[None, :, None, None]
-    return image
 
 
 def geodesic_features(fluid: NDArray[np.bool_], velocity: Floats, innovations: Floats) -> Floats:

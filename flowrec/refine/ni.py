@@ -9,16 +9,16 @@ observed only the equations count, and fluid at rest satisfies them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
 from flowrec.chip.clearance import median_width_um
 from flowrec.messages import FlowField
-from flowrec.ranges import Range, Seed, Threads, Weight
+from flowrec.ranges import Range, Weight
 from flowrec.refine.case import Case
 from flowrec.refine.method import Problem
-from flowrec.refine.network_fit import Device, FieldLoss, fit_network, torch_run
+from flowrec.refine.network_fit import FieldLoss, NetworkSettings, fit_network, torch_run
 from flowrec.refine.observation_operator import RELATIVE_NOISE
 
 if TYPE_CHECKING:
@@ -26,20 +26,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Ni:
+class Ni(NetworkSettings):
     """Settings of N/I."""
 
-    observations: Literal["soft", "hard"] = "soft"  # hard: as in the paper, the pixel takes the measured value
     iterations: Annotated[int, Range(1, 1_000_000)] = 150
-    # iterations times pixels in millions: larger fields get fewer iterations
     largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 6.0
-    patience: Annotated[int, Range(1, 1_000_000)] = 30  # iterations without a better loss before it stops
-    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
-    observation_weight: Weight = 0.1  # of the mean log-likelihood against the mean squared residual
-    base_channels: Annotated[int, Range(1, 512)] = 16
-    device: Device = "cpu"
-    threads: Threads = 1
-    seed: Seed = 0
+    patience: Annotated[int, Range(1, 1_000_000)] = 30
+    observation_weight: Weight = 0.1
 
     def fit(self, problem: Problem) -> FlowField:
         """A field from observations and equations; of the assumed field only stamp and labels are used.

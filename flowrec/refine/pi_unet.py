@@ -19,10 +19,10 @@ from typing import Annotated, Literal
 import numpy as np
 
 from flowrec.messages import FlowField
-from flowrec.ranges import Range, Seed, Threads, Weight
+from flowrec.ranges import Range
 from flowrec.refine.case import Case
 from flowrec.refine.method import Problem
-from flowrec.refine.network_fit import Device, FieldLoss, Fitted, fit_network, torch_run
+from flowrec.refine.network_fit import FieldLoss, Fitted, NetworkSettings, fit_network, torch_run
 from flowrec.refine.observation_operator import Floats, student_t_loss
 from flowrec.refine.weights import SHIPPED, read_weights, sha256
 
@@ -36,7 +36,7 @@ TRAINED_RATE = 0.1  # learning rate from trained weights, of that from random on
 
 
 @dataclass(frozen=True, slots=True)
-class PiUnet:
+class PiUnet(NetworkSettings):
     """Settings of the PI-UNet."""
 
     start: Literal["assimilate", "fvm"] = "assimilate"  # the initial field
@@ -44,20 +44,9 @@ class PiUnet:
     # values, which is what the weights have learned and the balance assumes.
     weights: Literal["vessels", "none"] = "vessels"  # trained on drawn vessels, or random ones as in the paper
     finish: Literal["balance", "none"] = "balance"  # with soft observations
-    observations: Literal["soft", "hard"] = "soft"  # hard: the pixel takes the measured value with its noise
     near_wall: Literal["scaled", "hard", "free"] = "scaled"  # hard: as in the paper, the initial values stay
     # None: 80 with random weights, none with trained ones
     iterations: Annotated[int, Range(0, 1_000_000)] | None = None
-    # iterations times pixels in millions: larger fields get fewer iterations
-    largest_work_mpx: Annotated[float, Range(1e-3, 1e6)] = 4.0
-    patience: Annotated[int, Range(1, 1_000_000)] = 25  # iterations without a better loss before it stops
-    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
-    observation_weight: Weight = 0.03  # of the mean log-likelihood against the mean squared residual
-    base_channels: Annotated[int, Range(1, 512)] = 16  # of the network with random weights
-    device: Device = "cpu"
-    # More than one only on idle cores: torch's threads wait actively, and on two shared cores two are ten times slower.
-    threads: Threads = 1
-    seed: Seed = 0
 
     @property
     def weights_sha256(self) -> str:

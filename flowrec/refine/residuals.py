@@ -1,4 +1,4 @@
-"""Residuals of continuity and momentum on pixels, by fixed convolutions, with their Jacobian and block sums.
+"""Residuals of continuity and momentum on pixels, by fixed convolutions, and their Jacobian.
 
 Dimensionless with length px, velocity V and pressure mu V / px, the equations are
 
@@ -10,7 +10,6 @@ beyond the last fluid pixel: the velocity beyond is minus the one before, and th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,18 +95,3 @@ class Physics:
                 parts.append((values[y, x, equation], rows, channel * h * w + pixel[varied][y, x]))
         data, rows, columns = (np.concatenate(part) for part in zip(*parts, strict=True))
         return sp.csr_array((data, (rows, columns)), shape=(3 * h * w, 3 * h * w))
-
-
-def balances(residual: Tensor, sides: Sequence[int]) -> Tensor:
-    """(n,) sum of the squared sums of residuals (n, c, h, w) over blocks of several sides that overlap by half.
-
-    The sum of the divergence over a block is the flux through its sides, so a branch that carries more than enters it
-    counts the same wherever along it the surplus appears. On single pixels a slow change of the flux is hardly visible.
-    """
-    total = (residual**2).sum(dim=(1, 2, 3))
-    for side in sides:
-        if side > max(residual.shape[-2:]):
-            break
-        blocks = functional.avg_pool2d(residual, side, max(side // 2, 1), side // 2) * float(side * side)
-        total = total + (blocks**2).sum(dim=(1, 2, 3)) / 4.0  # each pixel is in four blocks
-    return total

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import struct
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flowrec.errors import FlowError
 from flowrec.system.outputs import WEIGHTS, new_file
@@ -63,17 +62,6 @@ def read_weights(path: Path, network: nn.Module) -> None:
         if not torch.isfinite(stored[name]).all():
             raise FlowError(f"{path}: tensor '{name}' is not finite; train the weights anew")
     network.load_state_dict({name: value.to(torch.float32) for name, value in stored.items()})
-
-
-def facts_of(path: Path) -> dict[str, Any]:
-    """What `write_weights` was told about the weights; {} where the file is not readable."""
-    try:
-        with path.open("rb") as file:
-            (length,) = struct.unpack("<Q", file.read(8))
-            head = json.loads(file.read(min(length, 1_000_000)))
-        return dict(json.loads(head["__metadata__"]["facts"]))
-    except (OSError, ValueError, struct.error, KeyError, TypeError):
-        return {}
 
 
 def sha256(path: Path) -> str:

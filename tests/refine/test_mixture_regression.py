@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flowrec.refine.mixture_regression import OUTLIERS, fit
+from flowrec.refine.mixture_regression import OUTLIERS, Model
 
 WIDE = 1e6  # outliers would lie far beyond everything here
 
@@ -29,7 +29,7 @@ def least_squares(design, misfit, variance, share):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_fit_is_that_of_least_squares_with_one_row_per_prior(seed):
     design, misfit, variance = case(seed)
-    found = fit(design, misfit, variance, WIDE)
+    found = Model(design, misfit, variance, WIDE).fit()
     assert found.inlier.min() > 0.9
     mean, covariance = least_squares(
         design, misfit, found.correlation_length * found.noise_factor**2 * variance, found.inlier
@@ -42,15 +42,15 @@ def test_the_fit_is_that_of_least_squares_with_one_row_per_prior(seed):
 def test_what_no_observation_reaches_keeps_its_prior():
     design, misfit, variance = case(1)
     design[2] = 0.0
-    found = fit(design, misfit, variance, WIDE)
+    found = Model(design, misfit, variance, WIDE).fit()
     assert found.mean[2] == pytest.approx(0.0, abs=1e-12)
     assert found.covariance[2, 2] == pytest.approx(1.0)
 
 
 def test_moved_misfits_move_the_mean_as_least_squares_says():
     design, misfit, variance = case(2)
-    found = fit(design, misfit, variance, WIDE)
-    moved = found.with_misfit(design, 2.0 * misfit, variance)
+    found = Model(design, misfit, variance, WIDE).fit()
+    moved = Model(design, 2.0 * misfit, variance, WIDE).refit(found)
     mean, covariance = least_squares(
         design, 2.0 * misfit, found.correlation_length * found.noise_factor**2 * variance, found.inlier
     )
@@ -67,7 +67,7 @@ def test_the_energy_is_minus_the_ln_of_prior_times_likelihood():
         return -np.log(right + wrong).sum() + 0.5 * (found.mean**2).sum() - len(variance) * np.log(2.0 * np.pi)
 
     cases = [case(seed, std=0.1) for seed in (3, 4)]
-    fits = [fit(*each, WIDE) for each in cases]
+    fits = [Model(*each, WIDE).fit() for each in cases]
     assert all(found.noise_factor == 1.0 for found in fits)
     for found, each in zip(fits, cases, strict=True):
         assert found.energy == pytest.approx(posterior(found, *each), abs=2e-2)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -149,17 +149,15 @@ def _training_batches(lessons: list[Lesson], training: Training) -> Iterator[tup
     """Batches in random order and random orientation, without end."""
     import torch
 
-    from flowrec.refine.network_inputs import turn
-
     rng = np.random.default_rng([training.seed, 0xBA7C])
     order = np.arange(len(lessons))
     while True:
         rng.shuffle(order)
         for first in range(0, len(order), training.batch):
-            scene, truth = _batch([lessons[i] for i in order[first : first + training.batch]], rng, training)
+            inputs, truth = _batch([lessons[i] for i in order[first : first + training.batch]], rng, training)
             turned = int(rng.integers(4)), bool(rng.integers(2))  # quarter turns, mirrored
             truth = torch.cat([turn(truth[:, :2], *turned), turn(truth[:, 2:], *turned)], dim=1)
-            yield scene.turned(*turned), truth
+            yield turn_inputs(inputs, *turned), truth
 
 
 def _validation_batches(lessons: list[Lesson], training: Training) -> Iterator[tuple[NetworkInputs, Tensor]]:
@@ -169,30 +167,78 @@ def _validation_batches(lessons: list[Lesson], training: Training) -> Iterator[t
         yield _batch(lessons[first : first + training.batch], rng, training)
 
 
-def _predict(net: UNet, scene: NetworkInputs) -> tuple[Tensor, Tensor, Tensor]:
+def _predict(net: UNet, inputs: NetworkInputs) -> tuple[Tensor, Tensor, Tensor]:
     """Velocity, pressure and the network's output."""
-    output = net(scene.with_observations())
-    return *scene.correct(output), output
+    output = net(inputs.with_observations())
+    return *inputs.correct(output), output
 
 
-def _loss(net: UNet, scene: NetworkInputs, truth: Tensor, training: Training) -> Tensor:
+def _loss(net: UNet, inputs: NetworkInputs, truth: Tensor, training: Training) -> Tensor:
     """Relative errors of velocity and pressure; for `pi_unet` also negative log-likelihood and balance of mass."""
-    from flowrec.refine.residuals import Physics, balances
+    from flowrec.refine.residuals import Physics
 
     velocity, pressure = truth[:, :2], truth[:, 2:]
-    v, p, output = _predict(net, scene)
+    v, p, output = _predict(net, inputs)
     error = _error(v, velocity)
     loss = error.mean() + 0.1 * _error(p, pressure).mean()
     if training.kind == "unet":
         return loss
-    std = scene.std(output).clamp(min=1e-5)
+    std = output_std(inputs, output).clamp(min=1e-5)
     # Detached: the likelihood trains the error bars only, or it would move the velocity to where errors are likely.
     miss = ((v.detach() - velocity) ** 2).sum(dim=1, keepdim=True)
-    unlikely = (2.0 * std.log() + 0.5 * miss / std**2) * scene.fluid
-    physics = Physics.of(scene.fluid, scene.inside, scene.reynolds, scene.friction)
-    surplus = physics.residuals(v, p)[:, :1] - physics.residuals(scene.velocity, scene.pressure)[:, :1]
+    unlikely = (2.0 * std.log() + 0.5 * miss / std**2) * inputs.fluid
+    physics = Physics.of(inputs.fluid, inputs.inside, inputs.reynolds, inputs.friction)
+    surplus = physics.residuals(v, p)[:, :1] - physics.residuals(inputs.velocity, inputs.pressure)[:, :1]
     imbalance = (balances(surplus, SIDES) / (velocity**2).sum(dim=(1, 2, 3)) + 1e-6).sqrt()
-    return loss + 0.003 * unlikely.sum() / scene.fluid.sum() + 0.02 * imbalance.mean()
+    return loss + 0.003 * unlikely.sum() / inputs.fluid.sum() + 0.02 * imbalance.mean()
+
+
+def output_std(inputs: NetworkInputs, output: Tensor) -> Tensor:
+    """(n, 1, h, w) standard deviation of each component, from a network's output (n, 5, h, w)."""
+    from flowrec.refine.network_inputs import LEAST_SPEED, LOG_STD
+
+    return (output[:, LOG_STD].clamp(-6.0, 2.0) - 2.0).exp() * (inputs.local_rms + LEAST_SPEED) * inputs.fluid
+
+
+def turn_inputs(inputs: NetworkInputs, quarters: int, mirrored: bool) -> NetworkInputs:
+    """The same cases under one of the eight symmetries of a square."""
+    images = {f.name: turn(getattr(inputs, f.name), quarters, mirrored) for f in fields(inputs)}
+    return replace(inputs, **images)
+
+
+def turn(image: Tensor, quarters: int, mirrored: bool) -> Tensor:
+    """(n, c, h, w) turned by quarters, then mirrored left to right; two channels are a vector (x, y)."""
+    import torch
+
+    if image.shape[-1] == 1:
+        return image
+    vector = image.shape[1] == 2
+    for _ in range(quarters % 4):
+        image = torch.rot90(image, 1, (2, 3))  # a vector to the right (x) now points up (-y)
+        if vector:
+            image = torch.stack([image[:, 1], -image[:, 0]], dim=1)
+    if mirrored:
+        image = image.flip(3)
+        if vector:
+            image = image * torch.tensor([-1.0, 1.0]).to(image)[None, :, None, None]
+    return image
+
+
+def balances(residual: Tensor, sides: Sequence[int]) -> Tensor:
+    """(n,) sum of the squared sums of residuals (n, c, h, w) over blocks of several sides that overlap by half.
+
+    The sum of the divergence over a block is the flux through its sides, so a branch that carries more than enters it
+    counts the same wherever along it the surplus appears. On single pixels a slow change of the flux is hardly visible.
+    """
+    from torch.nn import functional
+
+    total = (residual**2).sum(dim=(1, 2, 3))
+    for side in sides:
+        if side > max(residual.shape[-2:]):
+            break
+        blocks = functional.avg_pool2d(residual, side, max(side // 2, 1), side // 2) * float(side * side)
+        total = total + (blocks**2).sum(dim=(1, 2, 3)) / 4.0  # each pixel is in four blocks
+    return total
 
 
 def _error(field: Tensor, true: Tensor) -> Tensor:
@@ -206,5 +252,7 @@ def _validation_error(net: UNet | None, exam: list[tuple[NetworkInputs, Tensor]]
     import torch
 
     with torch.no_grad():
-        fields = [(scene.velocity if net is None else _predict(net, scene)[0], truth[:, :2]) for scene, truth in exam]
+        fields = [
+            (inputs.velocity if net is None else _predict(net, inputs)[0], truth[:, :2]) for inputs, truth in exam
+        ]
         return float(torch.cat([_error(*pair) for pair in fields]).mean())
