@@ -1,6 +1,7 @@
 """Paths that can not be written, disks that fail, runs that are killed, files that are damaged or foreign."""
 
 import errno
+import os
 import resource
 import signal
 import subprocess
@@ -292,3 +293,12 @@ def test_an_index_that_was_changed_without_its_checksum_is_refused(tmp_path, ses
     path.write_bytes(content)
     with pytest.raises(SessionError, match="the checksum of the index is wrong"):
         SessionReader(path)
+
+
+def test_a_file_that_becomes_shorter_while_it_is_read_is_named(tmp_path, session):
+    path = tmp_path / "shrinking.mcap"
+    path.write_bytes(session.read_bytes())
+    with SessionReader(path) as reader:
+        os.truncate(path, 2000)
+        with pytest.raises(SessionError, match="has become shorter while it was read"):
+            list(reader.ticks())

@@ -23,7 +23,7 @@ from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.scan import scan
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
-from flowrec.units import seconds
+from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
 
@@ -354,3 +354,13 @@ def test_a_file_that_may_not_grow_is_told_and_what_it_holds_is_saved(tmp_path):
     assert first == second and "writing failed (File too large)" in first and not run.stderr
     saved = recover(tmp_path / "s.mcap.partial")
     assert saved.ticks > 5 and not saved.complete
+
+
+def test_the_operating_system_has_all_state_but_the_last_flush_s_of_stamps(tmp_path):
+    ticks = list(ticks_of(150, shape=(8, 8)))
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(flush_s=0.5, sync_s=100.0)) as writer:
+        for tick in ticks:
+            writer.write(tick)
+            while writer.queue_bytes:
+                time.sleep(1e-4)
+            assert (writer._output.flushed_ns or ticks[0].stamp_ns) >= tick.stamp_ns - NS_PER_S // 2

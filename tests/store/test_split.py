@@ -26,7 +26,9 @@ from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.paths import part_path, run_files
 from flowrec.store.scan import scan
+from flowrec.store.split import Parts
 from flowrec.store.viewer_topics import ViewerTopics
+from flowrec.store.write_queue import Entry
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
@@ -296,3 +298,13 @@ def test_however_slow_the_disk_ends_a_part_a_kill_leaves_no_hole_before_the_next
                     stamps |= {record.log_ns for record in source.messages(chunk) if record.channel == APPLIED}
         assert stamps == {tick.stamp_ns for tick in TICKS[: len(stamps)]}
     assert len(left) > 1
+
+
+def test_the_operating_system_has_a_part_before_the_next_one_begins_though_images_of_it_wait(tmp_path):
+    split = Split(seconds=0.3)
+    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, flush_s=100.0), split, "run")
+    for tick in TICKS[:30]:
+        parts.add(Entry(tick.stamp_ns, {"track": tick.track}, 500, ticks=1, image_bytes=64))
+    first, second = parts._router.open
+    assert first.awaited and first.segment.flushed_ns == second.keyframe_ns
+    parts.close()
