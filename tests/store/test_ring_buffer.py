@@ -1,5 +1,6 @@
 """What is kept of a run around an event, and nothing else."""
 
+import errno
 import resource
 import signal
 import subprocess
@@ -14,6 +15,7 @@ from mcap.reader import make_reader
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
 from flowrec.store import SessionReader, SessionWriter, Snapshot, WriterOptions, recover
+from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.paths import snapshot_path
 from flowrec.units import NS_PER_S
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
@@ -216,3 +218,13 @@ def test_a_snapshot_that_is_being_taken_outlives_a_kill(tmp_path):
         stamps = [tick.stamp_ns for tick in reader.ticks()]
     # The flush of a tick may still be under way when it has left the queue: at most the flush before it is there.
     assert QUIET[80].stamp_ns >= stamps[0] and stamps[-1] > QUIET[320].stamp_ns - 0.2 * NS_PER_S
+
+
+@pytest.mark.parametrize("method", ["add_chunks", "finish", "sync"])
+def test_a_disk_that_refuses_a_snapshot_is_an_error_of_the_run(tmp_path, monkeypatch, method):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(McapWriter, method, refuse)
+    with pytest.raises(SessionError, match="the disk is full; free some space, then `flowrec recover"):
+        record(tmp_path / "x.mcap", with_events((300, ("mark", ""))), sync_s=0.0)
