@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -109,8 +110,7 @@ class Controller:
         """
         if previous is not None and previous.stamp_ns == estimate.stamp_ns:
             return previous
-        row = CONTROLLERS[self.method]
-        law: TrackingLaw = row.load()(**{name: getattr(self, name) for name in row.options})
+        law = _law(self)
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
         lag_s = 0.0 if estimate_uses_map else self.observer_lag_s / speed_ratio(robot)
@@ -170,6 +170,14 @@ class Controller:
         if limit_um_s < _LEAST_SPEED * now.robot.speed_limit_um_s:
             return np.zeros(2)
         return limit_length(demand_um_s, limit_um_s)[0]
+
+
+@lru_cache(maxsize=16)
+def _law(settings: Controller) -> TrackingLaw:
+    """The method of a controller with the settings that its row names."""
+    row = CONTROLLERS[settings.method]
+    law: TrackingLaw = row.load()(**{name: getattr(settings, name) for name in row.options})
+    return law
 
 
 def _hold_position(now: Situation) -> Vector:
