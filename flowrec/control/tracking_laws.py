@@ -7,8 +7,8 @@ the settings of `Controller` that the row names, with the methods of `TrackingLa
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,25 +69,23 @@ class Reference:
         return Reference(position_um, position_um, np.zeros(2), progress_s, error_um)
 
 
-class TrackingLaw(Protocol):
+class TrackingLaw(ABC):
     """A method of the control stage."""
 
     def reference(self, now: Situation) -> Reference | None:
         """The law's own reference on a route; None: the trajectory's."""
+        return None
 
+    @abstractmethod
     def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
         """The demand without regard to walls, and whether the speed limit reduced it."""
 
 
 @dataclass(frozen=True, slots=True)
-class VectorLaw:
+class VectorLaw(TrackingLaw):
     """u = sat(xd_dot - v(x+) + Kp (xd - x+)), where x+ is the predicted position (science.md, section 5)."""
 
     kp_per_s: float
-
-    def reference(self, now: Situation) -> Reference | None:
-        """None: it follows the trajectory."""
-        return None
 
     def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
         """As in TrackingLaw."""
@@ -97,7 +95,7 @@ class VectorLaw:
 
 
 @dataclass(frozen=True, slots=True)
-class FeedforwardFeedback:
+class FeedforwardFeedback(TrackingLaw):
     """The feedforward-feedback law of the paper with its two defects corrected.
 
     |u| = |xd_dot - v| + Kp (e_x cos phi + e_y sin phi), where the heading phi is the mean of those of xd_dot - v and of
@@ -106,10 +104,6 @@ class FeedforwardFeedback:
     """
 
     ff_fb_kp_per_s: float
-
-    def reference(self, now: Situation) -> Reference | None:
-        """None: it follows the trajectory."""
-        return None
 
     def velocity(self, now: Situation, reference: Reference) -> tuple[Vector, bool]:
         """As in TrackingLaw."""
