@@ -1,4 +1,4 @@
-"""What can go wrong, told in one line: what, where, what next.
+"""Exceptions of flowrec. Each text is one line: what is wrong, where, and what to do next.
 
 The command line prints these without a traceback; anything else is a defect of flowrec.
 """
@@ -10,12 +10,12 @@ _UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2
 
 
 def printable(text: str) -> str:
-    """Text from a file, safe on a terminal: what is not to be seen but obeyed (ESC, ...) is spelled out."""
+    """Text from a file, safe on a terminal: control characters such as ESC are replaced by their escape sequences."""
     return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
 class FlowrecError(Exception):
-    """Something failed that a person can mend. Exit status 1."""
+    """A failure that the user can fix. Exit status 1."""
 
     exit_status = 1
 
@@ -30,7 +30,7 @@ class UsageError(FlowrecError):
 
 
 class UnreachableError(FlowrecError):
-    """No way leads from the start to the goal. Exit status 1, as for a run that finds it out on its way."""
+    """No route leads from the start to the goal. Exit status 1, as for a run that finds this out later."""
 
 
 class ChipError(UsageError):

@@ -1,4 +1,4 @@
-"""Where a session comes from: version, commit and local changes, packages, host, time.
+"""Provenance of a session: versions, commit and local changes, packages, host, time.
 
 Recorded first in every file, so that a result can be traced to the code that made it.
 """

@@ -31,11 +31,15 @@ def session_writer(
     derived: Mapping[str, float] | None = None,
     inputs: Iterable[Path] = (),
 ) -> SessionWriter:
-    """A new session file with its head written. `parent` is the session that it replays, named by content.
+    """Create a session file and write its header.
 
-    A `live` run drops images rather than wait for the disk. `in_pieces`: as `recording.split_*` and `.snapshot_*` say.
-    `derived`: settings that nobody gave, by key; they are named in the head.
-    `inputs` are other files that the command reads; none of them, and none of the parent's, is replaced.
+    Parameters
+    ----------
+    parent : the session that it replays; the header names it by its hash.
+    live : drop images rather than wait for the disk.
+    in_pieces : split the run, or record only around events, as the settings `recording.split_*` and `.snapshot_*` say.
+    derived : settings that were derived because they were not given, by key, for the header.
+    inputs : other files that the command reads; none of them, and none of the parent's, is replaced.
     """
     header = session_header(config, chip)
     if derived:
@@ -61,7 +65,7 @@ def session_writer(
 
 
 def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
-    """How much of a run a kill takes at most, in s of stamps; of a ring, from its event on."""
+    """Largest loss when the process is killed, in s of stamps; of a snapshot, from its event on."""
     camera, flush_s = config.camera, config.recording.flush_s
     pixels_s = camera.width_px * camera.height_px * camera.rate_hz
     waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only where the disk is too slow
@@ -95,7 +99,7 @@ def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region
 
 
 def queue_bytes_of(config: ResolvedConfig) -> int:
-    """How much may wait for the disk, in bytes."""
+    """Largest size of the write queue, in bytes."""
     camera, chosen_mb = config.camera, config.recording.queue_mb
     if chosen_mb is not None:
         return int(chosen_mb * 1e6)
@@ -104,7 +108,7 @@ def queue_bytes_of(config: ResolvedConfig) -> int:
 
 
 def frames_of(config: ResolvedConfig) -> str:
-    """How the images of a run travel, a name of store/frames.py."""
+    """Encoding of the images of a run, a name of store/frame_encodings.py."""
     camera, chosen = config.camera, config.recording.frames
     if chosen != "auto":
         return chosen
@@ -114,7 +118,7 @@ def frames_of(config: ResolvedConfig) -> str:
 
 
 def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:
-    """Everything that must be in a file before its first frame; the session clock starts now."""
+    """The header of a new session: configuration, chip and provenance. The session clock starts now."""
     png, toml = chip_files(chip)
     facts = provenance(config.recording.anonymous) | {
         "operator": config.recording.operator,

@@ -1,4 +1,4 @@
-"""What a run, a replay or a file comes to: numbers whose keys carry the unit. Words are made of them when shown."""
+"""Figures of a run, a replay or a file: numbers whose keys carry the unit. They become text only when shown."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _COUNTS = frozenset(
     {"ticks", "contacts", "observations", "frames_dropped", "dropped_frames", "frames_missing_from_camera", "seed"}
 )
 _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns", "_error": "", "_rad": "rad"}
-_LONGEST = 25  # characters of a number in a file: more is none of ours
-_OLD_SHARE = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
+_LONGEST = 25  # characters of a number in a file; flowrec writes no longer one
+_OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
-# Where the key alone would be misread.
+# Names for keys that alone would be misread.
 _NAMES = {
     "wall_s": "computed in",
     "contacts": "wall contacts",
@@ -31,36 +31,36 @@ _NAMES = {
 
 
 def as_text(figures: Mapping[str, Value]) -> dict[str, str]:
-    """As the metadata of a file, which knows nothing but text."""
+    """Figures as the metadata of a file, which is text only."""
     return {
         key: value if isinstance(value, str) else repr(value) for key, value in figures.items() if value is not None
     }
 
 
 def of_text(text: Mapping[str, str]) -> Figures:
-    """Back from the metadata of a file; what an older one says in a sentence stays text."""
-    return {key: _number(said) if _is_numeric(key) else said for key, said in text.items()}
+    """Figures from the metadata of a file; sentences of older files stay text."""
+    return {key: _number(value) if _is_numeric(key) else value for key, value in text.items()}
 
 
 def finite(value: float) -> float | None:
-    """None for what is not known: JSON has no NaN."""
+    """The value, None if it is NaN or infinite, which JSON can not hold."""
     return value if math.isfinite(value) else None
 
 
 def rows_for_people(figures: Mapping[str, Value]) -> list[tuple[str, str]]:
-    """Names and values in words; the outcome together with its note."""
+    """Names and values as text; the outcome together with its note."""
     rows = [(name_of(key), shown(key, value)) for key, value in figures.items() if key not in _HIDDEN]
     note = figures.get("note")
-    return [(name, f"{said} ({note})" if name == "outcome" and note else said) for name, said in rows]
+    return [(name, f"{value} ({note})" if name == "outcome" and note else value) for name, value in rows]
 
 
 def comparison_for_people(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
-    """The same of recorded and replayed figures beside each other."""
+    """The same for recorded and replayed figures side by side."""
     return [(name_of(key), shown(key, was), shown(key, now)) for key, was, now in rows]
 
 
 def name_of(key: str) -> str:
-    """A key without its unit, in words."""
+    """The name of a figure: its key without the unit, as words."""
     if key in _NAMES:
         return _NAMES[key]
     unit = next((unit for unit in _UNITS if key.endswith(unit) and unit != "_error"), "")
@@ -68,7 +68,7 @@ def name_of(key: str) -> str:
 
 
 def shown(key: str, value: Value) -> str:
-    """A value with its unit; `-` where there is none."""
+    """A value with its unit; `-` if it is None."""
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -90,9 +90,9 @@ def _is_numeric(key: str) -> bool:
 
 
 def _number(text: str) -> Value:
-    share = _OLD_SHARE.fullmatch(text)
-    if share is not None:
-        return float(share[1]) / 100
+    percent = _OLD_FLOW_ERROR.fullmatch(text)
+    if percent is not None:
+        return float(percent[1]) / 100
     if len(text) > _LONGEST:
         return text
     for kind in (int, float):

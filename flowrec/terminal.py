@@ -1,4 +1,4 @@
-"""What a person sees on the terminal while a run goes on, and the small tables at its end."""
+"""The terminal: lines, status line, progress bars and tables. A run never waits for it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:  # what only a running session needs is imported then: a table
 
     from flowrec.messages import Event, Tick
 
-_PATIENCE_S = 2.0  # without a tick, then a person wants to know why
+_EXPLAIN_AFTER_S = 2.0  # without a tick
 _PERIOD_S = 0.12
-_GOODBYE_S = 0.3  # for the last events to be shown
+_CLOSE_TIMEOUT_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000
 _COLOURS: dict[str, str] = {Level.WARNING: "yellow", Level.ERROR: "red"}
 _STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
@@ -38,26 +38,26 @@ console = Console(file=cast(TextIO, outlet), highlight=False)
 
 
 def say(text: str) -> None:
-    """One line for the person at the terminal (stderr: stdout is for --json)."""
+    """Print a line on stderr; stdout is for results and --json."""
     console.print(escape(printable(text)), soft_wrap=True)
 
 
 def warn(text: str) -> None:
-    """One line that something is not as it should be."""
+    """Print a warning on stderr."""
     console.print(f"[yellow]warning:[/yellow] {escape(printable(text))}", soft_wrap=True)
 
 
 class StatusLine:
     """Phase, frame rate, latency, drops, queue, file and disk of a running session; events as they come.
 
-    On a terminal one line is kept up to date; elsewhere (a log, CI) only the events are printed. All of it is done by
-    threads: the loop only leaves its tick here, and does not mind a terminal that is frozen or gone.
+    On a terminal one line is updated in place; elsewhere (a log, CI) only the events are printed. Threads do the
+    printing: the loop only hands over its tick, and a terminal that is frozen or gone does not delay it.
 
     Parameters
     ----------
     file_bytes : of the session so far.
-    disk : what is to be said of the disk.
-    note : the note that a person is typing just now; None: none is.
+    disk : state of the disk as text.
+    note : the note that a person is typing; None without one.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class StatusLine:
 
     @contextmanager
     def shown(self) -> Iterator[StatusLine]:
-        """Keep the line on the screen for the length of the context."""
+        """Context in which the line is shown."""
         over = threading.Event()
         with outlet.aside():
             thread = threading.Thread(target=self._show, args=(over,), name="status", daemon=True)
@@ -85,10 +85,10 @@ class StatusLine:
                 yield self
             finally:
                 over.set()
-                thread.join(_GOODBYE_S)
+                thread.join(_CLOSE_TIMEOUT_S)
 
     def __call__(self, tick: Tick) -> None:
-        """Take note of one tick."""
+        """Take one tick."""
         self._arrivals.append(time.perf_counter())
         if tick.timing is not None:
             self._latency_ms.append(tick.timing.total_ms)
@@ -111,14 +111,14 @@ class StatusLine:
                 if last:
                     return
                 arrivals = list(self._arrivals)
-                if not explained and time.perf_counter() - max([began, *arrivals[-1:]]) > _PATIENCE_S:
+                if not explained and time.perf_counter() - max([began, *arrivals[-1:]]) > _EXPLAIN_AFTER_S:
                     explained = True
                     say("working ... (the first run after an installation compiles its numerics, some 20 s in all)")
                 if live is not None and self._last is not None:
                     live.update(self.text(self._last), refresh=True)
 
     def text(self, tick: Tick) -> Text:
-        """The line itself."""
+        """The status line for a tick."""
         note = self._note()
         if note is not None:
             line = Text("note: ", style="bold", no_wrap=True, overflow="ellipsis")
@@ -159,7 +159,7 @@ def _print(event: Event) -> None:
 
 @contextmanager
 def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
-    """A bar for long work; the yielded function takes how much is done. Silent where there is no terminal."""
+    """A progress bar; the yielded function takes how much of `total` is done. Prints nothing without a terminal."""
     if not console.is_terminal:
         yield lambda _done: None
         return
@@ -183,12 +183,12 @@ def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
 
 
 def time_left(estimate_s: float | None, stands_s: float) -> str:
-    """The time that work will still take, in words; nothing where it is not known or work has not advanced lately.
+    """The time that work will still take, as text; '' if it is not known or work has not advanced lately.
 
     Parameters
     ----------
-    estimate_s : from how fast it advanced.
-    stands_s : how long ago it last did.
+    estimate_s : estimated from its rate.
+    stands_s : time since it last advanced.
     """
     if estimate_s is None or stands_s > _STALE_S:
         return ""
@@ -196,7 +196,7 @@ def time_left(estimate_s: float | None, stands_s: float) -> str:
 
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table for people on stdout."""
+    """Print a table on stdout."""
     shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
     for number, column in enumerate(columns):
         shown.add_column(column, justify="left" if number == 0 else "right", overflow="fold")

@@ -1,4 +1,4 @@
-"""Units are part of every name (`_um`, `_um_s`, `_pa`); the factors between them stand here once.
+"""Conversion factors between units. The unit is part of every name (`_um`, `_um_s`, `_pa`).
 
 The flow solver alone works in SI; everything else in um, um/s, s, rad, Hz, mT, Pa, mPa*s, kg/m3, A.
 """
@@ -10,7 +10,7 @@ NS_PER_S = 1_000_000_000
 M_PER_UM = 1e-6
 UM_PER_M = 1e6
 PA_S_PER_MPA_S = 1e-3
-# What people type on a command line.
+# Units on the command line.
 _S_PER = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 _MB_PER = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6}
 _AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
@@ -32,11 +32,11 @@ def wrap_rad(angle_rad: float) -> float:
 
 
 def amounts(text: str) -> dict[str, list[float]]:
-    """What is asked for with `10min`, `2GB`, `30s,10s`: times under `s`, in s, and sizes under `mb`, in MB.
+    """Times (key `s`, in s) and sizes (key `mb`, in MB) in a text such as `10min`, `2GB` or `30s,10s`.
 
     Raises
     ------
-    ValueError : a part of it that is neither.
+    ValueError : a part of the text is neither.
     """
     found: dict[str, list[float]] = {"s": [], "mb": []}
     for part in text.split(","):

@@ -1,4 +1,4 @@
-"""What killed runs have left in the folder of the next one: small remains are made whole on the spot."""
+"""Automatic recovery: unfinished sessions that killed runs left in the folder of the next run."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from flowrec.terminal import say, warn
 
 _REMAINS = SUFFIX + PARTIAL_SUFFIX
 _DRAFT = ".recovering" + _REMAINS
-_AT_ONCE_BYTES = 100_000_000  # two to four seconds' work
-_PATIENCE_S = 5.0  # for all of them together: a run is waiting
-_TIDY_S = 1.0  # for a recovery that is given up to remove its draft
+_LARGEST_BYTES = 100_000_000  # takes two to four seconds
+_TIMEOUT_S = 5.0  # for all of them together: a run is waiting
+_CLEANUP_TIMEOUT_S = 1.0  # for an abandoned recovery to remove its draft
 _REFUSED = 3  # exit status of that process where it says in one line why nothing can be recovered
 _OFFERED = 3  # by name, the others by number
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """Unfinished sessions in a folder that nobody is writing, the latest first."""
+    """Unfinished sessions in a folder that no process is writing, the latest first."""
     try:
         found = [path for path in folder.iterdir() if path.name.endswith(_REMAINS) and path.is_file()]
         # A recovery that was killed left the draft and what it was to be made of; the latter is all there is to save.
@@ -42,26 +42,26 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 def look_after(folder: Path, besides: frozenset[Path] = frozenset()) -> dict[Path, str]:
-    """Recover what is small, offer what is not, with a line about each; never raises for what it finds.
+    """Recover small remains, name the command for larger ones, with a line about each; raises for none of them.
 
     Parameters
     ----------
-    besides : remains that are none of our business, because they will be overwritten.
+    besides : remains to leave alone, because they will be overwritten.
 
     Returns
     -------
-    The sessions that were made, and what came of each.
+    The recovered sessions, each with a summary.
     """
     waiting = [path for path in leftovers(folder) if path.resolve() not in besides]
     if not waiting:
         return {}
     made: dict[Path, str] = {}
     offered: list[Path] = []
-    end_s = time.monotonic() + _PATIENCE_S
+    end_s = time.monotonic() + _TIMEOUT_S
     with _alone_in(folder) as alone:
         for path in waiting:
             left_s = end_s - time.monotonic()
-            if not alone or left_s <= 0.0 or _size(path) > _AT_ONCE_BYTES:
+            if not alone or left_s <= 0.0 or _size(path) > _LARGEST_BYTES:
                 offered.append(path)
                 continue
             try:
@@ -84,9 +84,9 @@ def look_after(folder: Path, besides: frozenset[Path] = frozenset()) -> dict[Pat
 
 
 def _recover_apart(path: Path, limit_s: float) -> tuple[Path, str]:
-    """Recover in a process of its own: the session that was made, and what came of it.
+    """Recover in a process of its own; returns the session and a summary.
 
-    Whatever an old file does to that process (threads that hang, memory that runs out), this one starts a live run.
+    Whatever an old file does to that process (threads that hang, memory that runs out), the live run starts.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def _recover_apart(path: Path, limit_s: float) -> tuple[Path, str]:
         if process.poll() is None:
             process.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(_TIDY_S)
+                process.wait(_CLEANUP_TIMEOUT_S)
             process.kill()
             process.communicate()
     if process.returncode:
@@ -141,7 +141,7 @@ def _size(path: Path) -> int:
 
 @contextmanager
 def _alone_in(folder: Path) -> Iterator[bool]:
-    """Whether nobody else looks after this folder just now: after a power cut several rigs begin at once."""
+    """Whether no other process recovers in this folder; after a power cut several rigs start at once."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:

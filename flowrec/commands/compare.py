@@ -1,4 +1,4 @@
-"""Element by element: is a replay the recording, is a session the other one, and where do they first differ?"""
+"""`flowrec compare`: element-wise comparison of two sessions, or of a replay with its recording."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ALL: Fields = {topic.field: frozenset(each.name for each in fields(topic.type))
 
 @dataclass(frozen=True, slots=True)
 class Side:
-    """One of the two that are compared.
+    """One of the two sides of a comparison.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Side:
 
     @classmethod
     def of(cls, word: str, session: Session) -> Side:
-        """A session: without the topics that it leaves out, and the fields that its own schemas do not have."""
+        """A session, without the topics that it leaves out and the fields that its schemas do not have."""
         patterns = session.setting("recording", "leave_out")
         left_out = list(map(str, patterns)) if isinstance(patterns, list) else []
         copy = bool(session.header.parent)
@@ -57,7 +57,7 @@ class Side:
         return cls(word, session.path.name, recorded, copy, session.numerics)
 
     def lacks(self, topic: Topic) -> dict[str, str]:
-        """What it does not record of a topic, `/topic` or `/topic field`, each with the words for it."""
+        """What it does not record of a topic, as `/topic` or `/topic field`, each with a text about it."""
         if topic.field not in self.recorded:
             copied = self.copy and topic.field == "frame"
             return {topic.path: f"not copied into {self.name}" if copied else f"not recorded in {self.name}"}
@@ -98,7 +98,7 @@ class Difference:
         return printable(f"{self.topic} at {seconds(self.stamp_ns):.3f} s: {self.field}{place} {told}")
 
     def as_json(self) -> dict[str, Any]:
-        """All of it; what JSON has no number for as text."""
+        """The difference for JSON; values that JSON can not hold are text."""
         values = [value if _is_json(value) else _said(value) for value in self.values]
         return {
             "topic": self.topic,
@@ -119,7 +119,7 @@ class TopicCount:
     first: Difference | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
+        """The result for JSON."""
         return {
             "identical": self.identical,
             "within_tolerance": self.within_tolerance,
@@ -130,7 +130,7 @@ class TopicCount:
 
 @dataclass(slots=True)
 class Comparison:
-    """Takes pairs of ticks; only what is new in either of a pair, and recorded on both sides, is compared.
+    """Compares pairs of ticks: messages that are new in either tick and recorded on both sides.
 
     Attributes
     ----------
@@ -230,7 +230,7 @@ class Comparison:
         return self.different_ticks == 0 and all(count.different == 0 for count in self.topics.values())
 
     def lines(self) -> list[str]:
-        """For people, a line to a topic."""
+        """A line of text for each topic."""
         lines = []
         for topic, count in self.topics.items():
             total = count.identical + count.within_tolerance + count.different
@@ -242,7 +242,7 @@ class Comparison:
         return lines + [printable(f"{what:20s} {why}") for what, why in self.not_recorded.items()]
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
+        """The result for JSON."""
         return {
             "same": self.same,
             "identical": self.identical,

@@ -1,4 +1,4 @@
-"""From a session to other files: the .rrd for Rerun. The MCAP stays the archive, these are caches for looking."""
+"""`flowrec export`: convert a session to an .rrd for Rerun. The MCAP stays the archive; an .rrd can be made again."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flowrec.view.scene import Scene
 
 
 def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:
-    """What the viewer needs to know besides the ticks."""
+    """Static data of a session for the viewer."""
     properties = {
         "chip": chip.name,
         "session": path.name,
@@ -33,17 +33,17 @@ def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path)
 
 
 def export(session: Session | Path | str, out: Path | None = None, overwrite: bool = False) -> Path:
-    """Write the .rrd of a session; a replay is shown beside its parent, where that is still there.
+    """Write the .rrd of a session; a replay is shown beside its parent, if that is in the same folder.
 
     Parameters
     ----------
-    out : where to; by default beside the session, with the suffix .rrd. What was made there of the same session before
-        is made anew. Any other existing file is refused.
-    overwrite : replace any existing file but those that are read.
+    out : the file; by default beside the session, with the suffix .rrd, where an earlier .rrd of the same session is
+        replaced. Any other existing file is refused.
+    overwrite : any existing file may be replaced, but none that is read.
 
     Raises
     ------
-    SessionError : the session can not be read, or the file not be written; OutputError where it may not be.
+    SessionError : the session can not be read, or the file not be written; OutputError if it may not be.
     """
     session = Session.of(session)
     path, key = session.path, session.key
@@ -67,7 +67,7 @@ def export(session: Session | Path | str, out: Path | None = None, overwrite: bo
 
 
 def _parent_of(session: Session) -> Path | None:
-    """The session that was replayed, where it is there, all of it."""
+    """The replayed session, if all of its files are in the same folder."""
     # A name only: a session from elsewhere does not say which files of this machine are opened.
     name = Path(session.header.parent.get("file", "")).name
     parent = session.path.parent / name

@@ -1,7 +1,7 @@
-"""What `flowrec info` and `flowrec ls` tell of sessions: from heads and indexes only, at once however large they are.
+"""`flowrec info` and `flowrec ls`: facts about sessions, from headers and indexes only, however large they are.
 
-The configuration is read as the text that it is, and topics by what the file calls them: the stages and the messages
-behind them take long to import.
+The configuration is read as plain TOML, and topics by their names in the file: importing stages and messages takes
+long.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flowrec.units import seconds
 _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16
-_SAID_ELSE = ("reason", "duration")  # the second of older files, a sentence
+_REPEATED = ("reason", "duration")  # the second is a sentence of older files
 _CLOCK_READINGS = ("wall_ns", "monotonic_ns")
 
 
@@ -63,11 +63,11 @@ def info(session: Session | Path | str) -> dict[str, Any]:
     if session.setting("recording", "region") == "robot" and "frames_windows" not in outcome:
         facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
     told = of_text(outcome)
-    return facts | {key: value for key, value in told.items() if key not in (*facts, *_SAID_ELSE)}
+    return facts | {key: value for key, value in told.items() if key not in (*facts, *_REPEATED)}
 
 
 def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The facts of `info` in words, what is not known left out."""
+    """The facts of `info` in words, what is unknown left out."""
     stages = ("observer", "refine", "plan", "control")
     width_um, height_um = facts.get("chip_width_um"), facts.get("chip_height_um")
     size = f", {width_um / 1000:.2f} x {height_um / 1000:.2f} mm" if width_um and height_um else ""

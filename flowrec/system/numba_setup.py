@@ -1,4 +1,4 @@
-"""How kernels are compiled: by numba, cached on disk, with their Python types kept for the type checker.
+"""Compilation of kernels by numba with a cache on disk; the type checker sees their Python types.
 
 numba keys a cached kernel by the file that it is in, and not by the kernels of other files that it calls: after a
 change of one of those it would go on with the old code. So the cache is a folder whose name holds a hash of all files

@@ -1,6 +1,6 @@
-"""What may be written where, for every verb: no file that is there is replaced unasked, and none that is read.
+"""Output files of every verb: an existing file is replaced only with --overwrite, and an input file never.
 
-A file gets its name when it is whole and on the disk. Sessions are written by store/, with the same rules.
+A file gets its name when it is complete and on the disk. Sessions are written by store/, with the same rules.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _WITHOUT_LINKS = (errno.EPERM, errno.EMLINK, errno.ENOSYS, errno.ENOTSUP, errno.
 
 
 class OutputError(SessionError):
-    """A file that may not be written: it is there, is read by the same command, or has a name of another format."""
+    """A file that may not be written: it exists, is an input of the command, or is named like another format."""
 
     exit_status = 2
 
@@ -41,7 +41,7 @@ def check_output(
     overwrite: bool = False,
     also: Iterable[Path] = (),
 ) -> None:
-    """Refuse an output before anything is done for it.
+    """Check an output before any work is done for it.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def check_output(
 
     Raises
     ------
-    OutputError : one line about what is wrong with it, and what would be right.
+    OutputError : it may not be written; the text says why, and what to do.
     """
     if path.is_dir():
         raise OutputError(f"{path}: is a directory; name a file, as in {path / ('NAME' + suffixes[0])}")
@@ -80,7 +80,7 @@ def check_output(
 
 
 def taken(path: Path, kept: str = "") -> OutputError:
-    """The refusal of a name that another file has."""
+    """The error for a name that another file has."""
     return OutputError(f"{path}: exists already{kept}; choose another name, or replace it with --overwrite")
 
 
@@ -116,7 +116,7 @@ def new_file(
 
 
 def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
-    """Give a finished file its name in one step, and have the disk keep the name.
+    """Rename a finished file to its final name in one step, and flush the name to the disk.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
 
 
 def sync_directory(directory: Path) -> None:
-    """Have the disk keep names that were given or taken in a directory; Windows has no such call."""
+    """Flush the names in a directory to the disk; Windows has no such call."""
     if sys.platform != "win32":
         descriptor = os.open(directory, os.O_RDONLY)
         try:

@@ -1,7 +1,7 @@
-"""Where our lines for people go: to stderr, which during a run must not be able to stop it.
+"""Output to stderr that can not stop a run.
 
 A terminal can freeze (Ctrl-S, a stopped emulator, a dead link) or vanish (EIO). During a run a thread does the
-writing, what it can not write in time is left out, and errors end nothing.
+writing, text that it can not write in time is dropped, and errors are ignored.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO, cast
 
-_LIMIT_CHARACTERS = 200_000  # that wait for a frozen terminal; what is older makes room
-_GOODBYE_S = 0.3  # for the rest to be written when the run is over
+_LIMIT_CHARACTERS = 200_000  # queued for a frozen terminal; then the oldest text is dropped
+_CLOSE_TIMEOUT_S = 0.3  # for the rest to be written after the run
 
 
 class Outlet(io.TextIOBase):
-    """The file that the console writes to: stderr as it is at that moment."""
+    """The file that the console writes to: the current stderr."""
 
     def __init__(self) -> None:
         self._pump: _Pump | None = None
 
     def write(self, text: str) -> int:
-        """Write, or during a run hand over and return at once."""
+        """Write; during a run queue the text and return at once."""
         if self._pump is not None:
             self._pump.put(text)
         else:
@@ -36,7 +36,7 @@ class Outlet(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Nothing waits here outside a run."""
+        """Flush stderr; during a run the thread does."""
         if self._pump is None:
             with _vanished_is_no_error():
                 _stderr().flush()
@@ -56,7 +56,7 @@ class Outlet(io.TextIOBase):
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """For the length of the context a thread does the writing."""
+        """Context in which a thread does the writing."""
         pump = _Pump()
         self._pump = pump
         try:
@@ -67,12 +67,12 @@ class Outlet(io.TextIOBase):
 
 
 def _stderr() -> TextIO:
-    """Itself, not what rich puts in its place while a bar or a status line is shown: that prints through us."""
+    """The real stderr, not the proxy that rich installs while it shows a bar, which prints through Outlet."""
     return cast(TextIO, getattr(sys.stderr, "rich_proxied_file", sys.stderr))
 
 
 class _Pump:
-    """Text on its way to a descriptor that may block for ever; the oldest is left out when there is too much."""
+    """Writes queued text to a descriptor that may block for ever; drops the oldest if there is too much."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -103,7 +103,7 @@ class _Pump:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        self._thread.join(_GOODBYE_S)
+        self._thread.join(_CLOSE_TIMEOUT_S)
 
     def _work(self) -> None:
         try:
@@ -142,7 +142,7 @@ def _vanished_is_no_error() -> Iterator[None]:
 
 
 def said_within(seconds: float, say: Callable[[], None]) -> bool:
-    """Print something that may block or fail; False where the terminal did not take it in time."""
+    """Print something that may block or fail; False if the terminal did not accept it in time."""
 
     def attempt() -> None:
         with _vanished_is_no_error():

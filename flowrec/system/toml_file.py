@@ -1,4 +1,4 @@
-"""Reading a configuration file, apart from what it means: without a heavy import, a wrong one is refused at once."""
+"""Read a TOML file within bounded memory and time, without heavy imports, so that a wrong file is refused at once."""
 
 from __future__ import annotations
 

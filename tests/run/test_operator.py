@@ -217,7 +217,7 @@ def test_a_disk_that_runs_low_ends_a_run_in_good_order_with_status_3(
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recovery has as long as a busy machine needs."""
-    monkeypatch.setattr("flowrec.commands.auto_recovery._PATIENCE_S", HANG_S)
+    monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", HANG_S)
 
 
 @pytest.mark.usefixtures("patient")
@@ -254,7 +254,7 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
     left = tmp_path / "left.mcap.partial"
     left.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
     threads, files = set(threading.enumerate()), len(list(Path("/dev/fd").iterdir()))
-    monkeypatch.setattr("flowrec.commands.auto_recovery._PATIENCE_S", 0.05)
+    monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", 0.05)
     assert look_after(tmp_path) == {}
     assert f"flowrec recover {left}" in capsys.readouterr().err.replace("\n", "")
     assert set(threading.enumerate()) == threads
@@ -272,8 +272,8 @@ def test_a_recovery_that_hears_no_signal_is_killed(
         f"time.sleep(20); pathlib.Path({str(ended)!r}).touch()"
     )
     monkeypatch.setattr("flowrec.commands.auto_recovery.child_command", lambda *_: [sys.executable, "-c", deaf])
-    monkeypatch.setattr("flowrec.commands.auto_recovery._PATIENCE_S", 2.0)
-    monkeypatch.setattr("flowrec.commands.auto_recovery._TIDY_S", 0.1)
+    monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", 2.0)
+    monkeypatch.setattr("flowrec.commands.auto_recovery._CLEANUP_TIMEOUT_S", 0.1)
     assert look_after(tmp_path) == {}
     assert not ended.exists()
     assert left.exists()
