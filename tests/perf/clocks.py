@@ -113,7 +113,7 @@ def measure(
 
 
 def _judged(one: Series, stamps: NDArray[np.float64]) -> dict[str, float]:
-    """Of the frames that got a date, once the fit had time to settle; the largest step is of all of them."""
+    """Errors of the stamped frames after the fit has settled; the largest step is that of all frames."""
     good = np.isfinite(stamps)
     off_s = (stamps[good] - one.true_ns[good]) / NS_PER_S
     at_s = one.true_ns[good] / NS_PER_S
@@ -146,7 +146,7 @@ def _ours(one: Series) -> tuple[NDArray[np.float64], str]:
 
 
 def said_of(fit: Fit) -> str:
-    """What a fit has to say of the clock."""
+    """Faults of the clock that a fit has detected."""
     counts = {
         "twice": fit.duplicates, "out of order": fit.disordered, "wraps": fit.wraps, "resets": fit.resets,
         "jumps": fit.jumps,
@@ -156,7 +156,7 @@ def said_of(fit: Fit) -> str:
 
 
 def _windowed(line: Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[float, float]]) -> Any:
-    """The same window as ours, a line fitted anew every half second, and nothing else."""
+    """A line fitted every half second to the same window as that of flowrec, and nothing else."""
 
     def dated(one: Series) -> tuple[NDArray[np.float64], str]:
         x = np.array(one.device, np.float64)
@@ -182,7 +182,7 @@ def _least_squares(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[floa
 
 
 def _median(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Slopes over half of the window, and the median of them (after Theil and Sen); the level likewise."""
+    """Median of the slopes over half of the window (after Theil and Sen), and of the levels."""
     half = len(x) // 2
     apart = x[half:] - x[: len(x) - half]
     slopes = (y[half:] - y[: len(y) - half])[apart != 0] / apart[apart != 0]
@@ -219,8 +219,8 @@ def show(figures: dict[str, Any]) -> None:
         for row in figures["rows"]
     ]
     table(
-        f"Errors of dates in us, {figures['rate_hz']:g} Hz for {figures['seconds']:g} s, {figures['skew_ppm']:g} ppm",
-        ("case", "fit", "mean", "rms", "p99", "max", "step", "backwards", "us/frame", "said"),
+        f"Errors of stamps in us, {figures['rate_hz']:g} Hz for {figures['seconds']:g} s, {figures['skew_ppm']:g} ppm",
+        ("case", "fit", "mean", "rms", "p99", "max", "step", "backwards", "us/frame", "detected"),
         rows,
     )
 

@@ -1,8 +1,8 @@
-"""Thousands of spoiled sessions, each opened, described, read, checked and recovered: what may not happen is counted.
+"""`python -m tests.perf.fuzz`: corrupted sessions, each opened, described, read, checked and recovered; counts faults.
 
-What may happen: it is read, or refused with one of our errors in one line. What may not: another exception, a hang,
-memory beyond a limit, a file anywhere but where one was asked for, less than everything passed for everything, or a
-verdict that the reader does not share.
+A session may be read, or refused with an error of flowrec in one line. A fault is another exception, a hang, memory
+above a limit, a file where none was asked for, an incomplete file that passes for complete, or a verdict of `check`
+that the reader contradicts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from flowrec.errors import FlowrecError, printable
 from flowrec.session import Session
 from flowrec.store import SessionReader, recover
 from flowrec.terminal import progress, table
-from tests.perf.mutate import blind, spoil
+from tests.perf.mutate import blind, corrupt
 from tests.store.drafts import Draft, small_draft
 
 TIME_LIMIT_S = 20.0
@@ -39,16 +39,16 @@ _FAULTS_KEPT = 50
 
 
 class _TookTooLongError(BaseException):
-    """Not an Exception: nobody in between may catch it."""
+    """Not an Exception, so that no code under test catches it."""
 
 
 class Campaign:
-    """Spoils one session in many ways; every file is known by its seed.
+    """Corrupts one session in many ways; a seed determines the file.
 
     Parameters
     ----------
     folder : an empty one.
-    verbs : what is done with each file; fewer are quicker.
+    verbs : what is done with each file.
     """
 
     def __init__(self, folder: Path, verbs: Sequence[str] = VERBS) -> None:
@@ -63,7 +63,7 @@ class Campaign:
         with SessionReader(path) as reader:
             self._stamps = [tick.stamp_ns for tick in reader.ticks()]
         if check(path).word != "good":
-            raise FlowrecError(f"{path}: the session to be spoiled is not good; mend tests/store/drafts.py first")
+            raise FlowrecError(f"{path}: the session to corrupt is not good; repair tests/store/drafts.py first")
         path.unlink()
         _forget_peak()
         self._base_mb = peak_mb()
@@ -73,8 +73,8 @@ class Campaign:
         self.worst_s = self.worst_mb = 0.0
 
     def run(self, seed: int) -> list[str]:
-        """Spoil and read one file; what may not happen and has."""
-        kind, data = spoil(self._draft, self._whole, seed)
+        """Corrupt and read one file; its faults."""
+        kind, data = corrupt(self._draft, self._whole, seed)
         self.kinds[kind] += 1
         path = self._work / ("case.mcap.partial" if seed % 5 == 0 else "case.mcap")
         path.write_bytes(data)
@@ -146,7 +146,7 @@ class Campaign:
         return faults
 
     def _strays(self) -> list[str]:
-        """Files where none was asked for; the ones that were are removed."""
+        """Files where none was asked for; the others are removed."""
         for path in self._work.iterdir():
             if path.name in ("case.mcap", "case.mcap.partial", "saved.mcap"):
                 path.unlink()
@@ -185,7 +185,7 @@ def measure(
 
 
 def show(figures: dict[str, Any]) -> None:
-    """Print what happened."""
+    """Print the table."""
     rows = [
         ("files", str(figures["files"])),
         ("seeds", f"{figures['first_seed']} to {figures['first_seed'] + figures['files'] - 1}"),
@@ -195,11 +195,11 @@ def show(figures: dict[str, Any]) -> None:
         ("faults", str(figures["fault_count"])),
         *((f"seed {fault['seed']} ({fault['kind']})", fault["fault"]) for fault in figures["faults"][:20]),
     ]
-    table("Spoiled sessions", ("", "value"), rows)
+    table("Corrupted sessions", ("", "value"), rows)
 
 
 def _tried(verb: Callable[[], object]) -> tuple[bool, str]:
-    """Whether it worked, and what happened that may not."""
+    """Whether it worked, and its fault if there is one."""
     try:
         with _time_limit():
             verb()
@@ -230,7 +230,7 @@ def _time_limit() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _without_waiting_for_the_disk() -> Iterator[None]:
-    """A recovery has each file kept by the disk; here that would be most of the time."""
+    """Without fsync, which would take most of the time of a recovery."""
     fsync = os.fsync
     os.fsync = lambda fd: None
     try:
@@ -240,7 +240,7 @@ def _without_waiting_for_the_disk() -> Iterator[None]:
 
 
 def _forget_peak() -> None:
-    """Let the peak of memory begin anew (Linux)."""
+    """Reset the peak memory of this process (Linux)."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 

@@ -1,4 +1,4 @@
-"""A session of many gigabytes: how quickly it opens, and what is read to get at a second, or all, of its poses.
+"""`python -m tests.perf.large`: time to open a session of many gigabytes, and bytes read for its poses.
 
 The file is real but for the pixels, which are holes in it: nobody who asks for poses may notice.
 """
@@ -71,7 +71,7 @@ def measure(
     gigabytes: Annotated[float, typer.Option("--gb", min=0.01, help="Size of each session (sparse files).")] = 10.0,
     folder: Annotated[Path | None, typer.Option(metavar="DIR", help="Where to write them; they are removed.")] = None,
 ) -> Results:
-    """Make sparse sessions in a folder that is removed again, and read them in processes of their own."""
+    """Write sparse sessions into a folder that is removed afterwards, and read them in processes of their own."""
     rows = []
     with tempfile.TemporaryDirectory(prefix="flowrec-large-", dir=folder) as made:
         for load in LOADS:
@@ -94,7 +94,7 @@ def measure(
 
 
 def show(figures: dict[str, Any]) -> None:
-    """Print the figures."""
+    """Print the tables."""
     for row in figures["rows"]:
         table(
             f"{row['load']}: {row['gigabytes']:.1f} GB, {row['seconds']:.0f} s",
@@ -116,7 +116,7 @@ def show(figures: dict[str, Any]) -> None:
 
 
 def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> Iterator[float]:
-    """Chunks as the writer makes them, the pixels left out; tells how far it is."""
+    """Write chunks as the writer does, without the pixels; yields the time written, s."""
     draft: Draft = small_draft()
     rng = np.random.default_rng(0)
     payloads = {
@@ -213,7 +213,7 @@ def _finish(file: BinaryIO, draft: Draft, listed: list[tuple[int, bytes]], count
 
 
 def _measured(path: Path, what: str) -> dict[str, float]:
-    """Figures of one reading, in a fresh process."""
+    """Results of poses.py in a process of its own."""
     command = [sys.executable, "-m", "tests.perf.poses", what, str(path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     row: dict[str, float] = json.loads(done.stdout)

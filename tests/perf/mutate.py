@@ -1,4 +1,4 @@
-"""Ways to spoil a session: blindly, and knowingly with all checksums right. The same seed spoils it the same way."""
+"""Corrupts a session, with wrong or with right checksums; the same seed corrupts it the same way."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ TEXTS = (
 _FLOATS = (float("nan"), float("inf"), -float("inf"), 1e308, -0.0)
 
 
-def spoil(draft: Draft, whole: bytes, seed: int) -> tuple[str, bytes]:
-    """What was done, and the spoiled file."""
+def corrupt(draft: Draft, whole: bytes, seed: int) -> tuple[str, bytes]:
+    """The kind of corruption and the corrupted file."""
     rng = np.random.default_rng(seed)
     kind = list(_KINDS)[int(rng.integers(len(_KINDS)))]
     return kind, _KINDS[kind](draft, whole, rng)
 
 
 def blind(kind: str) -> bool:
-    """Whether the checksums were left as they were, so that less than everything must not pass for everything."""
+    """Whether checksums are wrong, so that a reader must not pass an incomplete file for a complete one."""
     return kind in ("bits", "cut", "splice")
 
 
 def _bits(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
-    """A few bytes are other ones; half of them in the index, where the sizes and offsets are."""
+    """Change a few bytes, half of them in the index, where the sizes and offsets are."""
     data = bytearray(whole)
     for _ in range(rng.integers(1, 8)):
         low = len(data) - 6000 if rng.random() < 0.5 else 0
@@ -66,7 +66,7 @@ def _bits(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
 
 
 def _cut(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
-    """The end is missing, or is another one."""
+    """Cut off or replace the end."""
     data = whole[: int(rng.integers(len(whole)))]
     choice = rng.random()
     if choice < 0.3:
@@ -75,7 +75,7 @@ def _cut(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
 
 
 def _splice(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
-    """A block is left out, doubled or written over another place."""
+    """Remove, duplicate or overwrite a block."""
     a, b, c = (int(number) for number in rng.integers(0, len(whole), 3))
     block = whole[a : a + int(rng.integers(1, 5000))]
     choice = rng.random()
@@ -87,7 +87,7 @@ def _splice(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
 
 
 def _lengths(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
-    """Lengths of records are nonsense; the checksum of the index is right."""
+    """Change lengths of records; the checksum of the index is right."""
     data = bytearray(whole)
     heads = _heads(whole)
     for _ in range(rng.integers(1, 3)):
@@ -100,7 +100,7 @@ def _lengths(_draft: Draft, whole: bytes, rng: Rng) -> bytes:
 
 
 def _index(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
-    """The index says something else than the file, with its checksum right."""
+    """Change the index so that it contradicts the file; its checksum is right."""
 
     def change(parts: list[Part]) -> list[Part]:
         for _ in range(rng.integers(1, 4)):
@@ -123,7 +123,7 @@ def _index(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
 
 
 def _inside(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
-    """Messages inside chunks are spoiled and packed again: all checksums hold."""
+    """Change messages inside chunks; all checksums are right."""
     pieces = list(draft.pieces)
     for _ in range(rng.integers(1, 4)):
         at = int(rng.integers(len(pieces)))
@@ -131,14 +131,14 @@ def _inside(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
         if not messages:  # the only one has been taken out before
             continue
         number = int(rng.integers(len(messages)))
-        messages[number : number + 1] = _spoiled(messages[number], messages, rng)
+        messages[number : number + 1] = _changed(messages[number], messages, rng)
         pieces[at] = replace(pieces[at], messages=tuple(messages))
     if rng.random() < 0.1:
         rng.shuffle(pieces)
     return replace(draft, pieces=tuple(pieces)).build()
 
 
-def _spoiled(sent: Sent, others: Sequence[Sent], rng: Rng) -> list[Sent]:
+def _changed(sent: Sent, others: Sequence[Sent], rng: Rng) -> list[Sent]:
     choice = int(rng.integers(9))
     if choice == 0:
         return []
@@ -162,7 +162,7 @@ def _spoiled(sent: Sent, others: Sequence[Sent], rng: Rng) -> list[Sent]:
 
 
 def _chunks(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
-    """Chunks tell something else than what is in them: bombs, sizes, times, checksums, compressions."""
+    """Change the headers of chunks: decompression bombs, sizes, times, checksums, compressions."""
     pieces = list(draft.pieces)
     at = int(rng.integers(len(pieces)))
     pieces[at] = _told(pieces[at], int(rng.integers(8)), rng)
@@ -193,7 +193,7 @@ def _told(piece: Piece, choice: int, rng: Rng) -> Piece:
 
 
 def _heads_of_session(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
-    """What a session says about itself is hostile: names, texts, images, declarations."""
+    """Change the metadata of the session: names, texts, images, declarations."""
     head = list(draft.head)
     for _ in range(rng.integers(1, 4)):
         number = int(rng.integers(len(head)))
@@ -208,8 +208,8 @@ def _heads_of_session(draft: Draft, _whole: bytes, rng: Rng) -> bytes:
             words = TEXTS[int(rng.integers(len(TEXTS)))]
             own = ("config.toml", "chip.png", "chip.toml", name)[int(rng.integers(4))]
             attached = struct.pack("<QQ", 0, 0) + text(own) + text(name) + struct.pack("<Q", len(words)) + words
-            spoiled = ATTACHMENT, attached + struct.pack("<I", zlib.crc32(attached))
-            head[number if opcode == ATTACHMENT else len(head) - 1] = spoiled
+            changed = ATTACHMENT, attached + struct.pack("<I", zlib.crc32(attached))
+            head[number if opcode == ATTACHMENT else len(head) - 1] = changed
         elif opcode in (METADATA, CHANNEL, SCHEMA) and choice == 3:
             head[number] = opcode, _renamed(opcode, body, name)
         else:
@@ -229,7 +229,7 @@ def _renamed(opcode: int, body: bytes, name: str) -> bytes:
 def _built(draft: Draft) -> bytes:
     try:
         return draft.build()
-    except (struct.error, IndexError, ValueError):  # too spoiled even to be indexed: then without that part
+    except (struct.error, IndexError, ValueError):  # too corrupt for an index: without that part
         sound = tuple(part for part in draft.head if part[0] not in (METADATA, ATTACHMENT))
         return replace(draft, head=sound).build()
 
@@ -259,7 +259,7 @@ def _number(rng: Rng, near: int) -> int:
 
 
 def _heads(whole: bytes) -> list[int]:
-    """Where the records begin."""
+    """Offsets of the records."""
     found, at = [], len(MAGIC)
     while at + 9 <= len(whole) - len(MAGIC):
         found.append(at)

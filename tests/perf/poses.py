@@ -43,7 +43,7 @@ def read(what: str, path: Path) -> dict[str, float]:
 
 
 def _bytes_read() -> int:
-    """What this process has asked the system for so far (Linux); 0 elsewhere."""
+    """Bytes that this process has read so far (Linux); 0 elsewhere."""
     told = Path("/proc/self/io")
     found = re.search(r"rchar: (\d+)", told.read_text(encoding="ascii")) if told.exists() else None
     return int(found[1]) if found else 0

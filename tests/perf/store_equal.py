@@ -1,4 +1,4 @@
-"""`python -m tests.perf.store --equal`: our MCAP writer and protobuf encoder beside the libraries', at equal terms.
+"""`python -m tests.perf.store --equal`: flowrec's MCAP writer and encoder and those of the libraries.
 
 The writers are given the same bytes and pack them into chunks of 1 MiB with zstd at level 1, in one thread. The
 encoders are given the same messages and must give the same bytes. Speed is measured alone. The stall is measured at a
@@ -52,7 +52,7 @@ class Open(NamedTuple):
 
 
 class Load(NamedTuple):
-    """Payloads of one topic: how many at full speed, and how many a second while the stall is measured."""
+    """Payloads of one topic: the number at full speed, and the rate while the stall is measured."""
 
     name: str
     field: str
@@ -138,14 +138,14 @@ WRITERS: dict[str, Callable[[Path, Load], Open]] = {
 
 
 def lines_of(name: str) -> int:
-    """Lines of our own code behind a writer or encoder, those of the bench that stand for it included."""
+    """Lines of flowrec's own code in a writer or encoder, with those of this measurement that replace it."""
     own = {"flowrec": (chunk, mcap_writer, _ours), "mcap": (_mcap,), "protobuf, ours": (codec,)}
     fallback = protobuf_encoder if name.startswith("protobuf") else _foxglove
     return sum(len(inspect.getsource(part).splitlines()) for part in own.get(name, (fallback,)))
 
 
 def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
-    """What makes the payload of a message by protobuf's own runtime."""
+    """An encoder of messages with protobuf's own runtime."""
     wire, forms = message_codec(message_type).schema.wire, message_fields(message_type)
 
     def by_protobuf(message: Any) -> bytes:
@@ -169,7 +169,7 @@ def protobuf_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
 
 
 def our_encoder(message_type: type[Any]) -> Callable[[Any], bytes]:
-    """The same by ours, in one piece."""
+    """The encoder of flowrec, its parts joined."""
     parts_of = message_codec(message_type).encode
     return lambda message: b"".join(parts_of(message))
 
@@ -181,7 +181,7 @@ ENCODERS: dict[str, Callable[[type[Any]], Callable[[Any], bytes]]] = {
 
 
 def loads(share: float = 1.0) -> list[Load]:
-    """Poses of 1 kB and images of two cameras as foxglove.RawImage; `share` of the usual number."""
+    """Poses of 1 kB and images of two cameras as foxglove.RawImage; `share` scales their number."""
     rows = [
         ("poses of 1 kB", poses_given(), 60_000, 1000.0),
         ("images 640x512", frames_given(640, 512), 600, 200.0),
@@ -195,7 +195,7 @@ def loads(share: float = 1.0) -> list[Load]:
 
 
 def messages() -> dict[str, tuple[list[Message], int, float]]:
-    """By name: messages to be encoded in turn, how many at full speed, how many a second for the stall."""
+    """By name: messages to encode in turn, the number at full speed, the rate for the stall."""
     rng = np.random.default_rng(0)
     stamps = [10**9 + number * _STEP_NS for number in range(256)]
     tracks = [Track(now, True, rng.normal(size=2), 0.9, 0, 4.5, rng.normal(size=4), now) for now in stamps]
@@ -211,7 +211,7 @@ def messages() -> dict[str, tuple[list[Message], int, float]]:
 
 
 def measure(rounds: int = 3, share: float = 1.0, stall_s: float = 3.0) -> list[dict[str, Any]]:
-    """One row for each load and each writer or encoder, which take turns; least and median of the rounds."""
+    """A row per load and writer or encoder, which take turns; least and median of the rounds."""
     jobs: list[tuple[str, str, int, float, Callable[[Path], tuple[Callable[[int], Any], Callable[[], Any]]]]] = []
     sizes: dict[str, int] = {}
     for load in loads(share):
@@ -276,7 +276,7 @@ def _speed(
 
 
 def _stall_ms(put: Callable[[int], Any], rate_hz: float, duration_s: float) -> dict[str, float]:
-    """How late this thread wakes while another one puts messages at a rate; with the loop's priority and switching."""
+    """Delay of a thread with the loop's priority while another thread writes messages at a rate, ms."""
     over = threading.Event()
 
     def work() -> None:
@@ -309,7 +309,7 @@ def _stall_ms(put: Callable[[int], Any], rate_hz: float, duration_s: float) -> d
 
 
 def show(rows: list[dict[str, Any]]) -> None:
-    """Print the figures: the median of the rounds."""
+    """Print the medians of the rounds."""
     table(
         "At equal terms: same bytes or messages in, chunks of 1 MiB, zstd level 1; median of the rounds",
         ("load", "by", "us each", "MB/s", "CPU us each", "late p50 ms", "p99", "max", "lines"),

@@ -1,4 +1,4 @@
-"""kill -9 at random moments of a recording, and what `recover` makes of the rest."""
+"""kill -9 at random moments of a recording, and what `recover` restores."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _HANDED = struct.Struct("<QQ")  # stamp of the last tick that was handed over, n
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One way to record, and what README states to be lost at most, in s of stamps: of the state, and of the images."""
+    """One way to record, and the largest loss that README states, in s of stamps: of the state and of the images."""
 
     name: str
     width: int = 640
@@ -49,7 +49,7 @@ class Kind:
 
 @dataclass(slots=True)
 class _Found:
-    """What the kills of one kind have cost."""
+    """Losses and faults of the kills of one kind."""
 
     kills: int = 0
     files: int = 0
@@ -71,7 +71,7 @@ def _kinds(split_s: float) -> tuple[Kind, ...]:
 
 
 def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[str, Any]:
-    """What is lost per kill, in s of stamps, between the last tick handed over and the last one recovered.
+    """Loss per kill, in s of stamps: from the last tick handed over to the last one recovered.
 
     `count` kills of each kind. Every recovered session is read from end to end and recovered once more, which must
     change nothing. Runs that were killed before the first flush may have nothing to be saved; their length is no loss
@@ -96,7 +96,7 @@ def kills(count: int, folder: Path | None = None, split_s: float = 0.0) -> dict[
 
 
 def show(found: dict[str, Any]) -> None:
-    """The figures for people."""
+    """Print the table."""
 
     def worst(row: dict[str, Any], what: str) -> str:
         lost = row[f"{what}_lost_s"]
@@ -167,7 +167,7 @@ def _kill(kind: Kind, images: list[Image], path: Path, after_s: float, found: _F
 
 
 def _own_ticks(reader: SessionReader) -> Iterator[Tick]:
-    """Without the one that a piece repeats of what was before it."""
+    """The ticks of a part without its keyframe, which repeats the last tick of the part before."""
     begin_ns = -1 if reader.keyframe_ns is None else reader.keyframe_ns
     return (tick for tick in reader.ticks() if tick.stamp_ns > begin_ns)
 
@@ -194,7 +194,7 @@ def _spread(lost_s: list[float]) -> dict[str, float]:
 
 
 def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> None:
-    """Record until somebody ends it. In real time, stamps are those of the monotonic clock."""
+    """Record until the process is killed. In real time, stamps are those of the monotonic clock."""
     options = WriterOptions(frames=kind.frames, flush_s=_FLUSH_S, block=not kind.realtime, files=kind.pieces)
     with SessionWriter(path, made_up_header(), options) as writer:
         for number, made in enumerate(ticks_of(images, 10**6, kind.rate_hz)):
@@ -208,7 +208,7 @@ def _record(kind: Kind, path: Path, images: list[Image], handed: mmap.mmap) -> N
 
 
 def _at(tick: Tick, now_ns: int) -> Tick:
-    """The tick as if it were now."""
+    """The tick with other stamps."""
     assert tick.frame is not None
     assert tick.applied is not None
     assert tick.track is not None

@@ -1,4 +1,4 @@
-"""What recording does to the control loop, and to memory in a long run."""
+"""Cost of recording for the control loop, and memory of a long recording; two minimal rivals of the writer."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _WARM_S = 5.0  # until the queue, the pools and the caches have their size
 
 @dataclass(slots=True)
 class LargeCamera:
-    """A sink before the writer: the loop flies on 640x512, what is recorded are 2448x2048 images.
+    """A sink before the writer: the loop gets 640x512 images, the writer 2448x2048 images.
 
     Each is copied into a ring of buffers that is longer than the writer's queue, as a driver does; also when nothing
     is recorded.
@@ -62,7 +62,7 @@ class LargeCamera:
 
 
 def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
-    """The control step with recording off, on, and with what else could have been built, in turn, at 60 Hz.
+    """The control step at 60 Hz with recording off and on, and with the rivals, which take turns.
 
     With the priority that `record --realtime` gives the loop. The step is what the loop times: tracking, observing,
     control, and the hand-over to the sinks of the tick before.
@@ -174,7 +174,7 @@ def _pack(compressor: zstandard.ZstdCompressor, content: memoryview) -> None:
 
 
 class BareThread:
-    """A thread beside the loop."""
+    """The least that a recorder in a thread can cost: images are compressed and discarded."""
 
     def __init__(self) -> None:
         self._images: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -196,7 +196,7 @@ class BareThread:
 
 
 class BareProcess:
-    """A process beside the loop; what it costs the loop is one more copy of every image, and a message."""
+    """The least that a recorder in a process can cost: one more copy of every image, and a message."""
 
     def __init__(self, nbytes: int) -> None:
         context = get_context("spawn")

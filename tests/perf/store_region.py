@@ -1,4 +1,4 @@
-"""What a long run takes of the disk and of a core, with whole images and with windows around the robot."""
+"""Disk space and CPU time of a long recording, with whole images and with regions around the robot."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ENCODINGS = ("raw", "zstd", "delta")
 
 
 def regions(folder: Path, seconds: float = 10.0) -> list[dict[str, Any]]:
-    """A row per camera, encoding and region: MB per minute, and the share of a core that recording takes in all.
+    """A row per camera, encoding and region: MB per minute, and the CPU time of recording over the duration.
 
     The windows are those of a robot in sight on the built-in chip, with an image whole every ten seconds.
     """
@@ -61,7 +61,7 @@ def _row(
 
 
 def _window(width: int, height: int, rate_hz: float) -> tuple[Region, Any]:
-    """What is kept around a robot in the middle of the image of a default run, and where its tracker looks."""
+    """The recorded region around a robot in the middle of the image of a default run, and the tracker's search area."""
     sets = [f"camera.width_px={width}", f"camera.height_px={height}", f"camera.rate_hz={rate_hz}"]
     config = load_config(None, [*sets, "recording.region=robot"])
     chip = load_chip(config.chip)

@@ -28,7 +28,7 @@ _NEAR = 20  # ticks from a split on
 
 
 def splits(folder: Path | None, split_s: float, duration_s: float, rounds: int) -> dict[str, Any]:
-    """How long `write` takes a loop at 60 Hz with 1224x1024 images: one file, parts, and a ring with a mark.
+    """Duration of `write` in a loop at 60 Hz with 1224x1024 images: one file, parts, and a ring buffer with a mark.
 
     Runs take turns. Of the parts, the ticks about their ends are looked at apart.
     """
@@ -93,7 +93,7 @@ def _fly(
 
 
 def _ticks(images: list[Image], count: int) -> Iterator[Tick]:
-    """With two flow fields from the first tick on, and a mark in the middle."""
+    """Ticks with two flow fields from the first one on, and a mark in the middle."""
     y, x = np.mgrid[-1.0 : 1.0 : _FIELD[0] * 1j, -1.0 : 1.0 : _FIELD[1] * 1j]
     velocity = np.stack([100.0 * (1.0 - y * y), 10.0 * np.sin(9.0 * x)], axis=-1).astype(np.float32)
     pressure = (-50.0 * x).astype(np.float32)
@@ -135,7 +135,7 @@ def _row(runs: list[dict[str, Any]], split_ticks: int) -> dict[str, float]:
 
 
 def show_splits(found: dict[str, Any]) -> None:
-    """Print the figures as a table."""
+    """Print the table."""
     rows = found["rows"]
     base = rows["one file"]
     table(

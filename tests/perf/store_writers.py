@@ -42,7 +42,7 @@ Write = Callable[[Path, list[Given], int], None]  # file to make, messages to ta
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """What is written, by whom, and the writer that ours is held against."""
+    """Messages, the writers of them, and the writer that flowrec's is compared with."""
 
     name: str
     messages: int
@@ -60,7 +60,7 @@ def pictures(width: int, height: int, count: int = 8) -> list[Image]:
 
 
 def made_up_header() -> SessionHeader:
-    """A head without meaning."""
+    """A header without meaning."""
     return SessionHeader('name = "bench"\n', b"", "", {"host": "bench"})
 
 
@@ -79,7 +79,7 @@ def ticks_of(images: Sequence[Image], count: int, rate_hz: float) -> Iterator[Ti
 
 
 def poses_given() -> list[Given]:
-    """Estimates of 1 kB on the wire, by way of a covariance of ten states."""
+    """Estimates of 1 kB encoded, because of a covariance of ten states."""
     rng = np.random.default_rng(0)
     given = []
     for number, here in enumerate(np.cumsum(rng.normal(size=(4096, 2)), axis=0)):
@@ -108,7 +108,7 @@ def _session(encoding: str) -> Write:
 
 
 def _file(path: Path, data: list[Given], count: int) -> None:
-    """The file below the SessionWriter alone: bytes in, as the bare writers have it."""
+    """The MCAP file alone, without SessionWriter: bytes in, as for the other writers."""
     slot = SLOTS[BY_FIELD[data[0].field].path]
     file, builder = McapWriter(path), ChunkBuilder()
     file.start("flowrec", "bench")
@@ -155,7 +155,7 @@ def _foxglove(options: MCAPWriteOptions, file_of: Callable[[Given], bytes] = lam
 
 
 def _png(given: Given) -> bytes:
-    """As one would do it by hand: cv2's PNG as it comes."""
+    """PNG by cv2 with its defaults."""
     assert isinstance(given.message, Frame)
     return cv2.imencode(".png", given.message.image)[1].tobytes()
 

@@ -21,7 +21,7 @@ def test_whatever_is_done_to_a_session_every_verb_reads_or_refuses_it(tmp_path):
     assert len(campaign.kinds) == 8 and campaign.ends["ticks: read"] and campaign.ends["ticks: refused"]
 
 
-def test_a_thousand_spoiled_sessions_are_opened_and_read_or_refused(tmp_path):
+def test_a_thousand_corrupted_sessions_are_opened_and_read_or_refused(tmp_path):
     campaign = Campaign(tmp_path, verbs=("info", "ticks"))
     assert not [(seed, faults) for seed in range(10_000, 11_000) if (faults := campaign.run(seed))]
 
@@ -38,7 +38,7 @@ def test_the_campaign_notices_what_may_not_happen(tmp_path, monkeypatch):
     assert any("but it can not be read" in fault for fault in found)
 
 
-def test_the_session_that_is_spoiled_holds_every_topic(tmp_path):
+def test_the_session_that_is_corrupted_holds_every_topic(tmp_path):
     from flowrec.topics import TOPICS
     from tests.store.drafts import TICKS, small_draft
 
