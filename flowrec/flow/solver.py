@@ -22,7 +22,7 @@ ROUNDING = 1e-9  # smaller residuals are rounding errors: their digits differ be
 
 @dataclass(frozen=True, slots=True)
 class FlowSolver:
-    """Steady incompressible flow by finite volumes on a staggered grid (science.md, section 1)."""
+    """Steady incompressible flow by finite volumes on a staggered grid, with Newton's method."""
 
     k: Annotated[int, OneOf(1, 2, 4)] = 1  # subcells per pixel side: 1, 2 or 4
     max_iterations: Annotated[int, Range(1, 10_000)] = 40

@@ -3,8 +3,8 @@
 refiner: the table of methods. method, observation_operator: what all methods are given. prior, mixture_regression,
 discretisation_error, assimilate, report: assimilation. case, residuals, gauss_newton: a case without dimensions, its
 equations and their direct solution. network, network_inputs, network_fit, weights: what pi_unet, ni and unet share.
-pinn, collocation, coordinate_net: the network of the coordinates. training: makes the shipped weights. torch is
-imported when a method that needs it runs.
+pinn, collocation: the network of coordinates and its case. training: makes the shipped weights. torch is imported when
+a method that needs it runs.
 """
 
 from flowrec.refine.assimilate import Assimilate

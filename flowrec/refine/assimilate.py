@@ -2,8 +2,8 @@
 
 The parameters are the boundary values and the fluid's viscosity and density, with a Gaussian prior around the assumed
 ones. Without inertia the field is linear in inlet speeds and p_out / mu; with inertia a few steps of the full equations
-with frozen factors add the nonlinear remainder. The curvature of the posterior gives the covariance (science.md,
-section 2). Where the observations contradict the walls, masks a pixel off are compared by their evidence.
+with frozen factors add the nonlinear remainder. The curvature of the posterior gives the covariance. Where the
+observations contradict the walls, masks a pixel off are compared by their evidence.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ class Ni(NetworkSettings):
             If the device is not available.
         """
         assumed, operator, chip = problem.assumed, problem.operator, problem.chip
-        speed = float(np.sqrt((operator.flow_um_s**2).sum(axis=1).mean()))
+        speed = operator.rms_um_s
         if speed == 0.0:
             return replace(assumed, method="ni", note="start kept: all observations say that the fluid stands still")
         at_rest = replace(

@@ -32,6 +32,11 @@ class ObservationOperator:
         """Number of usable observations."""
         return len(self.std_um_s)
 
+    @property
+    def rms_um_s(self) -> float:
+        """Root mean square of the measured speed."""
+        return float(np.sqrt((self.flow_um_s**2).sum(axis=1).mean()))
+
     def predict(self, values: NDArray[np.floating]) -> Floats:
         """What would be measured (..., n, 2) in velocities (..., pixels, 2)."""
         return np.asarray(np.einsum("...nkc,nk->...nc", values[..., self.pixels, :], self.weights), np.float64)

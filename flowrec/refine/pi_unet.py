@@ -1,14 +1,13 @@
 """PI-UNet (the paper): a U-Net corrects an initial field so that physics and observations hold.
 
-Differences from the paper, and why (science.md, section 2): the operators are the true ones in dimensionless form. The
-loss is the residual of the field minus that of the initial field, because a field from the solver satisfies finer
-equations and its residual on pixels is truncation error. Pixels at walls keep the initial profile but not its
-amplitude, because a wrong inlet makes them wrong in proportion. Weights trained on drawn vessels give a correction
-without iterations. The last step balances physics, observations and boundary values directly (gauss_newton) and gives
-nearly all of the improvement: on 24 crops of real vessels the mean relative RMSE falls from 0.198 to 0.063 in 2 s a
-case. On eight of them, with 0.169 before, the trained network alone leaves 0.125 in 0.1 s, 80 iterations from random
-weights as in the paper 0.125 in 13 s, and balancing 0.083 after the one and 0.084 after the other. With weights "none"
-and finish "none" it is the paper's method.
+Differences from the paper, and why: the operators are the true ones in dimensionless form. The loss is the residual of
+the field minus that of the initial field, because a field from the solver satisfies finer equations and its residual on
+pixels is truncation error. Pixels at walls keep the initial profile but not its amplitude, because a wrong inlet makes
+them wrong in proportion. Weights trained on drawn vessels give a correction without iterations. The last step balances
+physics, observations and boundary values directly (gauss_newton) and gives nearly all of the improvement: on 24 crops
+of real vessels the mean relative RMSE falls from 0.198 to 0.063 in 2 s a case. On eight of them, with 0.169 before, the
+trained network alone leaves 0.125 in 0.1 s, 80 iterations from random weights as in the paper 0.125 in 13 s, and
+balancing 0.083 after the one and 0.084 after the other. With weights "none" and finish "none" it is the paper's method.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Pinn:
             If the device is not available, or the fit diverges.
         """
         assumed, operator, chip = problem.assumed, problem.operator, problem.chip
-        speed = float(np.sqrt((operator.flow_um_s**2).sum(axis=1).mean()))
+        speed = operator.rms_um_s
         if speed == 0.0:
             return replace(assumed, method="pinn", note="start kept: all observations say that the fluid stands still")
         case = PinnCase.of(speed, operator, chip)

@@ -1,4 +1,4 @@
-"""Weights of networks on disk: safetensors, so that reading a file never runs what is in it; checked before use."""
+"""Weights of networks on disk, in the safetensors format: reading a file never executes code; tensors are checked."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SHIPPED = {"vessels": FOLDER / "pi_unet.safetensors", "unet": FOLDER / "unet.saf
 
 
 def write_weights(path: Path, network: nn.Module, facts: Mapping[str, str]) -> None:
-    """Store the network's parameters in half precision, with facts about how they were made. Replaces an older file."""
+    """Store the network's parameters in half precision, with facts about their training. Replaces an existing file."""
     import torch
     from safetensors.torch import save
 
     halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    # One entry: the order of several is not the same twice.
+    # One entry of metadata: the order of several is not reproducible.
     with new_file(path, WEIGHTS, overwrite=True) as part:
         part.write_bytes(save(halves, {"facts": json.dumps(dict(facts), sort_keys=True)}))
 
@@ -36,7 +36,7 @@ def read_weights(path: Path, network: nn.Module) -> None:
     Raises
     ------
     FlowError
-        If the file is not there, is no safetensors file, is damaged, or its tensors are not those of the network.
+        If the file is missing, not a safetensors file or damaged, or its tensors are not those of the network.
     """
     import torch
     from safetensors import SafetensorError

@@ -1,4 +1,4 @@
-"""Walls between the grid lines: straight ones at any angle, curved ones, and those of masks that nobody would draw."""
+"""Walls between the grid lines: straight at any angle, curved, and of random masks."""
 
 from dataclasses import replace
 

@@ -123,7 +123,7 @@ def test_the_same_input_gives_the_same_bytes_and_keeps_stamp_and_request(twin):
     assert (first.stamp_ns, first.request) == (77, 5)
 
 
-def test_what_is_kept_changes_no_result(twin):
+def test_the_cache_changes_no_result(twin):
     case = twin(scale=300.0)
     doubled = replace(case.observations, flow_um_s=2.0 * case.observations.flow_um_s)
     Refiner().refine(case.assumed, doubled, case.chip, case.solver)

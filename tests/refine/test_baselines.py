@@ -1,4 +1,4 @@
-"""The paper's baselines: what each knows, what it must not know, and that it is given a fair chance."""
+"""The paper's baselines: what each uses, what it must not use, and that it finds a known flow."""
 
 from dataclasses import replace
 
@@ -176,14 +176,14 @@ def test_observations_of_fluid_at_rest_leave_the_assumed_field_and_say_so(twin, 
 @pytest.mark.parametrize(
     "refiner", [Refiner("ni", ni=Ni(device="cuda")), Refiner("pinn", pinn=Pinn(device="cuda"))], ids=("ni", "pinn")
 )
-def test_a_missing_gpu_is_said_in_one_line(twin, refiner):
+def test_a_missing_gpu_is_an_error_of_one_line(twin, refiner):
     case = twin()
     with pytest.raises(FlowError, match="sees no GPU: set it to 'cpu'"):
         refiner.refine(case.assumed, case.observations, case.chip, case.solver)
 
 
 def trained(tmp_path):
-    """Weights of the right shapes that move the field; not trained, so nothing can be said of the error."""
+    """Weights of the right shapes that move the field; not trained, so their error is not known."""
     path = tmp_path / "any.safetensors"
     torch.manual_seed(0)
     network = trained_network()
@@ -212,7 +212,7 @@ def test_unet_corrects_the_assumed_field_by_what_was_observed_in_units_of_its_ow
     assert np.allclose(twice.velocity_um_s, 2.0 * field.velocity_um_s, rtol=1e-3, atol=1e-2)
 
 
-def test_missing_and_damaged_weights_are_said_in_one_line(twin, tmp_path):
+def test_missing_and_damaged_weights_are_errors_of_one_line(twin, tmp_path):
     case = twin()
     path = trained(tmp_path)
 

@@ -1,4 +1,4 @@
-"""What is believed beforehand against the solver itself: the flow of a chip whose fluid is as the belief says."""
+"""The prior against the solver: the flow of a chip whose fluid and boundary values are those of a draw."""
 
 import numpy as np
 import pytest
@@ -37,24 +37,24 @@ def test_a_thicker_fluid_moves_the_flow_as_the_solver_says_at_the_same_pressures
     np.testing.assert_allclose(predicted, slope, atol=2e-3 * np.abs(slope).max())
 
 
-def test_the_chip_of_a_belief_has_the_flow_that_the_linear_model_predicts(driven):
+def test_the_chip_of_a_draw_has_the_flow_that_the_linear_model_predicts(driven):
     solver = FlowSolver(convection=False)
     response = solver.sensitivities(driven)
     prior = Prior.of(SETTINGS, driven, 0.01)
     rng = np.random.default_rng(4)
     for _ in range(4):
         z = 0.5 * rng.standard_normal(len(prior.effect))
-        believed = prior.chip(driven, z)
-        np.testing.assert_allclose(believed.viscosity_mpa_s, np.exp(0.30 * z[len(driven.openings)]))
+        drawn = prior.chip(driven, z)
+        np.testing.assert_allclose(drawn.viscosity_mpa_s, np.exp(0.30 * z[len(driven.openings)]))
         predicted = response.base + np.tensordot(prior.offset(z), response.modes, axes=1)
         # Exact: without inertia the flow is linear in the parameters.
-        np.testing.assert_allclose(predicted, seen(solver.solve(believed), driven), atol=1e-3)
+        np.testing.assert_allclose(predicted, seen(solver.solve(drawn), driven), atol=1e-3)
 
 
-def test_a_belief_in_the_viscosity_alone_leaves_a_pressure_where_it_is(driven):
+def test_a_change_of_the_viscosity_alone_leaves_the_pressures_as_they_are(driven):
     prior = Prior.of(SETTINGS, driven, 0.01)
     z = np.zeros(len(prior.effect))
     z[len(driven.openings)] = 0.01
-    believed = prior.chip(driven, z)
+    drawn = prior.chip(driven, z)
     # The product of two changes is left, of second order.
-    np.testing.assert_allclose(believed.boundary_values, driven.boundary_values, rtol=2.0 * (0.30 * 0.01) ** 2)
+    np.testing.assert_allclose(drawn.boundary_values, driven.boundary_values, rtol=2.0 * (0.30 * 0.01) ** 2)

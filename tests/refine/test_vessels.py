@@ -1,4 +1,4 @@
-"""Real vessel shapes with OpenFOAM's flow in them, where the environment says they are (science.md, section 7)."""
+"""Real vessel shapes with OpenFOAM's flow in them, where the environment says they are."""
 
 import os
 from pathlib import Path
