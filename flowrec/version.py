@@ -1,4 +1,4 @@
-"""Versions that every session states; that of the file format stands in store/metadata.py.
+"""Versions that every session states; that of the file format stands in store/session_metadata.py.
 
 A session without a version of the numerics is of version 1, the first release.
 """

@@ -169,8 +169,8 @@ def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes
 
 def detached(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int, memoryview]:
     """The cut-out fields, copied where a view would keep a much larger buffer in memory."""
-    whole = payload.obj
-    copy = not isinstance(whole, bytes | bytearray) or len(whole) > 2 * sum(map(len, fields.values()))
+    buffer = payload.obj
+    copy = not isinstance(buffer, bytes | bytearray) or len(buffer) > 2 * sum(map(len, fields.values()))
     return {number: memoryview(bytes(view)) if copy else view for number, view in fields.items()}
 
 

@@ -50,7 +50,7 @@ class Recovered:
 
     Attributes
     ----------
-    path : the whole session.
+    path : the complete session.
     ticks, duration_s : of its content, without the keyframe of a part.
     lost_bytes : of the old file, unusable.
     lost : what was lost, as text; empty when nothing was.
@@ -110,7 +110,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
 
 
 def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
-    """Recover a file as `recover` does or, where X.mcap is no file, whatever is unfinished of that run.
+    """Recover a file as `recover` does or, where X.mcap is no file, every unfinished file of that run.
 
     Where there is no complete tick in the last part, it is replaced by one with nothing but the keyframe, so that the
     run has an end; the old file is renamed to NAME.remains.
@@ -139,8 +139,8 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
             if last.part is not None and is_continued(last.outcome):
                 done.append(_end_of_run(path, last, last.part))
     if not done:
-        with SessionReader(path) as whole:
-            done = [Recovered(path, whole.counts.get("track", 0), whole.duration_s, changed=False)]
+        with SessionReader(path) as run:
+            done = [Recovered(path, run.counts.get("track", 0), run.duration_s, changed=False)]
     return done
 
 
@@ -155,13 +155,13 @@ def _recover(path: Path, out: Path | None) -> Recovered:
     if partial and path.is_file() and not path.stat().st_size:
         raise NothingSavedError(f"{path}: is empty; nothing was recorded into it; remove the file")
     with _without_circular_advice(path):
-        whole = _checked(path)
-        if whole is not None:
+        intact = _checked(path)
+        if intact is not None:
             if not partial:
-                return whole
+                return intact
             _refuse_if_taken(target)
             _rename(path, target)
-            return Recovered(target, whole.ticks, whole.duration_s)
+            return Recovered(target, intact.ticks, intact.duration_s)
         with contextlib.closing(McapReader(path)) as source:
             found = scan(source)
         if partial and not found.summary.chunks:
@@ -248,7 +248,7 @@ def _rewrite(
 ) -> tuple[int, str]:
     """Write all ticks, of which those after `end_ns` are incomplete; the number of complete ones and what was lost."""
     before = Tick()
-    whole = images_missing = images_ahead = dropped = 0
+    complete = images_missing = images_ahead = dropped = 0
     # Only replays are written without images.
     has_images = "frame" in reader.counts or not reader.header.parent
     options = WriterOptions(
@@ -261,7 +261,7 @@ def _rewrite(
             elif tick.stamp_ns == reader.keyframe_ns:
                 pass  # the keyframe was counted where it was recorded
             elif tick.applied is not before.applied and tick.track is not before.track:
-                whole += 1
+                complete += 1
                 images_missing += has_images and tick.frame is before.frame
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
@@ -270,7 +270,7 @@ def _rewrite(
                 time.sleep(_POLL_S)
         lost = "; ".join(_losses(reader, found, images_missing - dropped, images_ahead, skipped))
         writer.close(_outcome(reader, lost, end_ns, dropped))
-    return whole, lost
+    return complete, lost
 
 
 def _losses(

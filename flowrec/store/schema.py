@@ -1,6 +1,6 @@
 """Protobuf schemas: ours derived from the dataclasses in messages.py, the standard ones taken from foxglove-sdk.
 
-The secret of this file is the wire layout. Fields are numbered in the order of the dataclass:
+This file defines the wire layout. Fields are numbered in the order of the dataclass:
 
     int -> sint64    float -> double    bool -> bool    str -> string
     vector -> packed repeated double    array -> flowrec.Array    `X | None` -> the same with presence
@@ -60,7 +60,7 @@ def array_schema() -> Schema:
 
 
 def schema_of(message_type: type[Any]) -> Schema:
-    """The schema derived from a message dataclass; may be asked for once per type, codec.py keeps it."""
+    """The schema derived from a message dataclass; to be called once per type, codec.py caches it."""
     name = message_type.__name__
     file = descriptor_pb2.FileDescriptorProto(name=f"flowrec/{name}.proto", package="flowrec", syntax="proto3")
     message = file.message_type.add(name=name)
@@ -75,7 +75,7 @@ def schema_of(message_type: type[Any]) -> Schema:
                 file.dependency.append(_ARRAY_FILE)
         else:
             field.type = _SCALARS[form.kind]
-            if form.optional:  # proto3 presence is spelled as a one-of with a single member
+            if form.optional:  # proto3 declares presence as a one-of with a single member
                 field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
                 message.oneof_decl.add(name=f"_{form.name}")
     return _add(file, f"flowrec.{name}")
