@@ -305,3 +305,13 @@ def test_a_frame_that_can_not_be_stored_is_told_and_what_came_before_is_kept(tmp
     with pytest.raises(SessionError, match=r"not in 32 bit; `flowrec recover .*s\.mcap\.partial`"):
         writer.close()
     assert not writer.path.exists() and writer.partial_path.exists()
+
+
+def test_a_file_of_the_run_that_another_one_replaced_meanwhile_is_not_removed(tmp_path):
+    stale, newer = tmp_path / "x.part001.mcap", tmp_path / "newer"
+    stale.write_bytes(b"of an older run")
+    with SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(overwrite=True)) as writer:
+        newer.write_bytes(b"of another run")
+        newer.replace(stale)
+        writer.write(TICKS[0])
+    assert stale.read_bytes() == b"of another run" and (tmp_path / "x.mcap").exists()
