@@ -44,6 +44,8 @@ class Shape:
         object.__setattr__(self, "finite", finite)
 
 
+Vector2 = Annotated[Vector, Shape(2)]
+Vector3 = Annotated[Vector, Shape(3)]
 NanFloat = Annotated[float, Shape(finite=False)]  # a number for which NaN or infinity has a meaning
 
 

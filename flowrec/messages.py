@@ -15,7 +15,20 @@ from typing import Annotated
 
 import numpy as np
 
-from flowrec.declarations import Image, Matrix, Message, NanFloat, Raster, Shape, SlowStage, Source, Topic, Vector
+from flowrec.declarations import (
+    Image,
+    Matrix,
+    Message,
+    NanFloat,
+    Raster,
+    Shape,
+    SlowStage,
+    Source,
+    Topic,
+    Vector,
+    Vector2,
+    Vector3,
+)
 from flowrec.enums import WorkOrder
 from flowrec.errors import RigError
 
@@ -52,10 +65,10 @@ class Applied(Message):
     frequency_hz: float  # of the rotating field, now
     heading_rad: float
     amplitude_mt: float
-    currents_a: Annotated[Vector, Shape(3)]  # coil currents x, y, z, now
+    currents_a: Vector3  # coil currents x, y, z, now
     # Revolutions along x and y since the previous frame: the integral of f (cos phi, sin phi) dt. Multiplied by
     # um per revolution it is the robot's own displacement, with every delay and switching in between.
-    turns: Annotated[Vector, Shape(2)]
+    turns: Vector2
     # Stamp of the first of the consecutive frames that have the same image as this one; this frame's stamp if the
     # image is new. Images are compared on arrival, because a file may hold them in part or with losses. None: not
     # compared (older files); then only the number of frames decides on a loss of the robot.
@@ -118,7 +131,7 @@ class Track(Message):
 
     stamp_ns: int
     seen: bool
-    position_um: Annotated[Vector, Shape(2)]
+    position_um: Vector2
     score: float  # 0 to 1, similarity to the robot's appearance
     lost_frames: int  # in a row
     radius_px: float  # of the robot's image, low-pass filtered
@@ -131,8 +144,8 @@ class Estimate(Message):
     """The observer's estimate of the robot and of the flow that carries it."""
 
     stamp_ns: int
-    position_um: Annotated[Vector, Shape(2)]
-    flow_um_s: Annotated[Vector, Shape(2)]  # the disturbance: flow velocity at the robot
+    position_um: Vector2
+    flow_um_s: Vector2  # the disturbance: flow velocity at the robot
     # Of [x, y, vx, vy], then the slopes (without a map) and um_per_rev if estimated: um2, um2/s, um2/s2, ...
     covariance: Annotated[Matrix, Shape("k", "k")]
     nis: NanFloat  # normalised innovation squared; NaN on a frame without measurement
@@ -160,7 +173,7 @@ class Health(Message):
     bank_re: Annotated[Vector, Shape("n")]  # state of the 24 resonators, relative to the mean flow; real part
     bank_im: Annotated[Vector, Shape("n")]  # imaginary part
     bank_power: Annotated[Vector, Shape("n")]  # mean square of the input of each resonator
-    mean_um_s: Annotated[Vector, Shape(2)]  # mean flow
+    mean_um_s: Vector2  # mean flow
     offset_share: float  # mean of the resonators' input, which is subtracted from it
     # Motion per revolution, see estimation/step_out.py.
     # (4,) exponential sums: um rolled along the heading, um expected from the revolutions, um by which the map's flow
@@ -192,8 +205,8 @@ class Mission(Message):
     request: int  # number of the latest work order
     wanted: str  # enums.WorkOrder; '' when nothing is pending
     requested_ns: int  # when it was ordered
-    start_um: Annotated[Vector, Shape(2)]  # where the ordered route begins
-    goal_um: Annotated[Vector, Shape(2)]
+    start_um: Vector2  # where the ordered route begins
+    goal_um: Vector2
     finished: bool
     outcome: str  # enums.Outcome; '' while the mission runs
     note: str
@@ -210,7 +223,7 @@ class Demand(Message):
     """The motion that the controller demands of the robot."""
 
     stamp_ns: int
-    velocity_um_s: Annotated[Vector, Shape(2)]  # relative to the fluid
+    velocity_um_s: Vector2  # relative to the fluid
     reference_um: Annotated[Vector, Shape(2, finite=False)]  # where the robot should be now
     progress_s: float  # time along the route, slowed while the robot lags behind
     # Distance to the reference, NaN without one. With a policy, which may leave the route: distance to the nearest
@@ -229,7 +242,7 @@ class Currents(Message):
     heading_rad: float  # of the demanded motion
     amplitude_mt: float
     phase_rad: float  # accumulated over all changes of frequency and heading
-    currents_a: Annotated[Vector, Shape(3)]  # x, y, z at this phase
+    currents_a: Vector3  # x, y, z at this phase
     saturated: bool  # the coils can not generate the full amplitude
     plane_rad: float = 0.0  # heading of the plane of rotation; it turns towards heading_rad or its opposite
     limit_hz: float = 0.0  # step-out frequency at this amplitude; the field's direction never turns faster
@@ -301,8 +314,8 @@ class Truth(Message):
     """Ground truth of a simulated rig. Recorded for evaluation; no stage reads it."""
 
     stamp_ns: int
-    position_um: Annotated[Vector, Shape(2)]
-    flow_um_s: Annotated[Vector, Shape(2)]  # true flow at the robot
+    position_um: Vector2
+    flow_um_s: Vector2  # true flow at the robot
     clearance_um: NanFloat  # from the robot's surface to the nearest wall
     contacts: int  # wall contacts so far
 
