@@ -194,6 +194,17 @@ def test_a_file_made_before_a_field_with_a_default_existed_is_read(tmp_path, mon
     SessionReader(tmp_path / "s.mcap")
 
 
+def test_a_file_without_a_field_that_has_no_default_is_refused(tmp_path, monkeypatch):
+    slot = channels.SLOTS["/robot/track"]
+    files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
+    del files.file[0].message_type[0].field[3]
+    other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
+    monkeypatch.setitem(channels.SLOTS, "/robot/track", other)
+    SessionWriter(tmp_path / "s.mcap", HEADER).close()
+    with pytest.raises(SessionError, match=r"/robot/track is laid out differently \(Track\.score\)"):
+        SessionReader(tmp_path / "s.mcap")
+
+
 def test_a_message_that_is_laid_out_differently_is_named(tmp_path, monkeypatch):
     slot = channels.SLOTS["/robot/track"]
     files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)

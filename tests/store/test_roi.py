@@ -14,6 +14,7 @@ from flowrec.config import load_config
 from flowrec.errors import UsageError
 from flowrec.store import Region, SessionReader, SessionWriter, WriterOptions, nonzero_window, recover
 from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.roi import WindowSelector
 from tests.conftest import SMALL
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
@@ -111,3 +112,11 @@ def test_a_cut_session_of_windows_is_still_told_as_such_when_recovered(tmp_path)
 def test_settings_that_make_no_sense_are_refused_in_one_line():
     with pytest.raises(UsageError, match=r"recording\.full_every_s = -1"):
         load_config(None, ["recording.full_every_s=-1"])
+
+
+def test_a_whole_image_comes_at_the_interval_of_the_region():
+    selector = WindowSelector(REGION)
+    ticks = [seen_at(tick, (50, 50, 60, 60)) for tick in ticks_of(91, shape=(160, 200))]
+    whole_ns = [tick.stamp_ns for tick in ticks if selector.window_of(tick.frame, tick.track) is None]
+    # Every half second, which 30 periods of 16.67 ms just exceed.
+    assert whole_ns == [ticks[0].stamp_ns + 30 * number * PERIOD_NS for number in range(4)]
