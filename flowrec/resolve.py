@@ -137,7 +137,7 @@ def _start(
         start_um = np.array(point)
         if not (
             swept_out(chip, field, start_um, course_error, coils.ramp_s)
-            or too_swift(chip, field, start_um, start_um, robot.radius_um, course_error)
+            or too_swift(chip, field, start_um, start_um, course_error)
         ):
             return point
     return _point(chip, place, "start", robot)

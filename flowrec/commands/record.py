@@ -99,13 +99,13 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
     course_error = config.plan.swift.course_error(robot, robot.speed_limit_um_s)
-    reason = too_swift(chip, field, start, start, robot.radius_um, course_error)
+    reason = too_swift(chip, field, start, start, course_error)
     if reason:
         raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
     if {Phase.PLAN, Phase.NAVIGATE} & set(config.mission.phases):
         goal = np.asarray(config.mission.goal, np.float64)
         reason = no_room(chip, field, start, goal, robot)
-        reason = reason or too_swift(chip, field, start, goal, robot.radius_um, course_error)
+        reason = reason or too_swift(chip, field, start, goal, course_error)
         if reason:
             raise UnreachableError(f"unreachable: {reason}")
     reason = swept_out(chip, field, start, course_error, config.coils.ramp_s)

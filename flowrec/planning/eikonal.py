@@ -29,24 +29,6 @@ Points = NDArray[np.float64]
 _EXACT_PX = 3.0  # around the goal, where the front is too curved for triangles, times are those of straight lines
 
 
-def time_field(rasters: CostRasters, goal: Points) -> Raster:
-    """(h, w) seconds from each free pixel to a goal (2,) in px; inf where it can not be reached.
-
-    With `rasters.idle` > 0 it is the energy to go, px2/s (`kernels.step_energy`), by the same scheme.
-    """
-    return _march(rasters, float(goal[0]), float(goal[1]), _EXACT_PX)
-
-
-def descend(rasters: CostRasters, times: Raster, start: Points, goal: Points) -> Points | None:
-    """(n, 2) px, the fastest path from a start (2,) to the goal (2,) of `times` in steps of 1.5; None if it gets stuck.
-
-    Each step goes to the point of a circle where the time of the step and the time to go have the least sum. Unlike the
-    gradient this also crosses the kinks of T.
-    """
-    path = _descend(rasters, times, float(start[0]), float(start[1]), float(goal[0]), float(goal[1]))
-    return path if len(path) else None
-
-
 @compiled
 def _through_triangle(
     sign: float,
@@ -153,18 +135,23 @@ def _energy_through_triangle(
 
 
 @compiled
-def _march(rasters: CostRasters, goal_x: float, goal_y: float, exact: float) -> Raster:
+def time_field(rasters: CostRasters, goal: Points) -> Raster:
+    """(h, w) seconds from each free pixel to a goal (2,) in px; inf where it can not be reached.
+
+    With `rasters.idle` > 0 it is the energy to go, px2/s (`kernels.step_energy`), by the same scheme.
+    """
     free, clearance, need, vx, vy, speed, idle = rasters
     h, w = free.shape
+    goal_x, goal_y = goal
     times = np.full((h, w), np.inf)
     heap = [(0.0, 0) for _ in range(0)]
     # Near a goal that is itself too near to a wall, its own clearance is all that can be asked.
     near = min(need, bilinear(clearance, goal_x, goal_y)) - 1e-9
-    for b in range(max(0, math.floor(goal_y - exact)), min(h, math.ceil(goal_y + exact) + 1)):
-        for a in range(max(0, math.floor(goal_x - exact)), min(w, math.ceil(goal_x + exact) + 1)):
+    for b in range(max(0, math.floor(goal_y - _EXACT_PX)), min(h, math.ceil(goal_y + _EXACT_PX) + 1)):
+        for a in range(max(0, math.floor(goal_x - _EXACT_PX)), min(w, math.ceil(goal_x + _EXACT_PX) + 1)):
             if (
                 free[b, a]
-                and math.hypot(a - goal_x, b - goal_y) <= exact
+                and math.hypot(a - goal_x, b - goal_y) <= _EXACT_PX
                 and line_is_clear(clearance, float(a), float(b), goal_x, goal_y, near)
             ):
                 t = segment_cost(vx, vy, speed, idle, float(a), float(b), goal_x, goal_y, 0.25)
@@ -221,8 +208,20 @@ def _march(rasters: CostRasters, goal_x: float, goal_y: float, exact: float) -> 
     return times
 
 
+def descend(rasters: CostRasters, times: Raster, start: Points, goal: Points) -> Points | None:
+    """(n, 2) px, the fastest path from a start (2,) to the goal (2,) of `times` in steps of 1.5; None if it gets stuck.
+
+    Each step goes to the point of a circle where the time of the step and the time to go have the least sum. Unlike the
+    gradient this also crosses the kinks of T.
+    """
+    path = _descend(rasters, times, start, goal)
+    return path if len(path) else None
+
+
 @compiled
-def _descend(rasters: CostRasters, times: Raster, x: float, y: float, goal_x: float, goal_y: float) -> Points:
+def _descend(rasters: CostRasters, times: Raster, start: Points, goal: Points) -> Points:
+    x, y = start
+    goal_x, goal_y = goal
     _, clearance, need, vx, vy, speed, idle = rasters
     h, w = times.shape
     radius = 1.5

@@ -34,13 +34,12 @@ def why_apart(space: FreeSpace, a: int, b: int) -> str:
     )
 
 
-def too_swift(
-    chip: Chip, field: FlowField, start_um: Points, goal_um: Points, radius_um: float, course_error: CourseError
-) -> str:
+def too_swift(chip: Chip, field: FlowField, start_um: Points, goal_um: Points, course_error: CourseError) -> str:
     """Why a robot that fits through the channels can not be steered to the goal, '' if it can; names the worst place.
 
     The worst place is where the clearance is the smallest multiple of what the robot and its course error take.
     """
+    radius_um = course_error.radius_um
     wide = open_space(chip, field, radius_um, 0.0)
     off_um = course_error.um(field)
     a, b = attach_start(wide, start_um).node, attach_goal(wide, goal_um).node

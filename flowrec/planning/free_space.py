@@ -7,6 +7,7 @@ course before the camera has seen that and the controller has corrected it.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -152,13 +153,19 @@ def open_space(
     return space.with_need(float((radius_um + margin_um) / px))
 
 
-def margins_um(wanted_um: float | None, robot: Robot) -> tuple[float, ...]:
-    """Margins beside the robot's radius to try in turn: the one asked for; or half of the radius, a quarter, none."""
-    return (0.5 * robot.radius_um, 0.25 * robot.radius_um, 0.0) if wanted_um is None else (wanted_um,)
+def spaces_by_margin(
+    chip: Chip, field: FlowField, robot: Robot, wanted_um: float | None, course_error: CourseError
+) -> Iterator[tuple[FreeSpace, float, str]]:
+    """Free space, margin in um and remark for each margin to try in turn.
 
-
-def margin_remark(margin_um: float, tried_um: tuple[float, ...]) -> str:
-    """The remark on a route with less than the first margin tried; '' for the first."""
-    if margin_um >= tried_um[0]:
-        return ""
-    return f"no room for the margin of {tried_um[0]:.0f} um, {margin_um:.0f} um kept"
+    That is the wanted margin; if none is given, half of the robot's radius, a quarter, none. Errors as `open_space`.
+    """
+    radius_um = robot.radius_um
+    margins = (0.5 * radius_um, 0.25 * radius_um, 0.0) if wanted_um is None else (wanted_um,)
+    for margin_um in margins:
+        less = f"no room for the margin of {margins[0]:.0f} um, {margin_um:.0f} um kept"
+        yield (
+            open_space(chip, field, radius_um, margin_um, course_error),
+            margin_um,
+            less if margin_um < margins[0] else "",
+        )

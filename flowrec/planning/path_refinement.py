@@ -49,14 +49,14 @@ def refine_path(
     if weight is None:
         weight = np.ones_like(rasters.clearance)
     for step in dict.fromkeys((max(spacing, SPACING_PX), spacing)):
-        chords = _with_chords(path, rasters, weight, _LONGEST_CHORD_PX)
+        chords = _with_chords(path, rasters, weight)
         # Every vertex stays: to omit one would cut the corner of a wall. A single step would have no point to move.
         points = subdivided(chords, step, 1e-9, single_leg=2)
         if len(points) < 2:
             return points
         widest = math.ceil(_WIDEST_BUMP_PX / step)
         widths = widest // 2 ** np.arange(widest.bit_length())
-        path = _with_bumps(points, rasters, weight, step, widths, _SWEEPS)
+        path = _with_bumps(points, rasters, weight, step, widths)
     return path
 
 
@@ -81,14 +81,14 @@ def _cost(
 
 
 @compiled
-def _with_chords(path: Points, rasters: CostRasters, weight: Raster, longest: float) -> Points:
+def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
     """The path with chords wherever they cost no more and come no nearer to a wall than what they replace.
 
     Walls of pixels are notched: a path along them follows every notch, and bumps alone do not smooth it.
     """
     n = len(path)
     clearance = rasters.clearance
-    chord = np.empty((math.ceil(longest) + 1, 2))
+    chord = np.empty((math.ceil(_LONGEST_CHORD_PX) + 1, 2))
     costs = np.empty(len(chord))
     kept = np.empty((n, 2))
     kept[0] = path[0]
@@ -104,7 +104,7 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster, longest: fl
             spent += _cost(path[j - 1 :], 1, rasters, weight, math.inf, costs)
             x0, y0 = path[i, 0], path[i, 1]
             length = math.hypot(x1 - x0, y1 - y0)
-            if length > longest:
+            if length > _LONGEST_CHORD_PX:
                 break
             if j > best and lowest_clearance(clearance, x0, y0, x1, y1) >= lowest - 1e-9:
                 legs = max(1, math.ceil(length))
@@ -121,12 +121,7 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster, longest: fl
 
 @compiled
 def _with_bumps(
-    path: Points,
-    rasters: CostRasters,
-    weight: Raster,
-    spacing: float,
-    widths: NDArray[np.int64],
-    sweeps: int,
+    path: Points, rasters: CostRasters, weight: Raster, spacing: float, widths: NDArray[np.int64]
 ) -> Points:
     """The path (n, 2) with its points shifted along the normal by cosine bumps of half widths `widths`, in points.
 
@@ -147,7 +142,7 @@ def _with_bumps(
     for width in widths:
         height = 0.17 * width * spacing
         stride = max(1, width // 2)
-        for _ in range(sweeps):
+        for _ in range(_SWEEPS):
             accepted = 0
             for centre in range(1, n - 1, stride):
                 first = max(0, centre - width)

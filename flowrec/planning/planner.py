@@ -14,7 +14,7 @@ from flowrec.errors import UsageError
 from flowrec.messages import FlowField, Route
 from flowrec.methods import Method, Methods
 from flowrec.planning.feasibility import narrowest, too_swift, why_apart
-from flowrec.planning.free_space import FastFlowMargin, margin_remark, margins_um, open_space
+from flowrec.planning.free_space import FastFlowMargin, spaces_by_margin
 from flowrec.planning.problem import Problem, attach_goal, attach_start
 from flowrec.planning.route import no_route, planning_speed_um_s
 from flowrec.planning.survey import SurveyPlanner
@@ -124,22 +124,19 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         method = self._method()
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot)
         course_error = self.swift.course_error(robot, robot.speed_limit_um_s)
-        error = ""
-        for margin_um in margins:
-            space = open_space(chip, field, robot.radius_um, margin_um, course_error)
+        for space, margin_um, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             error = start.error or goal.error or why_apart(space, start.node, goal.node)
             if not error:
                 route = method.plan(
                     Problem(self.method, space, field, start, goal, goal_at, robot, margin_um, speed_um_s)
                 )
-                remarks = (margin_remark(margin_um, margins), start.remark, goal.remark, route.reason)
-                return replace(route, reason="; ".join(remark for remark in remarks if remark))
+                remarks = (less, start.remark, goal.remark, route.reason)
+                return replace(route, reason="; ".join(filter(None, remarks)))
         if self.clearance_margin_um is not None:
             error = narrowest(space, start_at, goal_at) or error
-        too_fast = too_swift(chip, field, start_at, goal_at, robot.radius_um, course_error)
+        too_fast = too_swift(chip, field, start_at, goal_at, course_error)
         return no_route(self.method, too_fast or error)
 
     def _method(self) -> PlanningMethod:

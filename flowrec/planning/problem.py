@@ -56,7 +56,7 @@ class Problem:
 
     def timed(self, path: Points, idle_um_s: float | None = None) -> Route:
         """The timed route along a path (n, 2) px."""
-        return timed_route(self.method, self.field, path * self.space.um_per_px, self.speed_um_s, idle_um_s=idle_um_s)
+        return timed_route(self.method, self.field, path * self.space.um_per_px, self.speed_um_s, idle_um_s)
 
 
 def attach_start(space: FreeSpace, point_um: Points) -> Endpoint:

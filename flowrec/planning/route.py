@@ -98,7 +98,7 @@ def no_route(method: str, reason: str) -> Route:
 
 
 def timed_route(
-    method: str, field: FlowField, path_um: Points, speed_um_s: float, remark: str = "", idle_um_s: float | None = None
+    method: str, field: FlowField, path_um: Points, speed_um_s: float, idle_um_s: float | None = None
 ) -> Route:
     """The route along a path (n, 2) um, waypoints at most a pixel apart; none where the flow is too fast for it.
 
@@ -109,7 +109,7 @@ def timed_route(
     arrival, feasible = travel_time(field, waypoints, speed_um_s, idle_um_s)
     if not feasible:
         return no_route(method, too_fast(field, waypoints, speed_um_s))
-    return Route(0, 0, method, True, remark, waypoints, arrival)
+    return Route(0, 0, method, True, "", waypoints, arrival)
 
 
 def too_fast(field: FlowField, path_um: Points, speed_um_s: float) -> str:

@@ -13,7 +13,7 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.openings import distance_px
 from flowrec.messages import FlowField, Route
 from flowrec.planning.cost_rasters import Mask, Raster
-from flowrec.planning.free_space import FastFlowMargin, FreeSpace, margin_remark, margins_um, open_space
+from flowrec.planning.free_space import FastFlowMargin, FreeSpace, spaces_by_margin
 from flowrec.planning.grid_search import TRAVEL_TIME, backtrack, directions, search
 from flowrec.planning.path_refinement import refine_path
 from flowrec.planning.problem import attach_start, with_ends
@@ -59,15 +59,11 @@ class SurveyPlanner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         limit_um = distance_um if distance_um is not None else self.distance_um
         start_at = np.asarray(start_um, np.float64)
-        margins = margins_um(self.clearance_margin_um, robot)
         course_error = self.swift.course_error(robot, speed_um_s)
-        route = no_route(_METHOD, "")
-        for margin_um in margins:
-            space = open_space(chip, field, robot.radius_um, margin_um, course_error)
+        for space, _, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
             route = self._downstream(space, field, start_at, chip, speed_um_s, limit_um)
             if route.reachable:
-                remarks = (margin_remark(margin_um, margins), route.reason)
-                return replace(route, reason="; ".join(remark for remark in remarks if remark))
+                return replace(route, reason="; ".join(filter(None, (less, route.reason))))
         return route
 
     def _downstream(
@@ -107,9 +103,9 @@ class SurveyPlanner:
         path = with_ends(space, backtrack(parent, end, space.width), start, None)
         rasters = space.cost_rasters(speed_um_s / px)._replace(clearance=space.clearance)
         for candidate in (refine_path(path, rasters, weight), path):
-            route = timed_route(_METHOD, field, candidate * px, speed_um_s, start.remark)
+            route = timed_route(_METHOD, field, candidate * px, speed_um_s)
             if route.reachable:
-                break
+                return replace(route, reason=start.remark)
         return route
 
 

@@ -24,8 +24,11 @@ _TORN_PX = 30.0
 
 def extend_to_walls(times: Raster, free: Mask, clearance: Raster, need: float, speed: float) -> Raster:
     """The times (h, w) with those of the fluid outside `free`; clearance and `need` in px, `speed` in px/s."""
-    band = times.copy()
-    _fill_band(band, free, clearance, need, _BAND_TOLL / speed, _TORN_PX / speed)
+    # A border of solid pixels without a time spares the kernel the question whether a neighbour exists.
+    padded = np.pad(times, 1, constant_values=np.inf)
+    solid = np.pad(clearance, 1, constant_values=-1.0)
+    _fill_band(padded, np.pad(free, 1), solid, need, _BAND_TOLL / speed, _TORN_PX / speed)
+    band = padded[1:-1, 1:-1]
     # Beyond the border nothing is known, and no camera looks there: half a pixel counts as lacking.
     half = 0.5 * _BAND_TOLL / speed
     for edge, inner in ((band[0], band[1]), (band[-1], band[-2]), (band[:, 0], band[:, 1]), (band[:, -1], band[:, -2])):
@@ -38,21 +41,18 @@ def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: 
     h, w = free.shape
     fluid = clearance > 0.0
     # Breadth-first from the free pixels beside the band; `layer` is the number of steps from them.
-    layer = np.full((h, w), -1, np.int64)
+    layer = np.where(free, 0, -1)
     rows = np.empty(h * w, np.int64)
     columns = np.empty(h * w, np.int64)
     tail = 0
-    for j in range(h):
-        for i in range(w):
-            if not free[j, i]:
-                continue
-            layer[j, i] = 0
-            if not math.isfinite(times[j, i]):
+    for j in range(1, h - 1):
+        for i in range(1, w - 1):
+            if not free[j, i] or not math.isfinite(times[j, i]):
                 continue
             for k in range(8):
                 a = i + NEIGHBOUR_X[k]
                 b = j + NEIGHBOUR_Y[k]
-                if 0 <= a < w and 0 <= b < h and fluid[b, a] and not free[b, a]:
+                if fluid[b, a] and not free[b, a]:
                     rows[tail] = j
                     columns[tail] = i
                     tail += 1
@@ -66,15 +66,12 @@ def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: 
         for k in range(8):
             a = i + NEIGHBOUR_X[k]
             b = j + NEIGHBOUR_Y[k]
-            if a < 0 or b < 0 or a >= w or b >= h or not fluid[b, a] or layer[b, a] >= 0:
-                continue
             # Between two solid pixels that touch at their corners there is no way.
-            if not fluid[j, a] and not fluid[b, i]:
-                continue
-            layer[b, a] = layer[j, i] + 1
-            rows[tail] = b
-            columns[tail] = a
-            tail += 1
+            if fluid[b, a] and layer[b, a] < 0 and (fluid[j, a] or fluid[b, i]):
+                layer[b, a] = layer[j, i] + 1
+                rows[tail] = b
+                columns[tail] = a
+                tail += 1
     for m in range(border, tail):
         j = rows[m]
         i = columns[m]
@@ -84,9 +81,7 @@ def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: 
             for k in range(diagonal, 8, 2):
                 a = i + NEIGHBOUR_X[k]
                 b = j + NEIGHBOUR_Y[k]
-                if a < 0 or b < 0 or a >= w or b >= h or layer[b, a] != layer[j, i] - 1:
-                    continue
-                if (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
+                if layer[b, a] == layer[j, i] - 1 and (fluid[j, a] or fluid[b, i]) and math.isfinite(times[b, a]):
                     lacking = max(min(clearance[b, a], need) - clearance[j, i], _LEAST_TOLL)
                     worst = max(worst, times[b, a] + toll * lacking)
             if worst >= 0.0:
@@ -99,10 +94,8 @@ def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: 
         for k in range(8):
             a = i + NEIGHBOUR_X[k]
             b = j + NEIGHBOUR_Y[k]
-            if 0 <= a < w and 0 <= b < h and math.isfinite(times[b, a]) and abs(times[b, a] - times[j, i]) > torn:
-                closed[m] = fluid[j, a] or fluid[b, i]
-                if closed[m]:
-                    break
+            if math.isfinite(times[b, a]) and abs(times[b, a] - times[j, i]) > torn:
+                closed[m] = closed[m] or fluid[j, a] or fluid[b, i]
     for m in range(border, tail):
         if closed[m]:
             times[rows[m], columns[m]] = math.inf

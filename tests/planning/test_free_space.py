@@ -1,4 +1,4 @@
-"""Room for what a swift flow may do before it can be put right, and the honest answer where there is none."""
+"""More clearance where the flow is fast, and the reason where there is not enough."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from flowrec.planning import Planner, SurveyPlanner
 from flowrec.planning.free_space import FastFlowMargin, open_space
 from tests.planning.worlds import PX, channel, chip_of, field_of, poiseuille, robot
 
-SWIFT = FastFlowMargin(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
+FAST = FastFlowMargin(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
 
 
 def lowest_um(route, wall_um=75.0, height_um=390.0):
@@ -20,20 +20,20 @@ def test_a_route_keeps_as_far_from_walls_as_the_robot_may_drift():
     field, chip = field_of(mask, 600.0), chip_of(mask)
     ends = (100.0, 195.0), (1000.0, 195.0)
     calm = open_space(chip, field, 10.0, 1.0)
-    swift = open_space(chip, field, 10.0, 1.0, SWIFT.course_error(robot(), 100.0))
+    fast = open_space(chip, field, 10.0, 1.0, FAST.course_error(robot(), 100.0))
     # The robot's radius, 0.2 x 600 x 0.1 um for the map, 0.1 x 100 x 0.1 for the heading, the rest for the bend.
     need_um = 10.0 + 12.0 + 1.0 + (0.05 * 700.0) ** 2 / 160.0
-    assert (swift.clearance - swift.usable_clearance + swift.need)[20, 50] * PX == pytest.approx(need_um)
-    assert calm.free.sum() > swift.free.sum() > 0
-    assert (swift.clearance[swift.free] * PX >= need_um).all()
-    assert lowest_um(Planner(swift=SWIFT).plan(field, *ends, chip, robot())) >= need_um
+    assert (fast.clearance - fast.usable_clearance + fast.need)[20, 50] * PX == pytest.approx(need_um)
+    assert calm.free.sum() > fast.free.sum() > 0
+    assert (fast.clearance[fast.free] * PX >= need_um).all()
+    assert lowest_um(Planner(swift=FAST).plan(field, *ends, chip, robot())) >= need_um
 
 
 @pytest.mark.parametrize("method", ["time_field", "astar_time", "astar_length"])
 def test_where_the_drift_fills_the_channel_the_place_and_the_reason_are_named(method):
     mask = channel()
     chip = chip_of(mask)
-    plan = Planner(method=method, swift=SWIFT)
+    plan = Planner(method=method, swift=FAST)
     ends = (100.0, 195.0), (1000.0, 195.0)
     assert plan.plan(field_of(mask, 500.0), *ends, chip, robot(600.0)).reachable
     field = field_of(mask, lambda x, y: 500.0 + 2000.0 * ((x > 500.0) & (x < 600.0)))
@@ -50,7 +50,7 @@ def test_no_survey_leads_into_what_is_too_swift():
     mask = channel()
     field = poiseuille(mask, 20000.0)
     assert SurveyPlanner().plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
-    assert not SurveyPlanner(swift=SWIFT).plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
+    assert not SurveyPlanner(swift=FAST).plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
 
 
 def test_the_time_to_go_lets_the_robot_as_near_to_the_wall_as_it_fits_between_the_pixels():

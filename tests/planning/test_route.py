@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from flowrec.planning import travel_time
-from flowrec.planning.cost_rasters import CostRasters
-from flowrec.planning.path_refinement import refine_path
 from tests.planning.worlds import channel, field_of, open_water, poiseuille
 
 
@@ -40,15 +38,3 @@ def test_what_can_not_be_done_takes_for_ever_from_there_on():
     assert not feasible and arrival[1] == pytest.approx(3.0) and arrival[2] == np.inf
     sideways = field_of(open_water(), 0.0, 150.0)
     assert not travel_time(sideways, np.array([[100.0, 300.0], [400.0, 300.0]]), 100.0)[1]
-
-
-def test_relaxing_a_path_only_ever_saves_time_and_keeps_its_ends():
-    even = np.ones((80, 120))
-    y = np.mgrid[0:80, 0:120][0]
-    vx, vy = 6.0 * np.sin(y / 9.0), np.zeros((80, 120))
-    path = np.array([[10.0, 10.0], [60.0, 70.0], [110.0, 10.0]])
-    rasters = CostRasters(even > 0.0, 50.0 * even, 1.0, vx, vy, 10.0 * even)
-    straightened = refine_path(path, rasters)
-    field = field_of(open_water(), 10.0 * vx)
-    assert travel_time(field, straightened * 10.0, 100.0)[0][-1] < 0.75 * travel_time(field, path * 10.0, 100.0)[0][-1]
-    np.testing.assert_allclose(straightened[[0, -1]], path[[0, -1]])
