@@ -81,6 +81,18 @@ def _cost(
 
 
 @compiled
+def _legs(points: Points, rasters: CostRasters, weight: Raster) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of each leg of a polyline (n, 2): its cost (n - 1,), and the clearance (n - 1,) that its successor must keep."""
+    costs = np.empty(len(points) - 1)
+    floors = np.empty(len(points) - 1)
+    for k in range(len(costs)):
+        _cost(points[k:], 1, rasters, weight, math.inf, costs[k:])
+        x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
+        floors[k] = min(rasters.need, lowest_clearance(rasters.clearance, x0, y0, x1, y1))
+    return costs, floors
+
+
+@compiled
 def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
     """The path with chords wherever they cost no more and come no nearer to a wall than what they replace.
 
@@ -89,7 +101,8 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
     n = len(path)
     clearance = rasters.clearance
     chord = np.empty((math.ceil(_LONGEST_CHORD_PX) + 1, 2))
-    costs = np.empty(len(chord))
+    chord_costs = np.empty(len(chord))
+    costs, floors = _legs(path, rasters, weight)
     kept = np.empty((n, 2))
     kept[0] = path[0]
     count = 1
@@ -99,10 +112,9 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
         lowest = rasters.need
         spent = 0.0
         for j in range(i + 1, n):
-            x0, y0, x1, y1 = path[j - 1, 0], path[j - 1, 1], path[j, 0], path[j, 1]
-            lowest = min(lowest, lowest_clearance(clearance, x0, y0, x1, y1))
-            spent += _cost(path[j - 1 :], 1, rasters, weight, math.inf, costs)
-            x0, y0 = path[i, 0], path[i, 1]
+            lowest = min(lowest, floors[j - 1])
+            spent += costs[j - 1]
+            x0, y0, x1, y1 = path[i, 0], path[i, 1], path[j, 0], path[j, 1]
             length = math.hypot(x1 - x0, y1 - y0)
             if length > _LONGEST_CHORD_PX:
                 break
@@ -111,7 +123,7 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
                 for k in range(legs + 1):
                     chord[k, 0] = x0 + (x1 - x0) * k / legs
                     chord[k, 1] = y0 + (y1 - y0) * k / legs
-                if _cost(chord, legs, rasters, weight, math.inf, costs) <= spent:
+                if _cost(chord, legs, rasters, weight, math.inf, chord_costs) <= spent:
                     best = j
         kept[count] = path[best]
         count += 1
@@ -131,12 +143,7 @@ def _with_bumps(
     h, w = clearance.shape
     points = path.copy()
     n = len(points)
-    costs = np.empty(n - 1)
-    floors = np.empty(n - 1)
-    for k in range(n - 1):
-        _cost(points[k:], 1, rasters, weight, math.inf, costs[k:])
-        x0, y0, x1, y1 = points[k, 0], points[k, 1], points[k + 1, 0], points[k + 1, 1]
-        floors[k] = min(rasters.need, lowest_clearance(clearance, x0, y0, x1, y1))
+    costs, floors = _legs(points, rasters, weight)
     moved = np.empty((2 * widths.max() + 1, 2))
     new_costs = np.empty(2 * widths.max())
     for width in widths:
