@@ -9,6 +9,7 @@ import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 
-from flowrec.config import load_config
+from flowrec.config import Recording, load_config
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
 from flowrec.session_writer import frames_of
@@ -158,3 +159,7 @@ def test_the_default_is_the_smallest_that_the_rate_allows():
     config = load_config(None, ["camera.rate_hz=60.0", "camera.width_px=2448", "camera.height_px=2048"])
     assert frames_of(config) == "zstd"
     assert frames_of(replace(config, recording=replace(config.recording, frames="jpeg"))) == "jpeg"
+
+
+def test_the_setting_accepts_the_names_of_the_table_and_auto():
+    assert set(get_args(get_type_hints(Recording)["frames"])) == {"auto", *ENCODINGS}
