@@ -55,3 +55,18 @@ def test_every_lock_is_granted_where_there_are_none(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(locks, "HAS_LOCKS", False)
         assert not locks.is_growing(tmp_path / "a")
         assert locks.try_lock(file.fileno(), exclusive=True)
+
+
+def test_a_session_is_read_by_several_threads_where_there_is_no_pread(monkeypatch: pytest.MonkeyPatch) -> None:
+    from concurrent.futures import ThreadPoolExecutor
+
+    from flowrec.store import byte_source
+
+    monkeypatch.setattr(byte_source.sys, "platform", "win32")
+    monkeypatch.delattr(byte_source.os, "pread")
+    data = GOLDEN.read_bytes()
+    source = byte_source.open_bytes(GOLDEN)
+    offsets = [(number * 7919) % (len(data) - 64) for number in range(20_000)]
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(lambda offset: source.read(offset, 64), offsets, chunksize=50))
+    assert found == [data[offset : offset + 64] for offset in offsets]

@@ -6,6 +6,8 @@ Another kind (an URL, an archive) is one class and one row of BYTE_SOURCES.
 from __future__ import annotations
 
 import os
+import sys
+import threading
 import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -59,6 +61,7 @@ class LocalFile:
         except OSError as error:
             raise SessionError(f"{path}: can not be opened ({error.strerror}); check its permissions") from error
         self._closer = weakref.finalize(self, os.close, self._descriptor)
+        self._seeking = threading.Lock()
         self.size = os.fstat(self._descriptor).st_size
 
     def read(self, offset: int, length: int) -> bytes:
@@ -67,12 +70,21 @@ class LocalFile:
         data = b""
         try:
             while len(data) < length:  # one call reads 2 GiB at most
-                more = os.pread(self._descriptor, length - len(data), offset + len(data))
+                more = self._read_once(offset + len(data), length - len(data))
                 if not more:
                     break
                 data = data + more if data else more
         except OSError as error:
             raise SessionError(f"{self.path}: can not be read at byte {offset} ({error.strerror})") from error
+        return data
+
+    def _read_once(self, offset: int, length: int) -> bytes:
+        if sys.platform != "win32":
+            data = os.pread(self._descriptor, length, offset)
+        else:
+            with self._seeking:  # there is no pread, and all threads share the position in the file
+                os.lseek(self._descriptor, offset, os.SEEK_SET)
+                data = os.read(self._descriptor, length)
         return data
 
     def close(self) -> None:

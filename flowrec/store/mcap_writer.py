@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import errno
 import os
+import sys
 import zlib
 from collections import Counter
 from collections.abc import Iterable
@@ -176,7 +177,10 @@ class McapWriter:
         """Write buffers without copying them; one system call takes a limited number and may write fewer bytes."""
         waiting = [memoryview(buffer) for buffer in buffers if len(buffer)]
         while waiting:
-            done = os.writev(self._file.fileno(), waiting[:_BUFFERS_PER_WRITE])
+            if sys.platform != "win32":
+                done = os.writev(self._file.fileno(), waiting[:_BUFFERS_PER_WRITE])
+            else:
+                done = os.write(self._file.fileno(), waiting[0])
             while waiting and done >= len(waiting[0]):
                 done -= len(waiting.pop(0))
             if done:

@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import operator
 import os
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -272,8 +273,9 @@ class SessionWriter:
             new["drops"] = self._drops = Drops(stamp_ns, FRAME_PATH, *now)
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError, AttributeError):  # of Linux, where each thread has its own
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        if sys.platform == "linux":  # only there has each thread a priority of its own
+            with contextlib.suppress(OSError):
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:
             while not self._queue.drained:
                 entry = self._queue.take(self._output.timeout_s)

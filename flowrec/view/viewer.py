@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import socket
 import subprocess
-import sys
 from pathlib import Path
 
 LOOPBACK = "127.0.0.1"  # Rerun's own default is every interface
@@ -42,7 +42,7 @@ def executable() -> Path | None:
 
 def has_display() -> bool:
     """Whether a window can open."""
-    if sys.platform in ("darwin", "win32"):
+    if platform.system() in ("Darwin", "Windows"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
