@@ -339,7 +339,7 @@ def recover(
     as_json: AsJson = False,
 ) -> None:
     """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
-    from flowrec.store import recover_run
+    from flowrec.store.recovery import recover_run
     from flowrec.terminal import say
 
     saved = recover_run(session, out)

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from flowrec.errors import FlowrecError, SessionError, UsageError
-from flowrec.store.part_continuity import Run, files_of
-from flowrec.store.paths import run_files
+from flowrec.store.run_files import Run, files_of, run_files
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.summary import Figures, of_text
 from flowrec.system.toml_file import parse_toml

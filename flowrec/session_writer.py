@@ -12,8 +12,12 @@ from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig, calibration_of, to_toml
 from flowrec.provenance import provenance
 from flowrec.session import files_behind, session_sha256
-from flowrec.store import Region, SessionHeader, SessionWriter, Snapshot, Split, WriterOptions, encoding_for, files_of
-from flowrec.store.session_metadata import SessionMetadata
+from flowrec.store.frame_encodings import encoding_for
+from flowrec.store.roi import Region
+from flowrec.store.run_files import files_of
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.writer import SessionWriter
 
 _QUEUE_S = 2.0
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000

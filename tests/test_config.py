@@ -20,7 +20,7 @@ from flowrec.config import Config, config_from_toml, load_config, to_toml, with_
 from flowrec.errors import FlowrecError, UnreachableError, UsageError
 from flowrec.resolve import resolve
 from flowrec.rig_settings import RIGS
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 
 
 def test_a_configuration_survives_its_own_toml() -> None:

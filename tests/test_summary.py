@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from flowrec.cli import main
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 
 GOLDEN = Path(__file__).parents[1] / "sessions" / "golden.mcap"

@@ -28,7 +28,8 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import Sink, run
 from flowrec.run.workers import LockstepWorker
 from flowrec.session_writer import session_header
-from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.terminal import progress, table
 from flowrec.view.live import LiveView
 

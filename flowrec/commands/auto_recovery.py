@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from flowrec.errors import FlowrecError
-from flowrec.store import recover
-from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX
+from flowrec.store.recovery import recover
+from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX
 from flowrec.system.locks import is_growing, try_lock
 from flowrec.system.processes import child_command, child_environment
 from flowrec.terminal import say, warn

@@ -19,8 +19,7 @@ from flowrec.errors import FlowrecError
 from flowrec.session import Session
 from flowrec.store.audit import audit
 from flowrec.store.channels import is_left_out
-from flowrec.store.part_continuity import continuity_fault, is_continued
-from flowrec.store.paths import part_number, part_path, run_files
+from flowrec.store.run_files import continuity_fault, is_continued, part_number, part_path, run_files
 from flowrec.summary import finite
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS

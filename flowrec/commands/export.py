@@ -11,7 +11,7 @@ from flowrec.config import ResolvedConfig
 from flowrec.errors import SessionError
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.session import Session, files_behind, input_blamed
-from flowrec.store import files_of
+from flowrec.store.run_files import files_of
 from flowrec.system.outputs import RRD, check_output
 from flowrec.terminal import progress, say
 from flowrec.view.rrd_file import is_made_from, write_rrd

@@ -15,8 +15,7 @@ from typing import Any
 
 from flowrec.errors import SessionError
 from flowrec.session import Session, toml_table
-from flowrec.store.part_continuity import Run
-from flowrec.store.paths import PARTIAL_SUFFIX, SUFFIX, part_number, run_path
+from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX, Run, part_number, run_path
 from flowrec.store.session_metadata import Part
 from flowrec.summary import name_of, of_text, shown
 from flowrec.system.locks import is_growing

@@ -10,7 +10,7 @@ from flowrec.messages import Tick
 from flowrec.run.control import RunControl
 from flowrec.run.disk_monitor import DiskMonitor
 from flowrec.run.watchdog import Watchdog
-from flowrec.store import SessionWriter
+from flowrec.store.writer import SessionWriter
 from flowrec.terminal import StatusLine, progress, say
 
 

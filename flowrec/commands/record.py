@@ -35,8 +35,8 @@ from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import LockstepWorker, Preloaded, Worker
 from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
-from flowrec.store import SessionWriter, runs_in
-from flowrec.store.paths import run_files, run_path
+from flowrec.store.run_files import run_files, run_path, runs_in
+from flowrec.store.writer import SessionWriter
 from flowrec.summary import as_text, finite
 from flowrec.system.outputs import MCAP, RRD, check_output
 from flowrec.system.processes import realtime_priority

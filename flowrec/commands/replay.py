@@ -27,7 +27,8 @@ from flowrec.run.loop import RunReport, Sink, run
 from flowrec.run.workers import LockstepWorker, work
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
-from flowrec.store import SessionReader, SessionWriter
+from flowrec.store.reader import SessionReader
+from flowrec.store.writer import SessionWriter
 from flowrec.summary import Figures, as_text
 from flowrec.system.outputs import MCAP, check_output
 from flowrec.terminal import warn

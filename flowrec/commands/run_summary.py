@@ -14,7 +14,7 @@ from flowrec.enums import Outcome, Phase
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Demand, FlowField, Route, Tick
 from flowrec.run.loop import RunReport
-from flowrec.store import is_snapshot
+from flowrec.store.run_files import is_snapshot
 from flowrec.summary import Figures, finite, rows_for_people
 from flowrec.terminal import say, table
 from flowrec.topics import FLOW_FIELDS

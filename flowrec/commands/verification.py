@@ -11,7 +11,7 @@ from flowrec.errors import printable
 from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import Pipeline
 from flowrec.run.workers import work
-from flowrec.store import digest_faults
+from flowrec.store.audit import digest_faults
 from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS
 
 

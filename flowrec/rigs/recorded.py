@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from flowrec.messages import Currents, Tick
 from flowrec.pipeline import ARRIVING, Inputs
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 
 
 class RecordedRig:

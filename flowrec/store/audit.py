@@ -11,13 +11,13 @@ from mcap.records import ChunkIndex
 
 from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
+from flowrec.store.channels import SessionContents
 from flowrec.store.digest import FileDigest
 from flowrec.store.mcap_format import Record
 from flowrec.store.mcap_reader import DamageError, McapReader, UnfinishedError
-from flowrec.store.part_continuity import RunFile, files_of
 from flowrec.store.roi import Region
+from flowrec.store.run_files import RunFile, files_of
 from flowrec.store.scan import Scan, scan
-from flowrec.store.schema_check import SessionContents
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -81,7 +81,7 @@ class Audit:
 
     @property
     def run_file(self) -> RunFile:
-        """The file as part_continuity.py compares it with others."""
+        """The file as run_files.py compares it with others."""
         part = self.header.part if self.header is not None else None
         counts = {BY_FIELD[name].path: count for name, count in self.counts.items()}
         return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.flowrec_version)

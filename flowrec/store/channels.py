@@ -1,4 +1,6 @@
-"""The MCAP channel, codec and chunk group of each topic, and which topics a recording leaves out.
+"""The MCAP channels: as flowrec declares them in a new file, and as a session file declares them.
+
+A channel has a codec and a chunk group. A session file is refused when its schemas are not those of this flowrec.
 
 There are three groups of chunks: frames, state, and the views for other programs. So reading all poses decompresses
 neither images nor previews. Channel numbers depend on the tables only: the same ticks make the same records.
@@ -7,22 +9,26 @@ neither images nor previews. Channel numbers depend on the tables only: the same
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from typing import Any
 
+from google.protobuf import descriptor_pb2
 from mcap.records import Channel
 from mcap.records import Schema as SchemaRecord
 
-from flowrec.declarations import Role
-from flowrec.errors import UsageError
+from flowrec.declarations import Role, defaulted_fields
+from flowrec.errors import SessionError, UsageError
 from flowrec.messages import Frame
-from flowrec.store.codec import Codec, codec_of
+from flowrec.store.codec import Codec, codec_of, decode
 from flowrec.store.frame_encodings import ENCODINGS, FRAME_CODECS, FrameEncoding
-from flowrec.store.roi import Region
+from flowrec.store.mcap_format import Record, Summary
+from flowrec.store.roi import Region, region_from
 from flowrec.store.schema import Schema, foxglove_schema
+from flowrec.store.session_metadata import SessionMetadata
 from flowrec.store.viewer_topics import VIEWER_TOPICS
-from flowrec.topics import BY_FIELD, TOPICS
+from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
+from flowrec.version import __version__
 
 FRAMES, STATE, VIEW = "frames", "state", "view"
 GROUPS = (FRAMES, STATE, VIEW)
@@ -102,3 +108,79 @@ def left_out(patterns: Iterable[str]) -> frozenset[str]:
             )
         chosen |= found
     return frozenset(chosen)
+
+
+class SessionContents(SessionMetadata):
+    """A session file whose messages can be read; besides what SessionMetadata has:
+
+    Attributes
+    ----------
+    fields : field of Tick by channel number, for the topics that this flowrec knows.
+    codecs : how their messages are decoded, by channel number.
+    recorded_fields : by field of Tick, the fields that its messages have in this file; an older file lacks some.
+    frame_encoding : name of the encoding of frames (frame_encodings.py); empty in files that do not say.
+    region : which window of most images was recorded (roi.py); None: they are whole.
+    """
+
+    def _open(self, summary: Summary | None) -> None:
+        super()._open(summary)
+        self.fields: dict[int, str] = {}
+        self.codecs: dict[int, Codec] = {}
+        self.recorded_fields: dict[str, frozenset[str]] = {}
+        self.frame_encoding = ""
+        self.region: Region | None = None
+        for channel in self.channels.values():
+            if channel.topic in BY_PATH:
+                self.fields[channel.id] = BY_PATH[channel.topic].field
+                self._check_schema(channel.id)
+            if channel.topic == FRAME_PATH:
+                self.frame_encoding = channel.metadata.get("encoding", "")
+                self.region = region_from(channel.metadata)
+
+    def decode(self, record: Record) -> Any:
+        """The message in a record of a known topic.
+
+        Raises
+        ------
+        SessionError : it is damaged.
+        """
+        kind = BY_FIELD[self.fields[record.channel]].type
+        assert isinstance(record.payload, memoryview)
+        return decode(kind, self.codecs[record.channel], record.payload, record.sequence, self.source.start_unix_ns)
+
+    def _check_schema(self, channel_number: int) -> None:
+        channel = self.channels[channel_number]
+        found = self.schemas[channel.schema_id]
+        kind = BY_PATH[channel.topic].type
+        codec = self.codecs[channel_number] = message_codec(kind, found.name)
+        expected = codec.schema
+        ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
+        self.recorded_fields[self.fields[channel_number]] = ours_all
+        same_kind = (found.name, found.encoding, channel.message_encoding) == (expected.name, "protobuf", "protobuf")
+        # The standard schemas may gain fields and comments with a new foxglove-sdk and stay compatible.
+        if same_kind and (found.data == expected.data or not expected.name.startswith("flowrec.")):
+            return
+        with self.source.parsing(0):
+            theirs, ours = _fields_of(found.data), _fields_of(expected.data)
+        # A field that was added since is empty in an older file; where the message allows for that, it is read.
+        missing = {name.removeprefix(f"{kind.__name__}.") for name, _ in ours - theirs}
+        if same_kind and theirs <= ours and not missing & (ours_all - defaulted_fields(kind)):
+            there = {name.removeprefix(f"{kind.__name__}.") for name, _ in theirs}
+            self.recorded_fields[self.fields[channel_number]] = ours_all & there
+            return
+        differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
+        raise SessionError(
+            f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
+            f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
+        )
+
+
+def _fields_of(data: bytes) -> set[tuple[str, bytes]]:
+    """Name, with its message's, and declaration of each field in a FileDescriptorSet."""
+    files = descriptor_pb2.FileDescriptorSet.FromString(data).file
+    return {
+        (f"{message.name}.{field.name}", field.SerializeToString(deterministic=True))
+        for file in files
+        for message in file.message_type
+        for field in message.field
+    }

@@ -17,11 +17,10 @@ from mcap.records import ChunkIndex
 from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
-from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.image_codec import PIXELS_LIMIT
+from flowrec.store.channels import SessionContents
+from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
-from flowrec.store.schema_check import SessionContents
 from flowrec.store.write_queue import NewMessages
 from flowrec.topics import BY_FIELD
 

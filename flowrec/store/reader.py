@@ -11,10 +11,10 @@ from typing import Any, Self
 
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
+from flowrec.store.channels import SessionContents
 from flowrec.store.file_reader import Cache, FileReader
-from flowrec.store.part_continuity import Run, RunFile
 from flowrec.store.roi import Region
-from flowrec.store.schema_check import SessionContents
+from flowrec.store.run_files import Run, RunFile
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
 from flowrec.units import seconds

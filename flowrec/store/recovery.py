@@ -12,13 +12,20 @@ from pathlib import Path
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
+from flowrec.store.channels import SessionContents
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_reader import DamageError, McapReader
-from flowrec.store.part_continuity import is_continued, unfinished_of
-from flowrec.store.paths import PARTIAL_SUFFIX, part_number, part_path, partial_path, parts
 from flowrec.store.reader import SessionReader
+from flowrec.store.run_files import (
+    PARTIAL_SUFFIX,
+    is_continued,
+    part_number,
+    part_path,
+    partial_path,
+    parts,
+    unfinished_of,
+)
 from flowrec.store.scan import Scan, scan
-from flowrec.store.schema_check import SessionContents
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import (
     CHIP_FILE,

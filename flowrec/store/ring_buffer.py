@@ -15,12 +15,11 @@ from pathlib import Path
 
 from flowrec.enums import Action, Level, Outcome
 from flowrec.messages import Drops, Event, OperatorEvent
-from flowrec.store.async_file_writer import AsyncFileWriter
 from flowrec.store.channels import FRAMES
 from flowrec.store.chunk import ChunkEncoder, SealedChunk, Sink, detached
-from flowrec.store.paths import partial_path, snapshot_path
+from flowrec.store.run_files import partial_path, snapshot_path
 from flowrec.store.segments import Counters, SegmentRouter, keyframe
-from flowrec.store.session_file import SessionFile, Snapshot, WriterOptions
+from flowrec.store.session_file import AsyncFileWriter, SessionFile, Snapshot, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry, NewMessages

@@ -1,4 +1,4 @@
-"""One file of a run while it is written: its head, its end, its two names, and the errors of the disk.
+"""One file of a run while it is written: header records, outcome, final name and disk errors.
 
 The options of a recording are here, because all files of a run are written with them.
 """
@@ -7,7 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-from collections.abc import Iterable, Iterator, Mapping
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent import futures
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +19,13 @@ from mcap.records import Metadata
 
 from flowrec.errors import SessionError
 from flowrec.store.channels import declarations, left_out
-from flowrec.store.chunk import SealedChunk
+from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
 from flowrec.store.mcap_writer import McapWriter
-from flowrec.store.paths import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.roi import Region
+from flowrec.store.run_files import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
+from flowrec.store.write_queue import Entry
 from flowrec.system.outputs import MCAP, check_output, put_in_place, sync_directory, taken
 from flowrec.version import __version__
 
@@ -239,3 +244,102 @@ def _disk_failed(path: Path, error: OSError) -> FileError:
         return FileError(f"{path}: is gone, it or its directory was removed or renamed; look for it there")
     what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
     return FileError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")
+
+
+class AsyncFileWriter(SessionFile):
+    """Takes chunks at once and writes them in order.
+
+    Parameters
+    ----------
+    path, header, options : of the file.
+    limit_bytes : how much may wait; beyond that `put` blocks.
+
+    Attributes
+    ----------
+    finished : the file is complete.
+
+    Raises
+    ------
+    FileError : when the file can not be made; what fails later is raised by `check`.
+    """
+
+    def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, *, limit_bytes: int) -> None:
+        super().__init__(path, header, options)
+        self.finished = False
+        self._limit_bytes = limit_bytes
+        self._synced_s, self._synced_size = time.monotonic(), 0
+        self._waiting_bytes = 0
+        self._written = threading.Condition()
+        self._failure: BaseException | None = None
+        self._last: Future[None] | None = None
+        self._thread = ThreadPoolExecutor(1, "session-snapshot")
+
+    def put_keyframe(self, encoder: ChunkEncoder, entry: Entry) -> None:
+        """Write the first tick. It is encoded in the thread, too, because that may take as long as writing it."""
+        encoder.sink = self.add_chunks
+
+        def encode() -> None:
+            encoder.add(entry)
+            encoder.seal()
+
+        self._submit(encode)
+
+    def put(self, chunks: list[SealedChunk]) -> None:
+        """Append chunks."""
+        for chunk in detached(chunks):
+            with self._written:
+                self._written.wait_for(lambda: self._failure is not None or self._waiting_bytes <= self._limit_bytes)
+                self._waiting_bytes += len(chunk.data)
+            self._submit(self._write, chunk)
+
+    def sync_if_due(self) -> None:
+        """Sync what was written, also where nothing more comes."""
+        if self._last is not None and self._last.done():
+            self._submit(self._sync)
+
+    def finish(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
+        """Complete the file when all has been written."""
+
+        def finish() -> None:
+            self.complete(outcome, top_um_s)
+            self.finished = True
+
+        self._submit(finish)
+
+    def check(self, *, wait: bool = False) -> None:
+        """Raise what has failed; with `wait`, after all has been written."""
+        if wait and self._last is not None:
+            futures.wait([self._last])
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """Close the file as it is, with what was put."""
+        self._thread.shutdown()
+        super().close()
+
+    def _submit(self, work: Callable[..., None], *arguments: SealedChunk) -> None:
+        """Have the thread do something, unless something has failed before."""
+
+        def run() -> None:
+            try:
+                if self._failure is None:
+                    work(*arguments)
+            except BaseException as error:  # noqa: BLE001  whatever it is, the writer must raise it
+                self._failure = error
+            finally:
+                with self._written:
+                    self._waiting_bytes -= sum(len(chunk.data) for chunk in arguments)
+                    self._written.notify_all()
+
+        self._last = self._thread.submit(run)
+
+    def _write(self, chunk: SealedChunk) -> None:
+        self.add_chunks([chunk])
+        self._sync()
+
+    def _sync(self) -> None:
+        now, size = time.monotonic(), self.size
+        if now >= self._synced_s + self._options.sync_interval_s and self._synced_size < size:
+            self.sync()
+            self._synced_s, self._synced_size = now, size

@@ -1,7 +1,7 @@
 """What a session file says about itself: enough to list, describe and run it again, whether or not its messages can be
 read.
 
-Light to import: no numpy, no schemas. schema_check.py adds what reading the messages needs.
+Light to import: no numpy, no schemas. channels.py adds what reading the messages needs.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from pathlib import Path
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
-from flowrec.store.paths import part_path
+from flowrec.store.run_files import part_path
 from flowrec.store.segments import Counters, OpenSegment, SegmentRouter, keyframe
 from flowrec.store.session_file import FileError, SessionFile, Split, WriterOptions
 from flowrec.store.session_metadata import Part, SessionHeader

@@ -21,9 +21,9 @@ from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.messages import Drops, Frame, Tick, Track
 from flowrec.store.channels import FRAME_PATH
-from flowrec.store.paths import run_files
 from flowrec.store.ring_buffer import RingBuffer
 from flowrec.store.roi import Window, WindowSelector
+from flowrec.store.run_files import run_files
 from flowrec.store.session_file import Snapshot, WriterOptions, refuse_if_taken
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.split import Parts

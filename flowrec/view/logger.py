@@ -29,7 +29,7 @@ from flowrec.messages import (
     Timing,
     Track,
 )
-from flowrec.store import nonzero_window
+from flowrec.store.roi import nonzero_window
 from flowrec.units import NS_PER_S
 from flowrec.view import colours, maps
 from flowrec.view import entities as e

@@ -25,7 +25,8 @@ from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
 from flowrec.session import Session
 from flowrec.session_writer import session_writer
-from flowrec.store import SessionReader, recover
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from tests.conftest import SMALL, until
 
 S = 1_000_000_000
@@ -172,7 +173,7 @@ CHILD = """
 import sys, time
 from dataclasses import replace
 from flowrec.clocks import ClockMonitor
-from flowrec.store import SessionWriter
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 
 watch = ClockMonitor()

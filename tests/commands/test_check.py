@@ -12,8 +12,11 @@ from typer.testing import CliRunner
 from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.errors import SessionError
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from tests.store.made_up import HEADER, ticks_of
 

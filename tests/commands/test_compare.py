@@ -18,7 +18,9 @@ from flowrec.cli import app
 from flowrec.commands.compare import Comparison
 from flowrec.config import load_config, to_toml
 from flowrec.messages import Demand, FlowField, Tick
-from flowrec.store import SessionHeader, SessionWriter, WriterOptions
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_metadata import SessionHeader
+from flowrec.store.writer import SessionWriter
 from tests.rewritten import array_of, rewrite
 from tests.store.made_up import HEADER, ticks_of
 

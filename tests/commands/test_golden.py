@@ -8,7 +8,7 @@ import pytest
 
 from flowrec.commands import replay as verb
 from flowrec.commands.replay import Change
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 

@@ -11,7 +11,8 @@ from typer.testing import CliRunner, Result
 from flowrec.cli import app
 from flowrec.commands.info import list_sessions
 from flowrec.errors import SessionError
-from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 
 

@@ -13,7 +13,7 @@ from flowrec.commands.record import record
 from flowrec.commands.replay_report import refly, report
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded
 from flowrec.config import load_config
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 
 SESSIONS = Path(__file__).parents[2] / "sessions"

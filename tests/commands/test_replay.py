@@ -18,7 +18,7 @@ from flowrec.errors import SessionError, UsageError
 from flowrec.estimation import Observer
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Estimate
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 
 

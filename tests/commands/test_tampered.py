@@ -20,8 +20,9 @@ from flowrec.config import load_config
 from flowrec.declarations import Role
 from flowrec.messages import Clocks, Drops, Health, Tick
 from flowrec.session_writer import session_header
-from flowrec.store import SessionWriter, Split, WriterOptions
+from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
+from flowrec.store.writer import SessionWriter
 from flowrec.topics import TOPICS
 from tests.conftest import SMALL
 from tests.rewritten import leaves_of, parser_of, rewrite

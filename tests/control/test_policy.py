@@ -15,7 +15,7 @@ from flowrec.messages import Estimate, Route
 from flowrec.planning import Planner
 from flowrec.planning.time_field import TimeField
 from flowrec.robot import Robot
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 from tests.control.plant import field_of, fly, mission, straight
 from tests.planning import worlds

@@ -18,7 +18,7 @@ from flowrec.messages import Applied, Estimate, FlowField, Health, Tick
 from flowrec.pipeline import Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.robot import Robot
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.8)

@@ -27,7 +27,8 @@ from flowrec.commands.check import check
 from flowrec.commands.info import info, list_sessions
 from flowrec.errors import FlowrecError, printable
 from flowrec.session import Session
-from flowrec.store import SessionReader, recover
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from flowrec.terminal import progress, table
 from tests.perf.mutate import blind, corrupt
 from tests.store.drafts import Draft, small_draft

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from flowrec.bench.harness import peak_mb
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from flowrec.units import nanoseconds
 
 

@@ -21,7 +21,8 @@ import typer
 
 from flowrec.bench.harness import Results, run
 from flowrec.errors import FlowrecError
-from flowrec.store import SessionReader, recover
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from flowrec.terminal import progress, table
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGUSR1, signal.SIGUSR2]

@@ -18,7 +18,10 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.terminal import progress, table
 from tests.perf import store_equal
 from tests.perf.store_kills import kills

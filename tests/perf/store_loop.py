@@ -24,7 +24,8 @@ from flowrec.config import load_config
 from flowrec.declarations import Image
 from flowrec.messages import Frame, OperatorEvent, Tick
 from flowrec.run.loop import Sink
-from flowrec.store import SessionWriter, Snapshot, Split, WriterOptions
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.system.processes import realtime_priority
 from flowrec.terminal import progress
 from tests.perf.store_writers import made_up_header, pictures, ticks_of

@@ -13,7 +13,9 @@ from flowrec.chip import load_chip
 from flowrec.config import load_config
 from flowrec.resolve import resolve
 from flowrec.session_writer import region_of
-from flowrec.store import Region, SessionWriter, WriterOptions
+from flowrec.store.roi import Region
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.terminal import progress
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 

@@ -15,7 +15,8 @@ import numpy as np
 from flowrec.declarations import Image
 from flowrec.messages import FlowField, OperatorEvent, Tick
 from flowrec.run.loop import SWITCH_S
-from flowrec.store import SessionWriter, Snapshot, Split, WriterOptions
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.terminal import progress, table
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 

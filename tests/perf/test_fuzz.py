@@ -2,7 +2,7 @@
 
 import pytest
 
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.perf.fuzz import Campaign
 
 # Seeds of files that were once a fault: what recovery passed for whole could not be read; a check that saw less than

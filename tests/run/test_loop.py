@@ -13,7 +13,7 @@ from flowrec.config import load_config
 from flowrec.estimation import Observer
 from flowrec.messages import Estimate
 from flowrec.pipeline import assemble
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from flowrec.units import NS_PER_S
 from tests.conftest import SMALL
 

@@ -19,7 +19,7 @@ from flowrec.messages import Applied, Currents, Event, Frame
 from flowrec.pipeline import Inputs
 from flowrec.rigs.frame_checks import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 
 AT_S = 4.5  # a moment while it navigates

@@ -24,7 +24,7 @@ from flowrec.messages import OperatorEvent, Tick
 from flowrec.run.control import RunControl
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.keyboard import Keyboard
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from flowrec.units import seconds
 from tests.conftest import HANG_S, SMALL
 

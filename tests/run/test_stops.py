@@ -17,7 +17,7 @@ from flowrec.commands import record as verb
 from flowrec.commands.replay import Change, replay
 from flowrec.config import load_config
 from flowrec.messages import OperatorEvent
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL
 from tests.perf.stop_trial import LoggedRig
 from tests.perf.stops import KINDS, Ended, Kind, stop

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.store import SessionReader
+from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL, until
 
 WORDS = [word for setting in (*SMALL, "safety.guard_timeout_s=20") for word in ("--set", setting)]

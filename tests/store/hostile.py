@@ -7,8 +7,9 @@ from dataclasses import replace
 import pytest
 
 from flowrec.errors import SessionError, printable
-from flowrec.store import SessionReader, recover
 from flowrec.store.channels import SLOTS
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from tests.store.drafts import (
     small_draft,
     text,

@@ -22,8 +22,9 @@ from flowrec.messages import (
     Track,
     Truth,
 )
-from flowrec.store import SessionHeader, codec
+from flowrec.store import codec
 from flowrec.store.channels import message_codec
+from flowrec.store.session_metadata import SessionHeader
 
 
 def encode(message, schema=""):

@@ -24,8 +24,11 @@ from mcap.writer import Writer
 
 from flowrec.errors import SessionError
 from flowrec.messages import Currents
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, channels, session_metadata
+from flowrec.store import channels, session_metadata
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.reader import SessionReader
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(30, shape=(8, 8)))
@@ -107,7 +110,8 @@ def test_a_full_disk_is_told_at_the_next_write_and_at_close(tmp_path, monkeypatc
 KILLED = """
 import sys, time
 from dataclasses import replace
-from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 sys.path.insert(0, sys.argv[2])
 from made_up import HEADER, ticks_of
 writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=10.0, sync_s=20.0))

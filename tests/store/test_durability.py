@@ -17,12 +17,15 @@ import pytest
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
+from flowrec.store.session_file import WriterOptions
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
+from flowrec.store.writer import SessionWriter
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
@@ -334,7 +337,8 @@ def test_a_place_that_may_not_be_written_is_told_before_anything_runs():
 FULL = """
 import resource, sys, time
 from flowrec.errors import SessionError
-from flowrec.store import SessionWriter, WriterOptions
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.05))

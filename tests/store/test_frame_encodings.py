@@ -23,10 +23,13 @@ from flowrec.config import Recording, load_config
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
 from flowrec.session_writer import frames_of
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, codec, encoding_for, recover
-from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.image_codec import decode_image, row_differences
+from flowrec.store import codec
+from flowrec.store.frame_encodings import ENCODINGS, decode_image, encoding_for, row_differences
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from flowrec.store.schema import foxglove_schema
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(30, shape=(47, 63)))

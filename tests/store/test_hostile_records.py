@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.errors import SessionError
-from flowrec.store import SessionReader, recover
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from tests.store.drafts import (
     CHANNEL,
     CHUNK_INDEX,

@@ -16,11 +16,14 @@ from flowrec.commands.replay import Change
 from flowrec.declarations import Role
 from flowrec.errors import SessionError
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
+from flowrec.store.session_file import WriterOptions
 from flowrec.store.split import PartFile
+from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import is_growing
 from flowrec.topics import TOPICS
 from tests.store.made_up import HEADER, ticks_of

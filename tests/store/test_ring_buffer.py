@@ -14,9 +14,12 @@ from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
-from flowrec.store import SessionReader, SessionWriter, Snapshot, WriterOptions, recover
 from flowrec.store.mcap_writer import McapWriter
-from flowrec.store.paths import snapshot_path
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.run_files import snapshot_path
+from flowrec.store.session_file import Snapshot, WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.units import NS_PER_S
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 from tests.store.test_damage import names_in
@@ -192,7 +195,8 @@ def test_a_place_that_may_not_be_written_or_is_taken_is_told_before_the_run(tmp_
 
 KILLED = """
 import sys, time
-from flowrec.store import SessionWriter, WriterOptions, Snapshot
+from flowrec.store.session_file import Snapshot, WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.test_ring_buffer import HEADER, with_events
 writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.1, files=Snapshot(2.0, 8.0)))
 for number, tick in enumerate(with_events((200, ("mark", "")))):

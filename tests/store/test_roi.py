@@ -12,9 +12,12 @@ from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config
 from flowrec.errors import UsageError
-from flowrec.store import Region, SessionReader, SessionWriter, WriterOptions, nonzero_window, recover
 from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.roi import WindowSelector
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.roi import Region, WindowSelector, nonzero_window
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.conftest import SMALL
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 

@@ -20,15 +20,18 @@ from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import OperatorEvent, Tick
-from flowrec.store import SessionReader, SessionWriter, Snapshot, Split, WriterOptions, recover
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
-from flowrec.store.paths import part_path, run_files
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.run_files import part_path, run_files
 from flowrec.store.scan import scan
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.split import Parts
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
+from flowrec.store.writer import SessionWriter
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
@@ -219,7 +222,8 @@ def test_a_disk_that_fails_in_a_part_leaves_the_ones_before_it_whole(tmp_path, m
 
 KILLED = """
 import sys, time
-from flowrec.store import SessionWriter, WriterOptions, Split
+from flowrec.store.session_file import Split, WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, ticks_of
 writer = SessionWriter(sys.argv[1], HEADER, WriterOptions(flush_s=0.05, files=Split(seconds=0.1)))
 for number, tick in enumerate(ticks_of(10_000, shape=(64, 64))):

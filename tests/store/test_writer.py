@@ -20,8 +20,10 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Tick
-from flowrec.store import SessionReader, SessionWriter, WriterOptions
+from flowrec.store.reader import SessionReader
 from flowrec.store.schema import foxglove_schema
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
 TICKS = list(ticks_of(150))

@@ -20,7 +20,9 @@ from flowrec.cli import main
 from flowrec.commands.record import record
 from flowrec.config import load_config
 from flowrec.errors import FlowrecError, SessionError
-from flowrec.store import SessionReader, SessionWriter, WriterOptions
+from flowrec.store.reader import SessionReader
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import is_growing, open_new, remove_idle
 from tests.conftest import SMALL
 from tests.store.made_up import HEADER, ticks_of

@@ -1,8 +1,9 @@
-"""A run in parts is read as if it had never been split; each part is a session of its own."""
+"""Names of the files of a run. A run in parts is read as if it had never been split; each part is readable alone."""
 
 import json
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -22,9 +23,12 @@ from flowrec.messages import Tick
 from flowrec.resolve import resolve
 from flowrec.session import Session, session_sha256
 from flowrec.session_writer import session_header
-from flowrec.store import SessionReader, SessionWriter, WriterOptions, recover_run
-from flowrec.store.paths import part_path, partial_path
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover_run
+from flowrec.store.run_files import part_path, partial_path, parts, run_files, run_path, snapshot_path
+from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import Part
+from flowrec.store.writer import SessionWriter
 from flowrec.topics import BY_FIELD
 from tests.store.made_up import ticks_of
 
@@ -297,3 +301,20 @@ def test_recover_and_export_answer_in_json(run, rrd_only_begun):
     done = CliRunner().invoke(app, ["recover", str(run), "--json"], catch_exceptions=False)
     (told,) = json.loads(done.stdout)
     assert told["path"].endswith("x.part004.mcap") and told["ticks"] == 20 and done.exit_code == 0
+
+
+@pytest.mark.parametrize("make", [lambda p: p, lambda p: part_path(p, 7), lambda p: snapshot_path(p, 1234)])
+def test_the_run_of_a_file_is_known_from_its_name(make):
+    run = Path("somewhere/a.part.of.it.mcap")
+    assert run_path(make(run)) == run
+    assert run_path(partial_path(make(run))) == run
+
+
+def test_parts_are_in_order_of_their_number_and_nothing_else_is_among_them(tmp_path):
+    run = tmp_path / "x.mcap"
+    numbers = (2, 999, 1000, 1)
+    others = (snapshot_path(run, 1), partial_path(part_path(run, 3)), part_path(tmp_path / "xy.mcap", 1))
+    for path in (*(part_path(run, number) for number in numbers), *others):
+        path.touch()
+    assert parts(run) == [part_path(run, number) for number in sorted(numbers)]
+    assert set(run_files(run)) == {part_path(run, number) for number in numbers} | set(others[:2])
