@@ -9,8 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 RECIPES = dict(re.findall(r"^### (Add .+?)\n(.*?)(?=^##)", GUIDE, re.M | re.S))
@@ -21,34 +19,25 @@ def blocks(text: str, kind: str) -> list[str]:
     return re.findall(rf"^```{kind}\n(.*?)^```", text, re.M | re.S)
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_a_recipe_applies_to_a_copy_of_flowrec_and_its_command_works(name: str, tmp_path: Path) -> None:
+def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     for folder in ("flowrec", "sessions"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (change,), (commands,) = blocks(RECIPES[name], "diff"), blocks(RECIPES[name], "sh")
-    applied = subprocess.run(
-        ["git", "apply", "--recount", "--verbose", "-"],
-        input=change,
-        cwd=copy,
-        env=os.environ | {"GIT_CEILING_DIRECTORIES": str(tmp_path)},  # the copy is no repository, nor in one
-        capture_output=True,
-        text=True,
-        check=False,
+    outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(tmp_path), "PYTHONPATH": str(copy)}
+    for name, text in RECIPES.items():
+        (change,), (commands,) = blocks(text, "diff"), blocks(text, "sh")
+        run(["git", "apply", "--recount", "-"], f"{name}: the change does not apply", copy, outside, change)
+        for command in commands.splitlines():
+            program, *arguments = command.split()
+            assert program == "flowrec"
+            run([sys.executable, "-m", "flowrec", *arguments], f"{name}: {command}", copy, outside)
+
+
+def run(command: list[str], what: str, folder: Path, environment: dict[str, str], given: str = "") -> None:
+    done = subprocess.run(
+        command, input=given, cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
-    assert applied.returncode == 0, applied.stderr
-    for command in commands.splitlines():
-        program, *arguments = command.split()
-        assert program == "flowrec"
-        done = subprocess.run(
-            [sys.executable, "-m", "flowrec", *arguments],
-            cwd=copy,
-            env=os.environ | {"PYTHONPATH": str(copy)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    assert done.returncode == 0, f"{what}\n{done.stdout}\n{done.stderr}"
 
 
 def test_there_are_recipes_for_a_message_a_planner_and_a_setting() -> None:
