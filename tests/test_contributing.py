@@ -1,4 +1,4 @@
-"""CONTRIBUTING and README state facts about the code; here they are compared with it, and the recipes are carried out."""
+"""What CONTRIBUTING states is compared with the code, and its recipes are carried out on a copy."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+
+from flowrec.control.controller import CONTROLLERS
+from flowrec.estimation.observer import OBSERVERS
+from flowrec.planning.planner import PLANNERS
+from flowrec.refine.refiner import REFINERS
 
 ROOT = Path(__file__).parents[1]
 GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -61,3 +66,14 @@ def test_the_map_names_every_file_and_nothing_else() -> None:
         named |= {f"{room}{name}.py" for name in re.findall(r"[a-z_0-9/]+", re.sub(r"\(.*?\)", "", rest))}
     files = {path.relative_to(ROOT / "flowrec").as_posix() for path in (ROOT / "flowrec").rglob("*.py")}
     assert named == {name for name in files if not name.endswith("__init__.py")}
+
+
+def test_readme_lists_the_methods_of_every_stage_as_the_tables_do() -> None:
+    rows = [
+        f"| `{row.name}` | {row.summary}" + (f" (`pip install '.[{row.extra}]'`) |" if row.extra else " |")
+        for table in (REFINERS, PLANNERS, OBSERVERS, CONTROLLERS)
+        for row in table.values()
+    ]
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert [row for row in rows if row not in readme] == []
+    assert len(re.findall(r"^\| `[a-z_]+` \|", readme, re.M)) == len(rows)
