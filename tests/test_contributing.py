@@ -21,7 +21,7 @@ RECIPES = dict(re.findall(r"^### (Add .+?)\n(.*?)(?=^##)", GUIDE, re.M | re.S))
 
 def blocks(text: str, kind: str) -> list[str]:
     """The contents of the fenced blocks of one kind."""
-    return re.findall(rf"^```{kind}\n(.*?)^```", text, re.M | re.S)
+    return [content for label, content in re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S) if label == kind]
 
 
 def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path: Path) -> None:
