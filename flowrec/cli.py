@@ -169,9 +169,6 @@ def replay(
 ) -> None:
     """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
     from flowrec.commands.interactive import AtTerminal
-    from flowrec.commands.replay_report import Outputs, refinement_remarks, replay_and_report
-    from flowrec.summary import comparison_for_people
-    from flowrec.terminal import say, table
 
     change = flowrec.Change(refine, plan, observer, controller, tuple(sets or ()))
     if verify:
@@ -184,6 +181,10 @@ def replay(
             for line in done.lines():
                 typer.echo(printable(line))
         raise typer.Exit(0 if done.same else 3)
+    from flowrec.commands.replay_report import Outputs, refinement_remarks, replay_and_report
+    from flowrec.summary import comparison_for_people
+    from flowrec.terminal import say, table
+
     outputs = Outputs.of(session, out, overwrite, refly=refly, rrd=view == "rrd")
     done, rows = replay_and_report(session, change, outputs, from_s, frames, AtTerminal())
     report, remarks = done.report, refinement_remarks(done)

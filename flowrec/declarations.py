@@ -7,6 +7,7 @@ file and the table of topics (topics.py) are derived from them.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -121,6 +122,13 @@ def array_fields(message_type: type) -> tuple[tuple[str, np.dtype[Any]], ...]:
     return found
 
 
+@functools.cache
+def array_shapes(message_type: type) -> tuple[tuple[str, tuple[int | str, ...]], ...]:
+    """Name and lengths of each array field of a message type whose declaration gives a shape, in order."""
+    declared = [each for each in message_fields(message_type) if each.dtype is not None]
+    return tuple((each.name, each.shape.lengths) for each in declared if each.shape is not None)
+
+
 def defaulted_fields(message_type: type) -> frozenset[str]:
     """Names of the fields with a default. A file made before such a field existed does not have it.
 
@@ -167,11 +175,10 @@ def shape_error(message: Message) -> str:
     The wire keeps any shape, so a damaged or forged file is stopped here before anybody computes with it.
     """
     lengths: dict[str, int] = {}
-    for each in message_fields(type(message)):
-        array = getattr(message, each.name)
-        if each.dtype is None or each.shape is None or array is None:
+    for name, wanted in array_shapes(type(message)):
+        array = getattr(message, name)
+        if array is None or array.shape == wanted:
             continue
-        wanted = each.shape.lengths
         fits = array.ndim == len(wanted)
         for found, length in zip(array.shape, wanted, strict=False):
             if isinstance(length, int):
@@ -179,7 +186,7 @@ def shape_error(message: Message) -> str:
             else:
                 fits = fits and lengths.setdefault(length, found) == found and (found > 0 or length in _MAY_BE_EMPTY)
         if not fits:
-            return f"{each.name} has the shape {array.shape} where ({', '.join(map(str, wanted))}) belongs"
+            return f"{name} has the shape {array.shape} where ({', '.join(map(str, wanted))}) belongs"
     return ""
 
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.ndimage import label
+import scipy  # its ndimage loads at first use, not at start-up
 
 from flowrec.chip import check_point, median_width_um
 from flowrec.chip.chip import Chip
@@ -152,7 +152,7 @@ def _point(chip: Chip, place: Place, what: str, robot: Robot) -> Point:
 
 def _refuse_apart(chip: Chip, mission: PlacedMission) -> None:
     """Start and goal must lie in one connected channel."""
-    channels, count = label(chip.mask)
+    channels, count = scipy.ndimage.label(chip.mask)
     rows, columns = chip.mask.shape
     ends = []
     for x, y in (mission.start, mission.goal):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import binary_dilation
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.openings import border, named_opening
@@ -57,7 +57,7 @@ def opening_point_um(chip: Chip, name: str, depth_um: float) -> tuple[float, flo
     border(side, opening.side)[opening.first : opening.last + 1] = True
     front = reached = side & chip.mask
     for _ in range(max(1, round(depth_um / chip.um_per_px))):
-        grown = binary_dilation(reached) & chip.mask
+        grown = scipy.ndimage.binary_dilation(reached) & chip.mask
         if not (grown & ~reached).any():
             break
         front, reached = grown & ~reached, grown

@@ -32,8 +32,8 @@ from typing import Any, cast, get_args
 
 import cv2
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.ndimage import label
 
 from flowrec.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls
 from flowrec.chip.openings import (
@@ -159,7 +159,7 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
 
 def without_pockets(chip: Chip) -> Chip:
     """The chip with all fluid filled that no opening reaches through the sides of pixels; its mask is read-only."""
-    labels, _ = label(chip.mask)
+    labels, _ = scipy.ndimage.label(chip.mask)
     mask = np.isin(labels, [border(labels, opening.side)[opening.first] for opening in chip.openings])
     mask.flags.writeable = False
     return replace(chip, mask=mask)

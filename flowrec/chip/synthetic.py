@@ -13,8 +13,8 @@ import itertools
 import math
 
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -199,9 +199,9 @@ def _as_drawn(mask: NDArray[np.bool_], loops: int, fourth_side: str) -> bool:
     """Whether the mask has one piece, the openings and the islands that were drawn: no channels have merged."""
     if [opening.side for opening in find_openings(mask)] != ["left", "right", "right", fourth_side]:
         return False
-    _, pieces = label(mask)
+    _, pieces = scipy.ndimage.label(mask)
     # Fluid connects through sides, so solid does through corners. Islands are what solid does not reach the border.
-    solid, _ = label(~mask, np.ones((3, 3)))
+    solid, _ = scipy.ndimage.label(~mask, np.ones((3, 3)))
     edge = np.concatenate((solid[0], solid[-1], solid[:, 0], solid[:, -1]))
     islands = np.setdiff1d(np.unique(solid[~mask]), edge)
     sizes = np.bincount(solid.ravel())[islands]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, label
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.openings import distance_um
@@ -101,7 +101,7 @@ def narrowest(space: FreeSpace, start_um: Points, goal_um: Points) -> str:
 
 def _connected(allowed: Mask, a: int, b: int) -> bool:
     """Whether two pixels (flat indices) are connected by allowed pixels, corners included."""
-    parts = label(allowed, _EIGHT)[0].ravel()
+    parts = scipy.ndimage.label(allowed, _EIGHT)[0].ravel()
     return bool(parts[a] == parts[b] != 0)
 
 
@@ -126,11 +126,11 @@ def _bottleneck(clearance: Raster, a: int, b: int) -> float:
 
 def _bottleneck_pixel(clearance: Raster, widest: float, a: int, b: int) -> tuple[int, int]:
     """(column, row) of the pixel of just the bottleneck's clearance that lies most nearly between the two sides."""
-    parts = label(clearance > widest, _EIGHT)[0]
+    parts = scipy.ndimage.label(clearance > widest, _EIGHT)[0]
     apart = np.zeros(clearance.shape)
     for node in (a, b):
         part = parts.ravel()[node]
         side = parts == part if part else np.arange(parts.size).reshape(parts.shape) == node
-        apart += distance_transform_edt(~side)
+        apart += scipy.ndimage.distance_transform_edt(~side)
     row, column = divmod(int(np.argmin(np.where(clearance == widest, apart, np.inf))), clearance.shape[1])
     return column, row

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.openings import distance_px
@@ -134,4 +134,4 @@ def _most_work(work: NDArray[np.float64], allowed: NDArray[np.bool_]) -> int:
 
 def _central(clearance: Raster) -> Mask:
     """(h, w) pixels near the middle of a channel: within two pixels none has more than one pixel more clearance."""
-    return np.asarray(clearance >= maximum_filter(clearance, 5) - 1.0)
+    return np.asarray(clearance >= scipy.ndimage.maximum_filter(clearance, 5) - 1.0)

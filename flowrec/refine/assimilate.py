@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-from scipy.ndimage import binary_dilation, binary_erosion
+import scipy  # its ndimage loads at first use, not at start-up
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.openings import border, run_around
@@ -242,8 +242,12 @@ def mask_variants(chip: Chip) -> Iterator[tuple[str, Chip]]:
     mask = chip.mask
     edge = np.pad(mask, 1, mode="edge")
     variants = (
-        ("its channels are drawn a pixel too wide on each side", binary_erosion(mask, border_value=1), (0, 0)),
-        ("its channels are drawn a pixel too narrow on each side", binary_dilation(mask), (0, 0)),
+        (
+            "its channels are drawn a pixel too wide on each side",
+            scipy.ndimage.binary_erosion(mask, border_value=1),
+            (0, 0),
+        ),
+        ("its channels are drawn a pixel too narrow on each side", scipy.ndimage.binary_dilation(mask), (0, 0)),
         ("it lies a pixel too far left", edge[1:-1, :-2], (1, 0)),
         ("it lies a pixel too far right", edge[1:-1, 2:], (-1, 0)),
         ("it lies a pixel too high", edge[:-2, 1:-1], (0, 1)),

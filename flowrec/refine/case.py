@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import border
@@ -105,8 +105,8 @@ class Case:
         inside = np.zeros(shape, bool)
         inside[1:-1, 1:-1] = True
         # The border of the image is not a wall, so openings keep their freedom.
-        walled = chip.mask & binary_dilation(~chip.mask, CROSS)
-        walled &= binary_dilation(chip.mask & ~walled, np.ones((3, 3), bool))
+        walled = chip.mask & scipy.ndimage.binary_dilation(~chip.mask, CROSS)
+        walled &= scipy.ndimage.binary_dilation(chip.mask & ~walled, np.ones((3, 3), bool))
         inflow, number = np.zeros(shape), np.zeros(shape, np.intp)
         for index, opening in enumerate(chip.openings):
             along = slice(opening.first, opening.last + 1)

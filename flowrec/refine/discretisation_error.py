@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
@@ -78,6 +78,6 @@ def local_rms(mask: NDArray[np.bool_], velocity: Floats) -> Floats:
     Beside a wall the flow is slow, but the error of the grid there is proportional to the speed in the channel.
     """
     square = fluid_image(mask, (velocity**2).sum(axis=1))
-    fluid = uniform_filter(mask.astype(np.float64), 5, mode="nearest")
-    mean = uniform_filter(square, 5, mode="nearest") / np.maximum(fluid, 0.04)
+    fluid = scipy.ndimage.uniform_filter(mask.astype(np.float64), 5, mode="nearest")
+    mean = scipy.ndimage.uniform_filter(square, 5, mode="nearest") / np.maximum(fluid, 0.04)
     return np.asarray(np.sqrt(np.maximum(mean, 0.0)[mask]))

@@ -187,7 +187,7 @@ def _with_events(arrived: Inputs, worker: Worker, control: RunControl, last: Tic
     event = control.next_event(arrived.stamp_ns, held) if live else None
     if event is not None:
         new["operator"] = event
-    return replace(arrived, **new)
+    return replace(arrived, **new) if new else arrived
 
 
 def _end(report: RunReport, sinks: Sequence[Sink], control: RunControl, watchdog: Watchdog, *, live: bool) -> None:

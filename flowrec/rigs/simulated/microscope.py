@@ -12,8 +12,8 @@ import math
 
 import cv2
 import numpy as np
+import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from flowrec.chip.clearance import clearance_um
 from flowrec.chip.registration import Calibration
@@ -209,7 +209,7 @@ def _outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     sigma, pad = 1.0, 8
     padded = np.pad(mask, pad, mode="edge").astype(np.float64)
     share = cv2.GaussianBlur(padded, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)[pad:-pad, pad:-pad]
-    near = sigma * ndtri(np.clip(share, 1e-6, 1.0 - 1e-6))
+    near = sigma * scipy.special.ndtri(np.clip(share, 1e-6, 1.0 - 1e-6))
     far = clearance_um(mask, 1.0)
     weight = np.clip(np.abs(far) - 2.0, 0.0, 1.0)
     return np.asarray((1.0 - weight) * near + weight * far, np.float32)
