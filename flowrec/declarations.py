@@ -175,7 +175,8 @@ def shape_error(message: Message) -> str:
     The wire keeps any shape, so a damaged or forged file is stopped here before anybody computes with it.
     """
     lengths: dict[str, int] = {}
-    for name, wanted in array_shapes(type(message)):
+    kind: type = type(message)
+    for name, wanted in array_shapes(kind):
         array = getattr(message, name)
         if array is None or array.shape == wanted:
             continue
