@@ -23,6 +23,7 @@ from flowrec.declarations import Role, Source
 from flowrec.enums import Action
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
+from flowrec.interpolation import nearest_pixel
 from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEvent, Route, Tick, Track, Truth
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
@@ -106,9 +107,8 @@ def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
     """Distance from a point (2,) to the nearest wall, at the nearest pixel; 0 if the point is not finite."""
     if not np.isfinite(point_um).all():
         return 0.0
-    height, width = p.clearance_um.shape
-    column, row = (round(value) for value in (point_um / p.chip.um_per_px).tolist())
-    return float(p.clearance_um[min(max(row, 0), height - 1), min(max(column, 0), width - 1)])
+    x, y = (point_um / p.chip.um_per_px).tolist()
+    return float(p.clearance_um[nearest_pixel(x, y, p.clearance_um.shape)])
 
 
 def _strength(coils: Coils, last: Tick) -> float:

@@ -18,6 +18,7 @@ from flowrec.control import Coils
 from flowrec.control.mission import Place, PlacedMission, Point
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.flow import FlowSolver
+from flowrec.interpolation import nearest_pixel
 from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
 from flowrec.rig_settings import SIMULATED, Camera
@@ -153,12 +154,11 @@ def _point(chip: Chip, place: Place, what: str, robot: Robot) -> Point:
 def _refuse_apart(chip: Chip, mission: PlacedMission) -> None:
     """Start and goal must lie in one connected channel."""
     channels, count = scipy.ndimage.label(chip.mask)
-    rows, columns = chip.mask.shape
-    ends = []
-    for x, y in (mission.start, mission.goal):
-        row, column = round(y / chip.um_per_px), round(x / chip.um_per_px)
-        ends.append(channels[min(max(row, 0), rows - 1), min(max(column, 0), columns - 1)])
-    if ends[0] != ends[1]:
+    start, goal = (
+        channels[nearest_pixel(x / chip.um_per_px, y / chip.um_per_px, chip.mask.shape)]
+        for x, y in (mission.start, mission.goal)
+    )
+    if start != goal:
         raise UnreachableError(
             f"unreachable: mission.goal = {mission.goal} lies in another channel than the start {mission.start}; the "
             f"mask of {chip.name} has {count} channels that do not meet; choose a goal in the same one"

@@ -79,7 +79,7 @@ class Change:
         changed = with_sets(config, [*sets, *self.sets], flags)
         mission = replace(changed.mission, replan_error_um=math.inf)
         if self.refine is not None and Phase.REFINE not in mission.phases:
-            phases = tuple(dict.fromkeys((*mission.phases, Phase.REFINE.value, Phase.PLAN.value)))
+            phases = tuple(dict.fromkeys((*mission.phases, Phase.REFINE, Phase.PLAN)))
             mission = replace(mission, phases=phases)
         return replace(changed, mission=mission)
 

@@ -14,6 +14,7 @@ import numpy as np
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay import Change, Replayed, planned_from, replay
 from flowrec.commands.run_summary import length_um
+from flowrec.enums import Phase
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
 from flowrec.flow.sampling import relative_rmse
@@ -173,7 +174,7 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[Row
         ("recorded", session.config, done.recorded, None),
         ("replayed", done.config, done.replayed, out),
     ):
-        mission = replace(config.mission, phases=("plan", "navigate"), start=(x_um, y_um), replan_error_um=None)
+        mission = replace(config.mission, phases=(Phase.PLAN, Phase.NAVIGATE), start=(x_um, y_um), replan_error_um=None)
         flown = replace(config, mission=mission)
         pipeline = assemble(flown, session.chip)
         rig = SimulatedRig.of(pipeline, flown, true_field=flow)

@@ -17,7 +17,7 @@ from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
-PhaseName = Literal["survey", "refine", "plan", "navigate"]
+PhaseName = Literal[Phase.SURVEY, Phase.REFINE, Phase.PLAN, Phase.NAVIGATE]
 PHASES: tuple[PhaseName, ...] = get_args(PhaseName)
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Point = tuple[Coordinate, Coordinate]
@@ -264,7 +264,7 @@ class MissionStateMachine:
     def _next_phase(self, done: Phase, previous: Mission, now: _Frame, note: str = "") -> Mission:
         """Enter the first selected phase after `done`, or end the run."""
         selected: set[str] = {*self.phases, Phase.PLAN} if Phase.NAVIGATE in self.phases else set(self.phases)
-        name = next((name for name in PHASES[PHASES.index(done.value) + 1 :] if name in selected), None)
+        name = next((name for name in PHASES[PHASES.index(done) + 1 :] if name in selected), None)
         if name is None:
             return _finish(previous, now, Outcome(f"{done} complete"), note)
         phase, orders = Phase(name), {"refine": WorkOrder.REFINE, "plan": WorkOrder.ROUTE}

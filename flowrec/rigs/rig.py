@@ -1,12 +1,23 @@
-"""What the loop needs of a rig. The table of rigs is in rig_settings.py, because the configuration names one."""
+"""The interface of a rig, and the checks of every frame that a camera delivers, before any stage sees it.
+
+The table of rigs is in rig_settings.py, because the configuration names one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Protocol, Self
 
-from flowrec.messages import Currents
+import numpy as np
+
+from flowrec.errors import RigError
+from flowrec.messages import Currents, Frame
 from flowrec.pipeline import Inputs
+from flowrec.units import seconds
+
+_ROW_STEP = 16  # a camera's noise changes some pixel of these rows in every image
+_REJECTED_LIMIT = 50  # frames in a row, then the robot is out of control
 
 
 class Rig(Protocol):
@@ -34,3 +45,61 @@ class Rig(Protocol):
         ------
         RigError : the hardware has refused; it is called again.
         """
+
+
+def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callable[[], None]) -> Iterator[Inputs]:
+    """Inputs whose stamps increase; `rejected` is called for every other one.
+
+    The turns of a rejected frame are added to those of the next one, so that no rotation of the field is lost.
+
+    Raises
+    ------
+    RigError : so many frames in a row are rejected that nobody controls the robot any more.
+    """
+    lost: list[Inputs] = []
+    for arrived in inputs:
+        if arrived.stamp_ns > after_ns:
+            turns = sum((one.applied.turns for one in lost), arrived.applied.turns)
+            yield replace(arrived, applied=replace(arrived.applied, turns=turns)) if lost else arrived
+            after_ns = arrived.stamp_ns
+            lost.clear()
+            continue
+        lost.append(arrived)
+        rejected()
+        if len(lost) == _REJECTED_LIMIT:
+            raise RigError(
+                f"the rig's frames have gone back in time by {seconds(after_ns - arrived.stamp_ns):.3f} s, {len(lost)}"
+                " in a row; see to the camera's clock, then record again"
+            )
+
+
+def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int]) -> Iterator[Inputs]:
+    """The inputs with `applied.image_since_ns` filled in; images must be (height, width) pixels of `image_shape`.
+
+    Raises
+    ------
+    RigError : an image has another size.
+    """
+    last: Frame | None = None
+    since_ns = 0
+    for arrived in inputs:
+        frame = arrived.frame
+        if frame is None:
+            yield arrived
+            continue
+        if frame.image.shape != image_shape:
+            height, width = frame.image.shape
+            raise RigError(
+                f"frame {frame.index}: an image of {width} x {height} pixels, where camera.width_px x camera.height_px "
+                f"= {image_shape[1]} x {image_shape[0]} is expected; set them, or the camera's region of interest"
+            )
+        if last is None or not _same(last, frame):
+            since_ns = arrived.stamp_ns
+        last = frame
+        yield replace(arrived, applied=replace(arrived.applied, image_since_ns=since_ns))
+
+
+def _same(one: Frame, other: Frame) -> bool:
+    """Whether two images are equal. A few rows are compared first, so that a new image costs microseconds."""
+    a, b = one.image, other.image
+    return np.array_equal(a[::_ROW_STEP], b[::_ROW_STEP]) and np.array_equal(a, b)

@@ -14,8 +14,7 @@ from flowrec.clocks import ClockMonitor
 from flowrec.enums import Action, Outcome
 from flowrec.messages import OperatorEvent, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step, with_inputs
-from flowrec.rigs.frame_checks import checked_images, increasing_stamps
-from flowrec.rigs.rig import Rig
+from flowrec.rigs.rig import Rig, checked_images, increasing_stamps
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.workers import Results, Worker

@@ -17,7 +17,7 @@ from flowrec.config import load_config
 from flowrec.errors import RigError
 from flowrec.messages import Applied, Currents, Event, Frame
 from flowrec.pipeline import Inputs
-from flowrec.rigs.frame_checks import checked_images
+from flowrec.rigs.rig import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.store.reader import SessionReader
 from tests.conftest import SMALL

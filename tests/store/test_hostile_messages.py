@@ -19,7 +19,7 @@ from flowrec.commands.export import export
 from flowrec.config import config_from_toml
 from flowrec.declarations import Message, invalid_numbers, message_fields, shape_error
 from flowrec.errors import SessionError, UsageError, printable
-from flowrec.messages import Estimate, Frame
+from flowrec.messages import Estimate, FlowField, Frame, Tick
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
@@ -47,7 +47,7 @@ from tests.store.hostile import (
     with_message,
     with_piece,
 )
-from tests.store.made_up import encode
+from tests.store.made_up import HEADER, encode
 
 NAMES = ["../../x", "/etc/flowrec", "C:\\x", "weights/../../../x", "a\0b", "\x1b[2J"]
 
@@ -213,3 +213,25 @@ def test_a_text_that_would_become_gigabytes_of_tables_is_not_parsed(tmp_path, to
     (tmp_path / "a.toml").write_text(toml)
     done = CliRunner().invoke(app, ["record", "--dry-run", str(tmp_path / "a.toml")])
     assert isinstance(done.exception, UsageError) and said in str(done.exception)
+
+
+def test_a_state_of_more_than_176_mb_is_refused_whichever_way_it_is_read(tmp_path):
+    # Three flow fields of 66 MB: each fits into a chunk, and all of them are known at the last tick.
+    shape = (1800, 1850)
+    velocity, pressure = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32)
+    velocity[::32] = np.random.default_rng(0).normal(size=velocity[::32].shape)  # or it compresses too well
+    path = tmp_path / "large.mcap"
+    with SessionWriter(path, HEADER, WriterOptions(leave_out=("/view/*",), block=True)) as writer:
+        tick = Tick()
+        for number, field in enumerate(("assumed", "refined", "true_field")):
+            stamp_ns = 10**9 + number * PERIOD_NS
+            flow = FlowField(stamp_ns, 1, "fvm", 2.0, velocity, pressure, velocity, np.zeros(1), 1.0, 998.0, "")
+            tick = replace(tick, stamp_ns=stamp_ns, **{field: flow})
+            writer.write(tick)
+    with SessionReader(path) as reader:
+        assert next(reader.ticks()).assumed is not None
+        with pytest.raises(SessionError, match=r"takes 199\d{6} bytes, more than 184549376"):
+            for _tick in reader.ticks():
+                pass
+        with pytest.raises(SessionError, match=r"takes 199\d{6} bytes, more than 184549376"):
+            reader.tick_before(reader.last_ns)
