@@ -172,7 +172,7 @@ class Message:
 def shape_error(message: Message) -> str:
     """Which array of a message has another shape than its declaration; '' if none has.
 
-    The wire keeps any shape, so a damaged or forged file is stopped here before anybody computes with it.
+    The wire keeps any shape, so a damaged or forged file is refused here, before its arrays are used.
     """
     lengths: dict[str, int] = {}
     kind: type = type(message)

@@ -136,7 +136,7 @@ def _no_lap(_stage: str) -> None:
 
 
 def with_inputs(last: Tick, inputs: Inputs) -> Tick:
-    """The tick after `last` before any stage has run: what was known, and what came in."""
+    """The tick after `last` before any stage has run: the state of `last` with the new inputs."""
     new = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
     return replace(last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, **new)
 

@@ -1,4 +1,4 @@
-"""Resolve the settings of a run on its chip: fill in what was left open, turn named places into points."""
+"""Resolve the settings of a run on its chip: choose the settings that are None, turn named places into points."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _Section = TypeVar("_Section")
 
 
 def resolve(config: Config, chip: Chip) -> ResolvedConfig:
-    """Choose what was left open so that it fits the chip, place the camera, and turn named places into points.
+    """Choose the settings that are None to fit the chip, place the camera, and turn named places into points.
 
     A robot that is not described fits the chip: radius 50 um, or a fifth of the median channel width if that is
     narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; a delay of 40 ms,
@@ -62,7 +62,7 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
 
 
 def derived(asked: Config, resolved: ResolvedConfig) -> dict[str, float]:
-    """The numbers that nobody gave or that were changed while a configuration was resolved, by key."""
+    """The numbers that resolving a configuration has filled in or changed, by key."""
     was, now = _flat(asdict(asked), ""), _flat(asdict(resolved), "")
     return {key: value for key, value in now.items() if isinstance(value, (int, float)) and value != was[key]}
 
@@ -91,7 +91,7 @@ def _refuse_unmeasured(config: Config) -> None:
 
 
 def _fitted(config: Config, chip: Chip) -> tuple[Robot, Camera]:
-    """The robot and the camera with what was left open chosen to fit the chip."""
+    """The robot and the camera, with the settings that are None chosen to fit the chip."""
     asked, camera, coils = config.robot, config.camera, config.coils
     channel_um = median_width_um(chip)
     width_um, height_um = chip.size_um

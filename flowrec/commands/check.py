@@ -119,7 +119,7 @@ class _FileCheck:
                 verdict.bad("end", "it is being recorded just now; stop that run with Ctrl-C, then check again")
             else:
                 fault = found.why_not if found.why_not.startswith(("was ", "has ")) else f"is damaged: {found.why_not}"
-                verdict.bad("end", f"it {fault}; `flowrec recover {found.path}` saves what is whole")
+                verdict.bad("end", f"it {fault}; `flowrec recover {found.path}` recovers what is intact")
         elif not how:
             verdict.odd("end", "how the run ended was not recorded")
         elif how == Outcome.FAILED:
@@ -135,7 +135,7 @@ class _FileCheck:
         if found.lost:
             text = f"{found.lost} bytes are damaged, the first at {found.first_lost}"
             if found.finished:
-                verdict.bad("content", f"{text}; `flowrec recover {found.path}` saves what is whole")
+                verdict.bad("content", f"{text}; `flowrec recover {found.path}` recovers what is intact")
             else:
                 verdict.odd("content", text)
         for text in found.contradictions:

@@ -1,4 +1,4 @@
-"""The rig of a replay: the inputs of a session arrive again, no command is sent."""
+"""The rig of a replay: it returns the recorded inputs of a session and sends no command."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class RecordedRig:
         before = self._reader.tick_before(self._start_ns - 1) if self._start_ns is not None else Tick()
         for tick in self._reader.ticks(self._start_ns):
             if tick.applied is None or tick.applied is before.applied:
-                # Not a whole tick: the one a crash cut off, or messages of an operator alone, which the next one takes.
+                # An incomplete tick: the last one before a crash, or an operator event, which the next tick takes.
                 before = replace(before, frame=tick.frame)
                 continue
             self.recorded = tick

@@ -33,7 +33,7 @@ class Rig(Protocol):
     def __exit__(self, *error: object) -> None: ...
 
     def inputs(self) -> Iterator[Inputs]:
-        """What arrives, frame by frame."""
+        """The inputs of each frame."""
 
     def apply(self, currents: Currents) -> None:
         """Send a command to the coils."""
@@ -54,7 +54,7 @@ def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callabl
 
     Raises
     ------
-    RigError : so many frames in a row are rejected that nobody controls the robot any more.
+    RigError : 50 frames in a row are rejected: the robot is out of control.
     """
     lost: list[Inputs] = []
     for arrived in inputs:

@@ -40,7 +40,7 @@ class RunControl:
 
     Attributes
     ----------
-    reason : why the run must end; empty while it goes on.
+    reason : why the run must end; empty before.
     ticking : whether the loop has begun; before, nothing is driven, and the end need not wait for anything.
     interruptible : context for the loop: inside it an overdue shutdown raises `Interrupted`.
     """

@@ -85,8 +85,8 @@ def run(
     ----------
     start : the tick to resume from.
     queue_state : MB that wait for the disk, and the number of frames dropped.
-    live : False for a replay. It goes on when the mission is finished, takes no operator's events from `control`, and
-        does not check frames, because its inputs hold what was found.
+    live : False for a replay. It continues after the end of the mission, takes no operator's events from `control`, and
+        does not check frames, because the recorded inputs hold the results of those checks.
     clocks : records the clocks, and the frames whose stamp did not increase.
     watchdog : that of this rig; None: one without a timer.
 

@@ -12,7 +12,7 @@ coils' zero() or leaves a lock taken. The exception is SIGALRM: the thread sends
 | SIGTSTP (Ctrl-Z) | zero() at once; then the process stops, and ends the run after `fg` |
 
 This thread ends the process if a signal or the watchdog has ended the run and its loop is stuck for 5 s, or if the run
-was stopped at once and goes on 3 s later: the field off, the file closed if its thread answers, os._exit(1).
+was stopped at once and has not ended 3 s later: the field off, the file closed if its thread answers, os._exit(1).
 """
 
 from __future__ import annotations

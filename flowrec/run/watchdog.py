@@ -1,11 +1,11 @@
 """Watchdog of the control loop: a thread that switches the field off when no tick ends any more.
 
 The loop sends its commands through the watchdog. When no tick ends for a stated time while a field is on, or when
-anybody asks for it, the watchdog calls `rig.zero()` in its own thread and lets no field pass afterwards. It works while
-the main thread waits or computes in C, as long as that code releases the interpreter's lock: drivers called through
-ctypes.CDLL or cffi, NumPy, OpenCV and file access do. It can not work while C code keeps the lock (ctypes.PyDLL, an
-extension that does not release it), nor when the process is stopped or gone (SIGKILL, SIGSTOP, a crash of the
-interpreter): for these, hardware needs a watchdog in another process.
+another thread requests it, the watchdog calls `rig.zero()` in its own thread and lets no field pass afterwards. It
+works while the main thread waits or computes in C, as long as that code releases the interpreter's lock: drivers called
+through ctypes.CDLL or cffi, NumPy, OpenCV and file access do. It can not work while C code keeps the lock
+(ctypes.PyDLL, an extension that does not release it), nor when the process is stopped or gone (SIGKILL, SIGSTOP, a
+crash of the interpreter): for these, hardware needs a watchdog in another process.
 
 Only `field_off` and `wait_off` wait.
 """
@@ -166,7 +166,7 @@ class Watchdog:
 
     @property
     def failure(self) -> str:
-        """How zero() fails."""
+        """Error text: zero() has failed, how often, and how."""
         return f"zero() raised {self.failures} times: {self._error}" if self._error else "zero() does not return"
 
     # ---- the thread
@@ -186,7 +186,7 @@ class Watchdog:
             return max(left_s, 0.0)
         try:
             self._rig.zero()
-        except Exception as error:  # noqa: BLE001  whatever a driver raises, zero() is called again
+        except Exception as error:  # noqa: BLE001  zero() is called again after any error of a driver
             self.failures += 1
             self._error = error
             if self.failures == 1:

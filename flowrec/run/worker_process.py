@@ -142,7 +142,7 @@ class ProcessWorker:
                 self._results.put(pickle.load(pipe))  # noqa: S301 - from our own process
         except (OSError, EOFError, pickle.UnpicklingError):
             self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._cause()}); {self._log()}"))
-        except BaseException as error:  # noqa: BLE001  whatever it is, the mission must not wait for ever
+        except BaseException as error:  # noqa: BLE001  after any error the mission must not wait for ever
             self._results.put(
                 FlowrecError(f"{_NAME} gave an answer that can not be read ({_described(error)}); {self._log()}")
             )
@@ -188,7 +188,7 @@ def _answer(pipeline: Pipeline, order: Tick) -> bytes:
 
 
 def _serve(orders: BinaryIO, results: BinaryIO) -> None:
-    """Work until the parent is gone, however it went."""
+    """Work until the parent process has ended."""
     waiting: queue.SimpleQueue[Tick] = queue.SimpleQueue()
     pipeline: Pipeline = pickle.load(orders)  # noqa: S301 - from our own parent
     threading.Thread(target=_listen, args=(orders, waiting.put), daemon=True).start()
@@ -203,7 +203,7 @@ def _listen(orders: BinaryIO, put: Callable[[Any], None]) -> None:
         while True:
             put(pickle.load(orders))  # noqa: S301 - from our own parent
     except (OSError, EOFError):
-        os._exit(0)  # in the midst of its work, because nobody waits for the result any more
+        os._exit(0)  # also during an order, because no process reads the result any more
     except BaseException:  # noqa: BLE001  an order that can not be read
         traceback.print_exc()
         os._exit(1)

@@ -1,4 +1,4 @@
-"""Reads a file from its first byte to its last, whatever state it is in, and compares it with its own index."""
+"""Reads all records of a file, finished or damaged, and compares them with its index."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ See = Callable[[str, int, Message], None]  # field of Tick, time of the tick in 
 
 @dataclass(slots=True)
 class Audit:
-    """What was found; texts are without advice.
+    """The result of an audit; its texts contain no advice.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Audit:
     finished : it has a summary, so that other verbs open it.
     why_not : else, what is wrong with its end.
     flowrec_version : of the program that wrote it.
-    header : configuration, chip and origin; None where they are not whole, see `header_fault`.
+    header : configuration, chip and origin; None where they are incomplete, see `header_fault`.
     outcome : how the run ended; may be empty.
     counts : messages read, by field of Tick.
     first_ns, last_ns : times of the first and the last message of a known topic; both 0 without any.
@@ -45,8 +45,8 @@ class Audit:
     first_lost : offset of the first of them.
     backwards : by field, how often the time of a tick was before that of the message before.
     stamps_backwards : the same of the stamps in the messages.
-    undecodable : by field, messages that make no sense; `first_undecodable` says why.
-    region : which window of most images was recorded (roi.py); None: they are whole.
+    undecodable : by field, messages that can not be decoded; `first_undecodable` says why.
+    region : which window of most images was recorded (roi.py); None: the images are not cut.
     edits : what differs from the digest that was recorded; None where there is no digest, or no end.
     missing : by field, messages that are missing between others, by their sequence numbers; not of images.
     """
@@ -194,7 +194,7 @@ class _Reading:
 
 
 def _contents_without_index(path: Path) -> SessionContents:
-    """What a file says about itself, found by reading it."""
+    """The contents of a file whose index is missing or damaged, by a scan."""
     source = McapReader(path)
     try:
         found = scan(source)

@@ -1,4 +1,4 @@
-"""Readers of bytes: where the bytes of a session come from. mcap_reader.py asks one of them for size and ranges.
+"""Sources of the bytes of a session. mcap_reader.py reads byte ranges from one of them.
 
 Another kind (an URL, an archive) is one class and one row of BYTE_SOURCES.
 """
@@ -37,7 +37,7 @@ class ByteSource(Protocol):
         """
 
     def close(self) -> None:
-        """Release it; a forgotten one is released when it is collected."""
+        """Release it; garbage collection releases it, too."""
 
 
 class LocalFile:

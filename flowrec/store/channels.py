@@ -2,7 +2,7 @@
 
 A channel has a codec and a chunk group. A session file is refused when its schemas are not those of this flowrec.
 
-There are three groups of chunks: frames, state, and the views for other programs. So reading all poses decompresses
+There are three groups of chunks: frames, state, and the viewer topics. So reading all poses decompresses
 neither images nor previews. Channel numbers depend on the tables only: the same ticks make the same records.
 """
 
@@ -88,7 +88,7 @@ def is_left_out(path: str, patterns: Iterable[str]) -> bool:
 
 
 def left_out(patterns: Iterable[str]) -> frozenset[str]:
-    """The topics, views for other programs included, that match names or patterns such as `/view/*`.
+    """The topics, viewer topics included, that match names or patterns such as `/view/*`.
 
     Raises
     ------
@@ -119,7 +119,7 @@ class SessionContents(SessionMetadata):
     codecs : how their messages are decoded, by channel number.
     recorded_fields : by field of Tick, the fields that its messages have in this file; an older file lacks some.
     frame_encoding : name of the encoding of frames (frame_encodings.py); empty in files that do not say.
-    region : which window of most images was recorded (roi.py); None: they are whole.
+    region : which window of most images was recorded (roi.py); None: the images are not cut.
     """
 
     def _open(self, summary: Summary | None) -> None:
@@ -170,7 +170,7 @@ class SessionContents(SessionMetadata):
             return
         differs = sorted({name for name, _ in theirs ^ ours}) or [found.name]
         raise SessionError(
-            f"{self.source.path}: {channel.topic} is laid out differently ({', '.join(differs)});"
+            f"{self.source.path}: {channel.topic} has another schema ({', '.join(differs)});"
             f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
         )
 

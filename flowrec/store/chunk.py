@@ -1,7 +1,6 @@
 """Messages of ticks -> sealed MCAP chunks: encoding, grouping and compression. Knows neither file nor thread.
 
-The messages of a group (channels.py) are collected in one chunk: what must be read for one message, and what a
-compressor sees at once.
+The messages of a group (channels.py) are collected in one chunk, the unit of compression and of reading.
 """
 
 from __future__ import annotations
@@ -158,12 +157,12 @@ class ChunkEncoder:
     ----------
     encoding : of the frames.
     views : makes the viewer topics; shared by all files of a run, because it remembers the colour scale.
-    sink : receives full or sealed chunks, and has used them when it returns. May be replaced between calls.
+    sink : receives sealed chunks and must not keep views of them after it returns. May be replaced between calls.
     start_unix_ns : Unix time of stamp 0, which is added to all times that MCAP and foxglove's schemas hold.
 
     Attributes
     ----------
-    sequences : the next sequence number by topic, where the writer counts.
+    sequences : the next sequence number by topic, for topics whose messages do not give their own.
     """
 
     def __init__(self, encoding: FrameEncoding, views: ViewerTopics, sink: Sink, start_unix_ns: int) -> None:
@@ -183,7 +182,7 @@ class ChunkEncoder:
         return sum(map(_size_of, self._builders.values()))
 
     def add(self, entry: Entry) -> None:
-        """Encode the messages of one tick; hand on the chunks that are full.
+        """Encode the messages of one tick; pass full chunks to `sink`.
 
         Raises
         ------
@@ -205,7 +204,7 @@ class ChunkEncoder:
             self.sink([builder.seal() for builder in full])
 
     def seal(self, groups: Iterable[str] = GROUPS) -> None:
-        """Hand on the chunks that are not full, too."""
+        """Pass the chunks that are not full to `sink`, too."""
         filled = [self._builders[group] for group in groups if self._builders[group].size]
         if filled:
             self.sink([builder.seal() for builder in filled])

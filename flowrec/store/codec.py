@@ -31,7 +31,7 @@ Payload = tuple[bytes | memoryview, ...]
 
 _UNCOPIED_BYTES = 1 << 14  # a larger array bypasses protobuf when it is written
 _LARGE_BYTES = 1 << 16  # in a larger message arrays bypass protobuf when it is read
-_FIELDS_LIMIT = 64  # a message with more fields is left to protobuf as a whole
+_FIELDS_LIMIT = 64  # protobuf parses a message with more fields
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # wire types
 # For lengths between these numpy converts quicker than a loop, but makes a list first.
 _SHORT_VECTOR, _LONG_VECTOR = 64, 1 << 16

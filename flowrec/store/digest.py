@@ -1,12 +1,12 @@
 """The digest of what a session file holds: one per topic over its messages, and one over its head.
 
-It finds damage and edits after the recording, also where a replay can not: in inputs, truth, diagnostics, views and
-the configuration. It does not find a forger, who can compute it anew.
+It detects damage and edits after the recording, also where a replay can not: in inputs, truth, diagnostics, views and
+the configuration. It does not detect a forgery, because anybody can compute it.
 
 The digest of a topic is the sum, modulo 2^256, of the SHA-256 of each message: MCAP sequence, log time, and payload. So
 it does not depend on the order, the chunks or the compression: a file that another MCAP tool has rewritten with the
 same messages keeps it. Of a payload of 64 KiB or more the length and the CRC-32 go into the SHA-256, which takes a
-quarter of the time: one edit of 4e9 goes unseen.
+quarter of the time; one edit in 4e9 is not detected.
 """
 
 from __future__ import annotations

@@ -45,8 +45,8 @@ class FileReader:
     ----------
     path : the file.
     contents : its index, where the file has none or a wrong one (recovery.py).
-    skip : receives what is wrong with a message that makes no sense, which is then left out; without it that is an
-        error.
+    skip : receives the fault of each message that can not be decoded, which is then left out; None: it is
+        an error.
     cache : restored messages, shared by the files of a run.
 
     Attributes
@@ -170,7 +170,7 @@ class FileReader:
             self._check_counts(read)
 
     def _check_counts(self, read: Mapping[int, int]) -> None:
-        """A file that contains less than it says must not pass for a whole one."""
+        """Raise DamageError for a file with other numbers of messages than its index says."""
         for channel, count in read.items():
             announced = self.contents.statistics.channel_message_counts.get(channel, 0)
             if count != announced:
@@ -224,7 +224,7 @@ class FileReader:
 
 
 class _StateSize:
-    """The memory of the full state at a tick: bounded, whatever a file says."""
+    """The bytes of the full state at a tick. Their bound limits the memory that a hostile file can take."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -232,25 +232,25 @@ class _StateSize:
         self._total = 0
 
     def add(self, field: str, record: Record) -> None:
-        """Note the latest message of a topic."""
+        """Count the latest message of a topic; DamageError when the state has become too large."""
         payload = record.payload
         nbytes = payload.image.nbytes if isinstance(payload, Frame) else len(payload)  # type: ignore[arg-type]
         self._total += nbytes - self._nbytes.get(field, 0)
         self._nbytes[field] = nbytes
         if self._total > _STATE_LIMIT_BYTES:
-            what = f"all that is known at {record.log_ns} ns takes {self._total} bytes, more than {_STATE_LIMIT_BYTES}"
+            what = f"the state at {record.log_ns} ns takes {self._total} bytes, more than {_STATE_LIMIT_BYTES}"
             raise DamageError(self._path, what)
 
 
 def _detached(record: Record) -> Record:
-    """The record without the chunk that it lies in."""
+    """The record with a copy of its payload instead of a view of its chunk."""
     payload = record.payload
     return record._replace(payload=memoryview(bytes(payload))) if isinstance(payload, memoryview) else record
 
 
 @contextlib.contextmanager
 def _threads() -> Iterator[Executor]:
-    """The threads that decompress; who stops reading early does not wait for what was to come."""
+    """The threads that decompress; at the end the tasks that have not begun are cancelled."""
     executor = ThreadPoolExecutor(_THREADS, "session-reader")
     try:
         yield executor

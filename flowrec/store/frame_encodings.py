@@ -277,5 +277,5 @@ ENCODINGS = {
         FrameEncoding("jpeg", _compressed_image("jpeg", jpeg), compressed_chunks=False, lossless=False),
     )
 }
-# By schema: two codecs decode whatever any of the encodings has written.
+# By schema: two codecs decode the images of all encodings.
 FRAME_CODECS = {codec.schema.name: codec for codec in (_RAW, ENCODINGS["png"].codec)}

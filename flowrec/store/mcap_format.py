@@ -52,7 +52,7 @@ class Record(NamedTuple):
 
 @dataclass(slots=True)
 class Summary:
-    """What the end of the file says about the rest.
+    """The summary section of a file.
 
     The `message_index_offsets` of a chunk tell which channels are in it; the offsets themselves are not kept.
     """
@@ -110,7 +110,7 @@ def parse_summary(data: bytes, data_start: int, data_end: int) -> Summary:
     for opcode, at, length in records_in(data):
         if opcode == Opcode.CHUNK_INDEX:
             chunk = _chunk_index(data, at, at + length, interned)
-            # Checked at once, so that a list of nonsense does not fill the memory first.
+            # Checked here, so that an invalid list does not fill the memory first.
             listed_bytes += chunk.chunk_length
             if listed_bytes > data_end or not chunk.chunk_length:
                 raise ValueError("the chunks that are listed do not fit into the file")
@@ -200,7 +200,7 @@ def _places(summary: Summary) -> Iterable[tuple[int, int]]:
 
 
 def _check_places(summary: Summary, start: int, end: int) -> None:
-    """Each thing has a place of its own: else a small file could be read for ever."""
+    """Raise ValueError if two listed records overlap: with overlaps a small file could list endless data."""
     reached = start
     for offset, length in sorted(_places(summary)):
         if offset < reached:

@@ -1,6 +1,6 @@
-"""An MCAP file open for reading: checked, bounded reads; the only place that trusts nothing in the file.
+"""An MCAP file open for reading: every size is checked and every read is bounded.
 
-mcap's own reader believes the sizes that a file declares (a file of 32 kB can then cost 1 GiB and minutes) and lets
+mcap's own reader trusts the sizes that a file declares (a file of 32 kB can then cost 1 GiB and minutes) and lets
 errors of several libraries escape. Here every size is checked before it is used and every error is a SessionError.
 """
 
@@ -71,10 +71,10 @@ class UnfinishedError(SessionError):
 
 
 class DamageError(SessionError):
-    """Bytes that make no sense; `what` says where and why, without advice."""
+    """Bytes that can not be parsed; `what` says where and why, without advice."""
 
     def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{path}: {what}; `flowrec recover {path}` saves what is whole")
+        super().__init__(f"{path}: {what}; `flowrec recover {path}` recovers what is intact")
         self.what = what
 
 
@@ -87,7 +87,7 @@ class McapReader:
 
     Raises
     ------
-    SessionError : on opening or reading, whatever is wrong with the file.
+    SessionError : on opening or reading, for every fault of the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -122,7 +122,7 @@ class McapReader:
         return data
 
     def damaged(self, offset: int, why: object) -> DamageError:
-        """The error for bytes that make no sense."""
+        """The error for bytes that can not be parsed."""
         return DamageError(self.path, f"damaged at byte {offset} ({why})")
 
     @contextlib.contextmanager
@@ -139,7 +139,7 @@ class McapReader:
         if not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER or len(tail) != FOOTER_BYTES + len(MAGIC):
             raise UnfinishedError(
                 f"{self.path}: was not finished (the run was killed, or the file is cut off);"
-                f" `flowrec recover {self.path}` makes a whole session of it"
+                f" `flowrec recover {self.path}` makes a complete session of it"
             )
         footer_at = self.size - len(tail)
         with self.parsing(footer_at):
@@ -184,7 +184,7 @@ class McapReader:
         return Attachment(create_ns, log_ns, name, media_type, data)  # type: ignore[arg-type]  # a view is not copied
 
     def content(self, offset: int, length: int) -> bytes | memoryview:
-        """The content of a chunk, decompressed within the limits whatever it announces; checksum verified."""
+        """The content of a chunk, decompressed within the limits, checksum verified."""
         self._check_size(offset, length, Opcode.CHUNK)
         whole = length <= _AT_ONCE_BYTES
         body = self.body(offset, length, Opcode.CHUNK) if whole else memoryview(self.read(offset, _AT_ONCE_BYTES))[9:]
@@ -262,7 +262,7 @@ class McapReader:
         return header
 
     def body(self, offset: int, length: int, opcode: Opcode) -> memoryview:
-        """The body of a record of that kind and whole length."""
+        """The body of a record with that opcode; `length` includes the head of the record."""
         self._check_size(offset, length, opcode)
         data = self.read(offset, length)
         with self.parsing(offset):
@@ -277,7 +277,7 @@ class McapReader:
             raise self.damaged(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
 
     def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> Any:
-        """One small record of that kind and whole length, parsed."""
+        """One small record with that opcode, parsed; `length` includes the head of the record."""
         body = self.body(offset, length, opcode)
         with self.parsing(offset):
             return parse(stream_of(body))
@@ -290,7 +290,7 @@ class _Range:
         self._reader, self._at, self._end = reader, start, end
 
     def read(self, count: int) -> bytes:
-        """The next bytes, at most so many."""
+        """The next bytes, at most `count`."""
         data = self._reader.read(self._at, min(count, self._end - self._at))
         self._at += len(data)
         return data
@@ -311,7 +311,7 @@ def _refuse_bomb(size: int, nbytes: int) -> None:
 
 
 def _refuse_other_size(data: memoryview, size: int) -> None:
-    # The size in zstd's own header is what the library allocates, whatever limit it is given.
+    # The library allocates the size in zstd's own header, also beyond the limit that it is given.
     if zstandard.frame_content_size(data) not in (-1, size):
         raise ValueError("zstd announces another size than the chunk")
 

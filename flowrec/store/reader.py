@@ -37,7 +37,7 @@ class SessionReader:
     ----------
     path : as it was named.
     files : its files, in order.
-    part : which file of a run it is; None for a whole run.
+    part : which file of a run it is; None for all parts of a run together.
     keyframe_ns : stamp of the first tick where that is a keyframe, the state before this file began, from which a
         replay starts. None where the session begins with the run.
     outcome : how the run ended: `outcome`, `reason`, `ticks`, `dropped_frames`, ...; all text, may be empty.
@@ -77,7 +77,7 @@ class SessionReader:
 
     @functools.cached_property
     def region(self) -> Region | None:
-        """Which window of most images was recorded, the rest being black (roi.py); None: they are whole."""
+        """Which window of most images was recorded, the rest being black (roi.py); None: the images are not cut."""
         return self._file(0).contents.region
 
     @functools.cached_property
@@ -122,7 +122,7 @@ class SessionReader:
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:
         """The tick at or before a stamp; an empty `Tick()` before the first one.
 
-        `tick_before(start_ns - 1)` holds the same objects as what `ticks(start_ns)` goes on from, so that a
+        `tick_before(start_ns - 1)` holds the same objects as the state from which `ticks(start_ns)` starts, so that a
         message of its first tick is new if and only if it is another object.
         """
         begun = [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
@@ -178,6 +178,6 @@ class SessionReader:
                 )
         self._open[number] = file
         if len(self._open) > _OPEN_FILES:
-            # Not closed: an iteration may be in it. With the last of these it is.
+            # Not closed here, because an iteration may still read it; it is closed when it is collected.
             del self._open[next(iter(self._open))]
         return file

@@ -1,4 +1,4 @@
-"""Makes a complete session of one whose run was killed, or whose file is cut off or damaged."""
+"""Recovers a session whose run was killed, or whose file is truncated or damaged."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ _HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE}
 
 
 class NothingSavedError(SessionError):
-    """There is no complete tick in what a killed run has left."""
+    """The file of a killed run holds no complete tick."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What came of a recovery.
+    """The result of a recovery.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Recovered:
 
 @dataclass(slots=True)
 class _Skipped:
-    """Messages that were skipped because they make no sense."""
+    """Messages that were skipped because they can not be decoded."""
 
     count: int = 0
     first: str = ""
@@ -112,7 +112,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
             return _recover(path, out)
     except BlockingIOError as error:
         raise SessionError(
-            f"{path}: is being recorded just now, or recovered; stop that with Ctrl-C, and the file is whole"
+            f"{path}: is being recorded just now, or recovered; stop that process with Ctrl-C, which completes the file"
         ) from error
 
 
@@ -191,7 +191,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
         _refuse_if_taken(target)
         _rename(draft, target)
     except SessionError as error:
-        # Its advice is about a draft that is gone.
+        # The advice of the error is about the draft, which is removed.
         raise SessionError(f"{path}: is left as it was; {str(error).split('; ')[0]}") from error
     finally:
         reader.close()
@@ -210,7 +210,7 @@ def _checked(path: Path) -> Recovered | None:
             _ = reader.header
             for _tick in reader.ticks():
                 pass
-            for chunk in contents.chunks:  # the rest: views for other programs
+            for chunk in contents.chunks:  # the rest: viewer topics
                 if contents.fields.keys().isdisjoint(chunk.message_index_offsets):
                     contents.source.messages(chunk)
             repeated = reader.keyframe_ns is not None
@@ -225,8 +225,8 @@ def _require_head(path: Path, found: Scan) -> None:
     missing = sorted(_HEAD - present)
     if missing:
         raise SessionError(
-            f"{path}: nothing can be saved: {', '.join(missing)} of its head is not whole,"
-            " without which nobody knows what was flown; remove the file"
+            f"{path}: nothing can be saved: {', '.join(missing)} of its header is missing or damaged,"
+            " without which the session can not be interpreted; remove the file"
         )
 
 

@@ -1,4 +1,4 @@
-"""Ring buffer: the last seconds of a run in memory, and snapshot files of what was around an event.
+"""Ring buffer: the last seconds of a run in memory, and snapshot files of the time around an event.
 
 The ring is a sequence of segments of about a second, each with sealed chunks and the full state when it began, so that
 dropping the oldest needs no decoding, and memory is that of compressed data. At an event the ring is written to a file,
@@ -90,7 +90,7 @@ class _RingSegment:
         self._ring.segment_ended(self, counters)
 
     def write_to(self, snapshot: _SnapshotFile) -> None:
-        """Write what is in memory, and what comes, to a file."""
+        """Write the chunks in memory, and later entries, to a file."""
         self.snapshot = snapshot
         snapshot.file.put(self.chunks)
         self.chunks, self.image, self.state = [], [], {}
@@ -141,7 +141,7 @@ class RingBuffer:
         self._sequences: Counter[str] = Counter()
         self._free: list[ChunkEncoder] = []
         self._ring: deque[tuple[_RingSegment, Counters]] = deque()  # without those that still wait for images
-        self._is_short = False  # of memory, since the ring began to fill
+        self._is_short = False  # the ring has been too small since it began to fill
         self._snapshot: _SnapshotFile | None = None
         self._finishing: list[_SnapshotFile] = []
         self._finished_bytes = 0
@@ -163,14 +163,14 @@ class RingBuffer:
 
     @property
     def timeout_s(self) -> float | None:
-        """How long one may wait for the next entry; None: for ever."""
+        """Time until `flush_if_due` has something to do, in s; None: not before the next entry."""
         if self._snapshot is None:
             return None
         return max(_POLL_S, self._flushed_s + self._options.flush_interval_s - time.monotonic())
 
     @property
     def flushed_ns(self) -> int | None:
-        """Stamp of all that was added: a run that is kept in memory does not wait for a disk."""
+        """Stamp of the last entry: a run in memory never waits for the disk."""
         return self._router.last_ns
 
     def add(self, entry: Entry) -> None:
@@ -188,7 +188,7 @@ class RingBuffer:
             self._take(event, entry.stamp_ns)
 
     def flush_if_due(self) -> None:
-        """Write what has waited for long enough; in memory it may wait for ever."""
+        """Write and sync the data of a snapshot whose interval has passed; the ring stays in memory."""
         snapshot, last_ns = self._snapshot, self._router.last_ns or 0
         if snapshot is None:
             return
@@ -204,7 +204,7 @@ class RingBuffer:
         """Nothing to do, see `flushed_ns`."""
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
-        """End the snapshot; `why` the run has ended badly makes one of what the ring holds."""
+        """End the snapshot; with `why`, the reason of a bad end, a snapshot of the ring is taken first."""
         if why:
             self._take(why, self._router.last_ns or 0)
         if self._snapshot is not None:
@@ -217,7 +217,7 @@ class RingBuffer:
             snapshot.file.close()
 
     def segment_ended(self, segment: _RingSegment, counters: Counters) -> None:
-        """Take a segment of which all images have come."""
+        """Add a complete segment to the ring or to its snapshot."""
         snapshot = segment.snapshot
         if snapshot is not None:
             snapshot.counters.include(counters)
@@ -264,7 +264,7 @@ class RingBuffer:
         return last_ns is not None and segment.begin_ns is not None and last_ns - segment.begin_ns >= self._before_ns
 
     def _trim(self) -> None:
-        """Discard what is older than asked for, or does not fit into memory."""
+        """Discard segments that are older than the settings ask for, or do not fit into memory."""
         now_ns = self._router.last_ns or 0
         while self._ring:
             segments = self._segments()
@@ -342,7 +342,7 @@ class RingBuffer:
         return ""
 
     def _collect_finished(self, *, wait: bool = False) -> None:
-        """Note the files that are complete, and raise what has failed."""
+        """Note the files that are complete; raises the error of a file."""
         for snapshot in self._unfinished():
             snapshot.file.check(wait=wait)
         while self._finishing and self._finishing[0].file.finished:
@@ -353,7 +353,7 @@ class RingBuffer:
             self._remarks.append(f"{file.path}: whole, {file.size / 1e6:.1f} MB")
 
     def _check_disk(self) -> None:
-        """Make a file and remove it: an error is better now than at the event."""
+        """Make a file and remove it, so that an error is reported at the start and not at the event."""
         file = SessionFile(snapshot_path(self._path, 1), self._header, self._options)
         file.partial_path.unlink(missing_ok=True)
         file.close()  # after that, for another process may make a file of this name as soon as it is not locked

@@ -52,7 +52,7 @@ class Region:
 
 
 def region_from(notes: Mapping[str, str]) -> Region | None:
-    """The region from the metadata of a channel, not to be applied again; None: its images are whole."""
+    """The region from the metadata of a channel, which is not applied again; None: its images are not cut."""
     if notes.get(_NOTE) != _ROBOT:
         return None
     pad, every = notes.get(_PAD, ""), notes.get(_EVERY, "")

@@ -139,7 +139,7 @@ class Run:
 
     @property
     def part(self) -> Part | None:
-        """Which file of a run it is; None for a whole run."""
+        """Which file of a run it is; None for all parts of a run together."""
         return None if self.in_parts else self.files[0].part
 
     @property
@@ -208,7 +208,7 @@ def _refuse_unfinished(path: Path, found: Sequence[Path]) -> None:
         raise UnfinishedError(f"{path}: is being recorded just now; stop that run with Ctrl-C{others}")
     raise UnfinishedError(
         f"{path}: was not finished (the run was killed; {unfinished[-1].name} is left of it);"
-        f" `flowrec recover {path}` makes a whole session of it{others}"
+        f" `flowrec recover {path}` makes a complete session of it{others}"
     )
 
 
@@ -228,7 +228,7 @@ def check_continuity(path: Path, run: Sequence[RunFile]) -> None:
     if is_continued(last.outcome):
         following = part_path(path, len(run) + 1)
         raise UnfinishedError(
-            f"{following}: is missing, though {last.path.name} says that the run goes on in it; put it back,"
+            f"{following}: is missing, though {last.path.name} says that the run is continued in it; put it back,"
             f" or let `flowrec recover {path}` end the run with what is there"
         )
 
@@ -237,20 +237,20 @@ def continuity_fault(file: RunFile, number: int, before: RunFile | None) -> str 
     """Why a file is not part `number` of a run after `before`; None where it is."""
     part = file.part
     if part is None or part.kind != "part":
-        return "is no part of a run, whatever its name says"
+        return "is named like a part of a run and is none"
     if part.number != number:
         return f"is part {part.number} of a run by what it says, and {number} by its name"
     if before is None:
-        return "is called the first part and goes on from another" if part.keyframe_ns is not None else None
+        return "is named as the first part and continues another one" if part.keyframe_ns is not None else None
     if before.part is not None and part.run != before.part.run:
         return f"is of another run than {before.path.name}"
     if part.keyframe_ns is None:
         return f"does not say where {before.path.name} ended"
     if part.keyframe_ns != before.last_ns:
         gap_s = seconds(part.keyframe_ns - before.last_ns)
-        return f"goes on {abs(gap_s):.3f} s {'after' if gap_s > 0 else 'before'} the end of {before.path.name}"
+        return f"begins {abs(gap_s):.3f} s {'after' if gap_s > 0 else 'before'} the end of {before.path.name}"
     if file.first_ns != part.keyframe_ns:
-        return "does not begin with the tick that it says to repeat"
+        return "does not begin with the keyframe that it announces"
     return None
 
 

@@ -1,7 +1,7 @@
 """Rebuilds the index of a file that has none, or a wrong one, from its records, front to back.
 
-What does not parse, or fails its checksum, is left out. After a record whose length makes no sense the next chunk is
-searched for by its byte pattern.
+Records that can not be parsed or fail their checksum are left out. After a record with an impossible length the next
+chunk is searched for by its byte pattern.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Gap(NamedTuple):
 
 @dataclass(slots=True)
 class Scan:
-    """What was found.
+    """The index of the intact records, and what was lost.
 
     Attributes
     ----------
@@ -152,7 +152,7 @@ class Scan:
 
 
 def scan(source: McapReader, visit: Visit | None = None, progress: Callable[[int], None] | None = None) -> Scan:
-    """Read a whole file and note what is intact; one chunk is in memory at a time.
+    """Read all of a file and index its intact records; one chunk is in memory at a time.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def scan(source: McapReader, visit: Visit | None = None, progress: Callable[[int
 
     Raises
     ------
-    SessionError : the disk does not give the bytes.
+    SessionError : the file can not be read.
     """
     found = Scan()
     at = len(MAGIC)

@@ -20,7 +20,7 @@ from flowrec.store.write_queue import Entry, NewMessages
 
 @dataclass(slots=True)
 class Counters:
-    """What is counted of a segment, or of several together."""
+    """Counts of the ticks and images of one segment, or of several together."""
 
     ticks: int = 0
     dropped_frames: int = 0
@@ -42,7 +42,7 @@ class Counters:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def summary(self, encoding: FrameEncoding) -> dict[str, str]:
-        """What is added to every outcome."""
+        """The entries that every outcome has besides its reason."""
         counts = {"ticks": str(self.ticks), "dropped_frames": str(self.dropped_frames)}
         if self.missing_frames:
             counts["frames_missing_from_camera"] = str(self.missing_frames)
@@ -65,7 +65,7 @@ class Segment(Protocol):
         """Take the last image before the segment, which was still queued when the segment began."""
 
     def end(self, counters: Counters) -> None:
-        """All entries have come."""
+        """End the segment: it has received all of its entries."""
 
 
 S = TypeVar("S", bound=Segment)
@@ -73,13 +73,13 @@ S = TypeVar("S", bound=Segment)
 
 @dataclass(slots=True)
 class OpenSegment(Generic[S]):
-    """A segment and what is known of it so far.
+    """A segment that may still receive entries.
 
     Attributes
     ----------
     keyframe_ns : stamp of the last tick before it; None at the beginning of the run.
     begin_ns : stamp of its first tick; None before that.
-    awaited, awaited_bytes : images that were announced and have not come.
+    awaited, awaited_bytes : number and size of the images that were announced and are still queued.
     """
 
     segment: S
@@ -108,11 +108,11 @@ class SegmentRouter(Generic[S]):
 
     @property
     def current(self) -> OpenSegment[S]:
-        """The one that ticks go to."""
+        """The segment that receives new ticks."""
         return self.open[-1]
 
     def add(self, entry: Entry) -> None:
-        """Hand on one entry."""
+        """Pass one entry to its segment."""
         # Images come in order: those of an earlier segment have all come before the first one of a later segment.
         place = self.open[0] if entry.late else self.open[-1]
         if entry.ticks and place.begin_ns is None:

@@ -69,14 +69,14 @@ class WriterOptions:
     Attributes
     ----------
     frames : encoding of the images, a name of frame_encodings.py: raw, zstd, png, delta, or jpeg, which alone is lossy.
-    flush_s : at most this much of a run is lost when the process is killed, in s, of stamps; without `block` also of
-        wall time, and besides the images that wait for a slow disk, at most `queue_limit_bytes` of them.
-    sync_s : the same when the power fails, as long as an fsync takes less than half of it.
-    overwrite : replace whatever there is of the run, once the new one is complete.
+    flush_s : longest end of a run, in s of stamps, that is lost when the process is killed; without `block` also in s
+        of wall time. Images that wait for a slow disk, at most `queue_limit_bytes`, are lost in addition.
+    sync_s : the same for a power failure, as long as an fsync takes less than half of it.
+    overwrite : replace all files of an earlier run of this name, once the new one is complete.
     block : what to do when the disk is slower than the run. True: `write` waits (simulation), also while more than
         `flush_s` of stamps is not yet with the operating system. False: images are decimated (write_queue.py) and
         counted; nothing else is ever dropped (live run).
-    queue_limit_bytes : how much may wait for the disk.
+    queue_limit_bytes : size of the queue to the writer's thread.
     files : a Split: the run X.mcap is written to the files X.part001.mcap, X.part002.mcap, ..., each of which is
         readable alone; a Snapshot: nothing is written but X.snap001.mcap, ... around events.
     region : record only the window around the robot of most images (roi.py); None: all of all images.
@@ -95,7 +95,7 @@ class WriterOptions:
 
     @property
     def left_out_topics(self) -> frozenset[str]:
-        """The topics that `leave_out` stands for; raises UsageError as channels.left_out."""
+        """The topics that match `leave_out`; raises UsageError as channels.left_out."""
         return left_out(self.leave_out)
 
     @property
@@ -105,17 +105,17 @@ class WriterOptions:
 
     @property
     def sync_interval_s(self) -> float:
-        """A message waits up to half of `sync_s` for the next fsync to begin, and the other half until it is done."""
+        """Half of `sync_s`: the fsync itself may take the other half."""
         return self.sync_s / 2
 
     @property
     def flush_interval_s(self) -> float:
-        """Half of the time is left for a thread that gets the processor late, or a slow disk."""
+        """Half of `flush_s`: the other half allows for a thread that is scheduled late, or a slow disk."""
         return 0.5 * min(self.flush_s, self.sync_interval_s)
 
 
 class FileError(SessionError):
-    """A file that can not be written any more; the text says which, and what to do next."""
+    """A file that can not be written; the text names it and says what to do."""
 
 
 class SessionFile:
@@ -131,7 +131,7 @@ class SessionFile:
 
     Attributes
     ----------
-    failed : something went wrong; what was written is for `flowrec recover`.
+    failed : an error has occurred; `flowrec recover` reads what was written.
 
     Raises
     ------
@@ -173,7 +173,7 @@ class SessionFile:
         with self._checked():
             self._file.sync()
             if not self._name_synced:
-                sync_directory(self.partial_path.parent)  # or a power cut leaves content without a name
+                sync_directory(self.partial_path.parent)  # otherwise a power failure may leave the file without a name
                 self._name_synced = True
 
     def complete(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
@@ -191,13 +191,15 @@ class SessionFile:
                 raise taken(self.path, f" (the finished session stays in {self.partial_path})") from error
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without completing it."""
         self._file.close()
 
     def encoding_failed(self, error: SessionError) -> FileError:
         """The error for a message that can not be stored."""
         self.failed = True
-        return FileError(f"{self.path}: {error}; `flowrec recover {self.partial_path}` keeps what came before")
+        return FileError(
+            f"{self.path}: {error}; `flowrec recover {self.partial_path}` recovers what was recorded before it"
+        )
 
     @contextlib.contextmanager
     def _checked(self) -> Iterator[None]:
@@ -227,7 +229,7 @@ def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ())
             raise taken(file)
         raise FileError(
             f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
-            " saves it, another --out or --overwrite goes on without it"
+            " saves it, another --out or --overwrite records without it"
         )
 
 
@@ -241,18 +243,20 @@ def _not_writable(path: Path, error: OSError) -> FileError:
 
 def _disk_failed(path: Path, error: OSError) -> FileError:
     if error.errno == errno.ENOENT:
-        return FileError(f"{path}: is gone, it or its directory was removed or renamed; look for it there")
+        return FileError(
+            f"{path}: no longer exists: the file or its directory was removed or renamed during the recording"
+        )
     what = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else f"writing failed ({error.strerror})"
     return FileError(f"{path}: {what}; free some space, then `flowrec recover {path}` saves what was recorded")
 
 
 class AsyncFileWriter(SessionFile):
-    """Takes chunks at once and writes them in order.
+    """A session file that a background thread writes: chunks are queued and written in order.
 
     Parameters
     ----------
     path, header, options : of the file.
-    limit_bytes : how much may wait; beyond that `put` blocks.
+    limit_bytes : size of the queue; `put` blocks while it is full.
 
     Attributes
     ----------
@@ -275,7 +279,7 @@ class AsyncFileWriter(SessionFile):
         self._thread = ThreadPoolExecutor(1, "session-snapshot")
 
     def put_keyframe(self, encoder: ChunkEncoder, entry: Entry) -> None:
-        """Write the first tick. It is encoded in the thread, too, because that may take as long as writing it."""
+        """Write the keyframe. The thread encodes it, too, because that may take as long as writing it."""
         encoder.sink = self.add_chunks
 
         def encode() -> None:
@@ -293,7 +297,7 @@ class AsyncFileWriter(SessionFile):
             self._submit(self._write, chunk)
 
     def sync_if_due(self) -> None:
-        """Sync what was written, also where nothing more comes."""
+        """Sync what was written, also if no other chunk follows."""
         if self._last is not None and self._last.done():
             self._submit(self._sync)
 
@@ -307,25 +311,25 @@ class AsyncFileWriter(SessionFile):
         self._submit(finish)
 
     def check(self, *, wait: bool = False) -> None:
-        """Raise what has failed; with `wait`, after all has been written."""
+        """Raise the error of the thread, if any; with `wait`, after all has been written."""
         if wait and self._last is not None:
             futures.wait([self._last])
         if self._failure is not None:
             raise self._failure
 
     def close(self) -> None:
-        """Close the file as it is, with what was put."""
+        """Write what is queued, and close the file without completing it."""
         self._thread.shutdown()
         super().close()
 
     def _submit(self, work: Callable[..., None], *arguments: SealedChunk) -> None:
-        """Have the thread do something, unless something has failed before."""
+        """Run a function in the thread, unless an earlier one has failed."""
 
         def run() -> None:
             try:
                 if self._failure is None:
                     work(*arguments)
-            except BaseException as error:  # noqa: BLE001  whatever it is, the writer must raise it
+            except BaseException as error:  # noqa: BLE001  `check` raises it
                 self._failure = error
             finally:
                 with self._written:

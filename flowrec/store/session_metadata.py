@@ -1,5 +1,4 @@
-"""What a session file says about itself: enough to list, describe and run it again, whether or not its messages can be
-read.
+"""The metadata of a session file: enough to list, describe and replay it, also where its messages can not be read.
 
 Light to import: no numpy, no schemas. channels.py adds what reading the messages needs.
 """
@@ -68,7 +67,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class SessionHeader:
-    """The resolved configuration, the chip and the origin of a session: what is written before the first message.
+    """The resolved configuration, the chip and the origin of a session; written before the first message.
 
     Attributes
     ----------
@@ -124,7 +123,7 @@ def is_header_file(name: str) -> bool:
 
 
 class SessionMetadata:
-    """The index of a session file and what it says of the run.
+    """The index and the metadata of a session file.
 
     Parameters
     ----------
@@ -187,7 +186,7 @@ class SessionMetadata:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of messages by topic, for the topics that have any; the views for other programs left out."""
+        """Number of messages by topic, for the topics that have any, without the viewer topics."""
         return self._by_topic(self.statistics.channel_message_counts)
 
     def counts_until(self, stamp_ns: int) -> dict[str, int]:
@@ -206,8 +205,8 @@ class SessionMetadata:
 
     @functools.cached_property
     def header(self) -> SessionHeader:
-        """Read when asked for: the network's weights may be large."""
-        # Only what a session is made of: whatever else is attached is not even read.
+        """Read on first use: the network's weights may be large."""
+        # Attachments of other programs are not read.
         wanted = [index for index in self.attachments if is_header_file(index.name)]
         self._limit("attachments", (index.length for index in wanted), _ATTACHMENTS_LIMIT_BYTES)
         files = {index.name: self.source.attachment(index) for index in wanted}
@@ -263,7 +262,7 @@ def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
 
     Raises
     ------
-    ValueError : the record makes no sense.
+    ValueError : the values of the record are invalid.
     """
     facts = records.get(PART)
     if facts is None:
@@ -272,6 +271,6 @@ def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
     are_numbers = number.isdecimal() and (keyframe.isdecimal() or not keyframe)
     if kind not in ("part", "snapshot") or not are_numbers or max(len(number), len(keyframe)) >= _DIGITS:
         what = f"{kind[:40]!r} {number[:40]!r}, carried from {keyframe[:40]!r}"
-        raise ValueError(f"a piece of a run that is called {what}")
+        raise ValueError(f"a record of a part with invalid values: {what}")
     kind_of: Literal["part", "snapshot"] = "part" if kind == "part" else "snapshot"
     return Part(facts.get("run", ""), int(number), kind_of, int(keyframe) if keyframe else None, facts.get("why", ""))

@@ -32,16 +32,16 @@ _POLL_S = 0.05
 class PartFile(SessionFile):
     """One part as it is recorded: encodes ticks, and bounds the age of what is not yet on the disk.
 
-    What is older than `flush_s`, in wall time or in stamps, is with the operating system, and what is older than
+    Data older than `flush_s`, in wall time or in stamps, has been passed to the operating system. Data older than
     `sync_s` is on the disk, as long as one fsync takes less than half of that. The fsync runs in a side thread: on a
-    busy disk it may take a second, in which a camera fills the queue.
+    busy disk it may take a second, in which a camera would fill the queue.
 
     Parameters
     ----------
     parts, number : the run, and which part of it this is.
     header : of this part.
-    first : its keyframe. Encoding large flow fields takes a while; it is done in the side thread, and chunks of what
-        follows are held back meanwhile. None: the run begins here, and the head is synced at once.
+    first : its keyframe, which the side thread encodes, because large flow fields take long. Later chunks are held back
+        until it is written. None: the run begins here, and the header is synced at once.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class PartFile(SessionFile):
 
     @property
     def timeout_s(self) -> float | None:
-        """How long one may wait for the next entry before `flush_if_due` has something to do; None: for ever."""
+        """Time until `flush_if_due` has something to do, in s; None: not before the next entry."""
         if self._writing_keyframe is not None:
             return _POLL_S
         if self._encoder.size:
@@ -97,9 +97,9 @@ class PartFile(SessionFile):
         return None
 
     def is_larger_than(self, megabytes: float, awaited_bytes: int) -> bool:
-        """Whether the part has come to that size; one whose keyframe alone is as large, to twice the size.
+        """Whether the part has reached a size; with a keyframe of more than half of that, twice the keyframe's size.
 
-        The images that are awaited are counted as if they compress as what came before.
+        For images that are still queued the compression ratio of the part so far is assumed.
         """
         first_bytes = self._first_bytes + self._image_bytes
         own_bytes = self._all_bytes - first_bytes
@@ -135,7 +135,7 @@ class PartFile(SessionFile):
         self._parts.finish_part(self, counters)
 
     def flush_if_due(self) -> None:
-        """Write what has waited for long enough, and sync it."""
+        """Write and sync the data whose interval has passed."""
         self._check_keyframe(wait=False)
         options, now, stamps_s = self._options, time.monotonic(), seconds(self._last_ns - (self._since_ns or 0))
         if now >= self._flushed_s + options.flush_interval_s or stamps_s >= options.flush_interval_s:
@@ -147,7 +147,7 @@ class PartFile(SessionFile):
             self._syncing = self._side.submit(self.sync)
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Write all that was added."""
         self._check_keyframe(wait=True)
         self._flush()
 
@@ -163,7 +163,7 @@ class PartFile(SessionFile):
 
     @property
     def _all_bytes(self) -> int:
-        """Bytes in the file and, mostly before they are compressed, those that wait."""
+        """Bytes in the file and bytes that are not written yet, of which most are not compressed yet."""
         return self.size + self._encoder.size + sum(len(chunk.data) for chunk in self._held)
 
     def _flush(self) -> None:
@@ -179,7 +179,7 @@ class PartFile(SessionFile):
         self._held += detached(chunks)
 
     def _check_keyframe(self, *, wait: bool) -> None:
-        """Write what was held back, once the keyframe is in the file."""
+        """Write the chunks that were held back, once the keyframe is in the file."""
         if self._writing_keyframe is None or not (wait or self._writing_keyframe.done()):
             return
         self._writing_keyframe.result()
@@ -195,7 +195,7 @@ class PartFile(SessionFile):
         return self._syncing is not None and not self._syncing.done()
 
     def _join_sync(self) -> None:
-        """Wait for the side thread, and raise what has failed there."""
+        """Wait for the side thread; raises its error."""
         if self._syncing is not None:
             self._syncing.result()
             self._syncing = None
@@ -249,7 +249,7 @@ class Parts:
 
     @property
     def timeout_s(self) -> float | None:
-        """How long one may wait for the next entry; None: for ever."""
+        """Time until `flush_if_due` has something to do, in s; None: not before the next entry."""
         return min((s for place in self._router.open if (s := place.segment.timeout_s) is not None), default=None)
 
     @property
@@ -270,16 +270,16 @@ class Parts:
         self._router.add(entry)
 
     def flush_if_due(self) -> None:
-        """Flush and sync what has waited for long enough."""
+        """Write and sync the data whose interval has passed."""
         for place in self._router.open:
             place.segment.flush_if_due()
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Write all that was added."""
         self._router.current.segment.flush()
 
     def finish(self, outcome: Mapping[str, str], why: str = "") -> None:
-        """Finish the last part; everything is on the disk then. `why` a run ended badly is for snapshots alone."""
+        """Finish the last part; everything is on the disk then. `why` is for snapshots only."""
         last = self._router.current
         try:
             last.segment.finish({**outcome, **last.counters.summary(self.options.encoding)})
@@ -321,7 +321,7 @@ class Parts:
             if self._until_ns is None:
                 self._until_ns = place.begin_ns + every_ns
             if stamp_ns >= self._until_ns:
-                # The parts of an hour begin on the hour, whatever was lost in between.
+                # The boundaries are multiples of the interval, also after a gap in the recording.
                 self._until_ns += ((stamp_ns - self._until_ns) // every_ns + 1) * every_ns
                 return True
         return bool(split.megabytes) and place.segment.is_larger_than(split.megabytes or 0.0, place.awaited_bytes)

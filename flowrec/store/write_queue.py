@@ -1,6 +1,7 @@
 """The queue from the control loop to the writer's thread, bounded by bytes, and which images enter it.
 
-It has two lanes: images wait behind everything else, so that a slow disk delays no pose and a kill takes none with it.
+It has two priorities: images wait behind everything else, so that a slow disk delays no pose, and no pose is lost
+with them when the process is killed.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class Entry(NamedTuple):
     ----------
     stamp_ns, messages, nbytes : stamp of the tick, its messages, their size.
     ticks : 1 for a tick itself, 0 for its image and for what is added to it.
-    image_bytes : size of its image, which follows in the other lane; 0 where none does.
+    image_bytes : size of its image, which follows at the lower priority; 0 where none does.
     late : this is that image.
     dropped, missing : images that the writer left out, and that the camera has not delivered, since the entry before.
     window : of the image, where not all of it is recorded.
@@ -45,17 +46,17 @@ class Entry(NamedTuple):
 
 
 class WriteQueue:
-    """First in, first out in each lane; `close` lets the thread drain it, `abandon` releases everyone who waits."""
+    """First in, first out for each priority; `close` lets the thread drain it, `abandon` releases waiting threads."""
 
     def __init__(self, limit_bytes: int) -> None:
-        self.nbytes = 0  # waiting, or in work
+        self.nbytes = 0  # waiting, or being encoded
         self._limit = limit_bytes
         self._state: deque[Entry] = deque()
         self._images: deque[Entry] = deque()
         self._changed = threading.Condition()
         self._closed = self._abandoned = False
         self._flushed_ns = -1
-        self.flush_wanted = False  # somebody waits for a flush
+        self.flush_wanted = False  # a thread waits for a flush
 
     @property
     def fill(self) -> float:
@@ -87,7 +88,7 @@ class WriteQueue:
                 self._changed.notify_all()
 
     def put(self, entry: Entry, image: Entry | None = None) -> None:
-        """Append an entry, and its image to the other lane; never blocks."""
+        """Append an entry, and its image at the lower priority; never blocks."""
         with self._changed:
             self._state.append(entry)
             self.nbytes += entry.nbytes
@@ -100,8 +101,8 @@ class WriteQueue:
         """The next entry; None after the timeout, when all is taken and a flush is wanted, or at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._state or self._images or self._closed or self.flush_wanted, timeout_s)
-            lane = self._state or self._images
-            return lane.popleft() if lane else None
+            queue = self._state or self._images
+            return queue.popleft() if queue else None
 
     @property
     def images_wait(self) -> bool:
@@ -122,7 +123,7 @@ class WriteQueue:
         return dropped
 
     def done(self, entry: Entry) -> None:
-        """Free the bytes of an entry that has been dealt with."""
+        """Free the bytes of an entry that the writer's thread has handled."""
         with self._changed:
             self.nbytes -= entry.nbytes
             self._changed.notify_all()

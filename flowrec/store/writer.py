@@ -57,14 +57,14 @@ class SessionWriter:
     path : file to make.
     header : is written first, and is on the disk when the constructor returns.
     options : how to write it.
-    inputs : files that the run reads; it is refused where it would replace one of them.
+    inputs : files that the run reads; a path that would replace one of them is refused.
 
     Attributes
     ----------
     ticks : written so far.
     dropped_frames : images that were left out because the disk is too slow.
     missing_frames : of a live run: images that the camera counted and never delivered.
-    remarks : on snapshots, as text, as they are taken.
+    remarks : texts about snapshots, added while the run goes on.
 
     Raises
     ------
@@ -152,7 +152,7 @@ class SessionWriter:
             self._raise_failure()
         self._last_ns = tick.stamp_ns
         new = self._new_messages(tick)
-        # A keyframe was counted by another part, and a tick of which recovery has found the image alone is no tick.
+        # Not counted: a keyframe, which the part before counted, and a tick of which recovery found only the image.
         ticks = int(tick.stamp_ns != self._keyframe_ns and new.keys() != {"frame"})
         self.ticks += ticks
         for field in self._left_out:
@@ -190,8 +190,8 @@ class SessionWriter:
         Parameters
         ----------
         outcome : how the run ended, as text; numbers of ticks and of dropped frames are added.
-        timeout_s : how long images that wait may still be written, in s; what is left of them then is dropped and
-            counted. Everything else is always written. None: as long as it takes.
+        timeout_s : time for writing the images in the queue, in s; the images that remain are dropped and counted. All
+            other messages are always written. None: no limit.
         why : take a snapshot of the end, for this reason.
 
         Raises
@@ -290,12 +290,12 @@ class SessionWriter:
                     self._queue.flushed(flushed_ns)
                 if entry is not None:
                     self._queue.done(entry)
-        except Exception as error:  # noqa: BLE001  whatever it is, the control loop must raise it
+        except Exception as error:  # noqa: BLE001  `write` and `close` raise it in the control loop
             self._failure = error
             self._queue.abandon()
 
     def _finish(self, outcome: Mapping[str, str], dropped: int, why: str) -> None:
-        """Complete the output after the end of the thread; `dropped` images found no time."""
+        """Complete the output after the end of the thread; `dropped` images were left in the queue."""
         if dropped:
             self.dropped_frames += dropped
             drops = Drops(self._last_ns, FRAME_PATH, self.dropped_frames, self.missing_frames, self._decimation.every)
@@ -308,7 +308,9 @@ class SessionWriter:
                 try:
                     remove_idle(stale)  # unless another process is writing it by now
                 except OSError as error:
-                    self.remarks.append(f"{stale}: is left from before, it can not be removed ({error.strerror})")
+                    self.remarks.append(
+                        f"{stale}: is left from an earlier run and can not be removed ({error.strerror})"
+                    )
 
     def _raise_failure(self) -> None:
         if isinstance(self._failure, SessionError):

@@ -1,8 +1,8 @@
 """Locks (flock) that tell which process writes a file: an exclusive one from its first byte to its last.
 
 A process that only asks takes a shared lock for some microseconds; a writer waits for that, and refuses the file of
-another writer. On a file system without locks, and on a system without flock (Windows), every lock is granted: nobody
-can tell there that a file is being written, and everything else holds as well.
+another writer. On a file system without locks, and on a system without flock (Windows), every lock is granted: no
+process can detect there that a file is being written.
 """
 
 from __future__ import annotations
@@ -96,7 +96,9 @@ def held(path: Path) -> Iterator[None]:
             _take(file.fileno())
         except BlockingIOError:
             raise
-        except OSError:  # who reads it next says why; some network file systems lock nothing that is opened to be read
+        except (
+            OSError
+        ):  # the next reader reports why; some network file systems lock no file that is opened for reading
             pass
         yield
 

@@ -1,7 +1,7 @@
 """Compilation of kernels by numba with a cache on disk; the type checker sees their Python types.
 
 numba keys a cached kernel by the file that it is in, and not by the kernels of other files that it calls: after a
-change of one of those it would go on with the old code. So the cache is a folder whose name holds a hash of all files
+change of one of those it would keep using the old code. So the cache is a folder whose name holds a hash of all files
 with kernels. It lies outside the installation, which may be read-only.
 """
 
@@ -64,7 +64,7 @@ def _cache_folder() -> str:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             found = folder.lstat()
             if not stat.S_ISDIR(found.st_mode) or found.st_uid != _user_id() or found.st_mode & 0o022:
-                continue  # somebody else could write code there that this process runs
+                continue  # another user could write code there that this process runs
             tempfile.TemporaryFile(dir=folder).close()
             os.utime(folder)
             return str(folder)
@@ -72,7 +72,7 @@ def _cache_folder() -> str:
 
 
 def _places() -> Iterator[Path]:
-    """What the user has told numba, the user's caches, the folder of temporary files."""
+    """Candidates for the cache: numba's own setting, the user's caches, the folder of temporary files."""
     if _config.CACHE_DIR:
         yield Path(_config.CACHE_DIR).absolute()
     home = os.environ.get("XDG_CACHE_HOME", "")
@@ -92,7 +92,7 @@ def _user_id() -> int:
 
 
 def _remove_unused(place: Path) -> None:
-    """Remove caches of other sources that nobody has used for a while."""
+    """Remove the caches of other sources that have not been used for a while."""
     for other in place.glob(f"{_PREFIX}*"):
         with contextlib.suppress(OSError):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:

@@ -46,7 +46,7 @@ def check_output(
     Parameters
     ----------
     suffixes : those of its format, the usual one first.
-    inputs : files that the command reads; the output may be none of them, whatever `overwrite` says.
+    inputs : files that the command reads; the output must be none of them, even with `overwrite`.
     overwrite : an existing file may be replaced.
     also : other files that this output replaces or adds to: the parts of a session, and what is unfinished of it.
 
@@ -153,7 +153,7 @@ def sync_directory(directory: Path) -> None:
 
 
 def _same(output: Path, other: Path) -> bool:
-    """Whether two paths are one file, by whatever names."""
+    """Whether two paths name the same file."""
     if "\0" in str(other):  # only a file can have given such a name, and none can have it
         return False
     try:

@@ -131,7 +131,7 @@ class _Pump:
                 left = left[os.write(self._descriptor, left) :]
             except BlockingIOError:
                 time.sleep(0.05)  # a terminal that some other program has set so
-            except OSError:  # vanished: nobody reads this any more
+            except OSError:  # the terminal has vanished
                 return
 
 

@@ -205,7 +205,7 @@ def test_a_file_without_a_field_that_has_no_default_is_refused(tmp_path, monkeyp
     other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
     monkeypatch.setitem(channels.SLOTS, "/robot/track", other)
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
-    with pytest.raises(SessionError, match=r"/robot/track is laid out differently \(Track\.score\)"):
+    with pytest.raises(SessionError, match=r"/robot/track has another schema \(Track\.score\)"):
         SessionReader(tmp_path / "s.mcap")
 
 
@@ -216,7 +216,7 @@ def test_a_message_that_is_laid_out_differently_is_named(tmp_path, monkeypatch):
     other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
     monkeypatch.setitem(channels.SLOTS, "/robot/track", other)
     SessionWriter(tmp_path / "s.mcap", HEADER).close()
-    with pytest.raises(SessionError, match=r"/robot/track is laid out differently \(Track\.likeness, Track\.score\)"):
+    with pytest.raises(SessionError, match=r"/robot/track has another schema \(Track\.likeness, Track\.score\)"):
         SessionReader(tmp_path / "s.mcap")
 
 

@@ -182,10 +182,10 @@ def _rewritten(source, target, change):
         ("no end", r"x.part004.mcap: is missing, though x.part003.mcap says .*recover .*x.mcap"),
         ("exchanged", r"x.part002.mcap: is part 3 of a run by what it says, and 2 by its name"),
         ("another run", r"x.part002.mcap: is of another run than x.part001.mcap"),
-        ("other cuts", r"x.part003.mcap: goes on 0.300 s after the end of x.part002.mcap"),
+        ("other cuts", r"x.part003.mcap: begins 0.300 s after the end of x.part002.mcap"),
         ("another head", r"x.part002.mcap: has another head than x.part001.mcap"),
-        ("no part", r"x.part002.mcap: is no part of a run"),
-        ("carries too early", r"x.part001.mcap: is called the first part and goes on from another"),
+        ("no part", r"x.part002.mcap: is named like a part of a run and is none"),
+        ("carries too early", r"x.part001.mcap: is named as the first part and continues another one"),
     ],
 )
 def test_parts_that_make_no_run_are_refused_in_one_line_and_judged(run, what, said):

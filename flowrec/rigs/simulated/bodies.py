@@ -96,7 +96,7 @@ class Swimmer:
 
     @property
     def flow_um_s(self) -> NDArray[np.float64]:
-        """(2,) true flow at the centre; zero once it is gone."""
+        """(2,) true flow at the centre; zero after it has left the chip."""
         if self.gone:
             return np.zeros(2)
         x, y = self.position_um / self._um_per_px
@@ -109,7 +109,7 @@ class Swimmer:
 
     @property
     def clearance_um(self) -> float:
-        """From the surface to the nearest wall; NaN once it is gone."""
+        """From the surface to the nearest wall; NaN after it has left the chip."""
         if self.gone:
             return math.nan
         x, y = self.position_um / self._um_per_px

@@ -1,8 +1,8 @@
 """The simulated rig: a microscope, coils and a robot in a flow that differs from the assumed one.
 
-Only `truth` and `true_field` hold what no stage may know. Everything derives from the seed and from the commands: same
-seed, same commands, same bytes, whatever the loop takes. In real time, stamps are made as for a real camera, from its
-own clock and from the arrival of its frames.
+Only `truth` and `true_field` hold what no stage may know. The world is a function of the seed and of the
+commands, and does not depend on the time that the loop takes. In real time, stamps are made as for a real camera, from
+its own clock and from the arrival of its frames.
 """
 
 from __future__ import annotations
