@@ -16,7 +16,6 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_origin
 
@@ -126,6 +125,8 @@ def need_matplotlib() -> None:
 
 def machine() -> dict[str, Any]:
     """The computer and the versions that a result depends on."""
+    from importlib.metadata import version  # late: every verb imports this file, and metadata takes 20 ms
+
     return {
         "cores": os.cpu_count(),
         "threads": os.environ.get("OMP_NUM_THREADS", "default"),
