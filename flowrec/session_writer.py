@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,32 +18,31 @@ from flowrec.store.run_files import files_of
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.store.writer import SessionWriter
+from flowrec.system.outputs import Output
 
 _QUEUE_S = 2.0
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
 
 
 def session_writer(
-    path: Path,
+    output: Output,
     config: ResolvedConfig,
     chip: Chip,
     *,
     parent: Path | None = None,
     live: bool = False,
-    overwrite: bool = False,
     in_pieces: bool = False,
     derived: Mapping[str, float] | None = None,
-    inputs: Iterable[Path] = (),
 ) -> SessionWriter:
     """Create a session file and write its header.
 
     Parameters
     ----------
+    output : the file; neither its inputs nor the files of the parent are replaced.
     parent : the session that it replays; the header names it by its hash.
     live : drop images rather than wait for the disk.
     in_pieces : split the run, or record only around events, as the settings `recording.split_*` and `.snapshot_*` say.
     derived : settings that were derived because they were not given, by key, for the header.
-    inputs : other files that the command reads; none of them, and none of the parent's, is replaced.
     """
     header = session_header(config, chip)
     if derived:
@@ -57,15 +56,15 @@ def session_writer(
         frames=frames_of(config),
         flush_s=config.recording.flush_s,
         sync_s=config.recording.sync_s,
-        overwrite=overwrite,
+        overwrite=output.overwrite,
         block=not live,
         queue_limit_bytes=queue_bytes_of(config),
         files=_files_of(config) if in_pieces else Split(),
         region=region_of(config, chip, again=parent is not None),
         leave_out=config.recording.leave_out,
     )
-    inputs = (*inputs, *(files_behind(parent) if parent is not None else ()))
-    return SessionWriter(path, header, options, inputs=inputs)
+    inputs = (*output.inputs, *(files_behind(parent) if parent is not None else ()))
+    return SessionWriter(output.path, header, options, inputs=inputs)
 
 
 def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:

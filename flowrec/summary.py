@@ -38,8 +38,14 @@ def as_text(figures: Mapping[str, Value]) -> dict[str, str]:
 
 
 def of_text(text: Mapping[str, str]) -> Figures:
-    """Figures from the metadata of a file; sentences of older files stay text."""
-    return {key: _number(value) if _is_numeric(key) else value for key, value in text.items()}
+    """Figures from the metadata of a file; sentences of older files stay text.
+
+    `frames_dropped` is the count of the writer, which older files hold under two names; the larger one is complete.
+    """
+    figures = {key: _number(value) if _is_numeric(key) else value for key, value in text.items()}
+    counts = [figures.pop("dropped_frames", None), figures.get("frames_dropped")]
+    numbers = [count for count in counts if isinstance(count, int)]
+    return figures | ({"frames_dropped": max(numbers)} if numbers else {})
 
 
 def finite(value: float) -> float | None:

@@ -182,7 +182,7 @@ def test_what_was_derived_is_said_and_kept_in_the_file(
 
 def test_a_start_called_outlet_is_where_the_robot_can_be_held_while_the_field_comes_up():
     def start_of(*sets):
-        config, chip, _ = prepare(load_config(None, ["mission.start=outlet", "mission.goal=inlet", *sets]))
+        config, chip, *_ = prepare(load_config(None, ["mission.start=outlet", "mission.goal=inlet", *sets]))
         end_um = (chip.mask.shape[1] - 0.5) * chip.um_per_px
         return (end_um - config.mission.start[0]) / config.robot.radius_um
 

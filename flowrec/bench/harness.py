@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_origin
 import typer
 
 from flowrec.errors import FlowrecError, UsageError
-from flowrec.system.outputs import FIGURE, JSON, new_file
+from flowrec.system.outputs import FIGURE, JSON, Output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,12 +75,12 @@ def _command(measure: Callable[..., Results], show: Callable[[Any], None]) -> Ca
     """A function with the options of `measure` and those of every bench, for typer."""
 
     def command(as_json: bool, out: Path | None, overwrite: bool, **options: Any) -> None:
-        inputs = [value for name, value in options.items() if isinstance(value, Path) and name != "figure"]
+        inputs = tuple(value for name, value in options.items() if isinstance(value, Path) and name != "figure")
         with ExitStack() as stack:
-            file = out and stack.enter_context(new_file(out, JSON, inputs=inputs, overwrite=overwrite))
+            file = out and stack.enter_context(Output(out, JSON, inputs, overwrite).new_file())
             if figure := options.get("figure"):
                 need_matplotlib()
-                options["figure"] = stack.enter_context(new_file(figure, FIGURE, inputs=inputs, overwrite=overwrite))
+                options["figure"] = stack.enter_context(Output(figure, FIGURE, inputs, overwrite).new_file())
             results = {"machine": machine(), **measure(**options)}
             if as_json:
                 typer.echo(json.dumps(results))

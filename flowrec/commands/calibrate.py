@@ -11,7 +11,7 @@ import numpy as np
 
 from flowrec.control.coil_calibration import CoilFit, advice, fit_coils, read_excitations
 from flowrec.control.coils import Coils
-from flowrec.system.outputs import TOML, check_output, new_file
+from flowrec.system.outputs import TOML, Output
 from flowrec.terminal import say, table
 from flowrec.version import __version__
 
@@ -25,14 +25,15 @@ def calibrate(path: Path, out: Path | None = None, overwrite: bool = False) -> C
     Raises
     ------
     UsageError : a table that can not be read or does not suffice, coils no run could use.
-    OutputError : `out` may not be written, see `check_output`.
+    OutputError : `out` may not be written, see `Output.check`.
     """
-    if out is not None:
-        check_output(out, TOML, inputs=(path,), overwrite=overwrite)
+    output = Output(out, TOML, (path,), overwrite) if out is not None else None
+    if output is not None:
+        output.check()
     fit = fit_coils(read_excitations(path))
     Coils(mt_per_a=_matrix(fit), bias_mt=_bias(fit)).check(path.name)
-    if out is not None:
-        with new_file(out, TOML, inputs=(path,), overwrite=overwrite) as part:
+    if output is not None:
+        with output.new_file() as part:
             part.write_text(fragment(fit, path), encoding="utf-8")
     return fit
 

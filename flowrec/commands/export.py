@@ -1,77 +1,72 @@
-"""`flowrec export`: convert a session to an .rrd for Rerun. The MCAP stays the archive; an .rrd can be made again."""
+"""`flowrec export`: convert a session to another format. The MCAP file is the archive; an export can be made again."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
-from flowrec.chip.chip import Chip
-from flowrec.config import ResolvedConfig
-from flowrec.errors import SessionError
-from flowrec.pipeline import Pipeline, assemble
+from flowrec.methods import Method, Methods
 from flowrec.session import Session, files_behind, input_blamed
-from flowrec.store.run_files import files_of
-from flowrec.system.outputs import RRD, check_output
+from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
-from flowrec.view.rrd_file import is_made_from, write_rrd
-from flowrec.view.scene import Scene
+
+EXPORTS = Methods(
+    "--format",
+    Method("rrd", "flowrec.commands.export_rrd:RrdExport", "a recording for Rerun, what flowrec view opens"),
+)
 
 
-def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:
-    """Static data of a session for the viewer."""
-    properties = {
-        "chip": chip.name,
-        "session": path.name,
-        "observer": config.observer.method,
-        "refine": config.refine.method,
-        "planner": config.plan.method,
-        "controller": config.control.method,
-    }
-    windows = config.recording.region != "whole"
-    return Scene(chip, pipeline.calibration, pipeline.robot, path.stem, properties, windows=windows)
+class Exporter(Protocol):
+    """What a row of EXPORTS implements.
+
+    Attributes
+    ----------
+    suffixes : of the files, the usual one first.
+    advice : how to open a file, as words before its name.
+    """
+
+    suffixes: tuple[str, ...]
+    advice: str
+
+    def is_export_of(self, path: Path, session: Session) -> bool:
+        """Whether a file is an earlier export of this session, which may be replaced without being asked for."""
+
+    def write(self, session: Session, output: Output, progress: Callable[[float], None]) -> None:
+        """Write the file; `progress` takes the session time in s since the first tick."""
 
 
-def export(session: Session | Path | str, out: Path | None = None, overwrite: bool = False) -> Path:
-    """Write the .rrd of a session; a replay is shown beside its parent, if that is in the same folder.
+def export(
+    session: Session | Path | str, out: Path | None = None, overwrite: bool = False, file_format: str = "rrd"
+) -> Path:
+    """Write a session in another format.
 
     Parameters
     ----------
-    out : the file; by default beside the session, with the suffix .rrd, where an earlier .rrd of the same session is
-        replaced. Any other existing file is refused.
+    out : the file; by default beside the session, with the suffix of the format, where an earlier export of the same
+        session is replaced. Any other existing file is refused.
     overwrite : any existing file may be replaced, but none that is read.
+    file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
 
     Raises
     ------
+    UsageError : there is no such format.
     SessionError : the session can not be read, or the file not be written; OutputError if it may not be.
     """
+    exporter: Exporter = EXPORTS[file_format].load()()
     session = Session.of(session)
-    path, key = session.path, session.key
-    target = out if out is not None else path.with_suffix(RRD[0])
-    overwrite = overwrite or (out is None and is_made_from(target, key))
-    inputs = files_behind(path)
-    check_output(target, RRD, inputs=inputs, overwrite=overwrite)
-    pipeline = assemble(session.config, session.chip)
-    scene = replace(scene_of(session.config, session.chip, pipeline, path), key=key)
-    parent = _parent_of(session)
-    began = time.perf_counter()
-    with progress(f"writing {target.name}", max(session.duration_s, 1e-3)) as done:
-        if parent is not None:
-            ticks, replayed = Session(parent).ticks(), session.ticks(with_frames=False)
-        else:
-            ticks, replayed = session.ticks(), None
-        with input_blamed(session, session.config, "drawn"):
-            write_rrd(target, scene, ticks, replayed, done, inputs=inputs, overwrite=overwrite)
-    say(f"{target} written in {time.perf_counter() - began:.1f} s; open it with: rerun {target}")
+    path = session.path
+    target = out if out is not None else path.with_suffix(exporter.suffixes[0])
+    overwrite = overwrite or (out is None and exporter.is_export_of(target, session))
+    output = Output(target, exporter.suffixes, tuple(files_behind(path)), overwrite)
+    output.check()
+    config = session.config
+    began_s = time.perf_counter()
+    with (
+        progress(f"writing {target.name}", max(session.duration_s, 1e-3)) as done,
+        input_blamed(session, config, "exported"),
+    ):
+        exporter.write(session, output, done)
+    say(f"{target} written in {time.perf_counter() - began_s:.1f} s; {exporter.advice} {target}")
     return target
-
-
-def _parent_of(session: Session) -> Path | None:
-    """The replayed session, if all of its files are in the same folder."""
-    # A name only: a session from elsewhere does not say which files of this machine are opened.
-    name = Path(session.header.parent.get("file", "")).name
-    parent = session.path.parent / name
-    try:
-        return parent if name and all(file.is_file() for file in files_of(parent)) else None
-    except SessionError:
-        return None

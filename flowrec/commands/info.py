@@ -91,8 +91,6 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         "chip_height_um",
         "chip_openings",
         "duration",
-        # The outcome holds this count twice: in the summary of the run, and for each file of it.
-        *(("dropped_frames",) if "frames_dropped" in facts else ()),
     )
     return [
         (names.get(key, name_of(key)), words.get(key) or shown(key, value))

@@ -9,7 +9,7 @@ from contextlib import ExitStack, nullcontext, suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from flowrec.commands.run_summary import GOOD_ENDS, Recorded, RunStatistics, fig
 from flowrec.config import Config, ResolvedConfig
 from flowrec.enums import Outcome, Phase
 from flowrec.errors import SessionError, UnreachableError, UsageError
+from flowrec.estimation.sampler import SAMPLERS
 from flowrec.messages import FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
@@ -38,7 +39,7 @@ from flowrec.session_writer import session_writer
 from flowrec.store.run_files import run_files, run_path, runs_in
 from flowrec.store.writer import SessionWriter
 from flowrec.summary import as_text, finite
-from flowrec.system.outputs import MCAP, RRD, check_output
+from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.system.processes import realtime_priority
 from flowrec.terminal import say, warn
 
@@ -54,12 +55,33 @@ _LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
 View = Literal["spawn", "serve", "rrd", "none"]
 
 
-def prepare(asked: Config) -> tuple[ResolvedConfig, Chip, Pipeline]:
-    """The resolved configuration, its chip and its pipeline. Warns where the plan will have to be honest."""
-    if asked.sampler.method == "smoothed":
+class Prepared(NamedTuple):
+    """What a run needs besides its rig.
+
+    Attributes
+    ----------
+    derived : settings that were derived because they were not given, by key.
+    """
+
+    config: ResolvedConfig
+    chip: Chip
+    pipeline: Pipeline
+    derived: dict[str, float]
+
+
+def prepare(asked: Config) -> Prepared:
+    """Resolve a configuration and check that the mission is feasible; warn where it is likely to fail.
+
+    Raises
+    ------
+    UsageError : the method of the sampler needs a recording.
+    UnreachableError : see `refuse_adrift`.
+    """
+    if "recording" in SAMPLERS[asked.sampler.method].needs:
+        able = " or ".join(f"'{row.name}'" for row in SAMPLERS.values() if "recording" not in row.needs)
         raise UsageError(
-            "sampler.method = 'smoothed' looks at what came later: use it in flowrec replay --refine; a run takes "
-            "'filter' or 'trimmed'"
+            f"sampler.method = {asked.sampler.method!r} needs the whole recording: use it in flowrec replay --refine; "
+            f"a run takes {able}"
         )
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
@@ -86,7 +108,7 @@ def prepare(asked: Config) -> tuple[ResolvedConfig, Chip, Pipeline]:
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
-    return config, chip, assemble(config, chip)
+    return Prepared(config, chip, assemble(config, chip), made)
 
 
 def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
@@ -164,13 +186,13 @@ def record(
     """
     inputs = (*inputs, *_files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
-        check_output(out, MCAP, inputs=inputs, overwrite=overwrite)
-    resolved, chip, pipeline = prepare(config)
-    made = derived(config, resolved)
+        Output(out, MCAP, inputs, overwrite).check()
+    resolved, chip, pipeline, made = prepare(config)
     timeout_s = _guard_timeout_s(resolved) if realtime else None
     path = _place(resolved, out, overwrite)
+    output = Output(path, MCAP, inputs, overwrite)
     if view == "rrd":
-        check_output(path.with_suffix(RRD[0]), RRD, inputs=inputs, overwrite=overwrite)
+        Output(path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
     fields = field_of_session(Path(resolved.start.field), chip) if resolved.start.field else {}
     rig: Rig = RIGS[resolved.rig].load().of(pipeline, resolved, resolved.duration_s, realtime)
     folder, floor_gb = path.resolve().parent, resolved.recording.disk_floor_gb
@@ -190,9 +212,7 @@ def record(
         # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
         stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
         writer = stack.enter_context(
-            session_writer(
-                path, resolved, chip, live=realtime, overwrite=overwrite, in_pieces=True, derived=made, inputs=inputs
-            )
+            session_writer(output, resolved, chip, live=realtime, in_pieces=True, derived=made)
         )
         opened.append(writer)
         sinks: list[Sink] = [writer, statistics]
@@ -200,7 +220,7 @@ def record(
         worker: Worker
         if view in ("spawn", "serve"):
             # Late: importing Rerun takes a second, and most runs do without.
-            from flowrec.commands.export import scene_of
+            from flowrec.commands.export_rrd import scene_of
             from flowrec.view.live import LiveView
 
             live = stack.enter_context(LiveView(scene_of(resolved, chip, pipeline, path), view))
@@ -231,9 +251,8 @@ def record(
                 watchdog=watchdog,
             )
         facts = figures_of(chip, report, statistics.true_field)
-        if resolved.control.method != "policy":  # which has no reference to be off
+        if not resolved.control.needs:  # a control law that descends the time to go has no reference
             facts["tracking_error_um"] = finite(statistics.tracking_error_um)
-        facts["frames_dropped"] = writer.dropped_frames
         if control.note:
             facts["note_not_finished"] = control.note
         outcome = as_text(facts) | clocks.outcome()
@@ -244,7 +263,7 @@ def record(
         _report_remarks(writer)
         if live is not None and run_control.reason:
             live.close(VIEW_TIMEOUT_S)
-    facts["frames_dropped"] = writer.dropped_frames  # more may have been, for want of time
+    facts["frames_dropped"] = writer.dropped_frames  # the writer has added it to the outcome of the file
     files = tuple(writer.files)
     recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason))
     if view == "rrd" and run_control.reason:

@@ -15,29 +15,32 @@ from numpy.typing import NDArray
 from flowrec import topics
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.verification import WorkerCheck, digest_lines
+from flowrec.commands.replay_result import CommandDifference, Replayed, WorkerCheck, digest_lines
 from flowrec.config import ResolvedConfig, with_sets
+from flowrec.control.controller import CONTROLLERS
 from flowrec.enums import Outcome, Phase, WorkOrder
 from flowrec.errors import SessionError, UsageError
+from flowrec.estimation.observer import OBSERVERS
+from flowrec.estimation.sampler import SAMPLERS
 from flowrec.estimation.smoother import observe, smooth
-from flowrec.messages import Applied, Demand, Mission, Observations, Tick, Track
+from flowrec.messages import Applied, Mission, Observations, Tick, Track
 from flowrec.pipeline import Pipeline, assemble
+from flowrec.planning.planner import PLANNERS
 from flowrec.rigs.recorded import RecordedRig
-from flowrec.run.loop import RunReport, Sink, run
+from flowrec.run.loop import Sink, run
 from flowrec.run.workers import LockstepWorker, work
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
 from flowrec.store.writer import SessionWriter
 from flowrec.summary import Figures, as_text
-from flowrec.system.outputs import MCAP, check_output
+from flowrec.system.outputs import MCAP, Output
 from flowrec.terminal import warn
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
 from flowrec.units import seconds
 
 # Sections that a recording has fixed.
 FIXED = ("chip", "camera", "rig", "simulated")
-_SAME_COMMAND_UM_S = 1.0  # smaller differences of the demanded velocity are not visible
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +64,12 @@ class Change:
         the recorded robot can not follow the replayed commands.
         """
         plan, controller = self.plan, self.controller
-        # The control law "policy" needs the planner "time_field": where one of them is asked for, the other follows.
-        if controller == "policy" and plan is None:
-            plan = "time_field"
-        elif plan not in (None, "time_field") and controller is None and config.control.method == "policy":
-            controller = "vector"
+        # A control law may need a planner that provides the time to go: if one of them is given, the other follows.
+        # An unknown name is reported below, with its option.
+        if controller is not None and controller in CONTROLLERS and plan is None:
+            plan = _able_planner(CONTROLLERS[controller].needs, config.plan.method)
+        elif plan is not None and plan in PLANNERS and controller is None and not _provides(plan, config.control.needs):
+            controller = next(row.name for row in CONTROLLERS.values() if not row.needs)
         given = {
             "refine.method": ("--refine", self.refine),
             "plan.method": ("--plan", plan),
@@ -102,108 +106,15 @@ class Change:
         return topics.stale_results([*sections, *(["refine"] if self.refine is not None else [])])
 
 
-@dataclass(slots=True)
-class CommandDifference:
-    """How far the replayed demand is from the recorded one.
-
-    Attributes
-    ----------
-    compared, changed : number of ticks.
-    first_ns : stamp of the first changed demand.
-    rms_um_s : root mean square difference of the demanded velocity, um/s.
-    """
-
-    compared: int = 0
-    changed: int = 0
-    first_ns: int | None = None
-    _square: float = 0.0
-
-    def add(self, was: Demand | None, now: Demand | None) -> None:
-        """Compare one pair of demands."""
-        if was is None or now is None:
-            return
-        self.compared += 1
-        difference = math.dist(was.velocity_um_s, now.velocity_um_s)
-        self._square += difference**2
-        if difference > _SAME_COMMAND_UM_S:
-            self.changed += 1
-            self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
-
-    @property
-    def rms_um_s(self) -> float:
-        """Root mean square difference of the demanded velocity."""
-        return math.sqrt(self._square / self.compared) if self.compared else 0.0
+def _provides(planner: str, needs: tuple[str, ...]) -> bool:
+    return set(needs) <= set(PLANNERS[planner].provides)
 
 
-@dataclass(slots=True)
-class Replayed:
-    """The result of a replay.
-
-    Attributes
-    ----------
-    session : what was replayed, with the recorded configuration.
-    config : the configuration of the replay.
-    report : how the loop went.
-    recorded, replayed : the last tick, as recorded and as replayed.
-    comparison : of the outputs of both, tick by tick.
-    commands : of the demands of both.
-    frames_missing : images that are not in the file.
-    worker_check : of --verify: the results of the worker.
-    digest : of --verify: whether the files hold what was recorded, and lines of text about it.
-    """
-
-    session: Session
-    config: ResolvedConfig
-    report: RunReport
-    recorded: Tick
-    replayed: Tick
-    comparison: Comparison
-    commands: CommandDifference
-    frames_missing: int
-    worker_check: WorkerCheck | None = None
-    digest: tuple[bool, list[str]] = (True, [])
-
-    @property
-    def same(self) -> bool:
-        """Whether everything that was compared is the same within its tolerance, and the files are unchanged."""
-        return self.digest[0] and all(comparison.same for comparison in self._comparisons)
-
-    @property
-    def identical(self) -> bool:
-        """The same bit for bit."""
-        return self.digest[0] and all(comparison.identical for comparison in self._comparisons)
-
-    @property
-    def _comparisons(self) -> list[Comparison]:
-        return [self.comparison, *([self.worker_check.comparison] if self.worker_check is not None else [])]
-
-    def lines(self) -> list[str]:
-        """How the replay compares with the recording, the conclusion last."""
-        lines = self.comparison.lines()
-        if self.worker_check is not None:
-            lines += self.worker_check.results
-        lines += self.digest[1]
-        if self.frames_missing:
-            lines.append(f"{self.frames_missing} frames are not in the file; their recorded tracks stood in")
-        first = next((each.first for each in self._comparisons if each.first is not None), None)
-        if first is not None:
-            lines.append(f"first difference: {first}")
-        differs = self.comparison.other_numerics if self.digest[0] else ""
-        conclusion = "every tick identical" if self.identical else "the same within tolerance"
-        lines.append(f"{self.comparison.ticks} ticks: {conclusion if self.same else differs or 'NOT the same'}")
-        return lines
-
-    def as_json(self) -> dict[str, Any]:
-        """The same in numbers, with the lines."""
-        found = [comparison.as_json() for comparison in self._comparisons]
-        return found[0] | {
-            "same": self.same,
-            "identical": self.identical,
-            "topics": {name: count for each in found for name, count in each["topics"].items()},
-            "first": next((each["first"] for each in found if each["first"] is not None), None),
-            "digest_faults": [] if self.digest[0] else self.digest[1],
-            "lines": self.lines(),
-        }
+def _able_planner(needs: tuple[str, ...], recorded: str) -> str | None:
+    """The first planner that provides what a control law needs; None if the recorded one does."""
+    if _provides(recorded, needs):
+        return None
+    return next((name for name in PLANNERS if _provides(name, needs)), None)
 
 
 def replay(
@@ -234,9 +145,9 @@ def replay(
     SessionError : the session can not be read or replayed, or `out` not be written.
     """
     if out is not None:
-        out = Path(out)
         source = session.path if isinstance(session, Session) else Path(session)
-        check_output(out, MCAP, inputs=files_behind(source), overwrite=overwrite)
+        output = Output(Path(out), MCAP, tuple(files_behind(source)), overwrite)
+        output.check()
     session, change = Session.of(session), change or Change()
     control = control or Unattended()
     config = change.apply(session.config)
@@ -245,7 +156,7 @@ def replay(
         raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
     config = _with_recorded_region(session, config)
     pipeline = assemble(config, session.chip)
-    if config.sampler.method == "smoothed":
+    if "recording" in SAMPLERS[config.sampler.method].needs:
         pipeline = replace(pipeline, hindsight=hindsight(session, pipeline))
     path, reader = session.path, session.reader
     start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
@@ -275,7 +186,7 @@ def replay(
         sinks: list[Sink] = []
         writer = None
         if out is not None:
-            writer = stack.enter_context(session_writer(out, config, session.chip, parent=path, overwrite=overwrite))
+            writer = stack.enter_context(session_writer(output, config, session.chip, parent=path))
             sinks.append(writer if frames else WithoutFrames(writer))
         length_s = max(seconds(reader.last_ns - first_ns), 1e-3)
         progress = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
@@ -327,8 +238,11 @@ def hindsight(session: Session, pipeline: Pipeline) -> Callable[[int], Observati
     ------
     UsageError : the observer is not the Kalman filter, whose model the smoother shares.
     """
-    if pipeline.observer.method == "luenberger":
-        raise UsageError("sampler.method = 'smoothed' needs observer.method = 'kalman', whose model it shares")
+    if "kalman" not in OBSERVERS[pipeline.observer.method].options:
+        able = " or ".join(f"'{row.name}'" for row in OBSERVERS.values() if "kalman" in row.options)
+        raise UsageError(
+            f"sampler.method = {pipeline.sampler.method!r} needs observer.method = {able}, whose model it shares"
+        )
     tracks: list[Track] = []
     applied: list[Applied] = []
     for tick in session.ticks(with_frames=False):

@@ -12,7 +12,8 @@ from typing import Self
 import numpy as np
 
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.replay import Change, Replayed, planned_from, replay
+from flowrec.commands.replay import Change, planned_from, replay
+from flowrec.commands.replay_result import Replayed
 from flowrec.commands.run_summary import length_um
 from flowrec.enums import Phase
 from flowrec.errors import SessionError, UsageError
@@ -27,7 +28,7 @@ from flowrec.run.workers import LockstepWorker, Preloaded, no_observations
 from flowrec.session import files_behind
 from flowrec.session_writer import session_writer
 from flowrec.summary import Row, Value, finite
-from flowrec.system.outputs import MCAP, RRD, check_output
+from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.terminal import say
 from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
@@ -99,13 +100,11 @@ class Outputs:
     session : of the replay.
     refly : of the flight of the replayed plan; None: it is not flown.
     rrd : for Rerun; None: it is not made.
-    overwrite : existing files may be replaced, but none that is read.
     """
 
-    session: Path
-    refly: Path | None
-    rrd: Path | None
-    overwrite: bool
+    session: Output
+    refly: Output | None
+    rrd: Output | None
 
     @classmethod
     def of(cls, path: Path, out: Path | None, overwrite: bool, *, refly: bool, rrd: bool) -> Self:
@@ -119,12 +118,15 @@ class Outputs:
         out = out or next((name for name in numbered if not name.exists()), None)
         if out is None:
             raise SessionError(f"{path.parent}: 999 replays of {path.name} are here; name one with --out")
-        flight = out.with_name(f"{out.stem}_refly{MCAP[0]}") if refly else None
-        outputs = cls(out, flight, out.with_suffix(RRD[0]) if rrd else None, overwrite)
-        inputs = files_behind(path)
-        for file, suffixes in ((out, MCAP), (flight, MCAP), (outputs.rrd, RRD)):
-            if file is not None:
-                check_output(file, suffixes, inputs=inputs, overwrite=overwrite)
+        session = Output(out, MCAP, tuple(files_behind(path)), overwrite)
+        outputs = cls(
+            session,
+            replace(session, path=out.with_name(f"{out.stem}_refly{MCAP[0]}")) if refly else None,
+            replace(session, path=out.with_suffix(RRD[0]), suffixes=RRD) if rrd else None,
+        )
+        for output in (outputs.session, outputs.refly, outputs.rrd):
+            if output is not None:
+                output.check()
         return outputs
 
 
@@ -137,19 +139,19 @@ def replay_and_report(
     control: Unattended | None = None,
 ) -> tuple[Replayed, list[Row]]:
     """Replay a session, report on it, and write all outputs; arguments and errors as of `replay` and `refly`."""
-    overwrite = outputs.overwrite
-    done = replay(path, change, from_s, False, outputs.session, overwrite, frames, control)
+    output = outputs.session
+    done = replay(path, change, from_s, False, output.path, output.overwrite, frames, control)
     rows = report(done)
     if outputs.refly is not None:
-        rows += refly(done, outputs.refly, overwrite)
+        rows += refly(done, outputs.refly)
     if outputs.rrd is not None:
         from flowrec.commands.export import export  # late: it imports Rerun
 
-        export(outputs.session, overwrite=overwrite)
+        export(output.path, overwrite=output.overwrite)
     return done, rows
 
 
-def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[Row]:
+def refly(done: Replayed, out: Output | None) -> list[Row]:
     """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
 
     Both flights begin where the recorded route does and have the same seed; rows as of `report`.
@@ -183,7 +185,7 @@ def refly(done: Replayed, out: Path | None, overwrite: bool = False) -> list[Row
         sinks: list[Sink] = []
         with ExitStack() as stack:
             if target is not None:
-                writer = session_writer(target, flown, session.chip, parent=session.path, overwrite=overwrite)
+                writer = session_writer(target, flown, session.chip, parent=session.path)
                 sinks.append(stack.enter_context(writer))
             say(f"reflying as {name} ...")
             flight = run(pipeline, rig, worker, sinks)

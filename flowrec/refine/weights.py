@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flowrec.errors import FlowError
-from flowrec.system.outputs import WEIGHTS, new_file
+from flowrec.system.outputs import WEIGHTS, Output
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
@@ -26,7 +26,7 @@ def write_weights(path: Path, network: nn.Module, facts: Mapping[str, str]) -> N
     halves = {name: value.detach().cpu().to(torch.float16).contiguous() for name, value in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     # One entry of metadata: the order of several is not reproducible.
-    with new_file(path, WEIGHTS, overwrite=True) as part:
+    with Output(path, WEIGHTS, overwrite=True).new_file() as part:
         part.write_bytes(save(halves, {"facts": json.dumps(dict(facts), sort_keys=True)}))
 
 

@@ -37,7 +37,7 @@ from flowrec.store.session_metadata import (
 )
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import held
-from flowrec.system.outputs import MCAP, OutputError, check_output, put_in_place
+from flowrec.system.outputs import MCAP, Output, OutputError, put_in_place
 from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
@@ -156,7 +156,7 @@ def _recover(path: Path, out: Path | None) -> Recovered:
     final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
     target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
     growing = partial_path(target)  # a run that will want the name at its end
-    check_output(target, MCAP, inputs=(path,), overwrite=True, also=(growing,) if growing != path else ())
+    Output(target, MCAP, (path,), overwrite=True).check((growing,) if growing != path else ())
     if out is not None:
         _refuse_if_taken(target)
     if partial and path.is_file() and not path.stat().st_size:
@@ -308,8 +308,9 @@ def _losses(
 
 
 def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Mapping[str, str]:
-    recorded = {key: value for key, value in reader.outcome.items() if key not in ("ticks", "dropped_frames")}
-    marks = {"recovered_from": reader.path.name, "frames_dropped": str(dropped)}
+    counted = ("ticks", "dropped_frames", "frames_dropped")  # the last one in older files
+    recorded = {key: value for key, value in reader.outcome.items() if key not in counted}
+    marks = {"recovered_from": reader.path.name, "dropped_frames": str(dropped)}
     if not lost:
         return {"outcome": Outcome.ENDED, **recorded, **marks}
     if "outcome" in recorded:

@@ -26,7 +26,7 @@ from flowrec.store.roi import Region
 from flowrec.store.run_files import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
 from flowrec.store.write_queue import Entry
-from flowrec.system.outputs import MCAP, check_output, put_in_place, sync_directory, taken
+from flowrec.system.outputs import MCAP, Output, put_in_place, sync_directory, taken
 from flowrec.version import __version__
 
 
@@ -213,15 +213,15 @@ class SessionFile:
 
 
 def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
-    """Refuse the output X.mcap as `check_output` does, and any file of that run, finished or not, in the same way.
+    """Refuse the output X.mcap as `Output.check` does, and any file of that run, finished or not, in the same way.
 
     Raises
     ------
-    OutputError : as `check_output`.
+    OutputError : as `Output.check`.
     FileError : the unfinished file of a killed run is there, which `overwrite` would remove.
     """
     there = run_files(path)
-    check_output(path, MCAP, inputs=inputs, overwrite=overwrite, also=(*there, partial_path(path)))
+    Output(path, MCAP, tuple(inputs), overwrite).check((*there, partial_path(path)))
     if overwrite:
         return
     for file in there:

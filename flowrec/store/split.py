@@ -282,6 +282,7 @@ class Parts:
         """Finish the last part; everything is on the disk then. `why` is for snapshots only."""
         last = self._router.current
         try:
+            last.counters.dropped_frames += int(outcome.get("dropped_frames", 0))  # before a recovery
             last.segment.finish({**outcome, **last.counters.summary(self.options.encoding)})
         finally:
             self._collect_finished(wait=True)

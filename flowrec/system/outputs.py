@@ -11,6 +11,7 @@ import os
 import secrets
 import sys
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from flowrec.errors import SessionError
@@ -33,86 +34,95 @@ class OutputError(SessionError):
     exit_status = 2
 
 
-def check_output(
-    path: Path,
-    suffixes: tuple[str, ...],
-    *,
-    inputs: Iterable[Path] = (),
-    overwrite: bool = False,
-    also: Iterable[Path] = (),
-) -> None:
-    """Check an output before any work is done for it.
+@dataclass(frozen=True, slots=True)
+class Output:
+    """An output file of a verb, and what it may replace.
 
-    Parameters
+    Attributes
     ----------
+    path : of the file.
     suffixes : those of its format, the usual one first.
     inputs : files that the command reads; the output must be none of them, even with `overwrite`.
     overwrite : an existing file may be replaced.
-    also : other files that this output replaces or adds to: the parts of a session, and what is unfinished of it.
-
-    Raises
-    ------
-    OutputError : it may not be written; the text says why, and what to do.
     """
-    if path.is_dir():
-        raise OutputError(f"{path}: is a directory; name a file, as in {path / ('NAME' + suffixes[0])}")
-    read = list(inputs)
-    for file in (path, *also):
-        if any(_same(file, other) for other in read):
-            raise OutputError(f"{file}: is read by this command and stays as it is; choose another name for the output")
-    if path.suffix not in suffixes:
-        formats = " or ".join(suffixes)
-        raise OutputError(
-            f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
-        )
-    if not path.parent.is_dir():
-        raise OutputError(f"{path.parent}: no such directory; make it, or choose another place for {path.name}")
-    for file in (path, *also):
-        if file.is_file() and is_growing(file):
+
+    path: Path
+    suffixes: tuple[str, ...]
+    inputs: tuple[Path, ...] = ()
+    overwrite: bool = False
+
+    def check(self, also: Iterable[Path] = ()) -> None:
+        """Check the output before any work is done for it.
+
+        Parameters
+        ----------
+        also : other files that this output replaces or adds to: the parts of a session, and its unfinished files.
+
+        Raises
+        ------
+        OutputError : it may not be written; the text says why, and what to do.
+        """
+        path, suffixes, files = self.path, self.suffixes, (self.path, *also)
+        if path.is_dir():
+            raise OutputError(f"{path}: is a directory; name a file, as in {path / ('NAME' + suffixes[0])}")
+        for file in files:
+            if any(_same(file, other) for other in self.inputs):
+                raise OutputError(
+                    f"{file}: is read by this command and stays as it is; choose another name for the output"
+                )
+        if path.suffix not in suffixes:
+            formats = " or ".join(suffixes)
             raise OutputError(
-                f"{file}: is being written by another process just now; let it end or stop it with Ctrl-C, or choose "
-                "another name"
+                f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
             )
-    if not overwrite and os.path.lexists(path):
-        raise taken(path)
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise OutputError(f"{path.parent}: can not be written to; choose another place for {path.name}")
+        if not path.parent.is_dir():
+            raise OutputError(f"{path.parent}: no such directory; make it, or choose another place for {path.name}")
+        for file in files:
+            if file.is_file() and is_growing(file):
+                raise OutputError(
+                    f"{file}: is being written by another process just now; let it end or stop it with Ctrl-C, or "
+                    "choose another name"
+                )
+        if not self.overwrite and os.path.lexists(path):
+            raise taken(path)
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise OutputError(f"{path.parent}: can not be written to; choose another place for {path.name}")
+
+    @contextlib.contextmanager
+    def new_file(self) -> Iterator[Path]:
+        """Yield a temporary file in the same folder; it gets the name `path` when the block ends without an exception.
+
+        If the block ends with an exception, nothing is left.
+
+        Raises
+        ------
+        OutputError : the output is refused, see `check`.
+        SessionError : it can not be written, in one line.
+        """
+        self.check()
+        path = self.path
+        part = path.with_name(f".flowrec-{secrets.token_hex(6)}{path.suffix}")
+        try:
+            part.touch(exist_ok=False)  # fails before any work is done if the folder can not be written to
+            yield part
+            with part.open("rb") as file:
+                os.fsync(file.fileno())
+            put_in_place(part, path, overwrite=self.overwrite)
+        except FileExistsError as error:
+            raise taken(path) from error
+        except OSError as error:
+            if error.filename not in (None, str(part), str(path)):
+                raise
+            raise SessionError(
+                f"{path}: can not be written ({error.strerror or error}); choose another place"
+            ) from error
+        finally:
+            part.unlink(missing_ok=True)
 
 
 def taken(path: Path, kept: str = "") -> OutputError:
     """The error for a name that another file has."""
     return OutputError(f"{path}: exists already{kept}; choose another name, or replace it with --overwrite")
-
-
-@contextlib.contextmanager
-def new_file(
-    path: Path, suffixes: tuple[str, ...], *, inputs: Iterable[Path] = (), overwrite: bool = False
-) -> Iterator[Path]:
-    """A temporary file in the same folder to be written to; it gets the name `path` when the block has ended well.
-
-    Where the block ends with an exception nothing is left. Parameters as of `check_output`.
-
-    Raises
-    ------
-    OutputError : the output is refused, see `check_output`.
-    SessionError : it can not be written, in one line.
-    """
-    check_output(path, suffixes, inputs=inputs, overwrite=overwrite)
-    part = path.with_name(f".flowrec-{secrets.token_hex(6)}{path.suffix}")
-    try:
-        part.touch(exist_ok=False)  # a folder that can not be written to is told before any work is done
-        yield part
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        put_in_place(part, path, overwrite=overwrite)
-    except FileExistsError as error:
-        raise taken(path) from error
-    except OSError as error:
-        if error.filename not in (None, str(part), str(path)):
-            raise
-        raise SessionError(f"{path}: can not be written ({error.strerror or error}); choose another place") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import rerun as rr
 
 from flowrec.messages import Tick
-from flowrec.system.outputs import RRD, new_file
+from flowrec.system.outputs import Output
 from flowrec.units import seconds
 from flowrec.view.blueprint import blueprint
 from flowrec.view.logger import TickLogger
@@ -24,27 +24,23 @@ _HEAD_BYTES = 1024  # contains the names of application and recording as plain t
 
 
 def write_rrd(
-    path: Path | str,
+    output: Output,
     scene: Scene,
     ticks: Iterable[Tick],
     replayed_ticks: Iterable[Tick] | None = None,
     progress: Callable[[float], None] | None = None,
-    *,
-    inputs: Iterable[Path] = (),
-    overwrite: bool = False,
 ) -> None:
     """Write ticks, and replayed ones beside them if given; a file of this name appears when it is complete.
 
     Parameters
     ----------
-    inputs, overwrite : as of `flowrec.system.outputs.check_output`.
     progress : called from time to time with the session time in s since the first tick.
 
     Raises
     ------
     SessionError : the file can not be written; OutputError if it may not be.
     """
-    with new_file(Path(path), RRD, inputs=inputs, overwrite=overwrite) as part:
+    with output.new_file() as part:
         stream = open_stream(scene)
         try:
             stream.save(part)

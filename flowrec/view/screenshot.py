@@ -16,7 +16,7 @@ from rerun.experimental import ViewerClient, ViewerState
 from flowrec.errors import FlowrecError
 from flowrec.store.mcap_reader import ForeignError
 from flowrec.store.session_metadata import SessionMetadata
-from flowrec.system.outputs import PICTURE, new_file
+from flowrec.system.outputs import PICTURE, Output
 from flowrec.units import nanoseconds
 from flowrec.view import viewer
 from flowrec.view.entities import SESSION_TIME
@@ -51,7 +51,7 @@ def screenshot(
     if not path.exists():
         raise FlowrecError(f"{path}: no such file")
     with (
-        new_file(Path(out_png), PICTURE, inputs=(path,), overwrite=overwrite) as part,
+        Output(Path(out_png), PICTURE, (path,), overwrite).new_file() as part,
         _headless(size) as (client, began),
     ):
         client.open(path.as_uri())

@@ -27,6 +27,7 @@ from flowrec.session import Session
 from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
+from flowrec.system.outputs import MCAP, Output
 from tests.conftest import SMALL, until
 
 S = 1_000_000_000
@@ -85,12 +86,12 @@ def stamped(arrived: Inputs, stamp_ns: int) -> Inputs:
 
 
 def flown(path, rig_of=Stumbling, watch=None, **more):
-    config, chip, pipeline = prepare(load_config(None, SHORT))
+    config, chip, pipeline, _ = prepare(load_config(None, SHORT))
     rig = rig_of.of(pipeline, config, config.duration_s)
     for name, value in more.items():
         setattr(rig, name, value)
     clocks = watch or ClockMonitor()
-    with session_writer(path, config, chip) as writer:
+    with session_writer(Output(path, MCAP), config, chip) as writer:
         report = run(pipeline, rig, LockstepWorker(pipeline, 0.5), [writer], clocks=clocks)
         writer.close({"outcome": report.outcome, **clocks.outcome()})
     return rig, report
@@ -215,7 +216,7 @@ def test_a_clock_really_set_back_an_hour_neither_delays_a_flush_nor_touches_a_st
 
 
 def test_the_same_seed_gives_the_same_camera_clock_and_real_time_dates_frames_by_it():
-    config, _, pipeline = prepare(load_config(None, SHORT))
+    config, _, pipeline, _ = prepare(load_config(None, SHORT))
     first, again = (list(SimulatedRig.of(pipeline, config, 1.0).inputs()) for _ in range(2))
     assert [one.clock for one in first] == [one.clock for one in again]
     quick = replace(

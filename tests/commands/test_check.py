@@ -6,6 +6,7 @@ import struct
 from dataclasses import replace
 
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
@@ -64,15 +65,31 @@ def test_a_real_mission_is_good_and_its_verdict_comes_first(session):
     assert told["topics"] == json.loads(typed("info", session, "--json").stdout)["topics"]
 
 
-def test_the_same_session_cut_off_is_not_usable_and_recovered_it_is_with_a_loss(session, tmp_path):
+def cut_off(session, channel, path):
+    """Write the beginning of a session: up to the first chunk of a channel that ends behind 60 % of the file."""
+    with session.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    ends = [
+        chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        for chunk in chunks
+        if channel in chunk.message_index_offsets
+    ]
+    path.write_bytes(session.read_bytes()[: next(end for end in sorted(ends) if end > 0.6 * session.stat().st_size)])
+
+
+# A flush writes the images before the state. A file that ends between the two has images of ticks that it lacks.
+@pytest.mark.parametrize(("last", "expected"), [(APPLIED, ["end"]), (FRAMES, ["end", "replay"])])
+def test_the_same_session_cut_off_is_not_usable_and_recovered_it_is_with_a_loss(last, expected, session, tmp_path):
     path = tmp_path / "s.mcap.partial"
-    path.write_bytes(session.read_bytes()[: int(0.6 * session.stat().st_size)])
+    cut_off(session, last, path)
     done = typed("check", path)
     assert done.exit_code == 1 and "was not finished" in done.stdout and "flowrec recover" in done.stdout
     saved = recover(path)
     verdict = check(saved.path)
     assert verdict.exit_status == 3
-    assert [about for about, _ in found(verdict)] == ["end"] and "recovered from s.mcap.partial" in found(verdict)[0][1]
+    assert [about for about, _ in found(verdict)] == expected
+    assert "recovered from s.mcap.partial" in found(verdict)[0][1]
+    assert all("ticks there is only the image" in text for about, text in found(verdict) if about == "replay")
 
 
 def test_a_run_that_is_going_on_is_told_as_such(tmp_path):

@@ -77,7 +77,7 @@ def test_two_sessions_of_other_numerics_are_compared_as_such_and_check_names_the
 def test_an_edited_file_is_told_as_such_whatever_its_numerics(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("flowrec.commands.verification.digest_faults", lambda path: {path: ["a message was changed"]})
+    monkeypatch.setattr("flowrec.commands.replay_result.digest_faults", lambda path: {path: ["a message was changed"]})
     _, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
     assert "DIFFERENT from its digest" in said
     assert "NOT the same" in said.splitlines()[-1]

@@ -13,6 +13,7 @@ from rerun.chunk import RrdReader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Tick
+from flowrec.system.outputs import RRD, Output
 from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene
 
@@ -63,7 +64,7 @@ class File:
 @pytest.fixture(scope="module")
 def single(tmp_path_factory: pytest.TempPathFactory, scene: Scene, ticks: list[Tick]) -> File:
     path = tmp_path_factory.mktemp("single") / "session.rrd"
-    write_rrd(path, scene, ticks)
+    write_rrd(Output(path, RRD), scene, ticks)
     return File(path)
 
 
@@ -73,7 +74,7 @@ def double(
 ) -> File:
     path = tmp_path_factory.mktemp("double") / "session.rrd"
     # As a replay comes: without frames, and with another flow, faster in the upper branch.
-    write_rrd(path, scene, ticks, (replace(tick, frame=None) for tick in made_up(120, seed=1, share=0.9)))
+    write_rrd(Output(path, RRD), scene, ticks, (replace(tick, frame=None) for tick in made_up(120, seed=1, share=0.9)))
     return File(path)
 
 
@@ -94,7 +95,7 @@ def test_everything_that_a_view_of_a_replay_asks_for_is_in_the_file(double: File
 
 def test_a_view_that_would_stay_empty_is_left_out(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
     bare = [replace(tick, true_field=None, truth=None, refined=None) for tick in ticks[:5]]
-    write_rrd(tmp_path / "bare.rrd", scene, bare)
+    write_rrd(Output(tmp_path / "bare.rrd", RRD), scene, bare)
     views = File(tmp_path / "bare.rrd").views
     assert "Flow speed: assumed" in views
     assert not {
@@ -107,7 +108,7 @@ def test_the_timelines_are_session_time_to_the_nanosecond_and_frame(
 ) -> None:
     late = 123_456_789_123_456_789  # four years, which a float does not hold to the nanosecond
     tick = replace(ticks[7], stamp_ns=late)
-    write_rrd(tmp_path / "late.rrd", scene, [tick])
+    write_rrd(Output(tmp_path / "late.rrd", RRD), scene, [tick])
     file = File(tmp_path / "late.rrd")
     assert set().union(*file.times.values()) == {"session time", "frame"}
     stamps = [stamp for stamp in file.columns["/camera/image"]["session time"] if stamp is not None]
@@ -139,10 +140,10 @@ def test_a_file_that_breaks_off_does_not_appear(tmp_path: Path, scene: Scene, ti
         raise SessionError("damaged")
 
     with pytest.raises(SessionError, match="damaged"):
-        write_rrd(tmp_path / "half.rrd", scene, breaks_off())
+        write_rrd(Output(tmp_path / "half.rrd", RRD), scene, breaks_off())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_place_that_cannot_be_written_is_said_in_one_line(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
     with pytest.raises(SessionError, match=r"nowhere: no such directory; .*choose another place"):
-        write_rrd(tmp_path / "nowhere" / "session.rrd", scene, ticks)
+        write_rrd(Output(tmp_path / "nowhere" / "session.rrd", RRD), scene, ticks)

@@ -21,7 +21,7 @@ from flowrec.refine.case import Case
 from flowrec.refine.network_fit import Device, torch_run
 from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.training.lessons import Lesson, prepare, read_lesson
-from flowrec.system.outputs import WEIGHTS, check_output
+from flowrec.system.outputs import WEIGHTS, Output
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -69,7 +69,7 @@ def train(
     OutputError
         If `out` may not be written; an existing file is replaced with `overwrite` only.
     """
-    check_output(out, WEIGHTS, overwrite=overwrite)
+    Output(out, WEIGHTS, overwrite=overwrite).check()
     if training.lessons < 4:
         raise UsageError(f"training: {training.lessons} lessons are too few; give at least 4")
     lessons = []

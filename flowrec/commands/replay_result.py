@@ -1,0 +1,194 @@
+"""The result of a replay: its comparison with the recording and, for `--verify`, worker results and file digests."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flowrec.commands.compare import Comparison
+from flowrec.config import ResolvedConfig
+from flowrec.enums import WorkOrder
+from flowrec.errors import printable
+from flowrec.messages import Demand, FlowField, Route, Tick
+from flowrec.pipeline import Pipeline
+from flowrec.run.loop import RunReport
+from flowrec.run.workers import work
+from flowrec.session import Session
+from flowrec.store.audit import digest_faults
+from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS
+
+_SAME_COMMAND_UM_S = 1.0  # smaller differences of the demanded velocity are not visible
+
+
+class WorkerCheck:
+    """Carries out every recorded work order again and compares the adopted result within the tolerance of its topic.
+
+    Parameters
+    ----------
+    pipeline : the stages as recorded.
+    start : the tick before the first one of the replay.
+    order : the tick of an order that is not yet answered there; None without one.
+    comparison : takes the results.
+
+    Attributes
+    ----------
+    results : a line of text for each result.
+    """
+
+    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None, comparison: Comparison) -> None:
+        self._pipeline = pipeline
+        self._computed: dict[int, FlowField | Route] = {}  # by number of the order
+        self._ordered = start.mission.request if start.mission is not None else 0
+        self._last = start
+        self._unknown = {0}  # orders that can not be carried out again; 0: fields of an earlier session
+        self.comparison = comparison
+        self.results: list[str] = []
+        if order is None or order.mission is None:
+            return
+        mission, seen = order.mission, order.observations
+        if mission.wanted == WorkOrder.REFINE and seen is not None and seen.stamp_ns > mission.requested_ns:
+            # Ordered before this part of a run begins, from fewer observations than its keyframe holds.
+            self._unknown.add(mission.request)
+            path = BY_FIELD[ANSWERED_BY[WorkOrder.REFINE]].path
+            self.results.append(f"{path}: ordered in the part before, taken as recorded")
+        else:
+            self._computed[mission.request] = work(pipeline, order)
+
+    def add(self, tick: Tick) -> None:
+        """Take the next tick: carry out a new order, compare newly adopted results."""
+        for name in WORKER_FIELDS:
+            adopted = getattr(tick, name)
+            if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._unknown:
+                continue
+            computed = self._computed.pop(adopted.request, None)
+            computed = replace(computed, stamp_ns=tick.stamp_ns) if computed is not None else None
+            topic = BY_FIELD[name]
+            found = self.comparison.add_pair(topic, adopted, computed, tick.stamp_ns)
+            how = "identical"
+            if found is not None:
+                how = f"{self.comparison.different_word if found.beyond else 'within tolerance'}: {found}"
+            self.results.append(printable(f"{topic.path} {adopted.method}: {how}"))
+        mission = tick.mission
+        if mission is not None and mission.wanted and mission.request > self._ordered:
+            self._ordered = mission.request
+            self._computed[mission.request] = work(self._pipeline, tick)
+        self._last = tick
+
+
+def digest_lines(path: Path) -> tuple[bool, list[str]]:
+    """Whether the files of a session hold what was recorded, by their digests, and lines of text about it."""
+    lines = []
+    intact = True
+    for file, faults in digest_faults(path).items():
+        if faults is None:
+            lines.append(printable(f"{file.name}: no digest, recorded by an older flowrec"))
+        elif faults:
+            intact = False
+            lines += [printable(f"{file.name}: DIFFERENT from its digest: {fault}") for fault in faults]
+    return intact, lines or ["all messages and the head are as the digest says"]
+
+
+@dataclass(slots=True)
+class CommandDifference:
+    """How far the replayed demand is from the recorded one.
+
+    Attributes
+    ----------
+    compared, changed : number of ticks.
+    first_ns : stamp of the first changed demand.
+    rms_um_s : root mean square difference of the demanded velocity, um/s.
+    """
+
+    compared: int = 0
+    changed: int = 0
+    first_ns: int | None = None
+    _square: float = 0.0
+
+    def add(self, was: Demand | None, now: Demand | None) -> None:
+        """Compare one pair of demands."""
+        if was is None or now is None:
+            return
+        self.compared += 1
+        difference = math.dist(was.velocity_um_s, now.velocity_um_s)
+        self._square += difference**2
+        if difference > _SAME_COMMAND_UM_S:
+            self.changed += 1
+            self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
+
+    @property
+    def rms_um_s(self) -> float:
+        """Root mean square difference of the demanded velocity."""
+        return math.sqrt(self._square / self.compared) if self.compared else 0.0
+
+
+@dataclass(slots=True)
+class Replayed:
+    """The result of a replay.
+
+    Attributes
+    ----------
+    session : what was replayed, with the recorded configuration.
+    config : the configuration of the replay.
+    report : how the loop went.
+    recorded, replayed : the last tick, as recorded and as replayed.
+    comparison : of the outputs of both, tick by tick.
+    commands : of the demands of both.
+    frames_missing : images that are not in the file.
+    worker_check : of --verify: the results of the worker.
+    digest : of --verify: whether the files hold what was recorded, and lines of text about it.
+    """
+
+    session: Session
+    config: ResolvedConfig
+    report: RunReport
+    recorded: Tick
+    replayed: Tick
+    comparison: Comparison
+    commands: CommandDifference
+    frames_missing: int
+    worker_check: WorkerCheck | None = None
+    digest: tuple[bool, list[str]] = (True, [])
+
+    @property
+    def same(self) -> bool:
+        """Whether everything that was compared is the same within its tolerance, and the files are unchanged."""
+        return self.digest[0] and all(comparison.same for comparison in self._comparisons)
+
+    @property
+    def identical(self) -> bool:
+        """The same bit for bit."""
+        return self.digest[0] and all(comparison.identical for comparison in self._comparisons)
+
+    @property
+    def _comparisons(self) -> list[Comparison]:
+        return [self.comparison, *([self.worker_check.comparison] if self.worker_check is not None else [])]
+
+    def lines(self) -> list[str]:
+        """How the replay compares with the recording, the conclusion last."""
+        lines = self.comparison.lines()
+        if self.worker_check is not None:
+            lines += self.worker_check.results
+        lines += self.digest[1]
+        if self.frames_missing:
+            lines.append(f"{self.frames_missing} frames are not in the file; their recorded tracks stood in")
+        first = next((each.first for each in self._comparisons if each.first is not None), None)
+        if first is not None:
+            lines.append(f"first difference: {first}")
+        differs = self.comparison.other_numerics if self.digest[0] else ""
+        conclusion = "every tick identical" if self.identical else "the same within tolerance"
+        lines.append(f"{self.comparison.ticks} ticks: {conclusion if self.same else differs or 'NOT the same'}")
+        return lines
+
+    def as_json(self) -> dict[str, Any]:
+        """The same in numbers, with the lines."""
+        found = [comparison.as_json() for comparison in self._comparisons]
+        return found[0] | {
+            "same": self.same,
+            "identical": self.identical,
+            "topics": {name: count for each in found for name, count in each["topics"].items()},
+            "first": next((each["first"] for each in found if each["first"] is not None), None),
+            "digest_faults": [] if self.digest[0] else self.digest[1],
+            "lines": self.lines(),
+        }

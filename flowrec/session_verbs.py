@@ -1,0 +1,239 @@
+"""The verbs for existing files: each function parses, calls and prints. Libraries are imported when a verb needs them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand, TyperOption
+
+import flowrec
+from flowrec.bench.verbs import AsJson, Overwrite
+from flowrec.errors import FlowrecError, printable
+
+# Options that select a method, and the table of its methods.
+METHODS = {
+    "refine": "flowrec.refine.refiner:REFINERS",
+    "plan": "flowrec.planning.planner:PLANNERS",
+    "observer": "flowrec.estimation.observer:OBSERVERS",
+    "controller": "flowrec.control.controller:CONTROLLERS",
+    "file_format": "flowrec.commands.export:EXPORTS",
+}
+
+SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
+RrdOut = Annotated[
+    Path | None,
+    typer.Option(
+        help="Where to write the .rrd; by default beside the session, where it replaces an .rrd of that session."
+    ),
+]
+
+
+class HelpWithMethods(TyperCommand):
+    """A verb whose help names the methods of its options; the tables are imported when the help is printed."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        for parameter in self.params:
+            if isinstance(parameter, TyperOption) and parameter.name in METHODS:
+                module, _, table = METHODS[parameter.name].partition(":")
+                rows = getattr(importlib.import_module(module), table).values()
+                parameter.help = f"{parameter.help} " + "; ".join(f"{row.name}: {row.summary}" for row in rows) + "."
+        super().format_help(ctx, formatter)
+
+
+def view(
+    session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
+    out: RrdOut = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
+    ] = None,
+    time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write the .rrd of a session and open it in Rerun."""
+    from flowrec.session import files_behind
+    from flowrec.system.outputs import PICTURE, Output
+    from flowrec.terminal import say
+    from flowrec.view.screenshot import screenshot as take
+    from flowrec.view.viewer import open_viewer
+
+    if session.suffix == ".rrd" and not session.exists():
+        raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
+    if screenshot is not None:
+        Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
+    rrd = session if session.suffix == ".rrd" else flowrec.export(session, out, overwrite)
+    if as_json:
+        typer.echo(_export_json(session, rrd))
+    if screenshot is not None:
+        for problem in take(rrd, screenshot, time_s=time, overwrite=overwrite):
+            say(problem)
+        say(f"{screenshot} written")
+    elif not no_open:
+        said = open_viewer(rrd)
+        if said:
+            say(said)
+
+
+def export(
+    session: SessionFile,
+    file_format: Annotated[str, typer.Option("--format", metavar="FORMAT", help="Format of the file.")] = "rrd",
+    out: Annotated[
+        Path | None,
+        typer.Option(help="File to write; by default beside the session, where it replaces an export of that session."),
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Convert a session to another format, such as a recording for Rerun (.rrd)."""
+    file = flowrec.export(session, out, overwrite, file_format)
+    if as_json:
+        typer.echo(_export_json(session, file, file_format))
+
+
+def info(
+    session: SessionFile,
+    as_json: AsJson = False,
+) -> None:
+    """What a session is: how it ended, how long, what is in it, where it comes from."""
+    opened = flowrec.open(session)
+    facts, topics = flowrec.info(opened), opened.topics
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "facts": facts, "topics": topics}))
+        return
+    from flowrec.commands.info import facts_for_people
+    from flowrec.terminal import table
+
+    table(session.name, ("", "value"), facts_for_people(facts))
+    table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
+
+
+def list_directory(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Where to look.")] = Path(),
+    as_json: AsJson = False,
+) -> None:
+    """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
+    from flowrec.commands.info import list_sessions
+
+    rows = list_sessions(directory)
+    if as_json:
+        typer.echo(json.dumps([asdict(row) for row in rows]))
+        return
+    from flowrec.terminal import say, table
+
+    columns = ("name", "outcome", "duration", "size", "chip", "recorded")
+    table(
+        str(directory),
+        columns,
+        [
+            (
+                row.name + (f" ({row.parts} parts)" if row.parts else ""),
+                row.outcome,
+                "" if row.duration_s is None else f"{row.duration_s:.1f} s",
+                f"{row.size_bytes / 1e6:.1f} MB",
+                row.chip,
+                row.recorded[:16].replace("T", " "),
+            )
+            for row in rows
+        ],
+    )
+    for row in rows:
+        if row.duration_s is None:
+            say(f"{row.name}: {row.note}")
+
+
+def check(
+    session: Annotated[Path, typer.Argument(metavar="FILE", help="Session (.mcap), or the remains of one (.partial).")],
+    as_json: AsJson = False,
+) -> None:
+    """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
+    from flowrec.commands.check import files_to_check
+    from flowrec.terminal import progress
+
+    nbytes = sum(file.stat().st_size for file in files_to_check(session) if file.is_file())
+    try:
+        with progress(f"reading {session.name}", max(nbytes, 1)) as done:
+            verdict = flowrec.check(session, done)
+    except FlowrecError as error:
+        if not as_json:
+            raise
+        finding = {"level": "bad", "about": "file", "text": str(error)}
+        typer.echo(json.dumps({"session": str(session), "verdict": "bad", "exit_status": 1, "findings": [finding]}))
+        raise typer.Exit(1) from error
+    if as_json:
+        typer.echo(json.dumps(verdict.as_json()))
+    else:
+        for line in verdict.lines():
+            typer.echo(line)
+    raise typer.Exit(verdict.exit_status)
+
+
+def recover(
+    session: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file, or a run in parts.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Session file to make; X.mcap or X_recovered.mcap by default.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
+    from flowrec.store.recovery import recover_run
+    from flowrec.terminal import say
+
+    saved = recover_run(session, out)
+    if as_json:
+        typer.echo(json.dumps([asdict(done) | {"path": str(done.path)} for done in saved]))
+    for done in saved:
+        lost = f"; lost: {done.lost}" if done.lost else ""
+        said = f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}" if done.changed else "is whole; nothing to do"
+        say(f"{done.path}: {said}")
+    raise typer.Exit(0 if all(done.complete for done in saved) else 3)
+
+
+def compare(
+    first: SessionFile,
+    second: SessionFile,
+    as_json: AsJson = False,
+) -> None:
+    """Compare two sessions, every message of every tick; exit status 3 where they differ."""
+    comparison = flowrec.compare(first, second)
+    if as_json:
+        typer.echo(json.dumps({"first_session": str(first), "second_session": str(second)} | comparison.as_json()))
+    else:
+        for line in comparison.lines():
+            typer.echo(printable(line))
+        if comparison.first is not None:
+            typer.echo(printable(f"first difference: {comparison.first}"))
+        conclusion = "identical" if comparison.identical else "the same within tolerance"
+        if not comparison.same:
+            conclusion = comparison.other_numerics or f"{comparison.different_ticks} of them differ"
+        typer.echo(f"{comparison.ticks} ticks: {conclusion}")
+    raise typer.Exit(0 if comparison.same else 3)
+
+
+def calibrate(
+    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="Write the coils section of a configuration.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit the coils' field per ampere and the bias to measured fields, and say how far they are to be trusted."""
+    from flowrec.commands import calibrate as verb
+
+    fit = verb.calibrate(file, out, overwrite)
+    if as_json:
+        typer.echo(json.dumps(verb.figures(fit)))
+    else:
+        verb.show(fit, out)
+
+
+def _export_json(session: Path, file: Path, file_format: str = "rrd") -> str:
+    return json.dumps({"session": str(session), file_format: str(file), "bytes": file.stat().st_size})
