@@ -1,4 +1,4 @@
-"""The verbs for existing files: each function parses, calls and prints. Libraries are imported when a verb needs them."""
+"""The verbs for existing files: each function parses, calls and prints, and imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -27,9 +27,7 @@ METHODS = {
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
 RrdOut = Annotated[
     Path | None,
-    typer.Option(
-        help="Where to write the .rrd; by default beside the session, where it replaces an .rrd of that session."
-    ),
+    typer.Option(help="File to write; by default beside the session, where it replaces an .rrd of that session."),
 ]
 
 

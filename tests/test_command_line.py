@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from flowrec import terminal
 from flowrec.bench import plan
-from flowrec.cli import METHODS, app, main
+from flowrec.cli import app, main
+from flowrec.session_verbs import METHODS
 
 SESSIONS = Path(__file__).parents[1] / "sessions"
 
