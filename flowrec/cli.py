@@ -37,7 +37,7 @@ from flowrec.units import amounts
 
 app = typer.Typer(
     name="flowrec",
-    help="Record, replay and look at missions of magnetic micro-robots that swim in flow.",
+    help="Record, replay and view missions of magnetic micro-robots in flow.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
@@ -61,36 +61,37 @@ def root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Record, replay and look at missions of magnetic micro-robots that swim in flow."""
+    """Record, replay and view missions of magnetic micro-robots in flow."""
 
 
 @app.command()
 def record(
     config: Annotated[Path | None, typer.Argument(help="Configuration (TOML); --dry-run prints one.")] = None,
-    rig: Annotated[str | None, typer.Option(help="Which rig: simulated.")] = None,
+    rig: Annotated[str | None, typer.Option(help="Rig to use: simulated.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
     out: Annotated[Path | None, typer.Option(help="Session file; by default named by date and sample.")] = None,
     sets: Sets = None,
     view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",
-    realtime: Annotated[bool, typer.Option("--realtime", help="Keep the simulated rig to the wall clock.")] = False,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after so many seconds.")] = None,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Run the simulated rig in real time.")] = False,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this many seconds.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and print the resolved configuration.")] = False,
     split: Annotated[
-        str | None, typer.Option(metavar="SIZE|TIME", help="Go on in another file after as much: 2GB, 10min, or both.")
+        str | None,
+        typer.Option(metavar="SIZE|TIME", help="Begin another file after this size or time, or both: 2GB,10min."),
     ] = None,
     snapshot: Annotated[
         str | None,
-        typer.Option(metavar="TIME[,TIME]", help="Only keep the time before and after marks and alarms: 30s,10s."),
+        typer.Option(metavar="TIME[,TIME]", help="Record only the time before and after marks and alarms: 30s,10s."),
     ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run a mission (survey, refine, plan, navigate) and record every stage of it."""
+    """Run a mission (survey, refine, plan, navigate) and record every stage."""
     from flowrec.system.toml_file import read_toml
 
     if config is not None:
-        read_toml(config)  # a file that is none is refused before the imports below, which take a second
+        read_toml(config)  # a file that is no TOML is refused before the imports below, which take a second
     from flowrec.config import load_config, to_toml
 
     settings, flags = _settings(
@@ -124,8 +125,8 @@ def record(
             print_summary(recorded)
 
     if recorded.stopped:
-        # The file is whole and the coils are off. A frozen terminal would keep us here for ever, and Python takes half
-        # a second to take itself apart.
+        # The file is complete and the coils are off. A frozen terminal must not delay the exit, and the shutdown of
+        # Python takes half a second.
         said_within(0.3, summarize)
         os._exit(recorded.exit_status)
     summarize()
@@ -136,11 +137,11 @@ def record(
 def replay(
     session: SessionFile,
     refine: Annotated[
-        str | None, typer.Option(metavar="[METHOD]", help=f"Refine the flow again; alone: {DEFAULT_REFINE}.")
+        str | None, typer.Option(metavar="[METHOD]", help=f"Refine the flow again; without a method: {DEFAULT_REFINE}.")
     ] = None,
     plan: Annotated[str | None, typer.Option(metavar="METHOD", help="Plan with another planner.")] = None,
     observer: Annotated[str | None, typer.Option(metavar="NAME", help="Estimate with another observer.")] = None,
-    controller: Annotated[str | None, typer.Option(metavar="NAME", help="Control with another law.")] = None,
+    controller: Annotated[str | None, typer.Option(metavar="NAME", help="Control with another control law.")] = None,
     sets: Sets = None,
     from_s: Annotated[float | None, typer.Option("--from", metavar="TIME", help="Resume at this second.")] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Compare with the recording, message by message.")] = False,
@@ -149,11 +150,11 @@ def replay(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Session file of the replay.")] = None,
     frames: Annotated[bool, typer.Option("--frames", help="Copy the camera images into the replay's file.")] = False,
-    view: Annotated[Literal["rrd", "none"], typer.Option(help="Write an .rrd with both side by side.")] = "none",
+    view: Annotated[Literal["rrd", "none"], typer.Option(help="Write an .rrd of both, side by side.")] = "none",
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run the pipeline again over a recorded session, the same or with other stages, and compare."""
+    """Run the pipeline again on a recorded session, with the same or other methods, and compare."""
     from flowrec.commands.interactive import AtTerminal
 
     change = flowrec.Change(refine, plan, observer, controller, tuple(sets or ()))
@@ -237,13 +238,13 @@ def _settings(
 
 
 def with_default_refine(words: list[str]) -> list[str]:
-    """`--refine` may stand alone: give it its method, so that a session path after it is not taken for one."""
+    """Insert the default method after a `--refine` without one, so that a session path is not taken for the method."""
     full: list[str] = []
     for number, word in enumerate(words):
         full.append(word)
         following = words[number + 1] if number + 1 < len(words) else "-"
-        alone = following.startswith("-") or following.endswith(".mcap")
-        if word == "--refine" and alone:
+        without_method = following.startswith("-") or following.endswith(".mcap")
+        if word == "--refine" and without_method:
             full.append(DEFAULT_REFINE)
     return full
 
@@ -258,7 +259,7 @@ def main() -> None:
         sys.exit(app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec", standalone_mode=False) or 0)
     except usage_error as error:
         message = printable(error.format_message()).rstrip(".")
-        if message:  # else the help has been printed
+        if message:  # empty if the help was printed
             verb = error.ctx.command_path if error.ctx is not None else "flowrec"
             sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")
         sys.exit(error.exit_code)
@@ -266,7 +267,7 @@ def main() -> None:
         sys.stderr.write(f"flowrec: {error}\n")
         sys.exit(error.exit_status)
     except BrokenPipeError:
-        # The reader of our output has gone (flowrec info ... | head); nothing left to say.
+        # The reader of the output has ended (flowrec info ... | head).
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 

@@ -35,7 +35,7 @@ _DIFF_LIMIT = 200_000  # characters; a larger change is cut and says so
 
 
 def provenance(anonymous: bool = False) -> dict[str, str]:
-    """Facts about code, machine and moment as text, for the head of a session; `anonymous` leaves the machine out."""
+    """Facts about code, machine and time as text, for the header of a session; `anonymous` omits machine and user."""
     facts = {
         "flowrec": __version__,
         "numerics_version": str(NUMERICS_VERSION),
@@ -58,9 +58,9 @@ def provenance(anonymous: bool = False) -> dict[str, str]:
 
 
 def _code(anonymous: bool) -> dict[str, str]:
-    """The commit, and what differs from it: asked of git in a checkout, else as the wheel was built."""
+    """The commit and the local changes: from git in a checkout, else from the build of the wheel."""
     commit = _git(PACKAGE, "rev-parse", "HEAD")
-    # Only a checkout of flowrec itself counts, not a repository that a virtual environment happens to lie in.
+    # Only a checkout of flowrec itself counts, not a repository that contains the virtual environment.
     if not (commit and _git(PACKAGE, "ls-files", "--error-unmatch", "__init__.py")):
         return _built(PACKAGE / "_build.json")
     facts = {"git_commit": commit, "git_changed": str(bool(_git(PACKAGE, "status", "--porcelain", "--", ".")))}
@@ -72,7 +72,7 @@ def _code(anonymous: bool) -> dict[str, str]:
 
 
 def _built(file: Path) -> dict[str, str]:
-    """What hatch_build.py wrote into the wheel; nothing where it was not built from a checkout."""
+    """What hatch_build.py wrote into the wheel; empty if it was not built from a checkout."""
     try:
         return {key: str(value) for key, value in json.loads(file.read_text(encoding="utf-8")).items()}
     except FileNotFoundError:
@@ -87,7 +87,7 @@ def _user() -> str:
 
 
 def _git(folder: Path, *words: str) -> str:
-    """Answer of git, or '' where there is no git or no repository: a wheel has neither."""
+    """Output of git, '' if there is no git or no repository."""
     try:
         done = subprocess.run(  # noqa: S603
             ["git", "-C", str(folder), *words],  # noqa: S607

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from flowrec.messages import Event, FlowField, Frame, Tick
     from flowrec.store.reader import SessionReader
 
-_LARGEST_NUMBER = 1e15  # no run holds a larger one: a million kilometres in um
+_LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
 
 class Session:
     """A finished session, or one finished part of a run, open for reading; it never writes.
 
-    X.mcap is that file or, where there is none, the run whose parts are X.part001.mcap and so on. Times are session
+    X.mcap is that file or, if there is none, the run with the parts X.part001.mcap and so on. Times are session
     time in s, the stamps of the ticks. Every attribute is read when it is first used. A session may be used as a
     context manager; it is closed when it is collected, too.
 
@@ -39,7 +39,7 @@ class Session:
 
     Attributes
     ----------
-    path : as it was named.
+    path : as given.
 
     Raises
     ------
@@ -74,7 +74,7 @@ class Session:
 
     @cached_property
     def outcome(self) -> Figures:
-        """How the run ended and what it came to; keys carry the unit, as in `duration_s`."""
+        """How the run ended, and its figures; keys carry the unit, as in `duration_s`."""
         return of_text(self.run.outcome)
 
     @property
@@ -219,14 +219,14 @@ def toml_table(text: str, where: str) -> dict[str, Any]:
 
 
 def files_behind(path: Path) -> list[Path]:
-    """All files of a session and, where they are in the same folder, of those that it replays.
+    """All files of a session and, if they are in the same folder, of the sessions that it replays.
 
-    None of them may be replaced by what is made of the session.
+    An output that is made from the session must not replace any of them.
     """
     files: list[Path] = []
     while path not in files:
         files += [path, *run_files(path)]
-        # What is wrong with a file is the error of whoever reads it.
+        # Errors in a file are reported by the code that reads it.
         with contextlib.suppress(SessionError), SessionMetadata(files_of(path)[0]) as file:
             path = path.with_name(Path(file.header.parent.get("file", "")).name or path.name)
     return files
@@ -234,14 +234,14 @@ def files_behind(path: Path) -> list[Path]:
 
 @contextlib.contextmanager
 def input_blamed(session: Session, config: ResolvedConfig, done: str) -> Iterator[None]:
-    """Turn a failure over absurd numbers in a session, or settings outside of their ranges, into a SessionError.
+    """Turn an exception that absurd numbers or settings in a session cause into a SessionError.
 
-    A replay runs with recorded settings as they are. Any other failure stays what it is.
+    A replay does not check the recorded settings. Any other exception is raised unchanged.
 
     Parameters
     ----------
     config : the settings in use.
-    done : what can not be done with the session, such as "replayed".
+    done : the participle for the error, such as "replayed".
     """
     try:
         yield
@@ -273,12 +273,12 @@ def _absurd_numbers(session: Session) -> Iterator[str]:
             if message is not None and message is not getattr(before, topic.field):
                 for name in invalid_numbers(message, _LARGEST_NUMBER):
                     at_s = seconds(tick.stamp_ns - session.run.first_ns)
-                    yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or a number beyond all measure"
+                    yield f"{topic.path} {name} at {at_s:.3f} s holds NaN, infinity or an impossibly large number"
         before = tick
 
 
 def session_sha256(files: Sequence[Path]) -> str:
-    """Hash of a session's content, by which a replay names its parent: of its file, or of its parts in order."""
+    """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
     digest = hashlib.sha256()
     for path in files:
         with path.open("rb") as file:

@@ -73,9 +73,9 @@ def view(
             say(problem)
         say(f"{screenshot} written")
     elif not no_open:
-        said = open_viewer(rrd)
-        if said:
-            say(said)
+        message = open_viewer(rrd)
+        if message:
+            say(message)
 
 
 def export(
@@ -98,7 +98,7 @@ def info(
     session: SessionFile,
     as_json: AsJson = False,
 ) -> None:
-    """What a session is: how it ended, how long, what is in it, where it comes from."""
+    """Show how a session ended, its length, content, settings and provenance."""
     opened = flowrec.open(session)
     facts, topics = flowrec.info(opened), opened.topics
     if as_json:
@@ -112,10 +112,10 @@ def info(
 
 
 def list_directory(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Where to look.")] = Path(),
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory to list.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """The sessions in a directory, one row each; unfinished and unreadable ones as such."""
+    """List the sessions in a directory, unfinished and unreadable ones included."""
     from flowrec.commands.info import list_sessions
 
     rows = list_sessions(directory)
@@ -146,10 +146,10 @@ def list_directory(
 
 
 def check(
-    session: Annotated[Path, typer.Argument(metavar="FILE", help="Session (.mcap), or the remains of one (.partial).")],
+    session: Annotated[Path, typer.Argument(metavar="FILE", help="Session (.mcap), or an unfinished one (.partial).")],
     as_json: AsJson = False,
 ) -> None:
-    """Read a whole session and judge it; exit status 0 good, 3 something was lost or is odd, 1 not usable."""
+    """Validate a session; exit status 0: good, 3: usable with losses or anomalies, 1: not usable."""
     from flowrec.commands.check import files_to_check
     from flowrec.terminal import progress
 
@@ -173,14 +173,15 @@ def check(
 
 def recover(
     session: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut or damaged file, or a run in parts.")
+        Path,
+        typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut-off or damaged file, or a run."),
     ],
     out: Annotated[
         Path | None, typer.Option(help="Session file to make; X.mcap or X_recovered.mcap by default.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a whole session of one that was killed or cut off; exit status 3 where something was lost."""
+    """Make a complete session from one that was killed or cut off; exit status 3 if something was lost."""
     from flowrec.store.recovery import recover_run
     from flowrec.terminal import say
 
@@ -189,8 +190,8 @@ def recover(
         typer.echo(json.dumps([asdict(done) | {"path": str(done.path)} for done in saved]))
     for done in saved:
         lost = f"; lost: {done.lost}" if done.lost else ""
-        said = f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}" if done.changed else "is whole; nothing to do"
-        say(f"{done.path}: {said}")
+        result = f"{done.ticks} ticks, {done.duration_s:.1f} s{lost}" if done.changed else "is whole; nothing to do"
+        say(f"{done.path}: {result}")
     raise typer.Exit(0 if all(done.complete for done in saved) else 3)
 
 
@@ -199,7 +200,7 @@ def compare(
     second: SessionFile,
     as_json: AsJson = False,
 ) -> None:
-    """Compare two sessions, every message of every tick; exit status 3 where they differ."""
+    """Compare all messages of two sessions; exit status 3 if they differ."""
     comparison = flowrec.compare(first, second)
     if as_json:
         typer.echo(json.dumps({"first_session": str(first), "second_session": str(second)} | comparison.as_json()))
@@ -223,7 +224,7 @@ def calibrate(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Fit the coils' field per ampere and the bias to measured fields, and say how far they are to be trusted."""
+    """Fit the field per ampere of the coils and the bias to measured fields, with standard errors."""
     from flowrec.commands import calibrate as verb
 
     fit = verb.calibrate(file, out, overwrite)

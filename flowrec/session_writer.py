@@ -1,4 +1,4 @@
-"""A new session file: its header with configuration, chip and provenance, and how its messages are written."""
+"""Creates a session file: the header with configuration, chip and provenance, and the options of the writer."""
 
 from __future__ import annotations
 
@@ -68,10 +68,10 @@ def session_writer(
 
 
 def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
-    """Largest loss when the process is killed, in s of stamps; of a snapshot, from its event on."""
+    """Largest loss if the process is killed, in s of stamps; of a snapshot, counted from its event."""
     camera, flush_s = config.camera, config.recording.flush_s
     pixels_s = camera.width_px * camera.height_px * camera.rate_hz
-    waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only where the disk is too slow
+    waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only if the disk is too slow
     return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
 
 
@@ -88,9 +88,9 @@ def _files_of(config: ResolvedConfig) -> Split | Snapshot:
 
 
 def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region | None:
-    """Which part of most images is kept, as settings and tracker will have it; None: all.
+    """The region of most images that is recorded, by the settings and the tracker; None: whole images.
 
-    `again`: the images were cut when they were recorded, and are kept as they are.
+    `again`: the images were cropped when they were recorded, and are not cropped again.
     """
     recording, camera = config.recording, config.camera
     if recording.region == "whole":
@@ -116,7 +116,7 @@ def frames_of(config: ResolvedConfig) -> str:
     if chosen != "auto":
         return chosen
     if config.recording.region == "robot":
-        return "zstd"  # makes less of the black than delta in a fifth of its time (python -m tests.perf.store)
+        return "zstd"  # compresses black better than delta in a fifth of its time (python -m tests.perf.store)
     return encoding_for(camera.width_px, camera.height_px, camera.rate_hz)
 
 

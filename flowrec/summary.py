@@ -1,4 +1,4 @@
-"""Figures of a run, a replay or a file: numbers whose keys carry the unit. They become text only when shown."""
+"""Figures of a run, a replay or a file: numbers whose keys carry the unit, and their conversion to text and back."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _COUNTS = frozenset(
     {"ticks", "contacts", "observations", "frames_dropped", "dropped_frames", "frames_missing_from_camera", "seed"}
 )
 _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns", "_error": "", "_rad": "rad"}
-_LONGEST = 25  # characters of a number in a file; flowrec writes no longer one
+_LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
-# Names for keys that alone would be misread.
+# Names of keys that would be misread as words.
 _NAMES = {
     "wall_s": "computed in",
     "contacts": "wall contacts",

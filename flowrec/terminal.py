@@ -77,5 +77,5 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> 
         shown.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     for row in rows:
         shown.add_row(*(escape(printable(cell)) for cell in row))
-    # In a log, where rich would take 80 columns, the widest table still keeps a row on a line.
+    # In a log rich takes 80 columns; 110 hold each row of the widest table on one line.
     Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 110).print(shown)

@@ -1,6 +1,6 @@
 """Conversion factors between units. The unit is part of every name (`_um`, `_um_s`, `_pa`).
 
-The flow solver alone works in SI; everything else in um, um/s, s, rad, Hz, mT, Pa, mPa*s, kg/m3, A.
+Only the flow solver works in SI; everything else uses um, um/s, s, rad, Hz, mT, Pa, mPa*s, kg/m3, A.
 """
 
 import math

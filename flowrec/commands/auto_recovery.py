@@ -1,4 +1,4 @@
-"""Automatic recovery: unfinished sessions that killed runs left in the folder of the next run."""
+"""Automatic recovery, before a run begins, of unfinished sessions in its folder."""
 
 from __future__ import annotations
 
@@ -20,87 +20,87 @@ from flowrec.system.locks import is_growing, try_lock
 from flowrec.system.processes import child_command, child_environment
 from flowrec.terminal import say, warn
 
-_REMAINS = SUFFIX + PARTIAL_SUFFIX
-_DRAFT = ".recovering" + _REMAINS
-_LARGEST_BYTES = 100_000_000  # takes two to four seconds
-_TIMEOUT_S = 5.0  # for all of them together: a run is waiting
-_CLEANUP_TIMEOUT_S = 1.0  # for an abandoned recovery to remove its draft
-_REFUSED = 3  # exit status of that process where it says in one line why nothing can be recovered
-_OFFERED = 3  # by name, the others by number
+_UNFINISHED = SUFFIX + PARTIAL_SUFFIX
+_DRAFT = ".recovering" + _UNFINISHED
+_LARGEST_BYTES = 100_000_000  # recovering that much takes two to four seconds
+_TIMEOUT_S = 5.0  # for all of them together: a run is unfinished
+_CLEANUP_TIMEOUT_S = 1.0  # for a terminated recovery to remove its draft
+_REFUSED = 3  # exit status of the recovery process if it reports in one line why nothing can be recovered
+_NAMED = 3  # are reported by name, the others by number
 
 
 def leftovers(folder: Path) -> list[Path]:
     """Unfinished sessions in a folder that no process is writing, the latest first."""
     try:
-        found = [path for path in folder.iterdir() if path.name.endswith(_REMAINS) and path.is_file()]
-        # A recovery that was killed left the draft and what it was to be made of; the latter is all there is to save.
+        found = [path for path in folder.iterdir() if path.name.endswith(_UNFINISHED) and path.is_file()]
+        # A recovery that was killed leaves its draft and its input. Only the input is worth recovering.
         found = [path for path in found if not path.name.endswith(_DRAFT)]
-        waiting = [path for path in found if not is_growing(path)]
-        return sorted(waiting, key=lambda path: path.stat().st_mtime_ns, reverse=True)
+        unfinished = [path for path in found if not is_growing(path)]
+        return sorted(unfinished, key=lambda path: path.stat().st_mtime_ns, reverse=True)
     except OSError:
-        return []  # whoever makes the new session there will say what is wrong
+        return []  # the writer of the new session reports what is wrong with the folder
 
 
-def look_after(folder: Path, besides: frozenset[Path] = frozenset()) -> dict[Path, str]:
-    """Recover small remains, name the command for larger ones, with a line about each; raises for none of them.
+def recover_leftovers(folder: Path, excluded: frozenset[Path] = frozenset()) -> dict[Path, str]:
+    """Recover small unfinished sessions and print the command for larger ones, a line for each; never raises for one.
 
     Parameters
     ----------
-    besides : remains to leave alone, because they will be overwritten.
+    excluded : remains to leave locked, because they will be overwritten.
 
     Returns
     -------
     The recovered sessions, each with a summary.
     """
-    waiting = [path for path in leftovers(folder) if path.resolve() not in besides]
-    if not waiting:
+    unfinished = [path for path in leftovers(folder) if path.resolve() not in excluded]
+    if not unfinished:
         return {}
-    made: dict[Path, str] = {}
-    offered: list[Path] = []
+    recovered: dict[Path, str] = {}
+    postponed: list[Path] = []
     end_s = time.monotonic() + _TIMEOUT_S
-    with _alone_in(folder) as alone:
-        for path in waiting:
+    with _folder_lock(folder) as locked:
+        for path in unfinished:
             left_s = end_s - time.monotonic()
-            if not alone or left_s <= 0.0 or _size(path) > _LARGEST_BYTES:
-                offered.append(path)
+            if not locked or left_s <= 0.0 or _size(path) > _LARGEST_BYTES:
+                postponed.append(path)
                 continue
             try:
-                done, came = _recover_apart(path, left_s)
+                done, summary = _recover_in_process(path, left_s)
             except subprocess.TimeoutExpired:
-                offered.append(path)
+                postponed.append(path)
             except FlowrecError as error:
                 warn(f"left from a run that did not finish: {error}")
             else:
-                made[done] = came
-                say(f"recovered {done} from a run that did not finish: {came}")
-    for path in offered[:_OFFERED]:
+                recovered[done] = summary
+                say(f"recovered {done} from a run that did not finish: {summary}")
+    for path in postponed[:_NAMED]:
         warn(
             f"{path} ({_size(path) / 1e6:.0f} MB) is left from a run that did not finish; "
             f"flowrec recover {path} makes a session of it"
         )
-    if len(offered) > _OFFERED:
-        warn(f"{len(offered) - _OFFERED} more like it in {folder}; flowrec ls {folder} names them")
-    return made
+    if len(postponed) > _NAMED:
+        warn(f"{len(postponed) - _NAMED} more like it in {folder}; flowrec ls {folder} names them")
+    return recovered
 
 
-def _recover_apart(path: Path, limit_s: float) -> tuple[Path, str]:
-    """Recover in a process of its own; returns the session and a summary.
+def _recover_in_process(path: Path, limit_s: float) -> tuple[Path, str]:
+    """Recover in a separate process; return the session and a summary.
 
-    Whatever an old file does to that process (threads that hang, memory that runs out), the live run starts.
+    The live run starts even if an old file makes that process hang or run out of memory.
 
     Raises
     ------
-    TimeoutExpired : it took longer; that process has ended, the remains are as they were.
+    TimeoutExpired : it took longer than `limit_s`; the process has ended, the old file is unchanged.
     FlowrecError : nothing could be recovered.
     """
     try:
-        process = subprocess.Popen(  # noqa: S603 - our own module
+        process = subprocess.Popen(  # noqa: S603 - a module of flowrec
             child_command("flowrec.commands.auto_recovery", str(path.resolve())),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            start_new_session=True,  # Ctrl-C ends this process, and then this one ends that one
+            start_new_session=True,  # Ctrl-C reaches this process only, which then ends the other one
             env=child_environment(),
         )
     except OSError as error:
@@ -117,12 +117,12 @@ def _recover_apart(path: Path, limit_s: float) -> tuple[Path, str]:
     if process.returncode:
         last = (said.strip().splitlines() or [f"exit status {process.returncode}"])[-1]
         raise FlowrecError(last if process.returncode == _REFUSED else f"{path}: recovering it failed ({last})")
-    name, came = json.loads(out)
-    return path.with_name(name), came
+    name, summary = json.loads(out)
+    return path.with_name(name), summary
 
 
 def _main(path: Path) -> None:
-    """The process that recovers one file."""
+    """Main function of the process that recovers one file."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the draft is removed on the way out
     try:
         done = recover(path)
@@ -140,8 +140,8 @@ def _size(path: Path) -> int:
 
 
 @contextmanager
-def _alone_in(folder: Path) -> Iterator[bool]:
-    """Whether no other process recovers in this folder; after a power cut several rigs start at once."""
+def _folder_lock(folder: Path) -> Iterator[bool]:
+    """Lock a folder; yield whether no other process recovers in it. After a power cut several rigs start at once."""
     try:
         descriptor = os.open(folder, os.O_RDONLY)
     except OSError:
@@ -149,10 +149,10 @@ def _alone_in(folder: Path) -> Iterator[bool]:
         return
     try:
         try:
-            alone = try_lock(descriptor, exclusive=True)
+            locked = try_lock(descriptor, exclusive=True)
         except OSError:  # a file system that can not lock folders
-            alone = True
-        yield alone
+            locked = True
+        yield locked
     finally:
         os.close(descriptor)
 

@@ -1,4 +1,4 @@
-"""`flowrec calibrate`: a table of currents and fields to the coils' settings, and how far they are to be trusted."""
+"""`flowrec calibrate`: the settings of the coils and their uncertainty, from a table of currents and fields."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ _EXACT_DIGITS = 9
 
 
 def calibrate(path: Path, out: Path | None = None, overwrite: bool = False) -> CoilFit:
-    """Fit the coils' settings to a table, and write them where they are wanted.
+    """Fit the settings of the coils to a table, and write them to `out` if it is given.
 
     Raises
     ------
-    UsageError : a table that can not be read or does not suffice, coils no run could use.
+    UsageError : the table can not be read or has too few rows, or no run could use such coils.
     OutputError : `out` may not be written, see `Output.check`.
     """
     output = Output(out, TOML, (path,), overwrite) if out is not None else None
@@ -39,7 +39,7 @@ def calibrate(path: Path, out: Path | None = None, overwrite: bool = False) -> C
 
 
 def fragment(fit: CoilFit, path: Path) -> str:
-    """The settings as a piece of TOML, with where they come from."""
+    """The settings as TOML, with a comment on their source."""
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
     noise = ", ".join(f"{value:.2g}" for value in fit.noise_mt)
     suspects = f"; {len(fit.suspects)} of them suspicious" if fit.suspects else ""
@@ -59,7 +59,7 @@ def as_sets(fit: CoilFit) -> list[str]:
 
 
 def figures(fit: CoilFit) -> dict[str, Any]:
-    """Everything as plain numbers; None for what the rows can not tell."""
+    """The fit as plain numbers; None where the rows do not determine one."""
     direction, strength = fit.weakest
     lines = fit.excitations.lines
     return {
@@ -85,7 +85,7 @@ def figures(fit: CoilFit) -> dict[str, Any]:
 
 
 def show(fit: CoilFit, out: Path | None) -> None:
-    """Print it for people."""
+    """Print the fit as a table."""
     lines = fit.excitations.lines
     rows = []
     for axis, name in enumerate(_AXES):
@@ -107,8 +107,8 @@ def show(fit: CoilFit, out: Path | None) -> None:
     direction, strength = fit.weakest
     say(
         f"A field of 4 mT is known to {fit.uncertainty_mt:.2g} mT (one standard error, {fit.freedom} degrees of "
-        f"freedom). Weakest direction: {direction}, {strength:.3g} mT/A; the strongest makes {fit.condition:.2g} "
-        "times that."
+        f"freedom). Weakest direction: {direction}, {strength:.3g} mT/A; the strongest direction has "
+        f"{fit.condition:.2g} times as much."
     )
     for sentence in advice(fit):
         say(f"- {sentence}")

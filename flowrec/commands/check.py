@@ -31,20 +31,20 @@ _RATE_TOLERANCE = 0.05
 _CLOCK_JUMP_S = 1.0
 _CLOCKS = ("wall_ns", "monotonic_ns")
 _EXACT = "yes: configuration, chip, and the inputs of every tick"
-_NOT_EXACT = "yes, but not exact after what is missing"
+_NOT_EXACT = "yes, but not exact after the first missing message"
 
 
 def files_to_check(path: Path) -> list[Path]:
-    """The file of that name or, where there is none, the existing parts of that run, finished or not."""
+    """The file of that name or, if there is none, the existing parts of that run, finished or not."""
     if path.exists():
         return [path]
     return sorted(filter(part_number, run_files(path)), key=part_number) or [path]
 
 
 def check(session: Session | Path | str, progress: Callable[[int], None] | None = None) -> Verdict:
-    """Read a whole session, finished or not, and judge it. Memory does not grow with the file.
+    """Validate a session, finished or not, by reading all of it. Memory does not grow with the file.
 
-    Each part of a run that was split is judged, and whether the parts fit together.
+    Each part of a split run is validated, and whether the parts are continuous.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def check(session: Session | Path | str, progress: Callable[[int], None] | None 
 
 
 class _FileCheck:
-    """Reads one file and fills its verdict, one method a subject."""
+    """Reads one file and fills its verdict, one method for each subject."""
 
     def __init__(self, path: Path, progress: Callable[[int], None] | None) -> None:
         self.tally = Tally()
@@ -90,14 +90,14 @@ class _FileCheck:
         verdict, found = self.verdict, self.found
         written = f"by flowrec {found.flowrec_version}"
         if found.flowrec_version != __version__:
-            written += f" (this is {__version__}: flowrec replay --verify tells whether it still does the same)"
+            written += f" (this is {__version__}: flowrec replay --verify shows whether it computes the same)"
         numerics = found.header.provenance.get("numerics_version", "1") if found.header is not None else None
         if numerics not in (None, str(NUMERICS_VERSION)):
             written += f", made by other numerics (version {numerics}; this is {NUMERICS_VERSION})"
         verdict.fact("written", written)
         header = found.header
         if header is None:
-            verdict.bad("head", f"its head is not whole: {found.header_fault}")
+            verdict.bad("head", f"its header is incomplete: {found.header_fault}")
             return None
         config = None
         try:
@@ -144,9 +144,9 @@ class _FileCheck:
             verdict.odd("index", text)
         undecodable = found.undecodable.total()
         if undecodable:
-            verdict.bad("content", f"{undecodable} messages make no sense, the first is {found.first_undecodable}")
+            verdict.bad("content", f"{undecodable} messages can not be decoded, the first is {found.first_undecodable}")
         for name, count in (+found.missing).items():
-            verdict.odd("content", f"{count} messages of {BY_FIELD[name].path} are missing on the way")
+            verdict.odd("content", f"{count} messages of {BY_FIELD[name].path} are missing in the middle")
         agrees = found.finished and not (found.contradictions or found.disagreements or found.lost)
         count = found.counts.total()
         verdict.figures |= {"messages": count, "size_bytes": found.size_bytes}
@@ -161,7 +161,7 @@ class _FileCheck:
         for text in found.edits:
             verdict.bad("digest", f"{text}: edited or damaged after the recording")
         if not found.edits:
-            verdict.fact("digest", "head and messages are those that were recorded")
+            verdict.fact("digest", "header and messages are those that were recorded")
 
     def _times(self) -> None:
         verdict, found, tally = self.verdict, self.found, self.tally
@@ -187,7 +187,7 @@ class _FileCheck:
             verdict.odd("gaps", text)
         wanted_hz = self._config.camera.rate_hz if self._config is not None else None
         if wanted_hz and tally.period_ns and abs(rate_hz / wanted_hz - 1.0) > _RATE_TOLERANCE:
-            verdict.odd("rate", f"{rate_hz:.1f} frames a second where {wanted_hz:g} were asked for")
+            verdict.odd("rate", f"{rate_hz:.1f} frames per second instead of camera.rate_hz = {wanted_hz:g}")
 
     def _images(self) -> None:
         verdict, found, tally = self.verdict, self.found, self.tally
@@ -229,7 +229,7 @@ class _FileCheck:
             if last.unit or (last.known and abs(skew_ppm(last)) > CRYSTAL_PPM):
                 verdict.odd(
                     "clocks",
-                    f"a count of the camera's clock is {last.rate:.6g} ns, which no crystal is off by; stamps are "
+                    f"a count of the camera's clock is {last.rate:.6g} ns, more than the error of a quartz; stamps are "
                     "corrected by the fit",
                 )
         for what, count in irregular_frames(last) if last is not None else ():
@@ -243,9 +243,9 @@ class _FileCheck:
         began = [_count(provenance, name) for name in _CLOCKS]
         ended = [_count(found.outcome, name) for name in _CLOCKS]
         if not all(began):
-            verdict.fact("clocks", "no reading of the wall clock beside the monotonic one")
+            verdict.fact("clocks", "the wall clock was not read together with the monotonic clock")
             return
-        text = f"wall and monotonic read at {provenance.get('wall_time', '')[:19].replace('T', ' ')} UTC"
+        text = f"wall clock and monotonic clock read at {provenance.get('wall_time', '')[:19].replace('T', ' ')} UTC"
         if all(ended):
             jump_s = seconds((ended[0] - began[0]) - (ended[1] - began[1]))
             text += f" and at the end, {round(1e3 * jump_s):+d} ms apart by then"
@@ -257,16 +257,16 @@ class _FileCheck:
     def _replay(self) -> None:
         verdict, tally = self.verdict, self.tally
         if not tally.ticks and tally.repeated:
-            verdict.odd("replay", "there is nothing in it but the tick that it repeats")
+            verdict.odd("replay", "it holds only the tick that it repeats from the part before")
         elif not tally.ticks:
             verdict.bad("replay", "there is no tick in it, so nothing to replay")
         if tally.inputs_missing:
             text = f"{tally.inputs_missing} of {tally.ticks} ticks lack inputs; a replay leaves them out"
             verdict.odd("replay", text)
         if tally.images_alone:
-            verdict.odd("replay", f"of {tally.images_alone} ticks there is only the image")
+            verdict.odd("replay", f"{tally.images_alone} ticks have only their image")
         if tally.unfinished_ticks:
-            verdict.odd("replay", f"{tally.unfinished_ticks} ticks were not worked on to their end")
+            verdict.odd("replay", f"{tally.unfinished_ticks} ticks have inputs, but no results of the stages")
         lacks = tally.inputs_missing or tally.images_alone or self.found.missing.total()
         verdict.fact("replay", "no" if verdict.word == "bad" else _NOT_EXACT if lacks else _EXACT)
 
@@ -292,7 +292,8 @@ def _check_run(path: Path, checks: Sequence[_FileCheck]) -> Verdict:
     if last.finished and is_continued(last.outcome):
         following = part_path(path, part_number(last.path) + 1).name
         run.bad(
-            "end", f"the run goes on in {following}, which is not here; `flowrec recover {path}` ends it before that"
+            "end",
+            f"the run continues in {following}, which is missing; `flowrec recover {path}` ends it there",
         )
     run.topics = {BY_FIELD[name].path: count for name, count in counts.items() if count}
     ticks, size_bytes = sum(check.tally.ticks for check in checks), sum(check.found.size_bytes for check in checks)
@@ -332,7 +333,7 @@ def _check_continuity(run: Verdict, checks: Sequence[_FileCheck]) -> None:
             _compare_ends(run, f"part {number}", before, check)
         before = check
     if not any(finding.about == "parts" for finding in run.findings):
-        run.fact("parts", f"{len(checks)}, each begins where the one before ends")
+        run.fact("parts", f"{len(checks)}, each begins where the part before ends")
 
 
 def _compare_ends(run: Verdict, name: str, before: _FileCheck, after: _FileCheck) -> None:
@@ -340,18 +341,18 @@ def _compare_ends(run: Verdict, name: str, before: _FileCheck, after: _FileCheck
     was, now = before.found.header, after.found.header
     assert was is not None and now is not None
     if not was.is_same_run(now):
-        run.bad("parts", f"{name} has another head (configuration, chip or origin) than the part before")
+        run.bad("parts", f"{name} has another header (configuration, chip or provenance) than the part before")
     outcome = before.found.outcome
     if before.found.finished and not is_continued(outcome) and outcome.get("outcome") != Outcome.CUT:
-        run.odd("parts", f"{name} goes on although the part before says that the run ended with it")
-    # An image that was dropped may be in one of them only; no stage reads truths and timings.
+        run.odd("parts", f"{name} exists although the run ended with the part before")
+    # A dropped image may be in only one of the parts; no stage reads truth and timing.
     read = {topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {"frame"}
     differ = [BY_FIELD[key].path for key in read if before.tally.latest_ns.get(key) != after.tally.repeated_ns.get(key)]
     if differ:
-        run.odd("parts", f"{name} repeats something else than the part before ended with: {', '.join(sorted(differ))}")
+        run.odd("parts", f"{name} repeats other messages than the part before ended with: {', '.join(sorted(differ))}")
 
 
 def _count(text: Mapping[str, str], key: str) -> int:
-    """A number of a header or an outcome, 0 where there is none."""
+    """A number in a header or an outcome, 0 if there is none."""
     number = text.get(key, "")
     return int(number) if number.isdecimal() and len(number) < 20 else 0

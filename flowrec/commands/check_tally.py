@@ -1,4 +1,4 @@
-"""What `flowrec check` counts in one pass over the messages of a file.
+"""The counts of `flowrec check`, from one pass over the messages of a file.
 
 Messages come in file order; those of one tick need not follow each other. Memory does not grow with the file.
 """
@@ -16,7 +16,7 @@ from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
 
 GAP_PERIODS = 1.5
-LISTED = 100  # longest gaps, and settings of the wall clock, that are kept
+LISTED = 100  # longest gaps, and settings of the wall clock, that are kept in memory
 _PENDING = 100_000  # incomplete ticks in memory; in files of flowrec these are half a second of ticks
 _STEP_NS = 10_000  # resolution of the histogram of intervals
 _INTERVALS = 100_000  # bins of that histogram

@@ -21,7 +21,7 @@ from flowrec.units import seconds
 from flowrec.version import NUMERICS_VERSION
 
 Fields = Mapping[str, frozenset[str]]  # names of message fields, by field of Tick
-_Apart = tuple[float, tuple[int, ...] | None, object, object]  # excess over the tolerance, index, both values
+_Deviation = tuple[float, tuple[int, ...] | None, object, object]  # excess over the tolerance, index, both values
 _ALL: Fields = {topic.field: frozenset(each.name for each in fields(topic.type)) for topic in TOPICS}  # type: ignore[arg-type]
 
 
@@ -57,7 +57,7 @@ class Side:
         return cls(word, session.path.name, recorded, copy, session.numerics)
 
     def lacks(self, topic: Topic) -> dict[str, str]:
-        """What it does not record of a topic, as `/topic` or `/topic field`, each with a text about it."""
+        """Parts of a topic that this side does not record, as `/topic` or `/topic field`, each with a text about it."""
         if topic.field not in self.recorded:
             copied = self.copy and topic.field == "frame"
             return {topic.path: f"not copied into {self.name}" if copied else f"not recorded in {self.name}"}
@@ -72,10 +72,10 @@ class Difference:
     Attributes
     ----------
     stamp_ns : of the tick.
-    index : of the element in an array; None for anything else.
-    values : of the element, or what is said of a whole message or array; in the order of `words`.
-    excess : size of the difference over what the tolerance of the field allows; inf where nothing is allowed, or
-        nothing can be subtracted.
+    index : of the element in an array; None for other values.
+    values : of the element, or text about a whole message or array; in the order of `words`.
+    excess : the difference divided by the tolerance of the field; inf if the tolerance is zero or the values have no
+        difference.
     words : what the two sides are called.
     """
 
@@ -94,12 +94,12 @@ class Difference:
 
     def __str__(self) -> str:
         place = "" if self.index is None else str(list(self.index))
-        told = ", ".join(f"{word} {_said(value)}" for word, value in zip(self.words, self.values, strict=True))
-        return printable(f"{self.topic} at {seconds(self.stamp_ns):.3f} s: {self.field}{place} {told}")
+        values = ", ".join(f"{word} {_text(value)}" for word, value in zip(self.words, self.values, strict=True))
+        return printable(f"{self.topic} at {seconds(self.stamp_ns):.3f} s: {self.field}{place} {values}")
 
     def as_json(self) -> dict[str, Any]:
         """The difference for JSON; values that JSON can not hold are text."""
-        values = [value if _is_json(value) else _said(value) for value in self.values]
+        values = [value if _is_json(value) else _text(value) for value in self.values]
         return {
             "topic": self.topic,
             "stamp_s": seconds(self.stamp_ns),
@@ -111,7 +111,7 @@ class Difference:
 
 @dataclass(slots=True)
 class TopicCount:
-    """How the messages of one topic compared; `first` is the first difference, beyond the tolerance if there is one."""
+    """Counts of the compared messages of one topic; `first`: the first difference, beyond the tolerance if any is."""
 
     identical: int = 0
     within_tolerance: int = 0
@@ -162,7 +162,7 @@ class Comparison:
 
     @property
     def other_numerics(self) -> str:
-        """That the two sides were computed by different numerics, so that they may differ; '' if by the same."""
+        """Text if the two sides were computed by different versions of the numerics, else ''."""
         if self.sides[0].numerics == self.sides[1].numerics:
             return ""
         versions = ", ".join(f"{side.word}: version {side.numerics}" for side in self.sides)
@@ -170,12 +170,12 @@ class Comparison:
 
     @property
     def different_word(self) -> str:
-        """What messages beyond their tolerance are called."""
+        """The word for messages beyond their tolerance."""
         return "by other numerics" if self.other_numerics else "DIFFERENT"
 
     @property
     def words(self) -> tuple[str, str]:
-        """What the values of the two sides are called."""
+        """The words for the values of the two sides."""
         return self.sides[0].word, self.sides[1].word
 
     def add(self, recorded: Tick, replayed: Tick) -> None:
@@ -201,7 +201,7 @@ class Comparison:
             self.first = Difference("tick", stamp_ns, "tick", None, values, math.inf, self.words)
 
     def add_pair(self, topic: Topic, was: Message | None, now: Message | None, stamp_ns: int) -> Difference | None:
-        """Compare two messages of a topic: where they differ most; None where they are bit for bit the same."""
+        """Compare two messages of a topic: where they differ most; None if they are identical bit for bit."""
         names = self._names[topic.field]
         if not names:
             return None
@@ -232,14 +232,15 @@ class Comparison:
     def lines(self) -> list[str]:
         """A line of text for each topic."""
         lines = []
+        width = max(map(len, (*self.topics, *self.not_recorded)), default=0)
         for topic, count in self.topics.items():
             total = count.identical + count.within_tolerance + count.different
             lines.append(
-                f"{topic:20s} {count.identical} of {total} identical"
+                f"{topic:{width}s}  {count.identical} of {total} identical"
                 + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
                 + (f", {count.different} {self.different_word}" if count.different else "")
             )
-        return lines + [printable(f"{what:20s} {why}") for what, why in self.not_recorded.items()]
+        return lines + [printable(f"{what:{width}s}  {why}") for what, why in self.not_recorded.items()]
 
     def as_json(self) -> dict[str, Any]:
         """The result for JSON."""
@@ -263,7 +264,7 @@ def first_difference(
     names: Iterable[str] | None = None,
     words: tuple[str, str] = ("recorded", "replayed"),
 ) -> Difference | None:
-    """The largest difference between two messages of a topic, by what its tolerance allows; None: bit for bit the same.
+    """The largest difference between two messages of a topic relative to its tolerance; None if they are identical.
 
     Parameters
     ----------
@@ -277,15 +278,15 @@ def first_difference(
         before, after = getattr(was, name), getattr(now, name)
         if type(before) is type(after) and not isinstance(before, np.ndarray) and before == after:
             continue  # most fields of a replay, without the search for the tolerance
-        apart = _apart(before, after, topic.rtol, topic.atol_of(name))
-        if apart is not None and (worst is None or apart[0] > worst.excess):
-            excess, index, *values_apart = apart
-            worst = Difference(topic.path, stamp_ns, name, index, (values_apart[0], values_apart[1]), excess, words)
+        deviation = _deviation(before, after, topic.rtol, topic.atol_of(name))
+        if deviation is not None and (worst is None or deviation[0] > worst.excess):
+            excess, index, first, second = deviation
+            worst = Difference(topic.path, stamp_ns, name, index, (first, second), excess, words)
     return worst
 
 
-def _apart(was: object, now: object, rtol: float, atol: float) -> _Apart | None:
-    """How far two values are apart, by |was - now| <= atol + rtol |was|; None where they are bit for bit the same."""
+def _deviation(was: object, now: object, rtol: float, atol: float) -> _Deviation | None:
+    """Deviation of two values relative to the tolerance, by |was - now| <= atol + rtol |was|; None if bit-identical."""
     if isinstance(was, np.ndarray) and isinstance(now, np.ndarray):
         if was.shape != now.shape or was.dtype.kind != now.dtype.kind:
             return math.inf, None, _form(was), _form(now)
@@ -304,7 +305,7 @@ def _apart(was: object, now: object, rtol: float, atol: float) -> _Apart | None:
 
 
 def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> NDArray[np.float64]:
-    """Per element |was - now| over what is allowed. Values that are not finite are the same as their like only."""
+    """|was - now| / (atol + rtol |was|) per element; values that are not finite equal only the same value."""
     a, b = np.asarray(was, np.float64), np.asarray(now, np.float64)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))
@@ -317,7 +318,7 @@ def _form(value: object) -> object:
     return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else value
 
 
-def _said(value: object) -> str:
+def _text(value: object) -> str:
     return "absent" if value is None else str(value) if value in ("absent", "present") else repr(value)
 
 

@@ -25,18 +25,19 @@ _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16
 _REPEATED = ("reason", "duration")  # the second is a sentence of older files
+_STATED = ("seed", "operator", "sample", "notes")  # in the provenance
 _CLOCK_READINGS = ("wall_ns", "monotonic_ns")
 
 
 def info(session: Session | Path | str) -> dict[str, Any]:
-    """Facts about a session; numbers have their unit in the key, None is what is not known.
+    """Facts about a session; numbers have their unit in the key, None means unknown.
 
-    Reads no message, but for those that the parts of a run repeat. Raises SessionError where there is no session.
+    Reads no message but the keyframes of the parts of a run. Raises SessionError if there is no session.
     """
     session = Session.of(session)
     path, run, header = session.path, session.run, session.header
     outcome, phases = run.outcome, session.setting("mission", "phases")
-    said = header.provenance
+    provenance = header.provenance
     facts: dict[str, Any] = {
         "outcome": outcome.get("outcome", "unknown"),
         "note": _why(outcome),
@@ -47,39 +48,40 @@ def info(session: Session | Path | str) -> dict[str, Any]:
         "rig": _name(session.setting("rig")),
         "phases": [str(phase) for phase in phases] if isinstance(phases, list) else [],
         **{stage: _name(session.setting(stage, "method")) for stage in ("observer", "refine", "plan", "control")},
-        "recorded": said.get("wall_time", "unknown"),
-        "flowrec": said.get("flowrec", "?"),
-        "commit": said.get("git_commit"),
-        "local_changes": said.get("git_changed", str("git_diff" in said)) == "True" if "git_commit" in said else None,
-        **of_text({key: said[key] for key in ("seed", "operator", "sample", "notes") if key in said}),
-        "derived": _derived(said.get("derived", "{}")),
+        "recorded": provenance.get("wall_time", "unknown"),
+        "flowrec": provenance.get("flowrec", "?"),
+        "commit": provenance.get("git_commit"),
+        "local_changes": _local_changes(provenance),
+        **of_text({key: provenance[key] for key in _STATED if key in provenance}),
+        "derived": _derived(provenance.get("derived", "{}")),
         "piece": _piece(run.part, path) if run.part is not None else None,
         "replay_of": header.parent.get("file", "?") if header.parent else None,
     }
-    for key, code in said.items():
+    for key, code in provenance.items():
         if key.startswith("weights."):
             facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
     if session.setting("recording", "region") == "robot" and "frames_windows" not in outcome:
         facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
-    told = of_text(outcome)
-    return facts | {key: value for key, value in told.items() if key not in (*facts, *_REPEATED)}
+    recorded_figures = of_text(outcome)
+    return facts | {key: value for key, value in recorded_figures.items() if key not in (*facts, *_REPEATED)}
 
 
 def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The facts of `info` in words, what is unknown left out."""
+    """The known facts of `info` as names and text."""
     stages = ("observer", "refine", "plan", "control")
     width_um, height_um = facts.get("chip_width_um"), facts.get("chip_height_um")
     size = f", {width_um / 1000:.2f} x {height_um / 1000:.2f} mm" if width_um and height_um else ""
     changed = ", with local changes" if facts["local_changes"] else ""
     words = {
-        "outcome": facts["outcome"] + _bracketed(facts["note"]),
+        "outcome": facts["outcome"] + _in_brackets(facts["note"]),
         "size_bytes": shown("size_bytes", facts["size_bytes"])
         + (f" in {facts['parts']} parts" if facts["parts"] else ""),
         "chip": f"{facts['chip']}{size}, {facts['chip_openings']} openings",
+        "recorded": facts["recorded"][:19].replace("T", " "),
         "phases": " -> ".join(facts["phases"]) or "?",
         "observer": ", ".join(facts[stage] for stage in stages),
         "derived": ", ".join(f"{key} = {value}" for key, value in facts["derived"].items()),
-        "flowrec": facts["flowrec"] + _bracketed((facts["commit"] or "")[:10] + changed),
+        "flowrec": facts["flowrec"] + _in_brackets((facts["commit"] or "")[:10] + changed),
     }
     names = {"observer": "stages", "flowrec": "by flowrec"}
     without = (
@@ -101,7 +103,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """One session of a directory, the parts of a run together; what is not known of it is None or empty."""
+    """One session of a directory, or one run with all its parts; unknown values are None or empty."""
 
     name: str
     outcome: str  # or: recording, unfinished, unreadable
@@ -114,7 +116,7 @@ class Listed:
 
 
 def list_sessions(directory: Path) -> list[Listed]:
-    """The sessions in a directory by name, with those that were not finished or can not be read.
+    """The sessions in a directory by name, unfinished and unreadable ones included.
 
     Reads heads and indexes only. Raises SessionError when there is no such directory.
     """
@@ -137,8 +139,8 @@ def _listed(path: Path, files: list[Path]) -> Listed:
     parts = len(files) if files != [path] else 0
     try:
         session = Session(path)
-        head, said = session.header, session.run.outcome
-        outcome = said.get("outcome", "unknown"), _why(said)
+        head, ended = session.header, session.run.outcome
+        outcome = ended.get("outcome", "unknown"), _why(ended)
         chip = str(toml_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
         recorded = head.provenance.get("wall_time", "")
         return Listed(path.name, *outcome, size, session.duration_s, chip, recorded, parts)
@@ -153,22 +155,29 @@ def _size(run: Run) -> int:
 
 
 def _piece(part: Part, path: Path) -> str:
-    said = f"{part.kind} {part.number} of the run {run_path(path).stem}" + _bracketed(part.why)
-    return said if part.keyframe_ns is None else f"{said}, goes on from {seconds(part.keyframe_ns):.2f} s"
+    text = f"{part.kind} {part.number} of the run {run_path(path).stem}" + _in_brackets(part.why)
+    return text if part.keyframe_ns is None else f"{text}, goes on from {seconds(part.keyframe_ns):.2f} s"
 
 
-def _chip(said: Mapping[str, Any], png: bytes) -> dict[str, Any]:
-    facts: dict[str, Any] = {"chip": str(said.get("name", "?"))}
-    scale_um = said.get("um_per_px")
+def _chip(table: Mapping[str, Any], png: bytes) -> dict[str, Any]:
+    facts: dict[str, Any] = {"chip": str(table.get("name", "?"))}
+    scale_um = table.get("um_per_px")
     if isinstance(scale_um, float) and len(png) >= _PNG_SIZE_AT + _PNG_SIZE.size:
         width_px, height_px = _PNG_SIZE.unpack_from(png, _PNG_SIZE_AT)
         facts |= {"chip_width_um": width_px * scale_um, "chip_height_um": height_px * scale_um}
-    openings = said.get("opening")
+    openings = table.get("opening")
     return facts | {"chip_openings": len(openings) if isinstance(openings, list) else 0}
 
 
+def _local_changes(provenance: Mapping[str, str]) -> bool | None:
+    """Whether the code differed from its commit; None if the commit is unknown. Older files state a difference only."""
+    if "git_commit" not in provenance:
+        return None
+    return provenance.get("git_changed", str("git_diff" in provenance)) == "True"
+
+
 def _derived(text: str) -> dict[str, Any]:
-    """Settings that nobody gave, by key; none where the file was edited."""
+    """Derived settings by key; none if the text is damaged."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError):
@@ -180,10 +189,10 @@ def _name(setting: Any) -> str:
     return "?" if setting is None else str(setting)
 
 
-def _bracketed(text: str) -> str:
+def _in_brackets(text: str) -> str:
     return f" ({text})" if text else ""
 
 
 def _why(outcome: Mapping[str, str]) -> str:
-    """The note of a run that ended by itself, the reason of one that failed."""
+    """The note of an outcome or, of a failed run, its reason."""
     return outcome.get("note") or outcome.get("reason", "")

@@ -49,20 +49,20 @@ class Unattended:
     def armed(
         self, watchdog: Watchdog | None = None, give_up: Callable[[], str] = lambda: ""
     ) -> AbstractContextManager[None]:
-        """While something is open that has to be ended in good order; see Signals."""
+        """Context in which signals end the run in an orderly way; see Signals."""
         return nullcontext()
 
     def shown(self, writer: SessionWriter, disk: DiskMonitor) -> AbstractContextManager[Callable[[Tick], None]]:
-        """While the loop runs; what is yielded takes every tick."""
+        """Context in which the loop runs; yields a function that takes every tick."""
         return nullcontext(lambda _tick: None)
 
     def progress(self, what: str, total: float) -> AbstractContextManager[Callable[[float], None]]:
-        """While long work goes on; what is yielded takes how much is done."""
+        """Context of long work; yields a function that takes how much of `total` is done."""
         return nullcontext(lambda _done: None)
 
     @property
     def note(self) -> str | None:
-        """A note that a person is typing."""
+        """The note that a person is typing; None without one."""
         return None
 
 
@@ -111,10 +111,10 @@ class AtTerminal(Unattended):
 
 
 class StatusLine:
-    """Phase, frame rate, latency, drops, queue, file and disk of a running session; events as they come.
+    """Shows phase, frame rate, latency, drops, queue, file and disk of a running session, and its events.
 
-    On a terminal one line is updated in place; elsewhere (a log, CI) only the events are printed. Threads do the
-    printing: the loop only hands over its tick, and a terminal that is frozen or gone does not delay it.
+    On a terminal one line is updated in place; elsewhere (a log, CI) only the events are printed. A thread
+    prints: the loop only appends its tick, so a terminal that is frozen or closed does not delay it.
 
     Parameters
     ----------

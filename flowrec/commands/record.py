@@ -16,7 +16,7 @@ import numpy as np
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.clocks import ClockMonitor
-from flowrec.commands.auto_recovery import look_after
+from flowrec.commands.auto_recovery import recover_leftovers
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded, RunStatistics, figures_of, files_text
 from flowrec.config import Config, ResolvedConfig
@@ -46,17 +46,17 @@ from flowrec.terminal import say, warn
 if TYPE_CHECKING:
     from flowrec.view.live import LiveView
 
-# Of the 2 s that a run may take to end: the rest is for the coils (run_control.py) and for Python itself.
-CLOSE_TIMEOUT_S = 0.5  # for images that still wait to be written
-VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last of it
-_GIVE_UP_TIMEOUT_S = 1.0  # for a file to be closed beside a thread that is stuck
+# Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
+CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
+VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last messages
+_GIVE_UP_TIMEOUT_S = 1.0  # to close the file while the main thread hangs
 _LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
 
 View = Literal["spawn", "serve", "rrd", "none"]
 
 
 class Prepared(NamedTuple):
-    """What a run needs besides its rig.
+    """What a run needs excluded its rig.
 
     Attributes
     ----------
@@ -112,11 +112,12 @@ def prepare(asked: Config) -> Prepared:
 
 
 def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
-    """Raise UnreachableError where the assumed flow leaves no way to the goal, before anything is driven.
+    """Check before the run that the assumed flow lets the robot reach the goal.
 
-    So it is where it can not be held at the start, or is out of an outlet before the coils are up: their field, and
-    with it the speed that they can drive, grows to all of it in the time of the ramp. And so it is where no way to the
-    goal is wide enough, or all are too swift to be steered on.
+    Raises
+    ------
+    UnreachableError : the flow at the start is too fast to hold the robot there; the flow carries it out of an outlet
+        before the ramp of the coils is complete; every route to the goal is too narrow, or too fast to be steered on.
     """
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
@@ -136,7 +137,7 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
 
 
 def default_path(config: Config, folder: Path | None = None) -> Path:
-    """date_operator_sample_number.mcap, the first number that is free."""
+    """The path date_operator_sample_number.mcap with the first free number."""
     sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
     words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
     stem = "_".join(word.replace(" ", "-") for word in words if word)
@@ -171,14 +172,14 @@ def record(
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
-    Whatever ends it, KeyboardInterrupt included, the field is off before this function returns or raises.
+    The field is off before this function returns or raises, whatever the exception; also for KeyboardInterrupt.
 
     Parameters
     ----------
     view : spawn, serve, rrd or none.
     realtime : keep the rig to the wall clock, with a watchdog of its ticks (run/watchdog.py).
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
-    inputs : files that were read for it besides those that `config` names; no output may be one of either.
+    inputs : files that were read besides those that `config` names; no output may be one of them.
 
     Raises
     ------
@@ -209,7 +210,7 @@ def record(
         run_control.stop(reason)
 
     with ExitStack() as stack:
-        # From the first byte of the file to its last one, whoever wants the run to end gets a whole file.
+        # From the first byte of the file to the last, every way to end the run leaves a complete file.
         stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
         writer = stack.enter_context(
             session_writer(output, resolved, chip, live=realtime, in_pieces=True, derived=made)
@@ -219,7 +220,7 @@ def record(
         live: LiveView | None = None
         worker: Worker
         if view in ("spawn", "serve"):
-            # Late: importing Rerun takes a second, and most runs do without.
+            # Imported here because importing Rerun takes a second and most runs do not need it.
             from flowrec.commands.export_rrd import scene_of
             from flowrec.view.live import LiveView
 
@@ -231,7 +232,7 @@ def record(
         if fields:
             worker = Preloaded(worker, fields)
         disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
-        # A run that does not keep real time never waits: it would keep a core for itself.
+        # A run that is not in real time never waits: with real-time priority it would occupy a core.
         priority = realtime_priority() if realtime else nullcontext(enter_result=False)
         with control.shown(writer, disk) as show, priority as first:
 
@@ -277,7 +278,7 @@ def record(
 
 
 def _guard_timeout_s(config: ResolvedConfig) -> float:
-    """The watchdog's timeout, which must not be shorter than a few frames of the camera."""
+    """The timeout of the watchdog in s; UsageError if it is shorter than a few frames of the camera."""
     timeout_s, rate_hz = config.safety.guard_timeout_s, config.camera.rate_hz
     if timeout_s * rate_hz < _LEAST_FRAMES:
         raise UsageError(
@@ -288,16 +289,16 @@ def _guard_timeout_s(config: ResolvedConfig) -> float:
 
 
 def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:
-    """Close the file beside a main thread that is stuck; returns what a person is to know of it.
+    """Close the file while the main thread hangs; return a message about the file.
 
-    In the thread of the signals. The writer is not in use: where the main thread is stuck in it, this does not wait.
+    Runs in the thread of the signals, and does not wait if the main thread hangs in the writer.
     """
     if not opened:
         return ""
     writer = opened[0]
 
     def close() -> None:
-        with suppress(SessionError):  # what is there stays in the partial file
+        with suppress(SessionError):  # what was written stays in the partial file
             writer.close(
                 {"outcome": Outcome.FAILED, "note": f"{reason}; the main thread did not answer"}, CLOSE_TIMEOUT_S
             )
@@ -311,7 +312,7 @@ def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:
 
 
 def _files_of(config: Config) -> list[Path]:
-    """The files that a configuration names, and what belongs to them."""
+    """The files that a configuration names, and those that are read with them."""
     files: list[Path] = []
     chip = Path(config.chip.path)
     if chip.name:
@@ -327,12 +328,12 @@ def _report_remarks(writer: SessionWriter) -> None:
 
 
 def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
-    """Where the session goes, with the remains of earlier runs there looked after and room on the disk."""
+    """The path of the session, after unfinished sessions in its folder are recovered and the free space is checked."""
     folder = out.parent if out is not None else Path()
     made: dict[Path, str] = {}
     if config.recording.recover_leftovers:
-        besides = frozenset(run_files(out.resolve())) if out is not None and overwrite else frozenset()
-        made = look_after(folder, besides)
+        excluded = frozenset(run_files(out.resolve())) if out is not None and overwrite else frozenset()
+        made = recover_leftovers(folder, excluded)
     path = out if out is not None else default_path(config)
     same = next((file for file in made if run_path(file) == path), None)
     if same is not None and not overwrite:

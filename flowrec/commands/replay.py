@@ -39,13 +39,13 @@ from flowrec.terminal import warn
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
 from flowrec.units import seconds
 
-# Sections that a recording has fixed.
+# Sections that a replay can not change.
 FIXED = ("chip", "camera", "rig", "simulated")
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a replay does differently from the recording: the options of the verb; None keeps what was recorded.
+    """Methods and settings that a replay changes; None leaves a method as recorded.
 
     Attributes
     ----------
@@ -60,8 +60,10 @@ class Change:
     sets: tuple[str, ...] = ()
 
     def apply(self, config: ResolvedConfig) -> ResolvedConfig:
-        """The recorded configuration with the changes. A changed run does not plan again because of tracking errors:
-        the recorded robot can not follow the replayed commands.
+        """The recorded configuration with the changes.
+
+        A changed replay does not plan again because of tracking errors: the recorded robot can not follow the
+        replayed commands.
         """
         plan, controller = self.plan, self.controller
         # A control law may need a planner that provides the time to go: if one of them is given, the other follows.
@@ -92,7 +94,7 @@ class Change:
 
         Raises
         ------
-        UsageError : a section is changed that the recording has fixed.
+        UsageError : a section of FIXED is changed.
         """
         sections = [
             each.name for each in fields(ResolvedConfig) if getattr(recorded, each.name) != getattr(changed, each.name)
@@ -265,7 +267,7 @@ def adoption_stamps(reader: SessionReader) -> dict[int, int]:
 
 
 class WithoutFrames:
-    """A sink that leaves the camera images out: they stay in the parent session, which the replay names by hash."""
+    """A sink that omits the camera images: they stay in the parent session, which the replay names by hash."""
 
     def __init__(self, writer: SessionWriter) -> None:
         self._writer = writer
@@ -275,9 +277,9 @@ class WithoutFrames:
 
 
 def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
-    """The tick that gave a work order whose result is not yet adopted at the start, with what was known then.
+    """The tick of a work order whose result is not yet adopted at the start; None if there is no such order.
 
-    Where a part of a run begins after that: its keyframe, in which only later observations differ.
+    If a part of a run begins after that tick, it is the keyframe, in which only later observations differ.
     """
     mission = start.mission
     if mission is None or not mission.wanted:
@@ -291,7 +293,7 @@ def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
 def _closing_work(
     pipeline: Pipeline, config: ResolvedConfig, last: Tick, recorded: Tick, stale: frozenset[str]
 ) -> Tick:
-    """Refine and plan after the last frame what the recording ended too early to adopt, or never ordered."""
+    """Compute, after the last frame, results that the recording ended too early to adopt or never ordered."""
     mission = last.mission
     if mission is None or last.assumed is None:
         return last
@@ -318,7 +320,7 @@ def _closing_work(
 
 
 def planned_from(recorded: Tick, last: Tick) -> NDArray[np.float64]:
-    """Where the recorded route begins, else where the robot is: a point (2,) in um."""
+    """The start of the recorded route, else the position of the robot: a point (2,) in um."""
     if recorded.route is not None and recorded.route.reachable and recorded.mission is not None:
         return np.array(recorded.route.waypoints_um[0], np.float64)
     assert last.estimate is not None

@@ -1,4 +1,4 @@
-"""What a replay is worth: recorded and replayed side by side, on paper and flown again in a simulator."""
+"""Report on a replay: recorded and replayed figures side by side, and both plans flown in a simulator."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from flowrec.terminal import say
 from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
-_SAME_MAP = 1e-3  # of the largest speed: no table shows less
+_SAME_MAP = 1e-3  # of the largest speed: smaller changes are not visible in any table
 
 
 def report(done: Replayed) -> list[Row]:
-    """Key, recorded and replayed value of every figure that a replay may change; both judged on the replay's map.
+    """Key, recorded and replayed value of every figure that a replay may change, both on the map of the replay.
 
     Flow errors are relative to the true flow, where it is known. A route that can not be followed on that map has no
     travel time.
@@ -75,7 +75,7 @@ def report(done: Replayed) -> list[Row]:
 
 
 def refinement_remarks(done: Replayed) -> list[str]:
-    """What the refinement of a replay did, in lines; why, if it left the recorded map as it was."""
+    """Lines about the refinement of a replay; why, if it left the recorded map unchanged."""
     was, now = done.recorded.refined, done.replayed.refined
     if now is None:
         return []

@@ -23,13 +23,13 @@ _SAME_COMMAND_UM_S = 1.0  # smaller differences of the demanded velocity are not
 
 
 class WorkerCheck:
-    """Carries out every recorded work order again and compares the adopted result within the tolerance of its topic.
+    """Computes every recorded work order again and compares the adopted result within the tolerance of its topic.
 
     Parameters
     ----------
     pipeline : the stages as recorded.
     start : the tick before the first one of the replay.
-    order : the tick of an order that is not yet answered there; None without one.
+    order : the tick of an order whose result is not yet adopted at `start`; None without one.
     comparison : takes the results.
 
     Attributes
@@ -42,7 +42,7 @@ class WorkerCheck:
         self._computed: dict[int, FlowField | Route] = {}  # by number of the order
         self._ordered = start.mission.request if start.mission is not None else 0
         self._last = start
-        self._unknown = {0}  # orders that can not be carried out again; 0: fields of an earlier session
+        self._unknown = {0}  # orders that can not be computed again; 0: fields of an earlier session
         self.comparison = comparison
         self.results: list[str] = []
         if order is None or order.mission is None:
@@ -57,7 +57,7 @@ class WorkerCheck:
             self._computed[mission.request] = work(pipeline, order)
 
     def add(self, tick: Tick) -> None:
-        """Take the next tick: carry out a new order, compare newly adopted results."""
+        """Take the next tick: compute a new order, compare newly adopted results."""
         for name in WORKER_FIELDS:
             adopted = getattr(tick, name)
             if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._unknown:
@@ -78,7 +78,7 @@ class WorkerCheck:
 
 
 def digest_lines(path: Path) -> tuple[bool, list[str]]:
-    """Whether the files of a session hold what was recorded, by their digests, and lines of text about it."""
+    """Whether the files of a session match their digests, and lines of text about it."""
     lines = []
     intact = True
     for file, faults in digest_faults(path).items():
@@ -87,12 +87,12 @@ def digest_lines(path: Path) -> tuple[bool, list[str]]:
         elif faults:
             intact = False
             lines += [printable(f"{file.name}: DIFFERENT from its digest: {fault}") for fault in faults]
-    return intact, lines or ["all messages and the head are as the digest says"]
+    return intact, lines or ["all messages and the header match the digest"]
 
 
 @dataclass(slots=True)
 class CommandDifference:
-    """How far the replayed demand is from the recorded one.
+    """Difference of the replayed demand from the recorded one.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class Replayed:
     commands : of the demands of both.
     frames_missing : images that are not in the file.
     worker_check : of --verify: the results of the worker.
-    digest : of --verify: whether the files hold what was recorded, and lines of text about it.
+    digest : of --verify: whether the files match their digests, and lines of text about it.
     """
 
     session: Session
@@ -172,7 +172,7 @@ class Replayed:
             lines += self.worker_check.results
         lines += self.digest[1]
         if self.frames_missing:
-            lines.append(f"{self.frames_missing} frames are not in the file; their recorded tracks stood in")
+            lines.append(f"{self.frames_missing} frames are not in the file; the recorded tracks were used instead")
         first = next((each.first for each in self._comparisons if each.first is not None), None)
         if first is not None:
             lines.append(f"first difference: {first}")

@@ -20,7 +20,7 @@ from flowrec.terminal import say, table
 from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
-# The mission has done what it was asked for, or was ended on purpose.
+# The mission was completed, or was ended on purpose.
 GOOD_ENDS = frozenset(
     outcome for outcome in Outcome if outcome.completes_mission or outcome in (Outcome.STOPPED, Outcome.TIME_OVER)
 )
@@ -63,7 +63,7 @@ class Recorded:
 
 
 class RunStatistics:
-    """A sink that keeps the true flow and the distance to the reference while navigating, for the figures."""
+    """A sink that collects the true flow and the distance to the reference during navigation, for the figures."""
 
     def __init__(self) -> None:
         self.true_field: FlowField | None = None

@@ -1,4 +1,4 @@
-"""The result of `flowrec check`: facts, findings, figures, and the judgement that follows from them."""
+"""The result of `flowrec check`: facts, findings, figures, and the judgement, which follows from the findings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that is not as it should be."""
+    """Something wrong or unusual."""
 
     level: Severity
     about: str
@@ -49,7 +49,7 @@ class Verdict:
     Attributes
     ----------
     path : the file.
-    findings : what is not as it should be.
+    findings : what is wrong or unusual.
     facts : what was examined, as text by name.
     figures : the same in numbers, with the unit in the key.
     topics : messages read, by topic.

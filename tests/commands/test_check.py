@@ -89,7 +89,7 @@ def test_the_same_session_cut_off_is_not_usable_and_recovered_it_is_with_a_loss(
     assert verdict.exit_status == 3
     assert [about for about, _ in found(verdict)] == expected
     assert "recovered from s.mcap.partial" in found(verdict)[0][1]
-    assert all("ticks there is only the image" in text for about, text in found(verdict) if about == "replay")
+    assert all("ticks have only their image" in text for about, text in found(verdict) if about == "replay")
 
 
 def test_a_run_that_is_going_on_is_told_as_such(tmp_path):
@@ -136,7 +136,7 @@ def test_images_that_were_dropped_are_told_apart_from_those_that_are_missing(tmp
 def test_ticks_that_lack_inputs_are_counted(tmp_path):
     verdict = check(file_of(tmp_path, only(lambda channel, tick: channel != APPLIED or tick != 4)))
     assert ("replay", f"1 of {TICKS} ticks lack inputs; a replay leaves them out") in found(verdict)
-    assert ("content", "1 messages of /coils/applied are missing on the way") in found(verdict)
+    assert ("content", "1 messages of /coils/applied are missing in the middle") in found(verdict)
     assert verdict.facts["replay"].startswith("yes, but not exact")
     verdict = check(file_of(tmp_path, only(lambda channel, tick: channel == FRAMES)))
     assert verdict.exit_status == 1 and verdict.facts["replay"] == "no"

@@ -269,7 +269,7 @@ def test_each_part_of_a_run_has_a_digest_of_its_own(tmp_path: Path) -> None:
     parts = sorted(tmp_path.glob("run.part*.mcap"))
     assert len(parts) > 1
     for part in parts:
-        assert check(part).facts["digest"] == "head and messages are those that were recorded"
+        assert check(part).facts["digest"] == "header and messages are those that were recorded"
 
 
 def test_a_session_of_the_first_release_is_said_to_have_no_digest() -> None:

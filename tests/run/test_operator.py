@@ -15,7 +15,7 @@ import pytest
 
 from flowrec.commands import record as verb
 from flowrec.commands import replay as again
-from flowrec.commands.auto_recovery import look_after
+from flowrec.commands.auto_recovery import recover_leftovers
 from flowrec.commands.interactive import Unattended
 from flowrec.config import load_config
 from flowrec.enums import Action
@@ -237,7 +237,7 @@ def test_what_a_killed_run_left_is_recovered_at_the_next_start_and_its_name_is_t
     told = capsys.readouterr().err
     assert "recovered" in told
     assert "junk.mcap.partial" in told
-    assert look_after(tmp_path) == {}  # nothing more to be done, and the junk keeps nobody from anything
+    assert recover_leftovers(tmp_path) == {}  # nothing more to be done, and the junk keeps nobody from anything
     assert junk.exists()
 
 
@@ -245,7 +245,7 @@ def test_what_a_killed_run_left_is_recovered_at_the_next_start_and_its_name_is_t
 def test_remains_are_looked_after_in_any_thread(session: Path, tmp_path: Path) -> None:
     (tmp_path / "left.mcap.partial").write_bytes(session.read_bytes()[: session.stat().st_size // 2])
     with ThreadPoolExecutor() as pool:
-        assert list(pool.submit(look_after, tmp_path).result()) == [tmp_path / "left.mcap"]
+        assert list(pool.submit(recover_leftovers, tmp_path).result()) == [tmp_path / "left.mcap"]
 
 
 def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
@@ -255,7 +255,7 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
     left.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
     threads, files = set(threading.enumerate()), len(list(Path("/dev/fd").iterdir()))
     monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", 0.05)
-    assert look_after(tmp_path) == {}
+    assert recover_leftovers(tmp_path) == {}
     assert f"flowrec recover {left}" in capsys.readouterr().err.replace("\n", "")
     assert set(threading.enumerate()) == threads
     assert len(list(Path("/dev/fd").iterdir())) == files
@@ -274,7 +274,7 @@ def test_a_recovery_that_hears_no_signal_is_killed(
     monkeypatch.setattr("flowrec.commands.auto_recovery.child_command", lambda *_: [sys.executable, "-c", deaf])
     monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", 2.0)
     monkeypatch.setattr("flowrec.commands.auto_recovery._CLEANUP_TIMEOUT_S", 0.1)
-    assert look_after(tmp_path) == {}
+    assert recover_leftovers(tmp_path) == {}
     assert not ended.exists()
     assert left.exists()
 
@@ -285,6 +285,6 @@ def test_remains_that_are_too_large_are_offered_and_left_alone(
     large = tmp_path / "large.mcap.partial"
     with large.open("wb") as file:
         file.truncate(3_000_000_000)
-    assert look_after(tmp_path) == {}
+    assert recover_leftovers(tmp_path) == {}
     assert f"flowrec recover {large}" in capsys.readouterr().err.replace("\n", "")
     assert large.stat().st_size == 3_000_000_000

@@ -167,7 +167,7 @@ def spoiled(session, tmp_path, field, **changes):
         ("replay", "assumed", {"velocity_um_s": float("nan")}, "replayed"),
         ("replay", "assumed", {"velocity_um_s": 1e300}, "replayed"),
         ("replay", "demand", {"velocity_um_s": 1e300}, "replayed"),
-        ("export", "assumed", {"velocity_um_s": 1e300}, "drawn"),
+        ("export", "assumed", {"velocity_um_s": 1e300}, "exported"),
     ],
 )
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

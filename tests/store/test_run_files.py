@@ -273,7 +273,7 @@ def test_a_part_that_repeats_something_else_is_odd(run):
     verdict = check(run)
     assert verdict.exit_status == 3
     assert [f.text for f in verdict.findings] == [
-        "part 3 repeats something else than the part before ended with: /robot/estimate"
+        "part 3 repeats other messages than the part before ended with: /robot/estimate"
     ]
 
 
