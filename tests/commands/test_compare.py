@@ -157,7 +157,7 @@ def test_images_that_a_replay_did_not_copy_are_not_a_difference(tmp_path: Path, 
     second = small_session(tmp_path / "b.mcap", [replace(tick, frame=None) for tick in ticks], parent=True)
     status, said = run("compare", first, second)
     assert status == 0, said
-    assert "/camera/frame        not copied into b.mcap" in said
+    assert "/camera/frame not copied into b.mcap" in " ".join(said.split())
     # In a session that is no replay they were lost.
     third = small_session(tmp_path / "c.mcap", [replace(tick, frame=None) for tick in ticks])
     assert run("compare", first, third)[0] == 3

@@ -14,6 +14,7 @@ from flowrec.commands.replay_report import refly, report
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded
 from flowrec.config import load_config
 from flowrec.store.reader import SessionReader
+from flowrec.system.outputs import MCAP, Output
 from tests.conftest import SMALL
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
@@ -59,7 +60,7 @@ def test_the_paper_planner_goes_upstream_the_same_way_but_slower(upstream: Recor
     assert done.replayed.route.method == "astar_paper"
     assert done.replayed.route.waypoints_um[:, 1].min() < ISLAND_ROW_UM - 500.0
     assert done.replayed.route.arrival_s[-1] > done.recorded.route.arrival_s[-1]
-    flown = {row[0]: row[1:] for row in refly(done, tmp_path / "flown.mcap")}
+    flown = {row[0]: row[1:] for row in refly(done, Output(tmp_path / "flown.mcap", MCAP))}
     assert flown["reflown_outcome"] == ("reached", "reached")
     ours_s, paper_s = flown["reflown_navigation_s"]
     assert paper_s > ours_s
