@@ -177,7 +177,7 @@ def test_numbers_that_can_not_be_are_named_where_a_verb_fails_over_them(session,
     error = CliRunner().invoke(app, words).exception
     assert isinstance(error, SessionError), error
     (name,) = changes
-    told = rf"{BY_FIELD[field].path} {name} at \d\.\d+ s holds NaN, infinity or a number beyond all measure, .* {done}"
+    told = rf"{BY_FIELD[field].path} {name} at \d\.\d+ s holds NaN, infinity or an impossibly large number, .* {done}"
     assert re.search(told, str(error)) and len(str(error).splitlines()) == 1
 
 
