@@ -246,7 +246,7 @@ def rrd_only_begun(monkeypatch):
 def test_the_verbs_take_the_run(run, whole, tmp_path, rrd_only_begun):
     verdict = check(run)
     assert (verdict.word, verdict.exit_status, len(verdict.parts)) == ("good", 0, 4), verdict.lines()
-    assert verdict.facts["parts"] == "4, each begins where the one before ends"
+    assert verdict.facts["parts"] == "4, each begins where the part before ends"
     assert (
         verdict.topics == {BY_FIELD[field].path: count for field, count in whole.counts.items()} == Session(run).topics
     )
