@@ -178,11 +178,11 @@ def replay(
     if as_json:
         figures = {"wall_s": report.wall_s, "duration_s": report.duration_s, "ticks": report.ticks}
         named = [dict(zip(("quantity", "recorded", "replayed"), row, strict=True)) for row in rows]
-        result = {"session": str(session), "out": str(outputs.session), "refinement": remarks, "rows": named}
+        result = {"session": str(session), "out": str(outputs.session.path), "refinement": remarks, "rows": named}
         typer.echo(json.dumps(result | figures))
         return
     table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
-    say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {outputs.session}")
+    say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {outputs.session.path}")
     for line in remarks:
         say(line)
 

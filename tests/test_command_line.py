@@ -152,3 +152,13 @@ def test_a_bar_that_stands_names_no_time_left() -> None:
     assert terminal.time_left(12.4, stands_s=0.2) == "12 s left"
     assert terminal.time_left(1.0, stands_s=5.0) == ""
     assert terminal.time_left(None, stands_s=0.0) == ""
+
+
+def test_a_replay_states_the_path_of_its_session(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "again.mcap"
+    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--json"], monkeypatch) == 0
+    assert json.loads(capsys.readouterr().out)["out"] == str(out)
+    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--overwrite"], monkeypatch) == 0
+    assert "".join(capsys.readouterr().err.split()).find(f"->{out}") > 0

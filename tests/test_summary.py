@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 
 from flowrec.cli import main
+from flowrec.session import Session
 from flowrec.store.reader import SessionReader
+from flowrec.summary import of_text
 from tests.conftest import SMALL
 
 GOLDEN = Path(__file__).parents[1] / "sessions" / "golden.mcap"
@@ -108,3 +110,14 @@ def test_check_gives_what_it_counted_as_numbers(session: Path, told) -> None:  #
     assert figures["frames_dropped"] == 0
     assert figures["rate_hz"] == pytest.approx(30.0, rel=0.01)
     assert figures["duration_s"] == pytest.approx((figures["ticks"] - 1) / 30.0, rel=0.01)
+
+
+def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_names_of_older_files(
+    session: Path,
+) -> None:
+    outcome = Session(session).run.outcome
+    assert outcome["dropped_frames"] == "0"
+    assert "frames_dropped" not in outcome
+    assert Session(session).outcome["frames_dropped"] == 0
+    for older in ({"frames_dropped": "3"}, {"dropped_frames": "3"}, {"frames_dropped": "1", "dropped_frames": "3"}):
+        assert of_text(older) == {"frames_dropped": 3}
