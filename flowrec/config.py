@@ -114,7 +114,7 @@ class Config:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResolvedConfig(Config):
-    """A run on its chip: robot, camera, start and goal are known."""
+    """The settings of a run on its chip: no setting of robot, camera, start and goal is None."""
 
     robot: Robot
     camera: Camera
@@ -183,7 +183,7 @@ def to_toml(config: Config) -> str:
 def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] | None = None) -> _AnyConfig:
     """The configuration with some `key=value` changed; `flags` as in `load_config`.
 
-    A recorded configuration may hold settings outside of their ranges; only the changed ones are checked.
+    A recorded configuration may hold settings outside of their ranges; only the changed settings are checked.
     """
     tree = _without_none(asdict(config))
     origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
@@ -258,7 +258,7 @@ def _config_from(kind: type[_AnyConfig], tree: dict[str, Any], origin: Origin) -
 
 
 def _type_error(key: str, value: Any, complaint: str) -> str:
-    """The error of a value that has not the type of its key, with the nearest valid value."""
+    """The error text for a value of the wrong type, with the nearest valid value."""
     known = dict(_all_hints(Config, ""))
     while key not in known and "." in key:  # a place in a tuple
         key = key.rpartition(".")[0]

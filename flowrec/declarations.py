@@ -1,4 +1,4 @@
-"""What an annotation of a message field or of a field of `Tick` can say: shape, finiteness, topic, source, tolerances.
+"""Annotations of message fields and of the fields of `Tick`: shape, finiteness, topic, source, tolerances.
 
 messages.py declares every record with these. The wire format (store/schema.py), the checks of what was read from a
 file and the table of topics (topics.py) are derived from them.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from flowrec.enums import WorkOrder
 
-# The second word is the wire form: a `vector` becomes a repeated double that viewers can plot,
+# The annotation is the wire form: a `vector` becomes a repeated double that viewers can plot,
 # an `array` keeps its shape and its bytes.
 Vector = Annotated[NDArray[np.float64], "vector"]
 Matrix = Annotated[NDArray[np.float64], "array"]

@@ -1,4 +1,4 @@
-"""The methods of a stage as a table: one row a method. `--help`, errors, README, tests and benches iterate the rows."""
+"""The methods of a stage as a table, a row per method. `--help`, errors, README, tests and benches iterate the rows."""
 
 from __future__ import annotations
 

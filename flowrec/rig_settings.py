@@ -39,7 +39,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera(CameraSettings):
-    """A camera of which everything is known."""
+    """The camera of a resolved configuration: no setting is None."""
 
     rate_hz: _Rate
     um_per_px: _Scale
@@ -47,7 +47,7 @@ class Camera(CameraSettings):
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """How the simulated world differs from what is assumed about it, and how the robot jitters. Drawn from the seed."""
+    """Differences between the simulated and the assumed world, and the robot's noise; drawn from the seed."""
 
     seed: Seed = 0
     # each true inlet speed is the assumed one times 1 +- (a third of this to all)
@@ -76,7 +76,7 @@ class Simulated:
 
 @dataclass(frozen=True, slots=True)
 class Safety:
-    """When a run that is not steered loses its field. With --realtime, and on hardware."""
+    """When the watchdog switches the field off, with --realtime and on hardware."""
 
     # time without a completed tick, while the field is on, after which the watchdog switches it off
     guard_timeout_s: Annotated[float, Range(0.01, 60.0)] = 0.5

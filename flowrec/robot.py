@@ -1,4 +1,4 @@
-"""The robot as every room sees it: how it moves, how large it is, where its limits are."""
+"""The robot: its kinematics, its size and its limits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RobotSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Robot(RobotSettings):
-    """A robot of which everything is known: kinematics xdot = u (cos phi, sin phi) + v(x), u = k f.
+    """The robot of a resolved configuration: kinematics xdot = u (cos phi, sin phi) + v(x), u = k f.
 
     This is eq. kinematic of the paper; k is `um_per_rev`, f the frequency of the field, phi its heading.
     """

@@ -90,7 +90,7 @@ _COUNTS = ("ticks", "dropped_frames", "frames_missing_from_camera")  # of an out
 
 @dataclass(frozen=True, slots=True)
 class RunFile:
-    """What must be known of a file to read it with others."""
+    """The properties of a file that decide whether it continues another one."""
 
     path: Path
     part: Part | None
@@ -152,7 +152,7 @@ class Run:
 
     @property
     def outcome(self) -> dict[str, str]:
-        """How it ended, and the sums of what each part counts."""
+        """The outcome of the last file, with the counts summed over the parts."""
         outcome = dict(self.files[-1].outcome)
         if self.in_parts:
             outcome.pop("frames_windows", None)  # of the last part alone
@@ -194,12 +194,12 @@ def files_of(path: Path) -> list[Path]:
 
 
 def unfinished_of(path: Path) -> list[Path]:
-    """What was begun of the run X.mcap and not finished: its file, parts and snapshots."""
+    """The unfinished files of the run X.mcap: its single file, parts and snapshots."""
     return [file for file in run_files(path) if file.name.endswith(PARTIAL_SUFFIX)]
 
 
 def _refuse_unfinished(path: Path, found: Sequence[Path]) -> None:
-    """The first parts must not pass for all of them. An unfinished snapshot is no part."""
+    """Raise UnfinishedError if a part is unfinished: the finished parts are not the complete run."""
     unfinished = [file for file in unfinished_of(path) if part_number(file) or file == partial_path(path)]
     if not unfinished:
         return
@@ -255,5 +255,5 @@ def continuity_fault(file: RunFile, number: int, before: RunFile | None) -> str 
 
 
 def is_continued(outcome: Mapping[str, str]) -> bool:
-    """Whether a part says that the run is continued in another."""
+    """Whether the outcome of a part says that the run is continued in another part."""
     return Outcome.CONTINUED in (outcome.get("outcome"), outcome.get("ended_as"))

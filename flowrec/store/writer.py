@@ -232,7 +232,7 @@ class SessionWriter:
                 error.add_note(str(second))
 
     def _new_messages(self, tick: Tick) -> NewMessages:
-        # This and `put` are all that recording costs the control loop: some 50 us.
+        # This and `put` are all of the writer that runs in the control loop: some 50 us.
         messages = _messages_of(tick)
         last, self._last = self._last, messages
         new: NewMessages = {}
