@@ -69,7 +69,7 @@ class Recording:
     snapshot_after_s: Annotated[float, Range(0.0, 1e6)] = 10.0
     # memory for the time before an event; if it is too small, less time is kept
     snapshot_mb: Annotated[float, Range(1e-3, 1e6)] = 1000.0
-    # free space below which a run is ended in good order; 0: never
+    # free space below which a run is ended as by Ctrl-C; 0: never
     disk_floor_gb: Annotated[float, Range(0.0, 1e6)] = 1.0
     recover_leftovers: bool = True  # recover what killed runs have left in the same folder
     operator: str = ""

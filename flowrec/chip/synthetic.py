@@ -149,7 +149,7 @@ def _junctions(rng: np.random.Generator) -> _Points:
 
 
 def _thin_out(rng: np.random.Generator, count: int) -> list[_Edge]:
-    """The edges of the lattice but some; all junctions stay connected and on a loop or between loops."""
+    """Lattice edges left after random removal; all junctions stay connected and none is a dead end."""
     lattice = [(k, k + 1) for k in range(count) if (k + 1) % _COLUMNS]
     lattice += [(k, k + _COLUMNS) for k in range(count - _COLUMNS)]
     edges = lattice

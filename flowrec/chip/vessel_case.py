@@ -60,7 +60,7 @@ def read_vessel_case(path: Path) -> Chip:
 
 
 def read_observations(path: Path, noise: str, share: str) -> Observations:
-    """What a robot felt on its way through a vessel case: `noise` is a key of NOISES, `share` one of SHARES.
+    """Observations of a robot on its path through a vessel case: `noise` is a key of NOISES, `share` one of SHARES.
 
     The standard deviation is that of one component.
     """

@@ -106,7 +106,7 @@ def _recover_in_process(path: Path, limit_s: float) -> tuple[Path, str]:
     except OSError as error:
         raise FlowrecError(f"{path}: recovering it does not start ({error.strerror or error})") from error
     try:
-        out, said = process.communicate(timeout=limit_s)
+        out, errors = process.communicate(timeout=limit_s)
     finally:
         if process.poll() is None:
             process.terminate()
@@ -115,7 +115,7 @@ def _recover_in_process(path: Path, limit_s: float) -> tuple[Path, str]:
             process.kill()
             process.communicate()
     if process.returncode:
-        last = (said.strip().splitlines() or [f"exit status {process.returncode}"])[-1]
+        last = (errors.strip().splitlines() or [f"exit status {process.returncode}"])[-1]
         raise FlowrecError(last if process.returncode == _REFUSED else f"{path}: recovering it failed ({last})")
     name, summary = json.loads(out)
     return path.with_name(name), summary

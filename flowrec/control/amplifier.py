@@ -95,8 +95,8 @@ class FieldLimits:
 
         The robot follows the nominal field up to `follow_hz`, and a weaker field up to a frequency that is lower in
         proportion; slower rotation in turn permits a stronger field. The amplitude at which both limits agree,
-        f = follow_hz max_amplitude(f) / nominal, is used at every frequency, so that neither waits for the other. With
-        max_amplitude(f) = V / (row |R + j w L|), f^2 is the root of a quadratic equation for each coil.
+        f = follow_hz max_amplitude(f) / nominal, is used at every frequency. With max_amplitude(f) =
+        V / (row |R + j w L|), f^2 is the root of a quadratic equation for each coil.
         """
         static_mt = min(self.nominal_mt, self.max_amplitude_mt(0.0))
         if follow_hz <= 0.0:

@@ -118,15 +118,15 @@ class CoilFit:
     noise_mt: NDArray[np.float64]  # (3,) of one reading: sqrt(sum of squares / degrees of freedom)
     freedom: int  # degrees of freedom: rows minus unknowns
     left_out_mt: NDArray[np.float64]  # (n, 3) measured minus predicted by the other rows; NaN where they can not
-    score: NDArray[np.float64]  # (n, 3) that in its own standard deviations (externally studentised); NaN likewise
-    suspicion: float  # critical score for all rows and axes together; inf without degrees of freedom
+    score: NDArray[np.float64]  # (n, 3) `left_out_mt` in standard deviations (externally studentised); NaN likewise
+    critical_score: float  # critical score for all rows and axes together; inf without degrees of freedom
     uncertainty_mt: float  # standard error of a nominal field in the worst direction, from the fit alone
 
     @property
     def suspects(self) -> list[int]:
         """Rows whose residual is significant, worst first."""
         worst = np.nan_to_num(np.abs(self.score), posinf=np.inf).max(axis=1)
-        return [int(row) for row in np.argsort(-worst) if worst[row] > self.suspicion]
+        return [int(row) for row in np.argsort(-worst) if worst[row] > self.critical_score]
 
     @property
     def unchecked(self) -> list[int]:
@@ -168,14 +168,14 @@ def fit_coils(excitations: Excitations) -> CoilFit:
     leverage = (Q**2).sum(1)
     free = np.where(leverage < 1.0 - 1e-9, 1.0 - leverage, np.nan)[:, None]
     left_out = residual / free
-    score, suspicion = np.full_like(residual, np.nan), np.inf
+    score, critical_score = np.full_like(residual, np.nan), np.inf
     if freedom > 1:
         # All axes share one probe and so one noise, estimated from all axes of the other rows: one axis alone has too
         # few of them. The floor keeps rounding errors of an exact fit from being significant.
         others = np.maximum((residual**2).sum() - (residual**2 / free).sum(1), 0.0) / (3 * (freedom - 1))
         floor = (1e-12 * max(float(np.abs(field).max()), 1e-12)) ** 2
         score = residual / np.sqrt((others[:, None] + floor) * free)
-        suspicion = float(student.ppf(1.0 - 0.5 * _SIGNIFICANCE / residual.size, 3 * (freedom - 1)))
+        critical_score = float(student.ppf(1.0 - 0.5 * _SIGNIFICANCE / residual.size, 3 * (freedom - 1)))
     A = solution[:3].T
     directions, gain, _ = np.linalg.svd(A)
     if gain[-1] * WORST_CONDITION <= gain[0]:
@@ -194,7 +194,7 @@ def fit_coils(excitations: Excitations) -> CoilFit:
         freedom=freedom,
         left_out_mt=left_out,
         score=score,
-        suspicion=suspicion,
+        critical_score=critical_score,
         uncertainty_mt=_uncertainty_mt(A, solution[3], variance, unscaled),
     )
 

@@ -1,4 +1,4 @@
-"""The coil stage: from a demanded velocity to a rotating field and the three coil currents (science.md, section 6)."""
+"""The coil stage: from a demanded velocity to a rotating field and the three coil currents."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ CONTROLLERS = Methods(
     Method(
         "policy",
         "flowrec.control.policy:Policy",
-        "down the planner's time to go, without a reference",
+        "descends the gradient of the planner's time to go, without a reference",
         ("kp_per_s", "hold_radii"),
         needs=("time_to_go",),
     ),
@@ -199,5 +199,5 @@ def _hold_position(now: Situation) -> Vector:
 
 
 def _hold_ns(mission: Mission) -> int | None:
-    """When the robot was first told to stay, by the operator or because it was out of sight; None: it is not."""
+    """When the hold began, by the operator or because the robot was not seen; None: no hold."""
     return min((ns for ns in (mission.held_since_ns, mission.blind_since_ns) if ns is not None), default=None)

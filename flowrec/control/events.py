@@ -25,7 +25,7 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
     """
     lines = [
         *_results(last, tick, needs_time_to_go),
-        *_sight(last, tick),
+        *_visibility(last, tick),
         *_health(last.health, tick.health),
         *_operator(last, tick),
         *_mission(last, tick),
@@ -56,7 +56,7 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
         yield "no time to go is known from here: the route is followed as by control.method = vector", Level.WARNING
 
 
-def _sight(last: Tick, tick: Tick) -> Iterator[Line]:
+def _visibility(last: Tick, tick: Tick) -> Iterator[Line]:
     """The robot found or lost, unless the camera repeats an image."""
     if tick.track is None or last.track is None or tick.track.seen == last.track.seen:
         return

@@ -1,6 +1,6 @@
 """How the rotating field moves from one command to the next, in closed form.
 
-The field of amplitude a rotates in a vertical plane that holds z and the horizontal unit vector h of its heading:
+The field of amplitude a rotates in a vertical plane that contains z and the horizontal unit vector h of its heading:
 B = a (z cos theta + h sin theta). After a new command
 - the phase theta continues from its present value at the new frequency;
 - if the heading changes by more than a quarter turn, the field rotates backwards (theta decreases) in the plane of the

@@ -2,7 +2,7 @@
 
 To first order the best heading is -grad T / |grad T|; the flow is already contained in T. Differences of neighbouring
 pixels are a poor gradient, though: beside walls they are one-sided, and on the kinks of T (two ways of equal duration,
-a corner, the edge of the band along the walls) the gradient is undefined there and the command chatters. The heading is
+a corner, the edge of the band along the walls) the gradient is undefined and the command chatters. The heading is
 therefore the one after which, a short distance on, the least time is left. In the limit of a short distance that is the
 gradient; on a kink it is one of the two ways.
 """

@@ -25,7 +25,7 @@ _LARGEST_CORRECTION = 0.3  # of an error, within one frame
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Situation:
-    """What a law knows on one frame."""
+    """Inputs of a tracking law for one frame."""
 
     previous: Demand | None
     mission: Mission
@@ -53,7 +53,7 @@ class Situation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Where the robot should be now, and where and how fast when a demand of now takes effect."""
+    """Reference position now, and position and velocity at the time when the present demand takes effect."""
 
     position_um: Vector
     future_um: Vector
@@ -64,7 +64,7 @@ class Reference:
 
     @staticmethod
     def at_rest(position_um: Vector, estimate: Estimate, progress_s: float) -> Reference:
-        """A place to hold."""
+        """The reference that holds a position."""
         error_um = math.dist(position_um, estimate.position_um)
         return Reference(position_um, position_um, np.zeros(2), progress_s, error_um)
 
@@ -83,7 +83,7 @@ class TrackingLaw(ABC):
 
 @dataclass(frozen=True, slots=True)
 class VectorLaw(TrackingLaw):
-    """u = sat(xd_dot - v(x+) + Kp (xd - x+)), where x+ is the predicted position (science.md, section 5)."""
+    """u = sat(xd_dot - v(x+) + Kp (xd - x+)), where x+ is the predicted position."""
 
     kp_per_s: float
 
@@ -100,7 +100,7 @@ class FeedforwardFeedback(TrackingLaw):
 
     |u| = |xd_dot - v| + Kp (e_x cos phi + e_y sin phi), where the heading phi is the mean of those of xd_dot - v and of
     e = xd - x - v dt, weighted by the errors along and across the heading of xd_dot. Unlike the printed law, the mean
-    is one of directions on the circle, and it is the feedforward's where there is no error (science.md, section 5).
+    is one of directions on the circle, and it is the feedforward's where there is no error.
     """
 
     ff_fb_kp_per_s: float

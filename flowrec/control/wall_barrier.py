@@ -1,4 +1,4 @@
-"""Control barrier function for walls: the robot approaches a wall the more slowly, the smaller the distance left."""
+"""Control barrier function for walls: limits the speed towards a wall in proportion to the remaining distance."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def wall_barrier(
     ----------
     clearance_um : (h, w) distance to the nearest wall at the pixels of the chip's mask.
     keep_um : clearance that the robot keeps.
-    per_s : largest ratio of the speed towards a wall and the distance left.
+    per_s : largest ratio of the speed towards a wall to the remaining distance.
     """
     if now.route is not None:
         waypoints = now.route.waypoints_um

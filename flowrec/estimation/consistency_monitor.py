@@ -1,6 +1,6 @@
 """Health: whether the observer's estimate is consistent with the measurements, with an alarm when it is not.
 
-There are three alarms. All means are exponential, so that the message is their memory.
+There are three alarms. All means are exponential, so that the message holds their state.
 
 - `nis`: the normalised innovation squared is far above 2, its mean when all noise is stated correctly: the robot is
   moved by something that the model does not include. A value far below 2 is no alarm: the noise is stated too large.
@@ -42,14 +42,14 @@ class HealthMonitor:
     """Settings of the alarms."""
 
     window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # of the means of NIS and of lost frames
-    # alarm where the mean NIS is above 2 by so many standard deviations of a mean of white innovations
+    # alarm if the mean NIS exceeds 2 by this many standard deviations of the mean of white innovations
     nis_sigma: Annotated[float, Range(0.1, 1e6)] = 8.0
     lost_share: Share = 0.3  # alarm above this fraction of frames without the robot
     # memory of a resonator in periods of its frequency; one second at least
     periods: Annotated[float, Range(0.5, 1e3)] = 2.0
     pulsation_share: Annotated[float, Range(1e-3, 1e3)] = 0.15  # alarm above this amplitude relative to the flow
     line_share: Share = 0.5  # if the line is at least this fraction of the variance
-    settle_s: Annotated[float, Range(0.0, 3600.0)] = 2.0  # the flow must have been accurate for so long
+    settle_s: Annotated[float, Range(0.0, 3600.0)] = 2.0  # the flow must have been accurate for this long
     # the spectrum is not updated while the flow's sigma exceeds this fraction of v_max
     settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1
     ends_at: Share = 0.8  # an alarm ends below this fraction of its thresholds

@@ -23,7 +23,7 @@ _LEAST_INTERVALS = 3
 _LEAST_SAMPLES = 8
 _SETTLING = 45  # frames before the filter's innovations count
 _AGILITY = (1e-3, 1e3)
-_STEPS = 8  # of the bisection of these six decades: to a sixth of a factor of ten
+_STEPS = 8  # of the bisection of these six decades: to 6 %
 _STD_PER_MAD = 1.4826  # of a normal distribution
 
 

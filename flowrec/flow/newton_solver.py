@@ -94,7 +94,7 @@ class System:
         return np.asarray(self.resistance @ flux + convection - (self.momentum.outlet @ drive + push))
 
     def unbalanced(self, flux: Floats, load: Floats) -> float:
-        """The part of a load (faces,) that no pressure can balance, over the largest term of its balance."""
+        """Largest part of a load (faces,) that no pressure can balance, relative to the largest viscous term."""
         left = self.stream.curl.T @ load
         terms = abs(self.stream.curl).T @ np.abs(self.resistance @ flux)
         return float(np.abs(left).max(initial=0.0) / max(float(terms.max(initial=0.0)), 1e-300))

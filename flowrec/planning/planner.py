@@ -54,7 +54,7 @@ PLANNERS = Methods(
     Method(
         "astar_length",
         "flowrec.planning.grid_search:AstarLength",
-        "A* on the pixels by length, blind to the flow",
+        "A* on the pixels by length; ignores the flow",
         ("reach_px",),
     ),
     Method("rrt", "flowrec.planning.rrt:Rrt", "RRT of OMPL: the first path found", ("rrt",), "ompl"),

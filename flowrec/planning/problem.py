@@ -72,8 +72,8 @@ def attach_goal(space: FreeSpace, point_um: Points) -> Endpoint:
 def with_ends(space: FreeSpace, path: Points, start: Endpoint, goal: Endpoint | None) -> Points:
     """A path (n, 2) px with the true ends instead of the nodes nearest to them.
 
-    An end replaces all nodes near it whose successor it sees: to go there first would only be a detour, which a flow
-    faster than the robot may even forbid.
+    An end replaces all nodes near it whose successor is in a clear line from it: to go to such a node first is a
+    detour, which a flow faster than the robot may even forbid.
     """
     for end in (start, goal):
         if end is not None and end.point is not None:

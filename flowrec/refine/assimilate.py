@@ -199,7 +199,7 @@ class _Posterior:
 
     @property
     def evidence(self) -> float:
-        """The ln of the probability of the observations (Laplace approximation), but for a constant."""
+        """Logarithm of the evidence of the observations (Laplace approximation), up to a constant."""
         return 0.5 * float(np.linalg.slogdet(self.found.covariance)[1]) - self.found.energy
 
     @property

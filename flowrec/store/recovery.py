@@ -93,8 +93,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write everything intact of a session to a new file.
 
     A tick is complete when it has both inputs and outputs. The images of a killed run are often ahead of the rest: they
-    are kept as ticks with nothing but an image, which a replay skips. Viewer topics are made anew. The outcome of the
-    new session says what is missing. The file `X.mcap.partial` is removed once `X.mcap` is complete, but not where it
+    are kept as ticks with nothing but an image, which a replay skips. Viewer topics are derived again. The outcome of
+    the new session says what is missing. The file `X.mcap.partial` is removed once `X.mcap` is complete, but not where it
     has topics that this flowrec does not know; any other file stays as it is, and so does a complete one, which at most
     gets the name that its run could not give it.
 
@@ -245,7 +245,7 @@ def _channel(found: Scan, topic: str) -> int:
 
 
 def _unknown_topics(found: Scan) -> list[str]:
-    """Topics of another flowrec or program, which can not be written anew."""
+    """Topics of another flowrec or program, which can not be written again."""
     channels = found.summary.channels.values()
     return sorted({c.topic for c in channels if c.topic not in BY_PATH and c.metadata.get("role") != "view"})
 

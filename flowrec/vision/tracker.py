@@ -246,8 +246,7 @@ def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, int]) 
 def _mask_distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance (h, w) to the walls of a mask in its pixels, as `clearance_um` defines it.
 
-    OpenCV's transform is exact as well and 20 times as fast: the first frame of a 5 Mpx camera would otherwise be
-    delayed by a second.
+    In single precision and without the rounding of the chip's own transform, which tracks of older sessions rely on.
     """
     if mask.all():
         return np.full(mask.shape, _FAR_PX, np.float32)

@@ -1,7 +1,7 @@
 """What a bright-field microscope shows of the chip: walls as dark refracting lines, particles as defocused discs.
 
 Noise: shot noise is Gaussian of variance level / photons_per_level, with read noise added. Its normal numbers are
-not drawn afresh: each row of an image takes a stretch, at a place drawn from the seed, of one pool of a million
+not drawn again: each row of an image takes a stretch, at a place drawn from the seed, of one pool of a million
 numbers of 1/32 sigma resolution. So single pixels are independent of their neighbours and of the next frame, but the
 whole film holds no more than a million different values. Same seed and frames, same bytes; wall time has no part in it.
 """
