@@ -95,8 +95,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     A tick is complete when it has both inputs and outputs. The images of a killed run are often ahead of the rest: they
     are kept as ticks with nothing but an image, which a replay skips. Viewer topics are derived again. The outcome of
     the new session says what is missing. The file `X.mcap.partial` is removed once `X.mcap` is complete, unless it has
-    topics that this flowrec does not know. Any other file stays as it is, and so does a complete one, which at most gets
-    the name that its run could not give it.
+    topics that this flowrec does not know. Any other file stays as it is, and so does a complete one, which at most
+    gets the name that its run could not give it.
 
     Parameters
     ----------
