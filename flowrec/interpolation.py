@@ -102,10 +102,23 @@ def cells_at(points: NDArray[np.float64], shape: tuple[int, ...]) -> Cells:
 
 def cell_at(x: float, y: float, shape: tuple[int, ...]) -> tuple[int, int, int, int, float, float]:
     """Row, column, row below, column to the right, a and b of one finite point in px, as in `Cells`."""
-    h, w = shape[:2]
-    x, y = min(max(x, 0.0), w - 1.0), min(max(y, 0.0), h - 1.0)
-    column, row = min(math.floor(x), max(w - 2, 0)), min(math.floor(y), max(h - 2, 0))
-    return row, column, min(row + 1, h - 1), min(column + 1, w - 1), x - column, y - row
+    row, below, b = _interval(y, shape[0])
+    column, right, a = _interval(x, shape[1])
+    return row, column, below, right, a, b
+
+
+def _interval(at: float, count: int) -> tuple[int, int, float]:
+    """The two neighbours of a finite place on an axis of `count` pixels, and how far it is from the first one.
+
+    The control loop asks some thirty times a frame; comparisons take a third of the time of min and max.
+    """
+    last = count - 1
+    if at <= 0.0 or last == 0:
+        return 0, min(1, last), 0.0
+    if at >= last:
+        return last - 1, last, 1.0
+    first = int(at)
+    return first, first + 1, at - first
 
 
 def nearest_pixel(x: float, y: float, shape: tuple[int, ...]) -> tuple[int, int]:

@@ -19,11 +19,12 @@ def sample(field: FlowField, points_um: ArrayLike) -> NDArray[np.float64]:
     In the outer half pixel the value of the border pixel holds. A single point takes a few microseconds, for use in
     the control loop.
     """
-    points = np.asarray(points_um, np.float64) / field.um_per_px
+    points = np.asarray(points_um, np.float64)
     velocity = field.velocity_um_s
     if points.ndim == 1:
-        return np.array(_at_point(velocity, float(points[0]), float(points[1])))
-    cells = cells_at(points, velocity.shape)
+        x_um, y_um = points.tolist()
+        return np.array(_at_point(velocity, x_um / field.um_per_px, y_um / field.um_per_px))
+    cells = cells_at(points / field.um_per_px, velocity.shape)
     return np.where(cells.inside[..., None], cells.interpolate(velocity), 0.0)
 
 
@@ -33,10 +34,10 @@ def _at_point(velocity: NDArray[np.float32], x: float, y: float) -> tuple[float,
     if not (-0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5):
         return 0.0, 0.0
     row, column, below, right, a, b = cell_at(x, y, velocity.shape)
-    item = velocity.item
+    block = velocity[row : below + 1, column : right + 1].tolist()
+    upper, lower = block[0], block[-1]
     vx, vy = (
-        (1.0 - b) * ((1.0 - a) * item(row, column, c) + a * item(row, right, c))
-        + b * ((1.0 - a) * item(below, column, c) + a * item(below, right, c))
+        (1.0 - b) * ((1.0 - a) * upper[0][c] + a * upper[-1][c]) + b * ((1.0 - a) * lower[0][c] + a * lower[-1][c])
         for c in (0, 1)
     )
     return vx, vy
