@@ -1,4 +1,4 @@
-"""flowrec: flight recorder and replay lab for magnetic micro-robots that swim in flow.
+"""Experiment recorder and replay tool for magnetic micro-robots that swim in flow.
 
     import flowrec
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.errors import FlowrecError as FlowrecError
     from flowrec.session import Session as Session
     from flowrec.session import open as open  # noqa: A004 - flowrec.open
+    from flowrec.store.recovery import recover as recover
 
 _MODULES = {
     "Change": "commands.replay",
@@ -44,6 +45,7 @@ _MODULES = {
     "load_config": "config",
     "open": "session",
     "record": "commands.record",
+    "recover": "store.recovery",
     "replay": "commands.replay",
     "report": "commands.replay_report",
 }
