@@ -84,3 +84,12 @@ def test_the_python_example_of_readme_runs(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.chdir(ROOT / "sessions")
     exec(example.replace("a.mcap", "golden.mcap"), {})
     assert capsys.readouterr().out.startswith("reached time_field")
+
+
+def test_every_file_that_contributing_and_readme_name_exists() -> None:
+    texts = (GUIDE, (ROOT / "README.md").read_text(encoding="utf-8"))
+    named = {name for text in texts for name in re.findall(r"`([a-z_./0-9]+\.(?:py|toml|mcap))`", text)}
+    made = {"a.mcap", "utils.py"}  # of an example; that there is none
+    assert [
+        name for name in sorted(named - made) if not ((ROOT / name).exists() or (ROOT / "flowrec" / name).exists())
+    ] == []
