@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import itertools
+import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -31,6 +32,7 @@ _LARGE_CHUNK_BYTES = 1 << 22
 _GROWTH = 2  # of an image that is decoded ahead; JPEG compresses more and is decoded when its turn comes
 _AHEAD_BYTES, _AHEAD_CHUNKS = 32 << 20, 16  # decompressed before they are asked for
 _THREADS = 2
+_THREAD_NAME = "session-reader"
 _FEW = 64  # messages of a chunk that may wait as objects
 
 _Decode = Callable[[Record], Record]
@@ -251,11 +253,13 @@ def _detached(record: Record) -> Record:
 @contextlib.contextmanager
 def _threads() -> Iterator[Executor]:
     """The threads that decompress; at the end the tasks that have not begun are cancelled."""
-    executor = ThreadPoolExecutor(_THREADS, "session-reader")
+    executor = ThreadPoolExecutor(_THREADS, _THREAD_NAME)
     try:
         yield executor
     finally:
-        executor.shutdown(cancel_futures=True)
+        # The garbage collector may end an abandoned reading in one of these threads, which can not wait for itself.
+        own = threading.current_thread().name.startswith(_THREAD_NAME)
+        executor.shutdown(wait=not own, cancel_futures=True)
 
 
 def _merged(

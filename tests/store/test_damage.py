@@ -24,7 +24,7 @@ from mcap.writer import Writer
 
 from flowrec.errors import SessionError
 from flowrec.messages import Currents
-from flowrec.store import channels, session_metadata
+from flowrec.store import channels, file_reader, session_metadata
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
@@ -317,3 +317,13 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_named(tmp_path, session
         os.truncate(path, 2000)
         with pytest.raises(SessionError, match="has become shorter while it was read"):
             list(reader.ticks())
+
+
+def test_a_reading_that_is_abandoned_may_be_collected_in_one_of_its_own_threads():
+    def reading():
+        with file_reader._threads() as executor:
+            yield executor
+
+    abandoned = reading()
+    executor = next(abandoned)
+    executor.submit(abandoned.close).result(timeout=10.0)
