@@ -20,7 +20,7 @@ class Method:
     name : value of the setting that selects the method.
     target : "module:name" of what implements it, imported when the method is first used.
     summary : what it does, in one line.
-    options : names of the settings of the stage that this method reads; those of no other row belong to the stage.
+    options : names of the settings of the stage that this method reads. A setting that no row names is for all methods.
     extra : extra of pyproject.toml that installs what the method needs, "" if it needs none.
     needs : what the method requires of other stages, or of its own inputs, besides what all methods get.
     provides : what the method states in its result besides what all methods state.

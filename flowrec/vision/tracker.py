@@ -246,7 +246,8 @@ def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, int]) 
 def _mask_distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance (h, w) to the walls of a mask in its pixels, as `clearance_um` defines it.
 
-    In single precision and without the rounding of the chip's own transform, which tracks of older sessions rely on.
+    It differs from `clearance_um` in the last bits: it is not rounded, and far from any wall it is finite. The two are
+    kept apart because a replay compares the tracks of recorded sessions.
     """
     if mask.all():
         return np.full(mask.shape, _FAR_PX, np.float32)
