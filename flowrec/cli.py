@@ -1,6 +1,7 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in session_verbs.py. Each is a function that parses, calls and prints, with late imports.
+The other verbs are in session_verbs.py and calibrate_verbs.py. Each function parses, calls
+and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
@@ -20,11 +21,11 @@ import typer
 
 import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
+from flowrec.calibrate_verbs import calibrate
 from flowrec.errors import FlowrecError, printable
 from flowrec.session_verbs import (
     HelpWithMethods,
     SessionFile,
-    calibrate,
     check,
     compare,
     export,
@@ -43,6 +44,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
+app.add_typer(calibrate, name="calibrate")
 app.add_typer(bench, name="bench")
 
 DEFAULT_REFINE = "pi_unet"
@@ -187,7 +189,7 @@ def replay(
         say(line)
 
 
-for _verb in (view, export, info, list_directory, check, recover, compare, calibrate):
+for _verb in (view, export, info, list_directory, check, recover, compare):
     app.command("ls" if _verb is list_directory else None, cls=HelpWithMethods)(_verb)
 
 

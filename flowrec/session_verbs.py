@@ -216,23 +216,5 @@ def compare(
     raise typer.Exit(0 if comparison.same else 3)
 
 
-def calibrate(
-    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
-    out: Annotated[
-        Path | None, typer.Option(metavar="TOML", help="Write the coils section of a configuration.")
-    ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-) -> None:
-    """Fit the field per ampere of the coils and the bias to measured fields, with standard errors."""
-    from flowrec.commands import calibrate as verb
-
-    fit = verb.calibrate(file, out, overwrite)
-    if as_json:
-        typer.echo(json.dumps(verb.figures(fit)))
-    else:
-        verb.show(fit, out)
-
-
 def _export_json(session: Path, file: Path, file_format: str = "rrd") -> str:
     return json.dumps({"session": str(session), file_format: str(file), "bytes": file.stat().st_size})

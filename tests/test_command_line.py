@@ -79,19 +79,30 @@ def test_a_shell_can_complete_the_verbs() -> None:
     assert "--install-completion" in CliRunner().invoke(app, ["--help"], env={"COLUMNS": "120"}).output
 
 
-def test_the_help_of_calibrate_names_the_section_that_it_writes() -> None:
-    shown = CliRunner().invoke(app, ["calibrate", "--help"], env={"COLUMNS": "160"}).output
-    assert "coils section of a configuration" in " ".join(shown.split())
+def test_the_help_of_calibrate_coils_names_the_section_that_it_writes() -> None:
+    shown = CliRunner().invoke(app, ["calibrate", "coils", "--help"], env={"COLUMNS": "160"}).output
+    assert "(section coils)" in " ".join(shown.split())
 
 
 def test_calibrate_prints_where_the_encoding_has_no_plus_minus_sign(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
     monkeypatch.setattr(sys, "stdout", printed)
     try:
-        assert run(["calibrate", SESSIONS / "coils.csv"], monkeypatch) == 0
+        assert run(["calibrate", "coils", SESSIONS / "coils.csv"], monkeypatch) == 0
     except UnicodeEncodeError as error:
         pytest.fail(str(error))
     assert b"b_x" in printed.buffer.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_table_given_to_calibrate_itself_is_fitted_and_the_new_command_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", SESSIONS / "coils.csv", "--json"], monkeypatch) == 0
+    said = capsys.readouterr()
+    assert said.err.splitlines() == ["flowrec calibrate TABLE is now flowrec calibrate coils TABLE"]
+    assert '"mt_per_a"' in said.out
+    assert run(["calibrate", "coil", SESSIONS / "coils.csv"], monkeypatch) == 2
+    assert "coil" in capsys.readouterr().err
 
 
 def test_a_chip_given_as_a_configuration_is_told_apart(

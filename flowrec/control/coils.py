@@ -150,7 +150,7 @@ class Coils:
             raise UsageError(
                 f"{where}: coils.mt_per_a: no currents make a field along {direction_name(directions[-1])} "
                 f"({gain[-1]:.3g} mT/A, {gain[0]:.3g} in the best direction); the fields of the three coils must be "
-                "linearly independent; flowrec calibrate measures them"
+                "linearly independent; flowrec calibrate coils measures them"
             )
         if amplifier.kind == "voltage" and self.ramp_s == 0.0:
             raise UsageError(f"{where}: coils.ramp_s = 0: a voltage amplifier needs time for a current; try 0.2")

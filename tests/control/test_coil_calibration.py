@@ -8,7 +8,7 @@ from scipy.stats import t as student
 from typer.testing import CliRunner
 
 from flowrec.cli import app
-from flowrec.commands.calibrate import as_sets, calibrate
+from flowrec.commands.calibrate_coils import as_sets, calibrate_coils
 from flowrec.config import load_config
 from flowrec.control.coil_calibration import Excitations, advice, fit_coils, read_excitations
 from flowrec.errors import UsageError
@@ -155,21 +155,21 @@ def test_columns_may_stand_in_any_order_beside_others_and_behind_a_byte_order_ma
 
 def test_a_run_takes_the_written_settings_and_the_printed_ones_alike(tmp_path):
     path, out = file_of(tmp_path, measured(5)), tmp_path / "out.toml"
-    fit = calibrate(path, out)
+    fit = calibrate_coils(path, out)
     written = load_config(out).coils
     assert written == load_config(None, as_sets(fit)).coils
     np.testing.assert_allclose(written.mt_per_a, fit.mt_per_a, atol=0.01 * fit.mt_per_a_std.max())
     assert "12 excitations" in out.read_text() and "sha256" in out.read_text()
     with pytest.raises(OutputError, match="--overwrite"):
-        calibrate(path, out)
+        calibrate_coils(path, out)
 
 
 def test_the_command_says_it_for_people_and_for_programs(tmp_path):
     path = file_of(tmp_path, measured(5))
-    told = CliRunner().invoke(app, ["calibrate", str(path)])
+    told = CliRunner().invoke(app, ["calibrate", "coils", str(path)])
     assert told.exit_code == 0
     assert "12 excitations" in told.stdout and "Weakest direction: z" in told.output
     assert "--set 'coils.mt_per_a=[[2." in told.output
-    figures = json.loads(CliRunner().invoke(app, ["calibrate", str(path), "--json"]).stdout)
+    figures = json.loads(CliRunner().invoke(app, ["calibrate", "coils", str(path), "--json"]).stdout)
     np.testing.assert_allclose(figures["mt_per_a"], A, atol=0.05)
     assert figures["degrees_of_freedom"] == 8 and len(figures["left_out_mt"]) == 12

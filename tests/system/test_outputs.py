@@ -38,7 +38,7 @@ VERBS: dict[str, tuple[Callable[[Path], list[object]], str, str]] = {
     "export": (lambda read: ["export", read, "--out"], "a.mcap", ".rrd"),
     "view": (lambda read: ["view", read, "--no-open", "--out"], "a.mcap", ".rrd"),
     "view, screenshot": (lambda read: ["view", read, "--screenshot"], "a.mcap", ".png"),
-    "calibrate": (lambda read: ["calibrate", read, "--out"], "coils.csv", ".toml"),
+    "calibrate, coils": (lambda read: ["calibrate", "coils", read, "--out"], "coils.csv", ".toml"),
     "recover": (lambda read: ["recover", read, "--out"], "cut.mcap", ".mcap"),
     "bench, figures": (lambda read: ["bench", "observer", "--session", read, "--out"], "a.mcap", ".json"),
     "bench, drawing": (lambda read: ["bench", "observer", "--session", read, "--figure"], "a.mcap", ".png"),
@@ -142,7 +142,10 @@ def test_a_replay_replaces_neither_the_session_that_it_comes_from_nor_a_part_of_
 
 
 def test_with_overwrite_an_existing_output_is_replaced_whole(folder, flowrec):
-    for words, out in ((["calibrate", folder / "coils.csv"], "c.toml"), (["export", folder / "a.mcap"], "c.rrd")):
+    for words, out in (
+        (["calibrate", "coils", folder / "coils.csv"], "c.toml"),
+        (["export", folder / "a.mcap"], "c.rrd"),
+    ):
         (folder / out).write_bytes(b"precious")
         os.link(folder / out, folder / "kept")
         assert flowrec(*words, "--out", folder / out, "--overwrite")[0] == 0
@@ -310,6 +313,6 @@ def test_a_file_that_fails_on_its_way_leaves_nothing(folder, flowrec, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    status, line = flowrec("calibrate", folder / "coils.csv", "--out", folder / "c.toml")
+    status, line = flowrec("calibrate", "coils", folder / "coils.csv", "--out", folder / "c.toml")
     assert status == 1 and "c.toml: can not be written (No space left on device)" in line
     assert contents(folder) == before

@@ -1,4 +1,4 @@
-"""`flowrec calibrate`: the settings of the coils and their uncertainty, from a table of currents and fields."""
+"""`flowrec calibrate coils`: the settings of the coils and their uncertainty, from a table of currents and fields."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _AXES = ("x", "y", "z")
 _EXACT_DIGITS = 9
 
 
-def calibrate(path: Path, out: Path | None = None, overwrite: bool = False) -> CoilFit:
+def calibrate_coils(path: Path, out: Path | None = None, overwrite: bool = False) -> CoilFit:
     """Fit the settings of the coils to a table, and write them to `out` if it is given.
 
     Raises
@@ -45,7 +45,7 @@ def fragment(fit: CoilFit, path: Path) -> str:
     suspects = f"; {len(fit.suspects)} of them suspicious" if fit.suspects else ""
     rows = "".join(f"    {list(row)},\n" for row in _matrix(fit))
     return (
-        f"# By flowrec {__version__} calibrate from {path.name} (sha256 {digest}...): "
+        f"# By flowrec {__version__} calibrate coils from {path.name} (sha256 {digest}...): "
         f"{len(fit.residual_mt)} excitations{suspects}.\n"
         f"# Residual rms {noise} mT in x, y, z; a field of 4 mT is known to {fit.uncertainty_mt:.2g} mT.\n"
         f"[coils]\nmt_per_a = [\n{rows}]\nbias_mt = {list(_bias(fit))}\n"

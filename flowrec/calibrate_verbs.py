@@ -1,0 +1,48 @@
+"""`flowrec calibrate NAME`: verbs that measure settings; each parses, calls and prints, with late imports."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from flowrec.bench.verbs import AsJson, Overwrite
+
+TomlOut = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
+]
+
+
+class _Calibrations(TyperGroup):
+    """The group; a table where the name of a command is expected goes to `coils`, as before there was a group."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in self.commands and args[0].lower().endswith(".csv"):
+            typer.echo(f"{ctx.command_path} TABLE is now {ctx.command_path} coils TABLE", err=True)
+            args = ["coils", *args]
+        return super().resolve_command(ctx, args)
+
+
+calibrate = typer.Typer(
+    cls=_Calibrations, help="Measure settings and write them as a section of a configuration.", no_args_is_help=True
+)
+
+
+@calibrate.command()
+def coils(
+    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
+    out: TomlOut = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit the field per ampere of the coils and the bias to measured fields, with standard errors (section coils)."""
+    from flowrec.commands import calibrate_coils as verb
+
+    fit = verb.calibrate_coils(file, out, overwrite)
+    if as_json:
+        typer.echo(json.dumps(verb.figures(fit)))
+    else:
+        verb.show(fit, out)
