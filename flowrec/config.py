@@ -299,6 +299,11 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
             "all of a run; set one of them to 0"
         )
+    if recording.frames == "jpeg" and config.camera.bits > 8:
+        raise UsageError(
+            f"{origin('recording.frames')}: recording.frames = 'jpeg' holds 8 bit, camera.bits = {config.camera.bits}; "
+            "set recording.frames = 'auto'"
+        )
     able = [row.name for row in PLANNERS.values() if set(config.control.needs) <= set(row.provides)]
     if config.plan.method not in able:
         raise UsageError(

@@ -25,7 +25,7 @@ from flowrec.enums import WorkOrder
 Vector = Annotated[NDArray[np.float64], "vector"]
 Matrix = Annotated[NDArray[np.float64], "array"]
 Raster = Annotated[NDArray[np.float32], "array"]
-Image = Annotated[NDArray[np.uint8], "array"]
+Image = Annotated[NDArray[np.uint8 | np.uint16], "array"]  # frames keep either; see messages.Frame
 
 _MAY_BE_EMPTY = "nmo"
 
@@ -106,7 +106,8 @@ def _declared(message_type: type) -> Iterator[MessageField]:
         shape = next((note for note in notes if isinstance(note, Shape)), None)
         dtype = None
         if typing.get_origin(kind) is np.ndarray:
-            dtype = np.dtype(typing.get_args(typing.get_args(kind)[1])[0])
+            scalar = typing.get_args(typing.get_args(kind)[1])[0]
+            dtype = np.dtype(next(iter(typing.get_args(scalar)), scalar))  # of several the first
             kind = "array" if optional else notes[0]  # a repeated field can not be absent
         if kind not in (int, float, bool, str, "vector", "array"):
             raise TypeError(f"{message_type.__name__}.{each.name}: no wire form for {hint!r}")

@@ -32,6 +32,13 @@ from flowrec.declarations import (
 from flowrec.enums import WorkOrder
 from flowrec.errors import RigError
 
+PIXEL_BITS = (8, 10, 12, 14, 16)
+
+
+def pixel_type(bits: int) -> np.dtype[np.uint8 | np.uint16]:
+    """The type of the pixels of images of a depth."""
+    return np.dtype(np.uint8 if bits <= 8 else np.uint16)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame(Message):
@@ -39,22 +46,39 @@ class Frame(Message):
 
     Raises
     ------
-    RigError : the image does not hold 8-bit grey levels. Nothing is converted, because that would change the data.
+    RigError : the image does not hold grey levels of `bits`: uint8 for 8 bits, for more uint16 in the host's byte order
+        and no level above 2^bits - 1. Nothing is converted, because that would change the data.
     """
 
     stamp_ns: int
     index: int
     image: Annotated[Image, Shape("h", "w")]  # grey levels
+    bits: int = 8  # depth of the camera's pixels: 8, 10, 12, 14 or 16
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image)
-        if image.dtype != np.uint8 or image.ndim != 2:
+        if self.bits not in PIXEL_BITS:
+            raise RigError(
+                f"frame {self.index}: an image of {self.bits} bit; the depths are {', '.join(map(str, PIXEL_BITS))}"
+            )
+        expected = pixel_type(self.bits)
+        if image.dtype != expected or image.ndim != 2:
             shape = " x ".join(map(str, image.shape))
             raise RigError(
-                f"frame {self.index}: an image of {image.dtype} and shape {shape}, where uint8 and shape height x "
-                "width is expected: it can not be kept exactly; set the camera to 8-bit grey levels (Mono8)"
+                f"frame {self.index}: an image of {image.dtype} and shape {shape}, where {expected} and shape height x "
+                f"width is expected for {self.bits} bit: it can not be kept exactly; set the camera to grey levels "
+                "(Mono8 to Mono16) and camera.bits to its depth"
             )
-        Message.__post_init__(self)
+        image = np.ascontiguousarray(image)
+        if 8 < self.bits < 16 and image.max(initial=0) >> self.bits:  # 0.2 ms for 5 Mpx
+            raise RigError(
+                f"frame {self.index}: a grey level of {image.max()} in an image of {self.bits} bit; set camera.bits to "
+                "the depth of the camera, or the camera to unpacked pixels aligned to the lowest bit"
+            )
+        if image.flags.writeable:
+            image = image.view()
+            image.flags.writeable = False
+        object.__setattr__(self, "image", image)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

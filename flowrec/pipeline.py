@@ -65,6 +65,7 @@ class Pipeline:
     robot: Robot
     clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
     image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
+    image_bits: int  # depth of their pixels
     tracker: Tracker
     observer: Observer
     health: HealthMonitor
@@ -89,6 +90,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
         robot=config.robot,
         clearance_um=clearance_um(chip.mask, chip.um_per_px),
         image_shape=(config.camera.height_px, config.camera.width_px),
+        image_bits=config.camera.bits,
         tracker=config.tracker,
         observer=config.observer,
         health=config.health,

@@ -24,6 +24,7 @@ class CameraSettings:
 
     width_px: Annotated[int, Range(8, 16_384)] = 640
     height_px: Annotated[int, Range(8, 16_384)] = 512
+    bits: Annotated[int, OneOf(8, 10, 12, 14, 16)] = 8  # depth of a pixel; grey levels are below 2^bits
     rate_hz: _Rate | None = None  # None: chosen to fit the robot's speed
     um_per_px: _Scale | None = None  # None: the whole chip fills the image
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004

@@ -10,6 +10,7 @@ from pathlib import Path
 from flowrec.chip import chip_files
 from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig, calibration_of, to_toml
+from flowrec.messages import pixel_type
 from flowrec.provenance import provenance
 from flowrec.session import files_behind, session_sha256
 from flowrec.store.frame_encodings import encoding_for
@@ -62,6 +63,7 @@ def session_writer(
         files=_files_of(config) if in_pieces else Split(),
         region=region_of(config, chip, again=parent is not None),
         leave_out=config.recording.leave_out,
+        bits=config.camera.bits,
     )
     inputs = (*output.inputs, *(files_behind(parent) if parent is not None else ()))
     return SessionWriter(output.path, header, options, inputs=inputs)
@@ -69,9 +71,8 @@ def session_writer(
 
 def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
     """Largest loss if the process is killed, in s of stamps; of a snapshot, counted from its event."""
-    camera, flush_s = config.camera, config.recording.flush_s
-    pixels_s = camera.width_px * camera.height_px * camera.rate_hz
-    waiting_s = queue_bytes_of(config) / pixels_s if live and pixels_s else 0.0  # only if the disk is too slow
+    bytes_s, flush_s = _image_bytes_s(config), config.recording.flush_s
+    waiting_s = queue_bytes_of(config) / bytes_s if live and bytes_s else 0.0  # only if the disk is too slow
     return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
 
 
@@ -103,11 +104,16 @@ def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region
 
 def queue_bytes_of(config: ResolvedConfig) -> int:
     """Largest size of the write queue, in bytes."""
-    camera, chosen_mb = config.camera, config.recording.queue_mb
+    chosen_mb = config.recording.queue_mb
     if chosen_mb is not None:
         return int(chosen_mb * 1e6)
-    images = int(_QUEUE_S * camera.width_px * camera.height_px * camera.rate_hz)
+    images = int(_QUEUE_S * _image_bytes_s(config))
     return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
+
+
+def _image_bytes_s(config: ResolvedConfig) -> float:
+    camera = config.camera
+    return camera.width_px * camera.height_px * pixel_type(camera.bits).itemsize * camera.rate_hz
 
 
 def frames_of(config: ResolvedConfig) -> str:
@@ -117,7 +123,7 @@ def frames_of(config: ResolvedConfig) -> str:
         return chosen
     if config.recording.region == "robot":
         return "zstd"  # compresses black better than delta in a fifth of its time (python -m tests.perf.store)
-    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz)
+    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz, camera.bits)
 
 
 def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:

@@ -73,12 +73,12 @@ def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callabl
             )
 
 
-def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int]) -> Iterator[Inputs]:
+def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int], bits: int = 8) -> Iterator[Inputs]:
     """The inputs with `applied.image_since_ns` filled in; images must be (height, width) pixels of `image_shape`.
 
     Raises
     ------
-    RigError : an image has another size.
+    RigError : an image has another size, or another depth than `bits`.
     """
     last: Frame | None = None
     since_ns = 0
@@ -92,6 +92,11 @@ def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int]) -> It
             raise RigError(
                 f"frame {frame.index}: an image of {width} x {height} pixels, where camera.width_px x camera.height_px "
                 f"= {image_shape[1]} x {image_shape[0]} is expected; set them, or the camera's region of interest"
+            )
+        if frame.bits != bits:
+            raise RigError(
+                f"frame {frame.index}: an image of {frame.bits} bit, where camera.bits = {bits} is expected; set it, "
+                "or the camera's pixel format"
             )
         if last is None or not _same(last, frame):
             since_ns = arrived.stamp_ns

@@ -120,7 +120,7 @@ def run(
         stack.enter_context(control.interrupted_when_overdue())
         arriving = increasing_stamps(rig.inputs(), tick.stamp_ns, reject)
         if live:
-            arriving = checked_images(arriving, pipeline.image_shape)
+            arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
         while True:
             with control.interruptible:
                 arrived = next(arriving, None)

@@ -8,7 +8,7 @@ neither images nor previews. Channel numbers depend on the tables only: the same
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from typing import Any
@@ -19,9 +19,9 @@ from mcap.records import Schema as SchemaRecord
 
 from flowrec.declarations import Role, defaulted_fields
 from flowrec.errors import SessionError, UsageError
-from flowrec.messages import Frame
+from flowrec.messages import PIXEL_BITS, Frame
 from flowrec.store.codec import Codec, codec_of, decode
-from flowrec.store.frame_encodings import ENCODINGS, FRAME_CODECS, FrameEncoding
+from flowrec.store.frame_encodings import FrameEncoding, frame_codec
 from flowrec.store.mcap_format import Record, Summary
 from flowrec.store.roi import Region, region_from
 from flowrec.store.schema import Schema, foxglove_schema
@@ -33,6 +33,8 @@ from flowrec.version import __version__
 FRAMES, STATE, VIEW = "frames", "state", "view"
 GROUPS = (FRAMES, STATE, VIEW)
 FRAME_PATH = BY_FIELD["frame"].path
+
+_BITS = "bits"  # in the metadata of the frames' channel: depth of the images; 8 where it is not stated
 
 # A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
 _NEEDED = {topic.path for topic in TOPICS if topic.role in (Role.INPUT, Role.OUTPUT)} - {FRAME_PATH}
@@ -48,10 +50,13 @@ class Slot:
     metadata: dict[str, str]
 
 
-def message_codec(message_type: type[Any], schema_name: str = "") -> Codec:
-    """The codec of any message type; of a Frame that of the schema, foxglove.RawImage where it is none of a Frame."""
+def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8) -> Codec:
+    """The codec of any message type; of a Frame that of the schema, foxglove.RawImage where it is none of a Frame.
+
+    `bits` is the depth of the frames.
+    """
     if message_type is Frame:
-        return FRAME_CODECS.get(schema_name, ENCODINGS["raw"].codec)
+        return frame_codec(schema_name, bits)
     return codec_of(message_type)
 
 
@@ -75,6 +80,7 @@ def declarations(frames: FrameEncoding, region: Region | None = None) -> Iterato
         if path == FRAME_PATH:
             schema = frames.codec.schema
             metadata = metadata | {"encoding": frames.name, "lossless": "yes" if frames.lossless else "no"}
+            metadata |= {_BITS: str(frames.bits)} if frames.bits != 8 else {}
             metadata |= region.notes if region is not None else {}
         if schema.name not in schemas:
             schemas[schema.name] = len(schemas) + 1
@@ -119,6 +125,7 @@ class SessionContents(SessionMetadata):
     codecs : how their messages are decoded, by channel number.
     recorded_fields : by field of Tick, the fields that its messages have in this file; an older file lacks some.
     frame_encoding : name of the encoding of frames (frame_encodings.py); empty in files that do not say.
+    frame_bits : depth of the images.
     region : which window of most images was recorded (roi.py); None: the images are not cut.
     """
 
@@ -128,14 +135,16 @@ class SessionContents(SessionMetadata):
         self.codecs: dict[int, Codec] = {}
         self.recorded_fields: dict[str, frozenset[str]] = {}
         self.frame_encoding = ""
+        self.frame_bits = 8
         self.region: Region | None = None
         for channel in self.channels.values():
+            if channel.topic == FRAME_PATH:
+                self.frame_encoding = channel.metadata.get("encoding", "")
+                self.frame_bits = _bits_from(channel.metadata)
+                self.region = region_from(channel.metadata)
             if channel.topic in BY_PATH:
                 self.fields[channel.id] = BY_PATH[channel.topic].field
                 self._check_schema(channel.id)
-            if channel.topic == FRAME_PATH:
-                self.frame_encoding = channel.metadata.get("encoding", "")
-                self.region = region_from(channel.metadata)
 
     def decode(self, record: Record) -> Any:
         """The message in a record of a known topic.
@@ -152,7 +161,7 @@ class SessionContents(SessionMetadata):
         channel = self.channels[channel_number]
         found = self.schemas[channel.schema_id]
         kind = BY_PATH[channel.topic].type
-        codec = self.codecs[channel_number] = message_codec(kind, found.name)
+        codec = self.codecs[channel_number] = message_codec(kind, found.name, self.frame_bits)
         expected = codec.schema
         ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
         self.recorded_fields[self.fields[channel_number]] = ours_all
@@ -173,6 +182,11 @@ class SessionContents(SessionMetadata):
             f"{self.source.path}: {channel.topic} has another schema ({', '.join(differs)});"
             f" read it with flowrec {self.flowrec_version}, which wrote it (this is {__version__})"
         )
+
+
+def _bits_from(metadata: Mapping[str, str]) -> int:
+    text = metadata.get(_BITS, "8")
+    return int(text) if text in map(str, PIXEL_BITS) else PIXEL_BITS[-1]
 
 
 def _fields_of(data: bytes) -> set[tuple[str, bytes]]:

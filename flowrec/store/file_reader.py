@@ -17,7 +17,7 @@ from mcap.records import ChunkIndex
 
 from flowrec.declarations import Message, shape_error
 from flowrec.errors import SessionError
-from flowrec.messages import Frame
+from flowrec.messages import Frame, pixel_type
 from flowrec.store.channels import SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
@@ -27,7 +27,7 @@ from flowrec.topics import BY_FIELD
 
 Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 _CACHED_MESSAGES = 64  # of restored states
-_STATE_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
+_STATE_LIMIT_BYTES = 208 << 20  # three flow fields on the largest chip, a route to all of it and an image
 _LARGE_CHUNK_BYTES = 1 << 22
 _GROWTH = 2  # of an image that is decoded ahead; JPEG compresses more and is decoded when its turn comes
 _AHEAD_BYTES, _AHEAD_CHUNKS = 32 << 20, 16  # decompressed before they are asked for
@@ -183,10 +183,11 @@ class FileReader:
         """Chunks that end at or after a time: those with anything but frames, and those with frames only."""
         state: list[ChunkIndex] = []
         frames: list[ChunkIndex] = []
+        largest_bytes = PIXELS_LIMIT * pixel_type(self.contents.frame_bits).itemsize + _LARGE_CHUNK_BYTES
         for chunk in self._chunks_with(set(self._fields)):
             if chunk.message_end_time >= start_ns:
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
-                if only_frames and chunk.uncompressed_size > PIXELS_LIMIT + _LARGE_CHUNK_BYTES:
+                if only_frames and chunk.uncompressed_size > largest_bytes:
                     raise self._source.damaged(chunk.chunk_start_offset, "images of more pixels than flowrec reads")
                 (frames if only_frames else state).append(chunk)
         return state, frames

@@ -1,28 +1,34 @@
 """The table of frame encodings: how camera images are stored, and which encoding suits which camera.
 
-Measured on one core, noise of 3 grey levels, 640x512 | 2448x2048 (ns per pixel and compression ratio):
+Measured on one core, noise of 3 grey levels, 640x512 | 2448x2048 (ns per pixel and compression ratio), and 12 bit with
+noise of 12 grey levels at 2448x2048:
 
-    raw     0     1.00         uncompressed: for cameras that outrun a core
-    zstd    1.1   1.70 | 1.78  foxglove.RawImage in a compressed chunk
-    delta   1.9   1.89 | 1.91  a PNG of row differences, stored, in a compressed chunk: as small, eight times quicker
-    png     16    1.89 | 1.90  a PNG that is readable without decompressing a chunk
-    jpeg    2.1   6.8  | 6.9   lossy: a replay reads other pixels than the tracker did
+    raw     0     1.00         0     1.00   uncompressed: for cameras that outrun a core
+    zstd    1.1   1.70 | 1.78  3.0   1.39   foxglove.RawImage in a compressed chunk
+    delta   1.9   1.89 | 1.91  5.1   1.93   a PNG of row differences, stored, in a compressed chunk: as small, quicker
+    png     16    1.89 | 1.90  12.6  1.93   a PNG that is readable without decompressing a chunk
+    jpeg    2.1   6.8  | 6.9   -     -      lossy: a replay reads other pixels than the tracker did; 8 bit only
+
+Images of 10 to 16 bit are stored in 16 bit, in RawImage as mono16 (low byte first), in PNG as the standard says (high
+byte first). Their depth is in the metadata of the channel.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.declarations import Image
-from flowrec.messages import Frame
+from flowrec.errors import RigError, UsageError
+from flowrec.messages import Frame, pixel_type
 from flowrec.store.codec import Codec, Payload, byte_field_head, cut_byte_fields, detached, stamp_of, timestamp
 from flowrec.store.schema import foxglove_schema
 
@@ -57,14 +63,16 @@ def row_differences(image: Image) -> Payload:
     """A PNG file of row differences without compression: zstd, which compresses the chunk, is ten times quicker.
 
     https://www.w3.org/TR/png-3/#9Filters; the stream consists of deflate's "stored" blocks, which every viewer reads.
+    A filter of PNG works on single bytes, also where a pixel has two.
     """
     _refuse_empty(image)
     height, width = image.shape
-    rows = np.empty((height, width + 1), np.uint8)
+    pixels = image.astype(">u2").view(np.uint8) if image.itemsize == 2 else image
+    rows = np.empty((height, pixels.shape[1] + 1), np.uint8)
     rows[:, 0] = _UP
-    rows[0, 1:] = image[0]
-    np.subtract(image[1:], image[:-1], out=rows[1:, 1:])
-    header = _PNG_HEADER.pack(width, height, 8, 0, 0, 0, 0)
+    rows[0, 1:] = pixels[0]
+    np.subtract(pixels[1:], pixels[:-1], out=rows[1:, 1:])
+    header = _PNG_HEADER.pack(width, height, 8 * image.itemsize, 0, 0, 0, 0)
     return (
         b"".join((_PNG_MAGIC, *_png_part(b"IHDR", header))),
         *_png_part(b"IDAT", zlib.compress(rows.data, 0)),
@@ -72,33 +80,38 @@ def row_differences(image: Image) -> Payload:
     )
 
 
-def decode_image(data: bytes | memoryview) -> Image:
-    """The pixels of a PNG or JPEG file, (h, w) grey levels.
+def decode_image(data: bytes | memoryview, bits: int = 8) -> Image:
+    """The pixels of a PNG or JPEG file, (h, w) grey levels, uint8 for a depth of 8 bits and uint16 for more.
 
     Raises
     ------
-    ValueError : it is neither, it is coloured, or it claims more pixels than its bytes or the limit allow.
+    ValueError : it is neither, it is coloured, its pixels have another size than those of the depth, or it claims more
+        of them than its bytes or the limit allow.
     """
-    data = memoryview(data)
-    height, width = _shape_of(data)
+    data, expected = memoryview(data), pixel_type(bits)
+    height, width = _shape_of(data, 8 * expected.itemsize)
     if not 0 < height * width <= min(_PIXELS_PER_BYTE * len(data), PIXELS_LIMIT):
         raise ValueError(f"an image of {width} x {height} in {len(data)} bytes")
-    rows = _stored_differences(data, height, width)
+    rows = _stored_differences(data, height, width, expected.itemsize)
     if rows is not None:
-        return _sums(rows)
+        pixels = _sums(rows)
+        return pixels if expected.itemsize == 1 else pixels.view(">u2").astype(np.uint16)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError("an image that can not be decoded") from error
-    if image is None or image.shape != (height, width) or image.dtype != np.uint8:
+    if image is None or image.shape != (height, width) or image.dtype != expected:
         raise ValueError("an image that is not of grey levels, or damaged")
-    pixels: Image = image.view(np.uint8)
-    return pixels
+    decoded: Image = image.view(expected)
+    return decoded
 
 
-def _stored_differences(data: memoryview, height: int, width: int) -> NDArray[np.uint8] | None:
-    """The row differences of a PNG like those of `row_differences`, (h, w), checksums verified; None for any other."""
-    head = _PNG_MAGIC + b"".join(_png_part(b"IHDR", _PNG_HEADER.pack(width, height, 8, 0, 0, 0, 0)))
+def _stored_differences(data: memoryview, height: int, width: int, itemsize: int) -> NDArray[np.uint8] | None:
+    """The row differences of a PNG like those of `row_differences`, as bytes (h, w * itemsize), checksums verified.
+
+    None for any other file.
+    """
+    head = _PNG_MAGIC + b"".join(_png_part(b"IHDR", _PNG_HEADER.pack(width, height, 8 * itemsize, 0, 0, 0, 0)))
     tail = b"".join(_png_part(b"IEND", b""))
     start, end = len(head) + 8, len(data) - len(tail) - 4
     if end <= start or data[: len(head)] != head or data[len(data) - len(tail) :] != tail:
@@ -108,18 +121,18 @@ def _stored_differences(data: memoryview, height: int, width: int) -> NDArray[np
     if zlib.crc32(data[start - 4 : end]) != _SIZE.unpack_from(data, end)[0]:
         return None
     # After zlib's head and without its own checksum: the one above covers both.
-    unpacker, nbytes = zlib.decompressobj(-zlib.MAX_WBITS), height * (width + 1)
+    unpacker, nbytes = zlib.decompressobj(-zlib.MAX_WBITS), height * (width * itemsize + 1)
     try:
         unpacked = unpacker.decompress(data[start + 2 : end - 4], nbytes + 1)
     except zlib.error:
         return None
     if len(unpacked) != nbytes or not unpacker.eof or unpacker.unused_data:
         return None
-    rows = np.frombuffer(unpacked, np.uint8).reshape(height, width + 1)
+    rows = np.frombuffer(unpacked, np.uint8).reshape(height, width * itemsize + 1)
     return rows[:, 1:] if (rows[:, 0] == _UP).all() else None
 
 
-def _sums(rows: NDArray[np.uint8]) -> Image:
+def _sums(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Each row plus all rows above it, modulo 256; in blocks, for which numpy needs few calls."""
     height, width = rows.shape
     size = max(1, math.isqrt(height))
@@ -154,20 +167,20 @@ def _png_part(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes]:
     return _SIZE.pack(len(data)) + kind, data, _SIZE.pack(zlib.crc32(data, zlib.crc32(kind)))
 
 
-def _shape_of(data: memoryview) -> tuple[int, int]:
+def _shape_of(data: memoryview, pixel_bits: int) -> tuple[int, int]:
     """Height and width as the file's own head says."""
     if data[: len(_PNG_MAGIC)] == _PNG_MAGIC:
         if len(data) < 33:
             raise ValueError("a PNG without a head")
         width, height, bits, colours = _PNG_HEADER.unpack_from(data, 16)[:4]
-        if (bits, colours) != (8, 0):  # or it would take several times as much memory until that is found out
-            raise ValueError("an image that is not of grey levels")
+        if (bits, colours) != (pixel_bits, 0):  # or it would take several times as much memory until that is found out
+            raise ValueError(f"an image that is not of grey levels in {pixel_bits} bit")
         return height, width
     for marker, body in _jpeg_segments(data):
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # the frame header of any kind of JPEG
             bits, height, width, colours = struct.unpack_from(">BHHB", data, body)
-            if (bits, colours) != (8, 1):
-                raise ValueError("an image that is not of grey levels")
+            if (bits, colours) != (pixel_bits, 1):
+                raise ValueError(f"an image that is not of grey levels in {pixel_bits} bit")
             return height, width
     raise ValueError("neither PNG nor JPEG")
 
@@ -185,6 +198,7 @@ _RAW_IMAGE_DATA, _COMPRESSED_IMAGE_DATA = 6, 2  # numbers of the fields that hol
 # Up to these rates compression takes at most about a quarter and three quarters of a core, checksums included.
 _DELTA_PX_S = 80e6
 _ZSTD_PX_S = 400e6
+_WIDE_COST = 2.7  # time for a pixel of 16 bit relative to one of 8 bit
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,53 +208,68 @@ class FrameEncoding:
     Attributes
     ----------
     name : value of `recording.frames`.
-    codec : Frame <-> payload.
+    codec : Frame <-> payload, for images of 8 bit unless the encoding is one of `of`.
     compressed_chunks : whether the chunks are compressed.
     lossless : whether the same pixels are read back.
+    bits : depth of the images.
     """
 
     name: str
     codec: Codec
     compressed_chunks: bool
     lossless: bool = True
+    bits: int = 8
+
+    def of(self, bits: int) -> FrameEncoding:
+        """The encoding for images of a depth; raises UsageError if it can not hold them."""
+        if bits == self.bits:
+            return self
+        if not self.lossless:
+            raise UsageError(f"recording.frames = {self.name!r} holds 8 bit, the camera has {bits}; set it to 'auto'")
+        return replace(self, codec=_codec(self.name, bits), bits=bits)
 
 
-def encoding_for(width_px: int, height_px: int, rate_hz: float) -> str:
+def encoding_for(width_px: int, height_px: int, rate_hz: float, bits: int = 8) -> str:
     """The smallest lossless encoding that leaves most of two cores to the control loop."""
-    px_s = width_px * height_px * rate_hz
+    px_s = width_px * height_px * rate_hz * (_WIDE_COST if bits > 8 else 1.0)
     return "delta" if px_s <= _DELTA_PX_S else "zstd" if px_s <= _ZSTD_PX_S else "raw"
 
 
-def _raw_image() -> Codec:
-    """Frame <-> foxglove.RawImage, mono8; Frame.index is the MCAP sequence (32 bit)."""
+def _raw_image(bits: int) -> Codec:
+    """Frame <-> foxglove.RawImage, mono8 or mono16; Frame.index is the MCAP sequence (32 bit)."""
     schema = foxglove_schema("RawImage")
+    stored = pixel_type(bits).newbyteorder("<")
+    nbytes, name = stored.itemsize, f"mono{8 * stored.itemsize}"
 
     def encode(frame: Frame) -> Payload:
-        height, width = _shape(frame)
+        height, width = _shape(frame, bits)
         head = schema.wire(
-            timestamp=timestamp(frame.stamp_ns), width=width, height=height, encoding="mono8", step=width
+            timestamp=timestamp(frame.stamp_ns), width=width, height=height, encoding=name, step=nbytes * width
         )
         prefix = head.SerializeToString() + byte_field_head(_RAW_IMAGE_DATA, frame.image.nbytes)
-        return (prefix, frame.image.reshape(-1).data)
+        return (prefix, frame.image.astype(stored, copy=False).reshape(-1).view(np.uint8).data)
 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
         rest, found = cut_byte_fields(memoryview(payload), (_RAW_IMAGE_DATA,))
         parsed = schema.wire.FromString(rest)
         data = detached(memoryview(payload), found).get(_RAW_IMAGE_DATA, parsed.data)
         shape = parsed.height, parsed.width
-        if parsed.encoding != "mono8" or parsed.step != shape[1] or len(data) != shape[0] * shape[1]:
+        size = nbytes * shape[0] * shape[1]
+        if parsed.encoding != name or parsed.step != nbytes * shape[1] or len(data) != size:
             raise ValueError(f"an image of {shape[1]} x {shape[0]} {parsed.encoding!r} in {len(data)} bytes")
-        return Frame(stamp_of(parsed), sequence, np.frombuffer(data, np.uint8).reshape(shape))
+        image = np.frombuffer(data, stored).reshape(shape)
+        # A copy where the bytes begin at an odd address, for which no kernel is compiled.
+        return _frame(stamp_of(parsed), sequence, image.astype(pixel_type(bits), copy=not image.flags.aligned), bits)
 
     return Codec(schema, encode, decode, _sequence, has_unix_time=True)
 
 
-def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> Codec:
+def _compressed_image(file_format: str, file_of: Callable[[Image], Payload], bits: int) -> Codec:
     """Frame <-> foxglove.CompressedImage; decodes any grey-level PNG or JPEG."""
     schema = foxglove_schema("CompressedImage")
 
     def encode(frame: Frame) -> Payload:
-        _shape(frame)
+        _shape(frame, bits)
         parts = file_of(frame.image)
         head = schema.wire(timestamp=timestamp(frame.stamp_ns), format=file_format).SerializeToString()
         return (head + byte_field_head(_COMPRESSED_IMAGE_DATA, sum(map(len, parts))), *parts)
@@ -248,12 +277,22 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload]) -> 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
         rest, found = cut_byte_fields(memoryview(payload), (_COMPRESSED_IMAGE_DATA,))
         parsed = schema.wire.FromString(rest)
-        return Frame(stamp_of(parsed), sequence, decode_image(found.get(_COMPRESSED_IMAGE_DATA, parsed.data)))
+        image = decode_image(found.get(_COMPRESSED_IMAGE_DATA, parsed.data), bits)
+        return _frame(stamp_of(parsed), sequence, image, bits)
 
     return Codec(schema, encode, decode, _sequence, has_unix_time=True)
 
 
-def _shape(frame: Frame) -> tuple[int, int]:
+def _frame(stamp_ns: int, index: int, image: Image, bits: int) -> Frame:
+    try:
+        return Frame(stamp_ns, index, image, bits)
+    except RigError as error:  # a level beyond the depth
+        raise ValueError(str(error)) from error
+
+
+def _shape(frame: Frame, bits: int) -> tuple[int, int]:
+    if frame.bits != bits:
+        raise ValueError(f"an image of {frame.bits} bit in a session of {bits} bit; set camera.bits to {frame.bits}")
     if frame.image.size > PIXELS_LIMIT:
         raise ValueError(f"an image of {frame.image.size} pixels, more than {PIXELS_LIMIT}, which the reader takes")
     height, width = frame.image.shape
@@ -266,16 +305,26 @@ def _sequence(frame: Frame) -> int:
     return frame.index
 
 
-_RAW = _raw_image()
+@functools.cache
+def _codec(name: str, bits: int) -> Codec:
+    if name in ("raw", "zstd"):
+        return _raw_image(bits)
+    file_format, file_of = {"delta": ("png", row_differences), "png": ("png", png), "jpeg": ("jpeg", jpeg)}[name]
+    return _compressed_image(file_format, file_of, bits)
+
+
 ENCODINGS = {
     encoding.name: encoding
     for encoding in (
-        FrameEncoding("raw", _RAW, compressed_chunks=False),
-        FrameEncoding("zstd", _RAW, compressed_chunks=True),
-        FrameEncoding("delta", _compressed_image("png", row_differences), compressed_chunks=True),
-        FrameEncoding("png", _compressed_image("png", png), compressed_chunks=False),
-        FrameEncoding("jpeg", _compressed_image("jpeg", jpeg), compressed_chunks=False, lossless=False),
+        FrameEncoding("raw", _codec("raw", 8), compressed_chunks=False),
+        FrameEncoding("zstd", _codec("zstd", 8), compressed_chunks=True),
+        FrameEncoding("delta", _codec("delta", 8), compressed_chunks=True),
+        FrameEncoding("png", _codec("png", 8), compressed_chunks=False),
+        FrameEncoding("jpeg", _codec("jpeg", 8), compressed_chunks=False, lossless=False),
     )
 }
-# By schema: two codecs decode the images of all encodings.
-FRAME_CODECS = {codec.schema.name: codec for codec in (_RAW, ENCODINGS["png"].codec)}
+
+
+def frame_codec(schema_name: str, bits: int) -> Codec:
+    """The codec that decodes frames of a schema and depth, in any encoding; a RawImage's for any other schema."""
+    return _codec("png" if schema_name == ENCODINGS["png"].codec.schema.name else "raw", bits)

@@ -81,6 +81,11 @@ class SessionReader:
         return self._file(0).contents.region
 
     @functools.cached_property
+    def frame_bits(self) -> int:
+        """Depth of the images."""
+        return self._file(0).contents.frame_bits
+
+    @functools.cached_property
     def counts(self) -> dict[str, int]:
         """Number of messages by field of Tick, for the topics that have any."""
         return {BY_PATH[path].field: count for path, count in self._run.counts().items() if path in BY_PATH}

@@ -259,7 +259,12 @@ def _rewrite(
     # Only replays are written without images.
     has_images = "frame" in reader.counts or not reader.header.parent
     options = WriterOptions(
-        frames=frames, overwrite=True, block=True, queue_limit_bytes=_QUEUE_BYTES, region=reader.region
+        frames=frames,
+        overwrite=True,
+        block=True,
+        queue_limit_bytes=_QUEUE_BYTES,
+        region=reader.region,
+        bits=reader.frame_bits,
     )
     with SessionWriter(draft, reader.header, options) as writer:
         for tick in reader.ticks():
@@ -345,7 +350,7 @@ def _end_of_run(path: Path, last: SessionReader, part: Part) -> Recovered:
     target = part_path(path, part.number + 1)
     header = replace(last.header, part=Part(part.run, part.number + 1, keyframe_ns=last.last_ns))
     lost = f"everything after {last.path.name}"
-    with SessionWriter(target, header, WriterOptions(block=True)) as writer:
+    with SessionWriter(target, header, WriterOptions(block=True, bits=last.frame_bits)) as writer:
         writer.write(replace(last.tick_before(last.last_ns), stamp_ns=last.last_ns))
         writer.close({"outcome": Outcome.CUT, "note": f"lost: {lost}", "recovered_from": last.path.name})
     return Recovered(target, 0, 0.0, lost=lost)

@@ -104,8 +104,9 @@ class WindowCutter:
 
     def cut(self, frame: Frame, window: Window) -> Frame:
         """The frame with all pixels outside of the window 0."""
-        if self._image.shape != frame.image.shape:
-            self._image = np.zeros(frame.image.shape, np.uint8)
+        if self._image.shape != frame.image.shape or self._image.dtype != frame.image.dtype:
+            self._image = np.zeros_like(frame.image)
+            self._filled = (0, 0, 0, 0)
         x0, y0, x1, y1 = self._filled
         self._image[y0:y1, x0:x1] = 0
         x0, y0, x1, y1 = self._filled = window

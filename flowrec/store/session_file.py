@@ -81,6 +81,7 @@ class WriterOptions:
         readable alone; a Snapshot: nothing is written but X.snap001.mcap, ... around events.
     region : record only the window around the robot of most images (roi.py); None: all of all images.
     leave_out : topics that are not recorded, as names or patterns such as `/view/*`.
+    bits : depth of the images; another one is refused.
     """
 
     frames: str = "zstd"
@@ -92,6 +93,7 @@ class WriterOptions:
     files: Split | Snapshot = Split()
     region: Region | None = None
     leave_out: tuple[str, ...] = ()
+    bits: int = 8
 
     @property
     def left_out_topics(self) -> frozenset[str]:
@@ -100,8 +102,8 @@ class WriterOptions:
 
     @property
     def encoding(self) -> FrameEncoding:
-        """Of the images."""
-        return ENCODINGS[self.frames]
+        """Of the images; raises UsageError if it can not hold their depth."""
+        return ENCODINGS[self.frames].of(self.bits)
 
     @property
     def sync_interval_s(self) -> float:

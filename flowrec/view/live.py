@@ -185,7 +185,7 @@ class LiveView:
         frame = self._frame
         if changes and frame is not None and sent.frame is not None and frame.index == sent.frame.index:
             step = max(1, -(-max(frame.image.shape) // _PREVIEW_PX))
-            changes[-1]["frame"] = Frame(frame.stamp_ns, frame.index, frame.image[::step, ::step])
+            changes[-1]["frame"] = replace(frame, image=frame.image[::step, ::step])
         return (step, changes), sent
 
 

@@ -155,6 +155,8 @@ class TickLogger:
             self._placed_step = self.image_step
             self._log(e.IMAGE, maps.placed(self._scene.preview_placement(self.image_step)), static=True)
         image = self._completed(frame.image) if self._scene.windows else frame.image
+        if frame.bits > 8:
+            image = (image >> (frame.bits - 8)).astype(np.uint8)
         done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         assert done
         self._log(e.IMAGE, rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg", draw_order=-20.0))
@@ -168,7 +170,7 @@ class TickLogger:
         if self._complete is None or self._complete.shape != image.shape:
             return image
         if self._dimmed is None:
-            self._dimmed = (_DIMMING * self._complete).astype(np.uint8)
+            self._dimmed = (_DIMMING * self._complete).astype(image.dtype)
         completed = self._dimmed.copy()
         completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
         return completed

@@ -15,6 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.declarations import Image
 from flowrec.system.numba_setup import compiled
 
 RIM_RATIO = 0.35  # brightness of the rim relative to the disc's darkness, where nothing better is known
@@ -45,7 +46,7 @@ def initial_edge_px(radius_px: float) -> float:
 
 @compiled
 def fit_disc(
-    image: NDArray[np.uint8],
+    image: Image,
     distance_px: NDArray[np.float32],
     margin_px: float,
     x: float,
@@ -112,7 +113,7 @@ def fit_radius(radius_px: float, edge_px: float) -> float:
 
 @compiled
 def block_means(
-    image: NDArray[np.uint8],
+    image: Image,
     distance_px: NDArray[np.float32],
     margin_px: float,
     x: float,

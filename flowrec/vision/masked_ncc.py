@@ -14,6 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.declarations import Image
 from flowrec.system.numba_setup import compiled
 from flowrec.vision.disc_fit import RIM_RATIO, initial_edge_px, profile
 
@@ -40,7 +41,7 @@ def template(radius_px: float, step: int) -> NDArray[np.float32]:
 
 @compiled
 def masked_ncc(
-    image: NDArray[np.uint8],
+    image: Image,
     distance_px: NDArray[np.float32],
     box: tuple[int, int, int, int],
     step: int,

@@ -20,8 +20,8 @@ from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 
 from flowrec.config import Recording, load_config
-from flowrec.errors import SessionError
-from flowrec.messages import Frame
+from flowrec.errors import RigError, SessionError, UsageError
+from flowrec.messages import PIXEL_BITS, Frame, pixel_type
 from flowrec.session_writer import frames_of
 from flowrec.store import codec
 from flowrec.store.frame_encodings import ENCODINGS, decode_image, encoding_for, row_differences
@@ -37,39 +37,88 @@ LOSSLESS = [name for name, encoding in ENCODINGS.items() if encoding.lossless]
 
 
 def there_and_back(frame, encoding):
+    encoding = encoding.of(frame.bits)
     sequence, parts = codec.encode_record(frame, encoding.codec)
     return codec.decode(Frame, encoding.codec, b"".join(parts), sequence)
 
 
-def record(path, frames, **options):
+def record(path, frames, ticks=TICKS, **options):
     with SessionWriter(path, HEADER, WriterOptions(frames=frames, block=True, **options)) as writer:
-        for tick in TICKS:
+        for tick in ticks:
             writer.write(tick)
     return path
 
 
+def deeper(tick, bits):
+    """A tick with grey levels that use all of a depth."""
+    wide = tick.frame.image.astype(np.uint16) << (bits - 8)
+    return replace(tick, frame=replace(tick.frame, image=wide | tick.frame.image >> (16 - bits), bits=bits))
+
+
 @pytest.mark.parametrize("name", LOSSLESS)
 def test_images_of_any_shape_and_content_come_back_bit_for_bit(name):
-    @settings(max_examples=40)
-    @given(hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=40)))
-    def round_trip(image):
-        frame = Frame(5, 7, image)
+    @settings(max_examples=80)
+    @given(st.sampled_from(PIXEL_BITS), st.data())
+    def round_trip(bits, data):
+        shapes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=40)
+        image = data.draw(hnp.arrays(pixel_type(bits), shapes, elements=st.integers(0, 2**bits - 1)))
+        frame = Frame(5, 7, image, bits)
         assert there_and_back(frame, ENCODINGS[name]).same_as(frame)
 
     round_trip()
     rng = np.random.default_rng(0)
     for shape in ((1, 70_000), (70_000, 1), (513, 641)):  # deflate's stored blocks end at 65535 bytes
-        frame = Frame(5, 7, rng.integers(0, 256, shape, dtype=np.uint8))
-        assert there_and_back(frame, ENCODINGS[name]).same_as(frame)
+        for bits in (8, 12):
+            frame = Frame(5, 7, rng.integers(0, 2**bits, shape, dtype=pixel_type(bits)), bits)
+            assert there_and_back(frame, ENCODINGS[name]).same_as(frame)
 
 
-@pytest.mark.parametrize("name", LOSSLESS)
-def test_a_session_in_any_lossless_encoding_reads_and_recovers_to_the_same_images(name, tmp_path):
-    path = record(tmp_path / "s.mcap", name)
+@pytest.mark.parametrize(("name", "bits"), [*((name, 8) for name in LOSSLESS), ("delta", 12), ("raw", 16)])
+def test_a_session_in_any_lossless_encoding_reads_and_recovers_to_the_same_images(name, bits, tmp_path):
+    ticks = TICKS if bits == 8 else [deeper(tick, bits) for tick in TICKS]
+    path = record(tmp_path / "s.mcap", name, ticks, bits=bits)
     (tmp_path / "cut.mcap.partial").write_bytes(path.read_bytes()[:-300])
     for found in (path, recover(tmp_path / "cut.mcap.partial").path):
         with SessionReader(found) as reader:
-            assert all(a.frame.same_as(b.frame) for a, b in zip(TICKS, reader.ticks(), strict=True))
+            assert reader.frame_bits == bits
+            assert all(a.frame.same_as(b.frame) for a, b in zip(ticks, reader.ticks(), strict=True))
+
+
+@pytest.mark.parametrize("name", LOSSLESS)
+def test_other_programs_see_all_bits_of_a_deep_image_and_learn_its_depth(name, tmp_path):
+    """By mcap, protobuf and OpenCV alone; and by Rerun's reader of MCAP."""
+    ticks = [deeper(tick, 12) for tick in TICKS[:3]]
+    path = record(tmp_path / "s.mcap", name, ticks, bits=12)
+    with path.open("rb") as stream:
+        for tick, (schema, channel, message) in zip(
+            ticks, make_reader(stream).iter_messages(["/camera/frame"]), strict=True
+        ):
+            assert channel.metadata["bits"] == "12"
+            found = foxglove_schema(schema.name.removeprefix("foxglove.")).wire.FromString(message.data)
+            if schema.name == "foxglove.RawImage":
+                assert (found.encoding, found.step) == ("mono16", 2 * found.width)
+                image = np.frombuffer(found.data, "<u2").reshape(found.height, found.width)
+            else:
+                image = cv2.imdecode(np.frombuffer(found.data, np.uint8), cv2.IMREAD_UNCHANGED)
+            assert np.array_equal(image, tick.frame.image)
+    rerun_reads(path, tmp_path)
+
+
+def test_an_image_of_another_depth_than_the_session_is_refused_in_one_line(tmp_path):
+    with pytest.raises(SessionError, match="12 bit in a session of 8 bit; set camera"):
+        record(tmp_path / "s.mcap", "zstd", [deeper(TICKS[0], 12)])
+    with pytest.raises(UsageError, match="'jpeg' holds 8 bit, the camera has 12"):
+        record(tmp_path / "t.mcap", "jpeg", [deeper(TICKS[0], 12)], bits=12)
+    with pytest.raises(UsageError, match=r"'jpeg' holds 8 bit, camera\.bits = 12"):
+        load_config(None, ["camera.bits=12", "recording.frames=jpeg"])
+    for bits, level in ((12, 4096), (10, 1024), (14, 65_535)):
+        with pytest.raises(RigError, match=f"a grey level of {level} in an image of {bits} bit"):
+            Frame(5, 7, np.full((2, 2), level, np.uint16), bits)
+    for image, bits in ((np.zeros((2, 2), np.uint16), 8), (np.zeros((2, 2), np.uint8), 12), (np.zeros((2, 2)), 16)):
+        with pytest.raises(RigError, match="it can not be kept exactly"):
+            Frame(5, 7, image, bits)
+    with pytest.raises(RigError, match="an image of 9 bit; the depths are 8, 10, 12, 14, 16"):
+        Frame(5, 7, np.zeros((2, 2), np.uint16), 9)
 
 
 @pytest.mark.parametrize("name", ["raw", "png"])
@@ -102,8 +151,14 @@ def test_other_programs_see_an_ordinary_image_file(name, kind, tmp_path):
     image = foxglove_schema("CompressedImage").wire.FromString(message.data)
     assert image.format == kind
     assert cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (47, 63)
+    if name == "delta":
+        rerun_reads(path, tmp_path)
+
+
+def rerun_reads(path, tmp_path):
+    """Whether Rerun, where it is installed, converts a session without an error."""
     rerun = Path(sys.executable).with_name("rerun")
-    if name == "delta" and (rerun.exists() or shutil.which("rerun")):
+    if rerun.exists() or shutil.which("rerun"):
         convert = [rerun if rerun.exists() else "rerun", "mcap", "convert", path, "-o", tmp_path / "s.rrd"]
         home = os.environ | {"HOME": str(tmp_path)}  # where Rerun notes that it was started
         done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=60, env=home)
@@ -141,13 +196,14 @@ def test_an_image_file_that_claims_more_pixels_than_it_can_hold_is_refused_unrea
 @settings(max_examples=150)
 @given(st.data())
 def test_a_damaged_image_file_is_a_session_error_or_an_image(data):
-    name = data.draw(st.sampled_from(["delta", "png", "jpeg"]))
-    _, parts = codec.encode_record(Frame(5, 7, np.full((20, 30), 90, np.uint8)), ENCODINGS[name].codec)
+    name, bits = data.draw(st.sampled_from([("delta", 8), ("png", 8), ("jpeg", 8), ("delta", 12), ("png", 12)]))
+    frames = ENCODINGS[name].of(bits).codec
+    _, parts = codec.encode_record(Frame(5, 7, np.full((20, 30), 90, pixel_type(bits)), bits), frames)
     payload = bytearray(b"".join(parts))
     for _ in range(data.draw(st.integers(1, 3))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     with contextlib.suppress(SessionError):
-        assert codec.decode(Frame, ENCODINGS[name].codec, payload, 7).image.ndim == 2
+        assert codec.decode(Frame, frames, payload, 7).image.dtype == pixel_type(bits)
 
 
 def test_an_empty_image_is_refused_by_the_encodings_that_can_not_hold_it():
@@ -158,7 +214,7 @@ def test_an_empty_image_is_refused_by_the_encodings_that_can_not_hold_it():
 def test_the_default_is_the_smallest_that_the_rate_allows():
     assert encoding_for(640, 512, 100.0) == "delta"
     assert encoding_for(2448, 2048, 60.0) == "zstd"
-    assert encoding_for(2448, 2048, 200.0) == "raw"
+    assert encoding_for(2448, 2048, 200.0) == encoding_for(2448, 2048, 60.0, bits=12) == "raw"
     config = load_config(None, ["camera.rate_hz=60.0", "camera.width_px=2448", "camera.height_px=2048"])
     assert frames_of(config) == "zstd"
     assert frames_of(replace(config, recording=replace(config.recording, frames="jpeg"))) == "jpeg"

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from flowrec.chip.clearance import clearance_um
 from flowrec.chip.registration import Calibration
 from flowrec.declarations import Image
+from flowrec.messages import pixel_type
 from flowrec.rig_settings import CameraSettings
 from flowrec.system.numba_setup import compiled
 
@@ -71,21 +72,23 @@ def _expose(
     offsets: NDArray[np.int64],
     shot: float,
     read: float,
-    image: NDArray[np.uint8],
+    top: int,
+    image: Image,
 ) -> None:
-    """Add the noise to grey levels (h, w) and digitise."""
+    """Add the noise to grey levels (h, w) of 8 bit and digitise, with `top` as the highest level."""
     height, width = scene.shape
     per_level = np.float32(shot / (_NOISE_STEPS * _NOISE_STEPS))
     fixed = np.float32(read * read / (_NOISE_STEPS * _NOISE_STEPS))
-    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(255.0)
+    half, low, high = np.float32(0.5), np.float32(0.0), np.float32(top)
+    scale = np.float32((top + 1) // 256)
     for y in range(height):
         noise = pool[offsets[y] : offsets[y] + width]
         line = scene[y]
         out = image[y]
         for x in range(width):
             level = line[x]
-            grey = level + np.float32(math.sqrt(level * per_level + fixed)) * np.float32(noise[x]) + half
-            out[x] = np.uint8(min(max(grey, low), high))
+            grey = level + np.float32(math.sqrt(level * per_level + fixed)) * np.float32(noise[x])
+            out[x] = min(max(grey * scale + half, low), high)
 
 
 class Microscope:
@@ -133,9 +136,11 @@ class Microscope:
             smear = robot_velocity_um_s * self._camera.exposure_s / self._calibration.um_per_px
             windows.append(self._particle(self._scene, robot_um, robot_radius_um, 0.8, smear))
         height, width = self._scene.shape
-        image = np.empty((height, width), np.uint8)
+        camera = self._camera
+        image = np.empty((height, width), pixel_type(camera.bits))
         offsets = self._noise.integers(0, _POOL - width, height)
-        _expose(self._scene, self._pool, offsets, 1.0 / self._camera.photons_per_level, self._camera.read_noise, image)
+        shot, top = 1.0 / camera.photons_per_level, 2**camera.bits - 1
+        _expose(self._scene, self._pool, offsets, shot, camera.read_noise, top, image)
         for x0, y0, x1, y1 in windows:
             self._scene[y0:y1, x0:x1] = self._empty[y0:y1, x0:x1]
         return image

@@ -221,7 +221,7 @@ class SimulatedRig:
             stamped = fit.stamp_ns if self._realtime else stamp
             yield Inputs(
                 stamp_ns=stamped,
-                frame=Frame(stamped, index, image),
+                frame=Frame(stamped, index, image, self._camera.bits),
                 applied=self._applied(stamped, turns),
                 truth=Truth(stamped, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
                 true_field=field if index == 0 else None,
