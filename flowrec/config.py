@@ -193,13 +193,17 @@ def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] 
 
 
 def calibration_of(config: ResolvedConfig, chip: Chip) -> Calibration:
-    """Transform from camera pixels to chip coordinates: the chip is centred in the image."""
-    camera = config.camera
+    """Transform from camera pixels to chip coordinates, as the settings state it."""
+    return registration_of(config.camera, chip)
+
+
+def registration_of(camera: Camera, chip: Chip) -> Calibration:
+    """Transform from the pixels of a camera to chip coordinates."""
     width_um, height_um = chip.size_um
     half = 0.5 * chip.um_per_px
-    x = width_um / 2 - half - camera.um_per_px * (camera.width_px - 1) / 2
-    y = height_um / 2 - half - camera.um_per_px * (camera.height_px - 1) / 2
-    return Calibration(camera.um_per_px, (x, y))
+    middle = (width_um / 2 - half, height_um / 2 - half) if camera.centre_um is None else camera.centre_um
+    size_px = (camera.width_px, camera.height_px)
+    return Calibration.centred(camera.um_per_px, middle, size_px, camera.angle_deg, camera.mirror)
 
 
 def _read_config(path: Path) -> dict[str, Any]:

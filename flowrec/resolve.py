@@ -13,6 +13,7 @@ from flowrec.chip import check_point, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import opening_point_um
 from flowrec.chip.openings import named_opening
+from flowrec.chip.registration import Calibration
 from flowrec.config import Config, ResolvedConfig, check_config
 from flowrec.control import Coils
 from flowrec.control.mission import Place, PlacedMission, Point
@@ -25,6 +26,7 @@ from flowrec.rig_settings import SIMULATED, Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
 
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
+_MAY_BE_NONE = ("camera.centre_um",)  # None is a value
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
@@ -82,7 +84,7 @@ def _narrowed(kind: type[_Section], settings: Any, **changed: Any) -> _Section:
 def _refuse_unmeasured(config: Config) -> None:
     """Only a simulated robot and camera can be made to fit the chip."""
     given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
-    missing = [key for key, value in given.items() if value is None]
+    missing = [key for key, value in given.items() if value is None and key not in _MAY_BE_NONE]
     if config.rig != SIMULATED and missing:
         raise UsageError(
             f"rig = {config.rig!r}: {', '.join(missing)} not given; measure them and set each: only the robot and the "
@@ -98,7 +100,8 @@ def _fitted(config: Config, chip: Chip) -> tuple[Robot, Camera]:
     um_per_px, radius_um, speed_um_s = camera.um_per_px, asked.radius_um, asked.max_speed_um_s
     delay_s, step_out_hz, rate_hz = asked.delay_s, asked.step_out_hz, camera.rate_hz
     if um_per_px is None:
-        um_per_px = max(width_um / camera.width_px, height_um / camera.height_px)
+        right_um, down_um = np.abs(Calibration(1.0, (0.0, 0.0), camera.angle_deg).axes) @ (width_um, height_um)
+        um_per_px = float(max(right_um / camera.width_px, down_um / camera.height_px))
     if radius_um is None:
         radius_um = round(min(max(min(50.0, 0.2 * channel_um), 3.0 * um_per_px), 0.25 * channel_um), 2)
     if speed_um_s is None:

@@ -16,6 +16,9 @@ RIGS = Methods(
 )
 _Rate = Annotated[float, Range(0.1, 5e3)]
 _Scale = Annotated[float, Range(1e-3, 1e3)]
+Angle = Annotated[float, Range(-360.0, 360.0)]
+_Coordinate = Annotated[float, Range(-1e7, 1e7)]
+PointUm = tuple[_Coordinate, _Coordinate]
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +30,10 @@ class CameraSettings:
     bits: Annotated[int, OneOf(8, 10, 12, 14, 16)] = 8  # depth of a pixel; grey levels are below 2^bits
     rate_hz: _Rate | None = None  # None: chosen to fit the robot's speed
     um_per_px: _Scale | None = None  # None: the whole chip fills the image
+    # Registration: how the chip lies in the image. flowrec calibrate image measures it together with um_per_px.
+    angle_deg: Angle = 0.0  # direction of the chip's x axis in the image: 0 right, 90 down
+    mirror: bool = False  # the image shows the chip as in a mirror
+    centre_um: PointUm | None = None  # chip point at the centre of the image; None: the centre of the chip
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004
     # The following settings belong to the simulated camera only.
     blur_px: Annotated[float, Range(0.0, 100.0)] = 0.8  # optical blur, one sigma
@@ -40,7 +47,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera(CameraSettings):
-    """The camera of a resolved configuration: no setting is None."""
+    """The camera of a resolved configuration: no setting is None but those of which None is a value."""
 
     rate_hz: _Rate
     um_per_px: _Scale
@@ -73,6 +80,11 @@ class Simulated:
     # relative rate error of the camera's clock; None: drawn, up to 50 either way
     clock_skew_ppm: Annotated[float, Range(-1e5, 1e5)] | None = None
     arrival_jitter_s: Annotated[float, Range(0.0, 1.0)] = 3e-4  # mean delay of a frame on its way to the host
+    # The camera's true registration; None: as [camera] states it.
+    um_per_px: _Scale | None = None
+    angle_deg: Angle | None = None
+    mirror: bool | None = None
+    centre_um: PointUm | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,12 +131,9 @@ class TickLogger:
                 log_message(message)
 
     def _log_static(self) -> None:
-        placement = self._scene.mask_placement()
-        mask = self._scene.chip.mask.astype(np.uint8)
-        contours, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-        strips = [
-            (np.concatenate([c, c[:1]])[:, 0] + 0.5) * placement.scale + np.array(placement.offset) for c in contours
-        ]
+        chip = self._scene.chip
+        contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        strips = [self._scene.to_plane(np.concatenate([c, c[:1]])[:, 0] * chip.um_per_px) for c in contours]
         self._log(e.OUTLINE, rr.LineStrips2D(strips, colors=colours.GREY, radii=points(0.6)), static=True)
         self._entities.log_styles()
         self._entities.log_series()
@@ -259,7 +256,8 @@ class TickLogger:
             reference = self._scene.to_plane(demand.reference_um)
             self._log(e.REFERENCE, rr.Points2D.from_fields(positions=[reference]))
         if self._tick.estimate is not None:
-            vector = demand.velocity_um_s * (_COMMAND_PX * self._unit_px / self._scene.robot.speed_limit_um_s)
+            length = _COMMAND_PX * self._unit_px / self._scene.robot.speed_limit_um_s
+            vector = self._scene.directions(demand.velocity_um_s * length)
             position = self._scene.to_plane(self._tick.estimate.position_um)
             self._log(e.COMMAND, rr.Arrows2D.from_fields(origins=[position], vectors=[vector]))
 

@@ -91,7 +91,9 @@ def encoded(pixels: NDArray[np.uint8]) -> rr.EncodedImage:
 
 def placed(placement: Placement) -> rr.Transform3D:
     """The transform of an image into the picture plane."""
-    return rr.Transform3D(translation=[*placement.offset, 0.0], scale=[placement.scale, placement.scale, 1.0])
+    matrix = np.diag([placement.scale, placement.scale, 1.0])
+    matrix[:2, :2] = placement.scale * placement.axes
+    return rr.Transform3D(translation=[*placement.offset, 0.0], mat3x3=matrix)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,5 +185,5 @@ def flow_arrows(scene: Scene, field: FlowField, grid: tuple[Floats, float]) -> t
     longest = _LONGEST * scene.length_px(spacing_um)
     # Limited, so that a jet through a narrow spot does not cover its neighbours.
     relative = np.minimum(magnitude / fastest, 1.0) if fastest > 0.0 else np.zeros_like(magnitude)
-    vectors = velocity * (longest * np.sqrt(relative) / np.maximum(magnitude, 1e-12))[:, None]
+    vectors = scene.directions(velocity * (longest * np.sqrt(relative) / np.maximum(magnitude, 1e-12))[:, None])
     return scene.to_plane(points_um) - 0.5 * vectors, vectors, magnitude

@@ -20,10 +20,11 @@ _HALF_PX = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Position of an image in the picture plane: x = offset + scale * column, from pixel corners."""
+    """Position of an image in the picture plane: offset + scale * axes (column, row), from pixel corners."""
 
     scale: float
     offset: tuple[float, float]
+    axes: NDArray[np.float64]  # (2, 2): its columns are the directions of the image's rows and columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,10 @@ class Scene:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""
         return self.calibration.to_px(points_um) + _HALF_PX
 
+    def directions(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Vectors (..., 2) along the chip's axes as vectors of the same length in the picture plane."""
+        return vectors @ self.calibration.axes.T
+
     def length_px(self, length_um: float) -> float:
         """A length in um in the picture plane."""
         return length_um / self.calibration.um_per_px
@@ -50,18 +55,20 @@ class Scene:
     def mask_placement(self) -> Placement:
         """Position of an image on the pixels of the chip's mask."""
         scale = self.length_px(self.chip.um_per_px)
-        x, y = self.to_plane((0.0, 0.0))  # of the centre of the mask's first pixel
-        return Placement(scale, (float(x) - _HALF_PX * scale, float(y) - _HALF_PX * scale))
+        axes = self.calibration.axes
+        first = self.to_plane((0.0, 0.0)) - _HALF_PX * scale * axes.sum(axis=1)  # the corner of the first pixel
+        return Placement(scale, (float(first[0]), float(first[1])), axes)
 
     def preview_placement(self, step: int) -> Placement:
         """Position of a camera image of which only each `step`-th row and column is shown."""
-        return Placement(float(step), (_HALF_PX * (1 - step), _HALF_PX * (1 - step)))
+        return Placement(float(step), (_HALF_PX * (1 - step), _HALF_PX * (1 - step)), np.eye(2))
 
     def chip_bounds(self) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom of the chip's mask in the picture plane."""
-        placement = self.mask_placement()
-        (left, top), (h, w) = placement.offset, self.chip.mask.shape
-        return left, top, left + w * placement.scale, top + h * placement.scale
+        """Left, top, right, bottom of the upright box around the chip's mask in the picture plane."""
+        h, w = self.chip.mask.shape
+        corners = (np.array([(0, 0), (w, 0), (0, h), (w, h)]) - _HALF_PX) * self.chip.um_per_px
+        (left, top), (right, bottom) = (edge(self.to_plane(corners), axis=0).tolist() for edge in (np.min, np.max))
+        return left, top, right, bottom
 
     def image_bounds(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom of the camera's image in the picture plane."""

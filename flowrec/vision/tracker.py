@@ -226,18 +226,19 @@ def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, int]) 
     """Walls of a chip (compared by identity) in an image of `shape` (rows, columns)."""
     height, width = shape
     scale = calibration.um_per_px / chip.um_per_px  # mask pixels per camera pixel
-    x0, y0 = (value / chip.um_per_px for value in calibration.origin_um)
+    to_mask = calibration.matrix / chip.um_per_px  # of (column, row, 1) in the image
     # Distances interpolate smoothly, while an interpolated mask would have stairs.
     distance = cv2.warpAffine(
         _mask_distance_px(chip.mask) / np.float32(scale),
-        np.array([[scale, 0.0, x0], [0.0, scale, y0]]),
+        to_mask,
         (width, height),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,  # a channel that the border cuts continues straight
     )
     rows, columns = chip.mask.shape
-    x, y = x0 + scale * np.arange(width), y0 + scale * np.arange(height)
-    fluid = (distance > 0) & ((y >= -0.5) & (y <= rows - 0.5))[:, None] & ((x >= -0.5) & (x <= columns - 0.5))
+    right, down = np.arange(width), np.arange(height)[:, None]
+    x, y = (row[2] + row[0] * right + row[1] * down for row in to_mask)
+    fluid = (distance > 0) & (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
     across, down = np.flatnonzero(fluid.any(axis=0)), np.flatnonzero(fluid.any(axis=1))
     box = (int(across[0]), int(down[0]), int(across[-1]) + 1, int(down[-1]) + 1) if len(across) else (0, 0, 0, 0)
     return Walls(np.ascontiguousarray(distance, np.float32), box)

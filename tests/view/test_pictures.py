@@ -147,13 +147,29 @@ def test_the_branches_of_a_narrow_network_all_have_arrows(scene: Scene) -> None:
     assert all(np.sum(np.abs(rows - at - 2) <= 2) > 15 for at in (37, 151, 263, 388))
 
 
-def test_pictures_of_any_resolution_lie_on_each_other(scene: Scene) -> None:
-    turned = replace(scene, calibration=Calibration(0.7, (30.0, -12.0)))
+@pytest.mark.parametrize(("angle_deg", "mirror"), [(0.0, False), (30.0, False), (-80.0, True)])
+def test_pictures_of_any_resolution_lie_on_each_other(scene: Scene, angle_deg: float, mirror: bool) -> None:
+    turned = replace(scene, calibration=Calibration(0.7, (30.0, -12.0), angle_deg, mirror))
     place = turned.mask_placement()
     column_row = np.array([10.0, 20.0])  # a pixel of the mask, whose centre Rerun counts half a pixel further
-    assert np.allclose(turned.to_plane(4.0 * column_row), (column_row + 0.5) * place.scale + place.offset)
+    in_plane = place.offset + place.scale * (place.axes @ (column_row + 0.5))
+    assert np.allclose(turned.to_plane(4.0 * column_row), in_plane)
+    left, top, right, bottom = turned.chip_bounds()
+    assert left < in_plane[0] < right and top < in_plane[1] < bottom
     preview = turned.preview_placement(3)
     assert np.allclose((column_row + 0.5) * preview.scale + preview.offset, 3 * column_row + 0.5)
+
+
+def test_arrows_turn_with_the_camera(scene: Scene, ticks: list[Tick]) -> None:
+    field = ticks[0].assumed
+    assert field is not None
+    turned = replace(scene, calibration=Calibration(2.0, (5.0, 9.0), 25.0, True))
+    (start, vector, _), (start_turned, vector_turned, _) = (
+        flow_arrows(each, field, arrow_grid(scene)) for each in (scene, turned)
+    )
+    for points, points_turned in ((start, start_turned), (start + vector, start_turned + vector_turned)):
+        on_chip = [each.calibration.to_um(at - 0.5) for each, at in ((scene, points), (turned, points_turned))]
+        assert np.allclose(*on_chip)
 
 
 def test_a_robot_that_is_not_seen_is_grey_and_says_so(scene: Scene, ticks: list[Tick]) -> None:

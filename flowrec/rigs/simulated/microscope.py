@@ -133,7 +133,7 @@ class Microscope:
             )
         ]
         if robot_um is not None:
-            smear = robot_velocity_um_s * self._camera.exposure_s / self._calibration.um_per_px
+            smear = self._calibration.vectors_to_px(robot_velocity_um_s * self._camera.exposure_s)
             windows.append(self._particle(self._scene, robot_um, robot_radius_um, 0.8, smear))
         height, width = self._scene.shape
         camera = self._camera
@@ -170,9 +170,8 @@ def _empty_scene(
 ) -> NDArray[np.float32]:
     """Grey levels (h, w) of the chip without particles."""
     height, width = camera.height_px, camera.width_px
-    columns = (np.arange(width) * calibration.um_per_px + calibration.origin_um[0]) / um_per_px
-    rows = (np.arange(height) * calibration.um_per_px + calibration.origin_um[1]) / um_per_px
-    map_x, map_y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
+    map_x, map_y = np.moveaxis((calibration.to_um(pixels) / um_per_px).astype(np.float32), -1, 0)
     outline = _outline_px(mask) * np.float32(um_per_px)
     distance = cv2.remap(outline, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 

@@ -19,7 +19,7 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import check_point, clearance_um
 from flowrec.chip.registration import Calibration
 from flowrec.clocks import DeviceClock
-from flowrec.config import ResolvedConfig
+from flowrec.config import ResolvedConfig, registration_of
 from flowrec.control.coils import Coils
 from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.errors import RigError
@@ -87,7 +87,7 @@ class SimulatedRig:
 
     Parameters
     ----------
-    chip, calibration : the assumed chip, and the camera's view of it.
+    chip, calibration : the assumed chip, and the camera's true view of it.
     robot : its delay is from `apply` to motion.
     start_um : (2,) centre of the robot on the first frame.
     duration_s : None: without end.
@@ -109,10 +109,12 @@ class SimulatedRig:
         true_field: FlowField | None = None,
     ) -> SimulatedRig:
         """The rig of a resolved configuration."""
+        keys = ("um_per_px", "angle_deg", "mirror", "centre_um")
+        true = {key: value for key in keys if (value := getattr(config.simulated, key)) is not None}
         return cls(
             pipeline.chip,
             config.robot,
-            pipeline.calibration,
+            registration_of(replace(config.camera, **true), pipeline.chip),
             config.camera,
             config.simulated,
             config.mission.start,
