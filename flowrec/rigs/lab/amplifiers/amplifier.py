@@ -1,0 +1,81 @@
+"""The interface of an amplifier, and the table of amplifiers.
+
+LabRig never uses a row of this table directly, but through `drive.Drive`, which puts the limits and the guardian above
+it: with Drive.of(config) as drive: drive.beat(), drive.apply(currents), drive.put_out(until_ns), drive.zero().
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from flowrec.control.field_log import FieldLog
+from flowrec.control.field_rotation import FieldCommand
+
+
+@dataclass(frozen=True, slots=True)
+class AmplifierInfo:
+    """What an amplifier says of itself when it is opened.
+
+    Attributes
+    ----------
+    model, serial : as the device states them; serial '' if it has none.
+    max_current_a : largest current of a coil that the device makes; inf where it only knows voltages.
+    max_voltage_v : largest output voltage; inf where it only knows currents.
+    max_output_hz : highest rate of its output samples.
+    latency_s : from `apply` to the output, as configured; the field log holds what was measured.
+    timer_s : silence after which the device itself goes to zero; 0: it holds its last output for ever.
+    """
+
+    model: str
+    serial: str
+    max_current_a: float
+    max_voltage_v: float
+    max_output_hz: float
+    latency_s: float
+    timer_s: float
+
+
+class Amplifier(Protocol):
+    """Three coil amplifiers behind one device. No method but `open`, `zero` and `close` blocks."""
+
+    def open(self) -> AmplifierInfo:
+        """Find the device and take its outputs to zero. It stays disarmed: no command makes a field.
+
+        Raises
+        ------
+        RigError : no device, a busy one, or another device than expected; one line.
+        """
+
+    def guard(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """Arguments and open file descriptors with which the guardian process takes this output to zero."""
+
+    def arm(self) -> None:
+        """Let commands make a field from now on; until `zero`, or until the guardian or the device takes it away.
+
+        Raises
+        ------
+        RigError : the device refuses.
+        """
+
+    def apply(self, command: FieldCommand) -> None:
+        """What the field does from the next output sample on; a command that is repeated keeps the device awake.
+
+        Raises
+        ------
+        RigError : the device is gone, or has taken its output to zero by itself.
+        """
+
+    def put_out(self, until_ns: int) -> FieldLog:
+        """What was put out up to a time of the host's monotonic clock, with the latency in it."""
+
+    def zero(self) -> None:
+        """Take the output to zero now and disarm. Any thread, at any time, also during `apply`; repeats are harmless.
+
+        Raises
+        ------
+        RigError : the device does not confirm it.
+        """
+
+    def close(self) -> None:
+        """Release the device; the output is at zero."""
