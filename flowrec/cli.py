@@ -69,7 +69,7 @@ def root(
 @app.command()
 def record(
     config: Annotated[Path | None, typer.Argument(help="Configuration (TOML); --dry-run prints one.")] = None,
-    rig: Annotated[str | None, typer.Option(help="Rig to use: simulated.")] = None,
+    rig: Annotated[str | None, typer.Option(help="Rig to use: simulated, movie, lab.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
     out: Annotated[Path | None, typer.Option(help="Session file; by default named by date and sample.")] = None,

@@ -29,7 +29,7 @@ from flowrec.methods import Methods
 from flowrec.planning import PLANNERS, Planner, SurveyPlanner
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
-from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Safety, Simulated
+from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Lab, Movie, Safety, Simulated
 from flowrec.robot import Robot, RobotSettings
 from flowrec.system.toml_file import parse_toml, read_toml
 from flowrec.vision import Tracker
@@ -95,6 +95,8 @@ class Config:
     robot: RobotSettings = field(default_factory=RobotSettings)
     camera: CameraSettings = field(default_factory=CameraSettings)
     simulated: Simulated = field(default_factory=Simulated)
+    movie: Movie = field(default_factory=Movie)
+    lab: Lab = field(default_factory=Lab)
     start: Start = field(default_factory=Start)
     tracker: Tracker = field(default_factory=Tracker)
     observer: Observer = field(default_factory=Observer)

@@ -9,10 +9,27 @@ from typing import Annotated
 from flowrec.methods import Method, Methods
 from flowrec.ranges import OneOf, Range, Seed, Share
 
-SIMULATED = "simulated"
+SIMULATED, MOVIE, LAB = "simulated", "movie", "lab"
 # `of(pipeline, config, duration_s, realtime)` of a row's class makes the rig, a rigs.rig.Rig.
 RIGS = Methods(
-    "rig", Method(SIMULATED, "flowrec.rigs.simulated.rig:SimulatedRig", "a simulated microscope, coils and robot")
+    "rig",
+    Method(SIMULATED, "flowrec.rigs.simulated.rig:SimulatedRig", "a simulated microscope, coils and robot"),
+    Method(MOVIE, "flowrec.rigs.movie.rig:MovieRig", "a movie, and the log of what the coils did", extra="movies"),
+    Method(LAB, "flowrec.rigs.lab.rig:LabRig", "the camera and the coil amplifiers of a lab"),
+)
+# Rows are rigs.lab.cameras.camera.Camera: `of(wanted)` makes one.
+CAMERAS = Methods(
+    "lab.camera",
+    Method("genicam", "flowrec.rigs.lab.cameras.genicam:GenicamCamera", "GigE and USB3 Vision", extra="genicam"),
+    Method("pylon", "flowrec.rigs.lab.cameras.pylon:PylonCamera", "Basler cameras by pylon", extra="pylon"),
+    Method("mmcore", "flowrec.rigs.lab.cameras.mmcore:MmcoreCamera", "any device of Micro-Manager", extra="mmcore"),
+    Method("opencv", "flowrec.rigs.lab.cameras.opencv:OpencvCamera", "webcams, V4L2 devices, streams, by OpenCV"),
+)
+# Rows are rigs.lab.amplifiers.amplifier.Amplifier: `of(config)` makes one of a resolved configuration.
+AMPLIFIERS = Methods(
+    "lab.amplifier",
+    Method("serial", "flowrec.rigs.lab.amplifiers.serial_line:SerialAmplifier", "a microcontroller", extra="serial"),
+    Method("ni", "flowrec.rigs.lab.amplifiers.ni:NiAmplifier", "analog outputs by NI-DAQmx", extra="ni"),
 )
 _Rate = Annotated[float, Range(0.1, 5e3)]
 _Scale = Annotated[float, Range(1e-3, 1e3)]
@@ -93,3 +110,32 @@ class Safety:
 
     # time without a completed tick, while the field is on, after which the watchdog switches it off
     guard_timeout_s: Annotated[float, Range(0.01, 60.0)] = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Movie:
+    """Section [movie]: the movie and the log that the rig `movie` plays."""
+
+    path: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Lab:
+    """Section [lab]: the devices of the rig `lab`. Image size, depth, rate and exposure are in [camera]."""
+
+    camera: Annotated[str, CAMERAS] = "genicam"
+    device: str = ""  # of the camera: serial number, model, address or name; '': the only one there is
+    device_config: str = ""  # of the camera: configuration file, where the driver needs one
+    # upper left pixel of the image on the sensor; None: the image is in the middle of the sensor
+    offset_x_px: Annotated[int, Range(0, 65_535)] | None = None
+    offset_y_px: Annotated[int, Range(0, 65_535)] | None = None
+    pixel_format: str = ""  # '': Mono8, Mono10, ... by camera.bits
+    gain: Annotated[float, Range(-100.0, 1e4)] | None = None  # in the camera's unit; None: as the camera has it
+    trigger: str = ""  # '': the camera runs freely; 'software'; else the line that triggers it, such as 'Line1'
+    queue_frames: Annotated[int, Range(1, 1000)] = 8  # images that may wait for the loop; more are dropped and counted
+    # time without an image after which the coils are switched off and the camera is asked for again
+    camera_timeout_s: Annotated[float, Range(0.05, 60.0)] = 0.5
+    # time without an image after which the run ends
+    give_up_s: Annotated[float, Range(0.1, 1e5)] = 60.0
+    amplifier: Annotated[str, AMPLIFIERS] = "serial"
+    port: str = ""  # of the amplifier: '/dev/ttyACM0', 'COM3', 'Dev1'
