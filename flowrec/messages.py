@@ -334,6 +334,24 @@ class Clocks(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class CameraLosses(Message):
+    """Blocks (images) that a camera has counted so far, and what became of them. Diagnostic.
+
+    ids = frames + link + incomplete + driver + backlog.
+    """
+
+    stamp_ns: int
+    ids: int  # by the camera's own block ids, unwrapped
+    frames: int  # handed on to the loop
+    link: int  # gaps of the ids: lost in the camera or on the link
+    incomplete: int  # arrived with parts missing, or marked as bad by the camera
+    driver: int  # thrown away by the driver, whose buffers were full
+    backlog: int  # thrown away by the queue before the loop, because the loop was slower than the camera
+    triggers: int  # triggers that no block has answered; not among the ids
+    reconnections: int  # the camera was absent and came back; blocks of the time between are not known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Truth(Message):
     """Ground truth of a simulated rig. Recorded for evaluation; no stage reads it."""
 
@@ -387,6 +405,7 @@ class Tick:
     truth: Annotated[Truth | None, Topic("/truth/robot", Source.SIMULATOR)] = None
     true_field: Annotated[FlowField | None, Topic("/truth/flow", Source.SIMULATOR)] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
+    losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
 
     @property
     def field(self) -> FlowField | None:

@@ -24,7 +24,18 @@ from flowrec.enums import Action
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
-from flowrec.messages import Applied, FlowField, Frame, Observations, OperatorEvent, Route, Tick, Track, Truth
+from flowrec.messages import (
+    Applied,
+    CameraLosses,
+    FlowField,
+    Frame,
+    Observations,
+    OperatorEvent,
+    Route,
+    Tick,
+    Track,
+    Truth,
+)
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
@@ -47,12 +58,13 @@ class Inputs:
     true_field: FlowField | None = None  # likewise
     track: Track | None = None  # the recorded one, if `frame` was dropped
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
+    losses: CameraLosses | None = None  # of the camera so far, for the record only
 
 
 # Fields of a Tick that arrive from outside, and those of them that stay known until the next message.
 ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.TRUTH))
 HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
-if {each.name for each in fields(Inputs)} != {"stamp_ns", "track", "clock", *ARRIVING}:
+if {each.name for each in fields(Inputs)} != {"stamp_ns", "track", "clock", "losses", *ARRIVING}:
     raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
 
 

@@ -156,7 +156,9 @@ def run(
                 queue_mb=queue_mb,
                 dropped_frames=dropped,
             )
-            recorded = replace(tick, timing=timing, truth=inputs.truth, true_field=inputs.true_field)
+            recorded = replace(
+                tick, timing=timing, truth=inputs.truth, true_field=inputs.true_field, losses=inputs.losses
+            )
             if clocks is not None:
                 recorded = replace(recorded, clocks=clocks.update(tick.stamp_ns, inputs.clock))
             _write(sinks, recorded)

@@ -18,7 +18,7 @@ from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.config import load_config
 from flowrec.declarations import Role
-from flowrec.messages import Clocks, Drops, Health, Tick
+from flowrec.messages import CameraLosses, Clocks, Drops, Health, Tick
 from flowrec.session_writer import session_header
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
@@ -46,7 +46,8 @@ def every_topic() -> list[Tick]:
     health = Health(now, "", 2.0, 0.0, 1.0, 2.0, 0.1, 0.2, bank, bank, bank, np.zeros(2), 0.0)
     clocks = Clocks(now, 1, 2, 0.0, 0, 0, 3, 4, 5, 1.0, True, 0.0, 0.0, 0, 0, 0, 0, 0, 0.0)
     drops = Drops(now, "/camera/frame", 1, 0, 1)
-    return [replace(tick, health=health, clocks=clocks, drops=drops) for tick in ticks]
+    losses = CameraLosses(now, 12, 2, 1, 2, 3, 4, 5, 6)
+    return [replace(tick, health=health, clocks=clocks, drops=drops, losses=losses) for tick in ticks]
 
 
 @pytest.fixture(scope="module")

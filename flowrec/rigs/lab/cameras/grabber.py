@@ -1,0 +1,425 @@
+"""A camera in a thread of its own, behind a queue of a few frames: frames with an index and a stamp, losses by cause.
+
+The thread takes every image from the driver at once, so that the driver's buffers never overflow because a stage is
+slow. If the queue is full, its oldest frame is dropped: a control loop needs the newest one.
+
+Every block that the device counts is accounted for: those that were handed on and those lost, by cause, add up to the
+ids (`CameraLosses`). A camera that is unplugged, or stands still, is closed and opened again until it is back;
+meanwhile `absent` says why no frame comes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Self, TypeVar
+
+from flowrec.clocks import DeviceClock, Fit
+from flowrec.errors import RigError
+from flowrec.messages import CameraLosses
+from flowrec.rigs.lab.cameras.block_ids import BlockIds
+from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Image, Wanted
+from flowrec.system.processes import realtime_priority
+from flowrec.units import NS_PER_S, nanoseconds, seconds
+
+SOFTWARE = "software"  # value of Wanted.trigger
+_SLICE_S = 0.1  # longest wait in the driver, so that the thread ends promptly
+_SILENT_S = 0.7  # without a frame, at least, before a camera is taken for absent
+_SILENT_PERIODS = 3.0  # likewise, in periods of its frames
+_START_S = 3.0  # a camera may take so long until its first frame
+_ANSWER_S = 0.5  # time for an answer to alive()
+_OPEN_S = 20.0  # time for the first open()
+_CLOSE_S = 1.0  # time for close() of a camera that may hang
+_AGAIN_S = 0.05  # between two attempts to open an absent camera
+_REPORT_S = 1.0  # between two messages of losses that are the same
+_FROZEN = 2  # frames in a row with the same device time: the clock stands still, and is not used
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """One frame, as it leaves the queue.
+
+    Attributes
+    ----------
+    image, bits : (height, width), uint8 for 8 bits, else uint16 with values below 2**bits.
+    index : counts the blocks of the device from the first one on; what is missing was lost.
+    stamp_ns : middle of the exposure on the session clock: arrival by the fit of the device's clock, less half of the
+        exposure; strictly increasing. The time from the end of the exposure to the earliest arrival (readout and
+        transfer, which is constant) remains in it.
+    arrival_ns : on the session clock.
+    clock : the fit, with which the stamp was made; None: the device has no clock, or it stands still.
+    losses : up to this frame; the same object until something changes, or a second has passed.
+    """
+
+    image: Image
+    bits: int
+    index: int
+    stamp_ns: int
+    arrival_ns: int
+    clock: Fit | None
+    losses: CameraLosses
+
+
+@dataclass(frozen=True, slots=True)
+class _Counts:
+    """Blocks lost before a frame, by cause, as far as the thread knows them."""
+
+    link: int = 0
+    incomplete: int = 0
+    driver: int = 0
+    triggers: int = 0
+    reconnections: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A frame in the queue."""
+
+    image: Image
+    bits: int
+    index: int
+    stamp_ns: int
+    arrival_ns: int
+    clock: Fit | None
+    counts: _Counts
+
+
+class Grabber:
+    """Takes the frames of a camera; a context manager.
+
+    Entering it opens the camera (RigError in one line if that fails), leaving it ends the thread. `next` is for one
+    thread at a time.
+
+    While the camera is absent, or waits for a trigger, `next` returns None after its timeout. It is for the rig to
+    decide what a silence means: the loop's watchdog fails a run whose field is on and whose ticks stay away for
+    safety.guard_timeout_s, so a rig that is to go on when the camera is back takes the field away before.
+
+    Parameters
+    ----------
+    make : makes the camera, not yet open; again for each new connection, because a driver may hang in the old one.
+    wanted : as `make` uses it: exposure, rate and trigger.
+    length : frames in the queue.
+    epoch_ns : zero of the session clock on the host's monotonic clock.
+
+    Attributes
+    ----------
+    info : what the camera says of itself; valid once the context is entered.
+    absent : why no frame comes, for people; '' while the camera delivers, or waits for a trigger.
+    absent_since_ns : on the host's monotonic clock, when the last frame came; of use while `absent`.
+    frames : handed on.
+    backlog : dropped, because the queue was full.
+    """
+
+    def __init__(self, make: Callable[[], Camera], wanted: Wanted, length: int = 8, epoch_ns: int = 0) -> None:
+        self.absent = ""
+        self.absent_since_ns = 0
+        self.frames = self.backlog = 0
+        self._make = make
+        self._wanted = wanted
+        self._length = length
+        self._epoch_ns = epoch_ns
+        self._queue: deque[_Waiting] = deque()
+        self._filled = threading.Condition()
+        self._opened = threading.Event()
+        self._over = threading.Event()
+        self._failure: Exception | None = None
+        self._info: CameraInfo | None = None
+        self._last: CameraLosses | None = None
+        # Of the thread only.
+        self._ids = BlockIds()
+        self._stamper = _Stamper()
+        self._counts = _Counts()
+        self._attributed = 0  # blocks of the driver's own count that are in the counts already
+        self._thread = threading.Thread(target=self._work, name="camera", daemon=True)
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the camera says of itself."""
+        assert self._info is not None, "the context has been entered"
+        return self._info
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What people should know of the camera, a line each; more may come with the first frames."""
+        frozen = ("the camera's clock stands still: frames are stamped by their arrival",)
+        return self.info.notes + (frozen if self._stamper.frozen else ())
+
+    @property
+    def losses(self) -> CameraLosses | None:
+        """The latest message of the losses."""
+        return self._last
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        if not self._opened.wait(_OPEN_S):
+            self._over.set()
+            raise RigError(f"the camera does not answer for {_OPEN_S:g} s; switch it off and on, then try again")
+        if self._info is None and self._failure is not None:
+            raise self._failure
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the thread. If a call of the driver hangs, it is left behind after a second."""
+        self._over.set()
+        if self._thread.ident is not None:
+            self._thread.join(_CLOSE_S)
+
+    def next(self, timeout_s: float) -> Captured | None:
+        """The next frame; None if none comes in this time.
+
+        Raises
+        ------
+        RigError : the camera can not be used any more; an unplugged one is waited for instead.
+        """
+        with self._filled:
+            if not self._queue and self._failure is None:
+                self._filled.wait(timeout_s)
+            if not self._queue:
+                if self._failure is not None:
+                    raise self._failure
+                return None
+            frame = self._queue.popleft()
+            self.frames += 1
+            losses = self._losses(frame)
+        return Captured(frame.image, frame.bits, frame.index, frame.stamp_ns, frame.arrival_ns, frame.clock, losses)
+
+    def _losses(self, frame: _Waiting) -> CameraLosses:
+        """The message up to a frame. All that the queue has dropped lies before the frame, which was behind it."""
+        counts, last = frame.counts, self._last
+        by_cause = (counts.link, counts.incomplete, counts.driver, self.backlog, counts.triggers, counts.reconnections)
+        if (
+            last is not None
+            and frame.stamp_ns < last.stamp_ns + nanoseconds(_REPORT_S)
+            and by_cause == (last.link, last.incomplete, last.driver, last.backlog, last.triggers, last.reconnections)
+        ):
+            return last
+        self._last = CameraLosses(frame.stamp_ns, frame.index + 1, self.frames, *by_cause)
+        return self._last
+
+    # ---- the thread
+
+    def _work(self) -> None:
+        # Above the loop, which may be what uses all of the processor.
+        with realtime_priority(2):
+            camera = self._make()
+            try:
+                self._connected(camera.open())
+            except Exception as error:  # noqa: BLE001  raised in the thread that waits for the camera
+                self._failure = error
+                self._opened.set()
+                return
+            self._opened.set()
+            try:
+                while True:
+                    self.absent = self._acquire(camera)
+                    if self._over.is_set():
+                        break
+                    _within(_CLOSE_S, camera.close)
+                    camera = self._found_again()
+                camera.close()
+            except Exception as error:  # noqa: BLE001  raised by `next`
+                with self._filled:
+                    self._failure = error
+                    self._filled.notify_all()
+                _within(_CLOSE_S, camera.close)
+
+    def _connected(self, info: CameraInfo) -> None:
+        self._info = info
+        rate_hz = info.rate_hz or self._wanted.rate_hz
+        self._ids.connected(info.id_bits, rate_hz)
+        self._stamper.connected(info, self._wanted.exposure_s)
+        self._attributed = 0
+        self._silent_s = max(_SILENT_S, _SILENT_PERIODS / rate_hz) + (info.exposure_s or self._wanted.exposure_s)
+
+    def _acquire(self, camera: Camera) -> str:
+        """Take images until the camera is gone, and say why it is; '' at the end."""
+        silent_s = max(_START_S, self._silent_s)  # before the first frame
+        heard_s = time.monotonic()
+        pace = _Pace(self._wanted, self._silent_s)
+        while not self._over.is_set():
+            try:
+                missed = pace.trigger(camera)
+                grabbed = camera.grab(pace.wait_s())
+            except RigError as error:
+                self.absent_since_ns = round(heard_s * NS_PER_S)
+                return str(error)
+            if missed:
+                self._counts = replace(self._counts, triggers=self._counts.triggers + 1)
+            now_s = time.monotonic()
+            if grabbed is not None:
+                self.absent = ""
+                pace.answered()
+                self._take(camera, grabbed)
+                heard_s, silent_s = now_s, self._silent_s
+            elif now_s - heard_s > silent_s:
+                self.absent_since_ns = round(heard_s * NS_PER_S)
+                # With a trigger, silence is usual; without one, the connection is made anew even if the device answers.
+                if not self._wanted.trigger or not _within(_ANSWER_S, camera.alive):
+                    return f"the camera has delivered no frame for {now_s - heard_s:.1f} s"
+                heard_s = now_s
+        return ""
+
+    def _take(self, camera: Camera, grabbed: Grabbed) -> None:
+        """Count a block, and queue it if it is whole."""
+        step = self._ids.step(grabbed.block_id, grabbed.arrival_ns)
+        counts = self._counts
+        if step <= 0:  # the same block again, or one that was counted as missing
+            if step and grabbed.incomplete and counts.link:
+                self._counts = replace(counts, link=counts.link - 1, incomplete=counts.incomplete + 1)
+            return
+        gap, discarded = step - 1, 0
+        if gap or grabbed.block_id is None:
+            # The driver's count runs ahead of the ids, by the frames that wait in its buffers.
+            discarded = max(camera.discarded() - self._attributed, 0)
+            if grabbed.block_id is None:
+                gap = discarded
+                self._ids.index += gap
+            discarded = min(discarded, gap)
+            self._attributed += discarded
+        link, incomplete = counts.link + gap - discarded, counts.incomplete + grabbed.incomplete
+        counts = replace(counts, link=link, incomplete=incomplete, driver=counts.driver + discarded)
+        self._counts = counts
+        if grabbed.incomplete or grabbed.image is None:
+            return
+        stamp_ns, fit, before_ns = self._stamper.take(grabbed.device_ticks, grabbed.arrival_ns - self._epoch_ns)
+        if fit is not None and before_ns is not None and self._wanted.trigger not in ("", SOFTWARE):
+            due = round(seconds(stamp_ns - before_ns) * self._wanted.rate_hz)
+            if due > step:
+                self._counts = counts = replace(counts, triggers=counts.triggers + due - step)
+        arrival_ns = grabbed.arrival_ns - self._epoch_ns
+        frame = _Waiting(grabbed.image, grabbed.bits, self._ids.index, stamp_ns, arrival_ns, fit, counts)
+        with self._filled:
+            if len(self._queue) == self._length:
+                self._queue.popleft()
+                self.backlog += 1
+            self._queue.append(frame)
+            self._filled.notify()
+
+    def _found_again(self) -> Camera:
+        """Open the camera again and again until it is back, the same as before, or the thread is to end."""
+        known = self.info
+        while True:
+            camera = self._make()
+            if self._over.is_set():
+                return camera
+            try:
+                info = camera.open()
+            except RigError:
+                info = None  # still absent; `absent` says since when, and this says nothing else
+            if info is not None and _same(known, info):
+                self._connected(info)
+                self._counts = replace(self._counts, reconnections=self._counts.reconnections + 1)
+                return camera
+            if info is not None:
+                self.absent = (
+                    f"another camera has answered ({info.model} {info.serial}, {info.width_px} x {info.height_px} "
+                    f"pixels of {info.bits} bits); connect {known.model} {known.serial} again"
+                )
+            _within(_CLOSE_S, camera.close)
+            self._over.wait(_AGAIN_S)
+
+
+class _Pace:
+    """How long to wait in the driver, and when to trigger it by software: a frame at a time, at the rate wanted."""
+
+    def __init__(self, wanted: Wanted, patience_s: float) -> None:
+        self._software = wanted.trigger == SOFTWARE
+        self._period_s = 1.0 / wanted.rate_hz
+        self._patience_s = patience_s
+        self._due_s = time.monotonic()
+        self._sent_s: float | None = None
+
+    def trigger(self, camera: Camera) -> bool:
+        """Trigger if it is time to; whether the trigger before was missed.
+
+        Raises
+        ------
+        RigError : of the driver.
+        """
+        if not self._software:
+            return False
+        now_s = time.monotonic()
+        missed = self._sent_s is not None and now_s > self._sent_s + self._patience_s
+        if missed:
+            self._sent_s = None
+        if self._sent_s is None and now_s >= self._due_s:
+            self._sent_s = now_s
+            self._due_s = max(self._due_s + self._period_s, now_s)
+            camera.trigger()
+        return missed
+
+    def answered(self) -> None:
+        """A frame has come."""
+        self._sent_s = None
+
+    def wait_s(self) -> float:
+        """How long to wait for a frame at most."""
+        if not self._software or self._sent_s is not None:
+            return _SLICE_S
+        return min(max(self._due_s - time.monotonic(), 1e-3), _SLICE_S)
+
+
+class _Stamper:
+    """Stamps by the device's clock, or by the arrival where it has none."""
+
+    def __init__(self) -> None:
+        self.frozen = False  # the clock stands still
+        self._fit: Fit | None = None
+        self._stood = 0
+        self._last_ns: int | None = None
+        self._clock = DeviceClock()
+        self._half_ns = 0
+
+    def connected(self, info: CameraInfo, exposure_s: float) -> None:
+        """Begin with a connection."""
+        if info.ticks_per_s:
+            self._clock = DeviceClock(unit=NS_PER_S / info.ticks_per_s)
+        self._half_ns = nanoseconds(0.5 * (info.exposure_s or exposure_s))
+        self._stood = 0
+        self.frozen = False
+
+    def take(self, ticks: int | None, arrival_ns: int) -> tuple[int, Fit | None, int | None]:
+        """The stamp of a frame, the fit that made it, and the stamp before."""
+        before_ns, fit = self._last_ns, None
+        stamp_ns = arrival_ns - self._half_ns
+        if ticks is not None and not self.frozen:
+            self._fit = self._clock.take(self._fit, ticks, arrival_ns)
+            self._stood = self._stood + 1 if self._fit.flag == "duplicate" else 0
+            self.frozen = self._stood == _FROZEN
+            if self._fit.good:
+                fit = self._fit
+                stamp_ns = fit.stamp_ns - self._half_ns
+        if before_ns is not None:
+            stamp_ns = max(stamp_ns, before_ns + 1)
+        self._last_ns = stamp_ns
+        return stamp_ns, fit, before_ns
+
+
+def _same(known: CameraInfo, info: CameraInfo) -> bool:
+    return (known.model, known.serial, known.width_px, known.height_px, known.bits) == (
+        info.model,
+        info.serial,
+        info.width_px,
+        info.height_px,
+        info.bits,
+    )
+
+
+def _within(time_s: float, call: Callable[[], _T]) -> _T | None:
+    """The result of a call that may hang, in a thread that is left behind then; None if it takes longer."""
+    results: list[_T] = []
+    thread = threading.Thread(target=lambda: results.append(call()), name="camera call", daemon=True)
+    thread.start()
+    thread.join(time_s)
+    return results[0] if results else None

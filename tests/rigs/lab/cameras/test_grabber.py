@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.errors import RigError
+from flowrec.messages import CameraLosses
+from flowrec.rigs.lab.cameras.camera import Wanted
+from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
+from tests.rigs.lab.cameras.scripted import GONE, INFO, WANTED, Scripted, Step, block
+
+
+@contextmanager
+def grabbing(*cameras: Scripted, wanted: Wanted = WANTED, length: int = 1000) -> Iterator[Grabber]:
+    """A grabber of cameras that come one after the other, as their connections fail."""
+    left = iter(cameras)
+    with Grabber(lambda: next(left), wanted, length) as grabber:
+        yield grabber
+
+
+def captured(grabber: Grabber) -> list[Captured]:
+    """All frames that come until a tenth of a second passes without one."""
+    return list(iter(lambda: grabber.next(0.1), None))
+
+
+def whole(losses: CameraLosses | None) -> bool:
+    assert losses is not None
+    lost = losses.link + losses.incomplete + losses.driver + losses.backlog
+    return losses.frames + lost == losses.ids
+
+
+def test_frames_and_losses_by_cause_add_up_to_the_ids() -> None:
+    steps: list[Step] = [block(n) for n in (65_530, 65_531, 65_533, 65_534)]
+    steps += [block(65_535, whole=False), block(1), block(5), block(3, whole=False), block(6)]
+    with grabbing(Scripted.delivering(steps)) as grabber:
+        frames = captured(grabber)
+    last = frames[-1].losses
+    assert [frame.index for frame in frames] == [0, 1, 3, 4, 6, 10, 11]
+    assert (last.ids, last.frames, last.link, last.incomplete) == (12, 7, 3, 2)
+    assert all(whole(frame.losses) for frame in frames)
+    assert [int(frame.image[0, 0]) for frame in frames] == [n % 251 for n in (65_530, 65_531, 65_533, 65_534, 1, 5, 6)]
+
+
+def test_an_incomplete_image_is_never_handed_on_and_is_counted() -> None:
+    with grabbing(Scripted.delivering([block(1, whole=False), block(2), block(3, whole=False), block(4)])) as grabber:
+        frames = captured(grabber)
+    assert [frame.index for frame in frames] == [1, 3]
+    assert frames[-1].losses.incomplete == 2 and whole(frames[-1].losses)
+
+
+def test_what_a_full_queue_drops_is_the_oldest_and_counted_as_backlog() -> None:
+    camera = Scripted.delivering([block(n) for n in range(1, 21)])
+    with grabbing(camera, length=4) as grabber:
+        assert camera.exhausted.wait(5.0)
+        frames = captured(grabber)
+    assert [frame.index for frame in frames] == [16, 17, 18, 19]
+    assert frames[-1].losses.backlog == 16 and all(whole(frame.losses) for frame in frames)
+
+
+def test_what_the_driver_threw_away_is_told_from_what_the_link_lost() -> None:
+    camera = Scripted()
+    # The driver's buffers hold blocks 2 and 3 when 4 to 6 find no room; 9 is lost on the link.
+    camera.steps.extend([block(1), lambda: setattr(camera, "lost", 3), *map(block, (2, 3, 7, 8, 10))])
+    with grabbing(camera) as grabber:
+        last = captured(grabber)[-1].losses
+    assert (last.driver, last.link) == (3, 1) and whole(last)
+
+
+def test_a_camera_without_ids_is_counted_by_its_driver() -> None:
+    camera = Scripted(info=replace(INFO, id_bits=0))
+    camera.steps.extend([block(None), lambda: setattr(camera, "lost", 2), block(None), block(None)])
+    with grabbing(camera) as grabber:
+        frames = captured(grabber)
+    assert [frame.index for frame in frames] == [0, 3, 4]
+    assert frames[-1].losses.driver == 2 and whole(frames[-1].losses)
+
+
+@pytest.mark.parametrize("end", [[GONE], []], ids=["the driver says so", "silence"])
+def test_a_camera_that_is_gone_is_opened_again_until_it_is_back(end: list[Step]) -> None:
+    first = Scripted.delivering([block(7), block(8), *end])
+    away = [Scripted(info=RigError("no camera found")) for _ in range(3)]
+    back = Scripted.delivering([block(1), block(3)])
+    with grabbing(first, *away, back) as grabber:
+        assert [grabber.next(1.0), grabber.next(1.0)].count(None) == 0
+        absent_s = time.monotonic()
+        while not grabber.absent and time.monotonic() < absent_s + 5.0:
+            time.sleep(0.001)
+        assert grabber.absent and first.closed.wait(1.0)
+        third, fourth = grabber.next(5.0), grabber.next(5.0)
+        assert third is not None and fourth is not None and grabber.absent == ""
+    assert (third.index, fourth.index) == (2, 4)
+    assert fourth.losses.reconnections == 1 and fourth.losses.link == 1 and whole(fourth.losses)
+    assert [camera.opened for camera in away] == [1, 1, 1]
+
+
+def test_another_camera_in_the_place_of_the_one_that_is_gone_is_not_used() -> None:
+    other = Scripted.delivering([block(1)], info=replace(INFO, serial="2"))
+    back = Scripted.delivering([block(1)])
+    with grabbing(Scripted.delivering([block(7), GONE]), other, back) as grabber:
+        frames = [grabber.next(2.0), grabber.next(2.0)]
+    assert None not in frames and len(other.steps) == 1 and other.closed.is_set()
+
+
+def test_with_a_trigger_silence_is_no_fault_while_the_camera_answers() -> None:
+    camera = Scripted.delivering([block(1)], info=replace(INFO, exposure_s=0.0))
+    with grabbing(camera, wanted=replace(WANTED, trigger="Line1")) as grabber:
+        assert grabber.next(1.0) is not None
+        time.sleep(1.0)
+        assert grabber.absent == "" and not camera.closed.is_set()
+        camera.answers = False
+        assert camera.closed.wait(3.0) and grabber.absent
+
+
+def test_triggers_that_no_block_has_answered_are_counted_by_the_clock_of_the_camera() -> None:
+    period = 10_000_000
+    times = [0, 1, 2, 5, 6, 8, 9]  # in periods: triggers 3, 4 and 7 are missed; block 5 is lost on the link
+    blocks = [block(n, ticks=1_000 + at * period) for n, at in zip((1, 2, 3, 4, 6, 7, 8), times, strict=True)]
+    arrived = [replace(one, arrival_ns=10**9 + at * period) for one, at in zip(blocks, times, strict=True)]
+    camera = Scripted.delivering(arrived, info=replace(INFO, ticks_per_s=1e9))
+    with grabbing(camera, wanted=replace(WANTED, trigger="Line1")) as grabber:
+        last = captured(grabber)[-1].losses
+    assert (last.triggers, last.link) == (3, 1) and whole(last)
+
+
+def test_a_software_trigger_is_sent_at_the_rate_and_a_missed_one_is_counted() -> None:
+    camera = Scripted(info=replace(INFO, id_bits=64))
+
+    def answer(timeout_s: float) -> object:
+        time.sleep(min(timeout_s, 0.002))
+        if camera.triggered > len(seen) and camera.triggered != 4:
+            seen.append(camera.triggered)
+            return block(camera.triggered if camera.triggered < 4 else camera.triggered - 1)
+        return None
+
+    seen: list[int] = []
+    camera.grab = answer  # type: ignore[method-assign, assignment]
+    with grabbing(camera, wanted=replace(WANTED, trigger="software")) as grabber:
+        assert all(grabber.next(0.5) is not None for _ in range(3))
+        assert grabber.next(3.0) is not None
+        assert grabber.next(3.0) is not None and grabber.losses is not None
+        assert grabber.losses.triggers == 1 and whole(grabber.losses)
+
+
+@pytest.mark.parametrize("ticks", [None, 0], ids=["none", "always 0"])
+def test_without_a_clock_stamps_are_arrivals_less_half_of_the_exposure(ticks: int | None) -> None:
+    blocks = [replace(block(n, ticks=ticks), arrival_ns=n * 10_000_000) for n in range(1, 8)]
+    info = replace(INFO, ticks_per_s=0.0 if ticks is None else 1e9, exposure_s=0.004)
+    with grabbing(Scripted.delivering(blocks, info=info)) as grabber:
+        frames = captured(grabber)
+        notes = grabber.notes
+    assert [frame.stamp_ns for frame in frames] == [n * 10_000_000 - 2_000_000 for n in range(1, 8)]
+    assert [frame.clock for frame in frames[1:]] == [None] * 6
+    assert ("stands still" in " ".join(notes)) == (ticks == 0)
+
+
+def test_stamps_follow_the_clock_of_the_camera_whatever_its_unit_and_survive_a_restart_of_it() -> None:
+    rng = np.random.default_rng(3)
+
+    def blocks(first_ns: int, started: int) -> Iterable[Step]:
+        for n in range(600):
+            at_ns = first_ns + n * 10_000_000
+            late_ns = int(rng.exponential(3e6))
+            # The device is said to count in ns, and counts in units of 8 ns.
+            yield replace(block(n + 1, ticks=started + n * 1_250_000), arrival_ns=at_ns + late_ns)
+
+    info = replace(INFO, ticks_per_s=1e9)
+    first = Scripted.delivering([*blocks(10**9, 77_000_000_000), GONE], info=info)
+    back = Scripted.delivering(blocks(9 * 10**9, 5), info=info)
+    with grabbing(first, back, length=2000) as grabber:
+        frames = captured(grabber)
+    stamps = np.array([frame.stamp_ns for frame in frames])
+    assert len(frames) == 1200 and (np.diff(stamps) > 0).all()
+    for settled in (slice(350, 600), slice(950, 1200)):
+        assert np.abs(np.diff(stamps[settled]) - 10_000_000).max() < 200_000  # arrivals scatter by 3 ms
+    clock = frames[-1].clock
+    assert clock is not None and clock.unit == pytest.approx(8.0, rel=0.01) and clock.resets == 1
+
+
+def test_the_end_is_prompt_even_if_a_call_of_the_driver_hangs() -> None:
+    hangs = threading.Event()
+
+    def hang() -> None:
+        hangs.set()
+        released.wait(20.0)
+
+    released = threading.Event()
+    before_s = time.monotonic()
+    with grabbing(Scripted.delivering([block(1), hang])) as grabber:
+        assert grabber.next(1.0) is not None and hangs.wait(1.0)
+    assert time.monotonic() - before_s < 10.0  # a hang of 20 s is not waited for
+    released.set()
+
+
+def test_an_error_when_it_is_opened_is_that_of_the_driver() -> None:
+    with pytest.raises(RigError, match="no camera found"):
+        grabbing(Scripted(info=RigError("no camera found"))).__enter__()
+
+
+def test_a_defect_of_a_driver_reaches_the_loop() -> None:
+    with grabbing(Scripted.delivering([block(1), ValueError("defect")])) as grabber:
+        assert grabber.next(1.0) is not None
+        with pytest.raises(ValueError, match="defect"):
+            grabber.next(1.0)
