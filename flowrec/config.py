@@ -305,6 +305,11 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
             "all of a run; set one of them to 0"
         )
+    if config.mission.observes and len(config.mission.phases) > 1:
+        raise UsageError(
+            f"{origin('mission.phases')}: mission.phases = {', '.join(config.mission.phases)}: observe drives no robot "
+            "and ends with a refinement of its own; set mission.phases = 'observe', or leave it out"
+        )
     if recording.frames == "jpeg" and config.camera.bits > 8:
         raise UsageError(
             f"{origin('recording.frames')}: recording.frames = 'jpeg' holds 8 bit, camera.bits = {config.camera.bits}; "

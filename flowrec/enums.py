@@ -15,6 +15,7 @@ class Phase(StrEnum):
     REFINE = "refine"
     PLAN = "plan"
     NAVIGATE = "navigate"
+    OBSERVE = "observe"  # the robot is only watched, from the first frame to the last
     DONE = "done"
 
 
@@ -34,6 +35,7 @@ class Outcome(StrEnum):
     SURVEY_COMPLETE = "survey complete"
     REFINE_COMPLETE = "refine complete"
     PLAN_COMPLETE = "plan complete"
+    OBSERVE_COMPLETE = "observe complete"
     STOPPED = "stopped"  # by a person, a signal or the disk monitor
     TIME_OVER = "time over"  # the time that the run was given
     TIMEOUT = "timeout"  # the time limit of a phase
@@ -57,6 +59,7 @@ class Outcome(StrEnum):
             Outcome.SURVEY_COMPLETE,
             Outcome.REFINE_COMPLETE,
             Outcome.PLAN_COMPLETE,
+            Outcome.OBSERVE_COMPLETE,
         )
 
 
@@ -69,7 +72,7 @@ class Level(StrEnum):
 
 
 class Action(StrEnum):
-    """What a person did."""
+    """What a person did, or the end of the rig's frames."""
 
     STOP = "stop"
     MARK = "mark"
@@ -77,6 +80,7 @@ class Action(StrEnum):
     PAUSE = "pause"
     RESUME = "resume"
     ZERO = "zero"
+    END = "end"  # of the observation: its refinement is due
 
 
 class Alarm(StrEnum):

@@ -229,8 +229,8 @@ class Mission(Message):
     request: int  # number of the latest work order
     wanted: str  # enums.WorkOrder; '' when nothing is pending
     requested_ns: int  # when it was ordered
-    start_um: Vector2  # where the ordered route begins
-    goal_um: Vector2
+    start_um: Annotated[Vector, Shape(2, finite=False)]  # where the ordered route begins; NaN without a route
+    goal_um: Annotated[Vector, Shape(2, finite=False)]  # NaN without a goal
     finished: bool
     outcome: str  # enums.Outcome; '' while the mission runs
     note: str
@@ -240,6 +240,7 @@ class Mission(Message):
     blind_since_ns: int | None = None  # stamp at which the robot was held because it was not seen; None: it is seen
     blind: str = ""  # why it is not seen, human-readable
     field_off: bool = False  # not seen for so long that the field must be off
+    input_ended: bool = False  # no more frames come; in the phase observe only
 
 
 @dataclass(frozen=True, slots=True, eq=False)

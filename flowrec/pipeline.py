@@ -168,7 +168,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     # Sessions recorded before step-out was monitored replay without it.
     looked = inputs.applied if inputs.applied.image_since_ns is not None else None
     wall_um = _wall_um(p, estimate.position_um)
-    health = p.health.watch(last.health, last.estimate, estimate, flow, p.robot, looked, wall_um)
+    health = last.health
+    if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
+        health = p.health.watch(health, last.estimate, estimate, flow, p.robot, looked, wall_um)
     robot = robot.limited_to(health.limit_hz)
     observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
     lap("observe")

@@ -22,11 +22,12 @@ from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
 from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
-from flowrec.rig_settings import SIMULATED, Camera
+from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera, Simulated
 from flowrec.robot import USUAL_DELAY_S, Robot
 
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _MAY_BE_NONE = ("camera.centre_um",)  # None is a value
+_ONLY_FOR_DRIVING = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s")
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
@@ -38,8 +39,8 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
 
     A robot that is not described fits the chip: radius 50 um, or a fifth of the median channel width if that is
     narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; a delay of 40 ms,
-    or the time through a fifth of a channel at v_max if that is shorter. This holds for the simulated rig only;
-    `derived` lists the numbers.
+    or the time through a fifth of a channel at v_max if that is shorter. On another rig these numbers have to be given,
+    but for those that only matter for driving the robot where it is only observed. `derived` lists the numbers.
 
     Raises
     ------
@@ -47,19 +48,24 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     UnreachableError : start and goal lie in channels that do not meet.
     """
     check_config(config)
+    _refuse_simulated(config)
     _refuse_unmeasured(config)
     robot, camera = _fitted(config, chip)
     swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
     plan = replace(config.plan, swift=_timed(config.plan.swift, swift))
     survey = replace(config.survey, swift=_timed(config.survey.swift, swift))
     course_error = plan.swift.course_error(robot, robot.speed_limit_um_s)
-    mission = _narrowed(
-        PlacedMission,
-        config.mission,
-        start=_start(config.mission.start, chip, robot, course_error, config.flow, config.coils),
-        goal=_point(chip, config.mission.goal, "goal", robot),
-    )
-    _refuse_apart(chip, mission)
+    if config.mission.observes and config.rig != SIMULATED:  # which needs to know where the robot starts
+        nowhere = 0.5 * chip.size_um[0], 0.5 * chip.size_um[1]
+        mission = _narrowed(PlacedMission, config.mission, start=nowhere, goal=nowhere)
+    else:
+        mission = _narrowed(
+            PlacedMission,
+            config.mission,
+            start=_start(config.mission.start, chip, robot, course_error, config.flow, config.coils),
+            goal=_point(chip, config.mission.goal, "goal", robot),
+        )
+        _refuse_apart(chip, mission)
     return _narrowed(ResolvedConfig, config, robot=robot, camera=camera, plan=plan, survey=survey, mission=mission)
 
 
@@ -84,11 +90,26 @@ def _narrowed(kind: type[_Section], settings: Any, **changed: Any) -> _Section:
 def _refuse_unmeasured(config: Config) -> None:
     """Only a simulated robot and camera can be made to fit the chip."""
     given = _flat({"robot": asdict(config.robot), "camera": asdict(config.camera)}, "")
-    missing = [key for key, value in given.items() if value is None and key not in _MAY_BE_NONE]
+    needless = (*_MAY_BE_NONE, *(_ONLY_FOR_DRIVING if config.mission.observes else ()))
+    missing = [key for key, value in given.items() if value is None and key not in needless]
     if config.rig != SIMULATED and missing:
         raise UsageError(
             f"rig = {config.rig!r}: {', '.join(missing)} not given; measure them and set each: only the robot and the "
             "camera of the simulated rig are made to fit the chip"
+        )
+
+
+def _refuse_simulated(config: Config) -> None:
+    """A setting of the simulated rig has no effect on another one, which whoever sets it should know."""
+    if config.rig == SIMULATED:
+        return
+    keys = [f"simulated.{each.name}" for each in fields(Simulated)] + [f"camera.{name}" for name in OF_SIMULATED_CAMERA]
+    given, usual = _flat(asdict(config), ""), _flat(asdict(Config()), "")
+    changed = [key for key in keys if given[key] != usual[key]]
+    if changed:
+        raise UsageError(
+            f"rig = {config.rig!r}: {', '.join(changed)} is of the simulated rig only and has no effect here; leave it "
+            "out"
         )
 
 

@@ -52,7 +52,7 @@ class CameraSettings:
     mirror: bool = False  # the image shows the chip as in a mirror
     centre_um: PointUm | None = None  # chip point at the centre of the image; None: the centre of the chip
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004
-    # The following settings belong to the simulated camera only.
+    # The following settings, OF_SIMULATED_CAMERA, are those of the simulated rig only.
     blur_px: Annotated[float, Range(0.0, 100.0)] = 0.8  # optical blur, one sigma
     background: Annotated[float, Range(1.0, 255.0)] = 172.0  # grey level of the open channel in the middle of the image
     illumination: Share = 0.18  # relative loss of light in the corners
@@ -60,6 +60,9 @@ class CameraSettings:
     photons_per_level: Annotated[float, Range(1e-3, 1e9)] = 40.0
     read_noise: Annotated[float, Range(0.0, 255.0)] = 0.8  # grey levels, one sigma
     debris: Annotated[int, Range(0, 10_000)] = 24  # particles that drift with the flow; a sixth as many more lie still
+
+
+OF_SIMULATED_CAMERA = ("blur_px", "background", "illumination", "photons_per_level", "read_noise", "debris")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

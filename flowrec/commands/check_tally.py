@@ -10,7 +10,8 @@ from collections import Counter
 
 from flowrec.commands.verdict import Gap
 from flowrec.declarations import Message, invalid_numbers
-from flowrec.messages import Clocks, Frame, Timing
+from flowrec.enums import Action
+from flowrec.messages import Applied, Clocks, Frame, OperatorEvent, Timing
 from flowrec.store.audit import Audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -20,7 +21,8 @@ LISTED = 100  # longest gaps, and settings of the wall clock, that are kept in m
 _PENDING = 100_000  # incomplete ticks in memory; in files of flowrec these are half a second of ticks
 _STEP_NS = 10_000  # resolution of the histogram of intervals
 _INTERVALS = 100_000  # bins of that histogram
-_FRAME, _APPLIED, _TRACK = 1, 2, 4
+_FRAME, _APPLIED, _TRACK, _REPEATS = 1, 2, 4, 8
+_WHOLE = _FRAME | _APPLIED | _TRACK
 _BITS = {"frame": _FRAME, "applied": _APPLIED, "track": _TRACK}
 
 
@@ -57,7 +59,7 @@ class Tally:
     Attributes
     ----------
     ticks : ticks with a report of the coils or a track.
-    images_missing : ticks without an image.
+    images_missing : ticks without an image, other than those that repeat the one before.
     images_alone : ticks with nothing but an image.
     inputs_missing : ticks that can not be replayed: no report of the coils, or neither image nor track.
     unfinished_ticks : ticks with inputs that no stage has answered.
@@ -82,6 +84,7 @@ class Tally:
         self._last_index: int | None = None
         self._pending: dict[int, int] = {}  # by time of the tick, which of _BITS have been seen
         self._keyframe_ns: int | None = None
+        self._ended = False  # the rig delivers no more frames
 
     def begin(self, found: Audit) -> None:
         """Take the header, before the first message."""
@@ -97,8 +100,11 @@ class Tally:
             self.repeated[name] += 1
             self.repeated_ns[name] = stamp_ns
         elif name in _BITS:
-            self._add_to_tick(log_ns, _BITS[name])
-        if name == "applied":
+            repeats = isinstance(message, Applied) and message.repeats_image
+            self._add_to_tick(log_ns, _BITS[name] | (_REPEATS if repeats else 0))
+        if isinstance(message, OperatorEvent):
+            self._ended = message.action == Action.END
+        if name == "applied" and not self._ended:
             self._add_interval(log_ns)
         if isinstance(message, Frame):
             step = message.index - self._last_index - 1 if self._last_index is not None else 0
@@ -146,7 +152,7 @@ class Tally:
 
     def _add_to_tick(self, log_ns: int, bit: int) -> None:
         bits = self._pending.pop(log_ns, 0) | bit
-        if bits == _FRAME | _APPLIED | _TRACK:
+        if bits & _WHOLE == _WHOLE:
             self._count(bits)
             return
         self._pending[log_ns] = bits
@@ -158,6 +164,6 @@ class Tally:
             self.images_alone += 1
             return
         self.ticks += 1
-        self.unfinished_ticks += bits == _FRAME | _APPLIED
+        self.unfinished_ticks += bits & _WHOLE == _FRAME | _APPLIED
         self.images_missing += bits == _APPLIED | _TRACK
-        self.inputs_missing += not bits & _APPLIED or bits == _APPLIED
+        self.inputs_missing += not bits & _APPLIED or bits & _WHOLE == _APPLIED

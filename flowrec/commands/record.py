@@ -87,7 +87,7 @@ def prepare(asked: Config) -> Prepared:
     config = resolve(asked, chip)
     made = derived(asked, config)
     if made:
-        say(f"derived for the simulated rig: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
+        say(f"derived to fit the chip: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
     refuse_adrift(config, chip)
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:
@@ -112,13 +112,15 @@ def prepare(asked: Config) -> Prepared:
 
 
 def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
-    """Check before the run that the assumed flow lets the robot reach the goal.
+    """Check before the run that the assumed flow lets the robot reach the goal; a robot that is observed has none.
 
     Raises
     ------
     UnreachableError : the flow at the start is too fast to hold the robot there; the flow carries it out of an outlet
         before the ramp of the coils is complete; every route to the goal is too narrow, or too fast to be steered on.
     """
+    if config.mission.observes:
+        return
     robot, field = config.robot, config.flow.solve(chip)
     start = np.asarray(config.mission.start, np.float64)
     course_error = config.plan.swift.course_error(robot, robot.speed_limit_um_s)
@@ -250,6 +252,7 @@ def record(
                 queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
                 clocks=clocks,
                 watchdog=watchdog,
+                paced=realtime,
             )
         facts = figures_of(chip, report, statistics.true_field)
         if not resolved.control.needs:  # a control law that descends the time to go has no reference

@@ -84,7 +84,7 @@ class Change:
         flags = {key: flag for key, (flag, value) in given.items() if value is not None}
         changed = with_sets(config, [*sets, *self.sets], flags)
         mission = replace(changed.mission, replan_error_um=math.inf)
-        if self.refine is not None and Phase.REFINE not in mission.phases:
+        if self.refine is not None and not {Phase.REFINE, Phase.OBSERVE} & set(mission.phases):
             phases = tuple(dict.fromkeys((*mission.phases, Phase.REFINE, Phase.PLAN)))
             mission = replace(mission, phases=phases)
         return replace(changed, mission=mission)
@@ -309,7 +309,7 @@ def _closing_work(
         return work(pipeline, replace(tick, mission=ordered))
 
     phases = config.mission.phases
-    if "refined" in stale and Phase.REFINE in phases and last.refined is None:
+    if "refined" in stale and {Phase.REFINE, Phase.OBSERVE} & set(phases) and last.refined is None:
         tick = replace(tick, refined=result_of(WorkOrder.REFINE))
     navigated = mission.phase in (Phase.NAVIGATE, Phase.DONE)
     planned = last.route is not None and last.route is not recorded.route and navigated

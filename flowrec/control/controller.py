@@ -183,9 +183,12 @@ def _law(settings: Controller) -> TrackingLaw:
 def _hold_position(now: Situation) -> Vector:
     """Position to hold: the predicted one when the phase or the hold began, or when the robot was found again.
 
-    NaN before the robot is seen for the first time, and when it has not been seen for so long that the demand is zero.
+    NaN before the robot is seen for the first time, when it has not been seen for so long that the demand is zero, and
+    where it is only observed.
     """
     previous, mission = now.previous, now.mission
+    if mission.phase == Phase.OBSERVE:
+        return np.full(2, np.nan)
     if previous is None or not np.isfinite(previous.reference_um).all():
         return now.predicted_um if now.estimate.seen else np.full(2, np.nan)
     if mission.finished:

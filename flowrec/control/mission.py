@@ -17,8 +17,8 @@ from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
-PhaseName = Literal[Phase.SURVEY, Phase.REFINE, Phase.PLAN, Phase.NAVIGATE]
-PHASES: tuple[PhaseName, ...] = get_args(PhaseName)
+PhaseName = Literal[Phase.SURVEY, Phase.REFINE, Phase.PLAN, Phase.NAVIGATE, Phase.OBSERVE]
+PHASES: tuple[PhaseName, ...] = get_args(PhaseName)[:4]  # of a robot that is driven, in order
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Point = tuple[Coordinate, Coordinate]
 Place = Point | str
@@ -65,8 +65,10 @@ class _Frame:
 class MissionStateMachine:
     """Phases of the mission and the limits that end it.
 
-    `phases` is any selection of survey, refine, plan, navigate; navigate always plans first. `start` and `goal` are
-    points (x, y) in um on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
+    `phases` is any selection of survey, refine, plan, navigate; navigate always plans first. Or it is `observe` alone:
+    the robot is watched and never driven, whether it is in sight or not, until the frames end or a person ends it; then
+    the flow is refined with all observations. `start` and `goal`, which `observe` does not use, are points (x, y) in um
+    on the chip, or `inlet`, `outlet` (the widest), `inlet:1` (counted along the border).
     """
 
     phases: tuple[PhaseName, ...] = PHASES
@@ -109,6 +111,8 @@ class MissionStateMachine:
         does not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
         """
         now = _Frame(track, estimate, assumed, refined, route, operator, demand, robot, applied)
+        if self.observes:
+            return self._observe(previous if previous is not None else self._first(now), now)
         if previous is None:
             return self._after_command(self._first(now), now)
         if previous.finished:
@@ -129,21 +133,48 @@ class MissionStateMachine:
         result = now.result(previous)
         return previous if previous.wanted and result is None else self._advance(previous, now, result)
 
+    @property
+    def observes(self) -> bool:
+        """Whether the robot is only watched."""
+        return Phase.OBSERVE in self.phases
+
     def _first(self, now: _Frame) -> Mission:
         has_field = now.assumed is not None  # of an earlier session
+        nowhere = np.full(2, np.nan)
         return Mission(
             stamp_ns=now.now_ns,
-            phase=Phase.START.value,
+            phase=Phase.OBSERVE.value if self.observes else Phase.START.value,
             since_ns=now.now_ns,
             request=0 if has_field else 1,
             wanted="" if has_field else WorkOrder.SOLVE.value,
             requested_ns=now.now_ns,
-            start_um=np.asarray(self.start, np.float64),
-            goal_um=np.asarray(self.goal, np.float64),
+            start_um=nowhere if self.observes else np.asarray(self.start, np.float64),
+            goal_um=nowhere if self.observes else np.asarray(self.goal, np.float64),
             finished=False,
             outcome="",
             note="",
         )
+
+    def _observe(self, previous: Mission, now: _Frame) -> Mission:
+        """Wait for the assumed flow and for the end of the frames, then for the refinement."""
+        if previous.finished:
+            return previous
+        mission, operator = previous, now.operator
+        if now.command in (Action.STOP, Action.ZERO):
+            note = operator.text if operator is not None else ""
+            return _finish(mission, now, Outcome.STOPPED, note or f"operator: {now.command}")
+        if now.command == Action.END and not mission.input_ended:
+            mission = replace(mission, stamp_ns=now.now_ns, input_ended=True)
+        if mission.wanted and now.result(mission) is None:
+            return mission
+        if mission.wanted == WorkOrder.REFINE:
+            return _finish(mission, now, Outcome.OBSERVE_COMPLETE)
+        if not mission.input_ended:
+            return replace(mission, stamp_ns=now.now_ns, wanted="") if mission.wanted else mission
+        if now.track.seen_ns is None:
+            note = "the robot was never seen; is it in view (camera.um_per_px), and of the size in robot.radius_um?"
+            return _finish(mission, now, Outcome.NOT_FOUND, note)
+        return _order(mission, now, Phase.OBSERVE, WorkOrder.REFINE)
 
     def _after_command(self, mission: Mission, now: _Frame) -> Mission:
         """The mission after the operator's command; the mission itself if there is none.

@@ -1,7 +1,8 @@
 """Keys during a run. They are read from the terminal, so they need no display server and work over SSH.
 
-q stops, m marks, n opens a note, space holds the robot or lets it go on, ! switches the field off at once. Only a
-terminal is read, and only in the foreground: piped input belongs to the program that started the run.
+q stops, m marks, n opens a note, space holds the robot or lets it go on, e ends an observation, ! switches the field
+off at once. Only a terminal is read, and only in the foreground: piped input belongs to the program that started the
+run.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from flowrec.run.control import RunControl
 
 assert sys.platform != "win32"  # there is no termios
 
-HELP = "keys: q stop   m mark   n note   space hold, go on   ! zero field at once"
+HELP = "keys: q stop   m mark   n note   space hold, go on   e end observing   ! zero field at once"
 _POLL_S = 0.25
 _LONGEST_NOTE = 500
 _SEQUENCE = re.compile("\x1b(\\[[0-?]*[ -/]*[@-~]|O.)")  # arrows and function keys, which are ignored
@@ -56,6 +57,8 @@ class Keyboard:
     def _command(self, character: str) -> None:
         if character == "q":
             self._control.stop("stopped by the operator (q)")
+        elif character == "e":
+            self._control.request(Action.END, "ended by the operator (e)")
         elif character == "!":
             self._control.stop("operator: zero field (!)", zero=True)
         elif character == " ":

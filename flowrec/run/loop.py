@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Protocol
 
+import numpy as np
+
 from flowrec.clocks import ClockMonitor
-from flowrec.enums import Action, Outcome
-from flowrec.messages import OperatorEvent, Tick, Timing
+from flowrec.enums import Action, Outcome, Phase
+from flowrec.messages import Applied, OperatorEvent, Tick, Timing
 from flowrec.pipeline import Inputs, Pipeline, step, with_inputs
 from flowrec.rigs.rig import Rig, checked_images, increasing_stamps
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.workers import Results, Worker
-from flowrec.units import nanoseconds, seconds
+from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 SWITCH_S = 1e-4
+_END_NS, _AFTER_NS = NS_PER_S // 1000, NS_PER_S // 2  # from the last frame to the tick of its end; between later ticks
 
 
 class Sink(Protocol):
@@ -74,8 +77,11 @@ def run(
     live: bool = True,
     clocks: ClockMonitor | None = None,
     watchdog: Watchdog | None = None,
+    paced: bool = False,
 ) -> RunReport:
     """Run until the rig ends, the mission is finished and the coils are at zero, or `control` stops the run.
+
+    A mission that observes goes on when the rig has ended, without images, until its refinement is adopted.
 
     However it ends, the watchdog takes the field away before anything else is done. A stage that fails leaves its
     inputs, and only those, as the last tick in the sinks. A frame whose stamp does not increase enters no stage and is
@@ -89,6 +95,7 @@ def run(
         does not check frames, because the recorded inputs hold the results of those checks.
     clocks : records the clocks, and the frames whose stamp did not increase.
     watchdog : that of this rig; None: one without a timer.
+    paced : the worker takes real time, and the ticks after the end of the rig wait for it.
 
     Raises
     ------
@@ -121,6 +128,7 @@ def run(
         arriving = increasing_stamps(rig.inputs(), tick.stamp_ns, reject)
         if live:
             arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
+            arriving = _and_afterwards(arriving, lambda: tick, paced=paced)
         while True:
             with control.interruptible:
                 arrived = next(arriving, None)
@@ -180,12 +188,34 @@ def run(
     return report
 
 
+def _and_afterwards(arriving: Iterator[Inputs], state: Callable[[], Tick], *, paced: bool) -> Iterator[Inputs]:
+    """The rig's inputs, and for a mission that observes then others without images until it is finished.
+
+    The first of these tells the mission, as an event, that the frames have ended. They say that the last image is
+    repeated, so that no stage takes anything for seen, and a replay needs no image.
+    """
+    yield from arriving
+    ended = False
+    while True:
+        last = state()
+        mission, applied = last.mission, last.applied
+        if mission is None or mission.phase != Phase.OBSERVE or applied is None:
+            return
+        if paced and ended:
+            time.sleep(seconds(_AFTER_NS))
+        stamp_ns, zeros = last.stamp_ns + (_AFTER_NS if ended else _END_NS), np.zeros(3)
+        nothing = Applied(stamp_ns, 0.0, 0.0, 0.0, zeros, np.zeros(2), applied.image_since_ns)
+        event = None if ended else OperatorEvent(stamp_ns, Action.END, "the frames have ended")
+        yield Inputs(stamp_ns, None, nothing, operator=event)
+        ended = True
+
+
 def _with_events(arrived: Inputs, worker: Worker, control: RunControl, last: Tick, *, live: bool) -> Inputs:
     """The inputs with the results of the worker that are due and, in a live run, the next event of the operator."""
     none: Results = {}
     new: dict[str, Any] = dict(control.unless_stopped(partial(worker.due, arrived.stamp_ns), none))
     held = last.mission is not None and last.mission.held_since_ns is not None
-    event = control.next_event(arrived.stamp_ns, held) if live else None
+    event = control.next_event(arrived.stamp_ns, held) if live and arrived.operator is None else None
     if event is not None:
         new["operator"] = event
     return replace(arrived, **new) if new else arrived

@@ -50,6 +50,7 @@ _PHASES: dict[str, colours.Rgb] = {
     Phase.REFINE.value: colours.BLUE,
     Phase.PLAN.value: colours.YELLOW,
     Phase.NAVIGATE.value: colours.ORANGE,
+    Phase.OBSERVE.value: colours.PURPLE,
     Phase.DONE.value: colours.GREEN,
 }
 _CROSS = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])

@@ -34,11 +34,13 @@ class World:
         self.mission: Mission | None = None
         self.time_s = 0.0
         self.results: dict[str, object] = {"assumed": None, "refined": None, "route": None}
+        self.seen_ns: int | None = None
 
     def tick(self, at=(0.0, 500.0), seen=True, error_um=0.0, operator="", lost=0, **results) -> Mission:  # type: ignore[no-untyped-def]
         self.results |= results
         stamp = round(self.time_s * 1e9)
-        track = Track(stamp, seen, at, 0.9, lost, 5.0, np.zeros(4))
+        self.seen_ns = stamp if seen else self.seen_ns
+        track = Track(stamp, seen, at, 0.9, lost, 5.0, np.zeros(4), self.seen_ns)
         estimate = Estimate(stamp, at, np.zeros(2), np.eye(4), math.nan, at, seen)
         demand = Demand(stamp, np.zeros(2), at, 0.0, error_um, False, np.zeros((0, 2)))
         event = OperatorEvent(stamp, operator, "") if operator else None
@@ -187,3 +189,34 @@ def test_a_held_robot_that_is_carried_off_is_swept_until_it_is_back() -> None:
 
 def test_a_stop_on_the_very_first_frame_is_heard() -> None:
     assert World().tick(operator="stop").outcome == "stopped"
+
+
+def test_a_robot_that_is_only_watched_is_neither_sought_nor_lost_and_the_last_frame_orders_the_refinement() -> None:
+    world = World(phases=("observe",), find_limit_s=1.0, lost_limit_frames=2)
+    first = world.tick(seen=False)
+    assert (first.phase, first.wanted) == ("observe", "solve")
+    assert np.isnan([*first.start_um, *first.goal_um]).all()
+    watched = world.tick(assumed=field(1))
+    assert (watched.phase, watched.wanted) == ("observe", "")
+    for _ in range(9):
+        assert world.tick(seen=False, lost=100) is watched
+    assert world.tick(operator="pause") is watched
+    assert world.tick(operator="end").wanted == "refine"
+    assert not world.tick(refined=field(1)).finished  # an answer to another order is none
+    done = world.tick(refined=field(2))
+    assert (done.finished, done.outcome) == (True, "observe complete")
+
+
+def test_frames_that_end_before_the_flow_is_solved_are_remembered_and_a_stop_ends_an_observation_at_once() -> None:
+    world = World(phases=("observe",))
+    world.tick()
+    assert world.tick(operator="end").wanted == "solve"
+    assert world.tick(assumed=field(1)).wanted == "refine"
+    assert world.tick(operator="stop").outcome == "stopped"
+
+
+def test_a_robot_that_was_never_seen_until_the_frames_end_is_not_found() -> None:
+    world = World(phases=("observe",))
+    world.tick(seen=False)
+    world.tick(seen=False, assumed=field(1))
+    assert world.tick(seen=False, operator="end").outcome == "not found"
