@@ -78,6 +78,7 @@ class FieldLimits:
     inverse: Vector  # (3, 3) A^-1, A per mT
     bias_a: Vector  # (3,) currents that would produce the bias field; their negative compensates it
     row_a_per_mt: Vector  # (3,) norms of the rows of A^-1
+    a_per_mt_ramp: Vector  # (3,) A/s per mT/s while the amplitude ramps, and the bias compensation with it
     available_a: Vector  # (3,) current left for the rotating field after bias compensation
     available_v: Vector  # (3,) voltage left for the rotating field after bias compensation and ramp
     ohm: Vector  # (3,)

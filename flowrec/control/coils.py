@@ -185,13 +185,13 @@ def field_limits(coils: Coils) -> FieldLimits:
     row = np.linalg.norm(inverse, axis=1)
     ohm, henry = coils.amplifier.ohm, coils.amplifier.henry
     # While the amplitude ramps, and the bias compensation with it, L di/dt is larger by at most this.
-    ramp_a_s = np.zeros(3)
-    if coils.ramp_s > 0.0:
-        ramp_a_s = coils.ramp_mt_s * (row + np.abs(bias_a) / (_FADE_FRACTION * coils.amplitude_mt))
+    a_per_mt_ramp = row + np.abs(bias_a) / (_FADE_FRACTION * coils.amplitude_mt)
+    ramp_a_s = coils.ramp_mt_s * a_per_mt_ramp if coils.ramp_s > 0.0 else np.zeros(3)
     return FieldLimits(
         inverse=inverse,
         bias_a=bias_a,
         row_a_per_mt=row,
+        a_per_mt_ramp=a_per_mt_ramp,
         available_a=coils.max_current_a - np.abs(bias_a),
         available_v=coils.amplifier.max_voltage_v - ohm * np.abs(bias_a) - henry * ramp_a_s,
         ohm=ohm,
