@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 from flowrec.methods import Method, Methods
@@ -123,6 +123,16 @@ class Movie:
 
 
 @dataclass(frozen=True, slots=True)
+class OutputLimits:
+    """Section [lab.output]: limits of the coils besides those of [coils] and [coils.amplifier]."""
+
+    # largest rate of change of a coil's current, A/s; None: not limited
+    slew_a_s: Annotated[float, Range(1e-3, 1e9)] | None = None
+    longest_on_s: Annotated[float, Range(0.1, 1e6)] = 3600.0  # for which the coils may be energised; then they rest
+    rest_s: Annotated[float, Range(1e-3, 1e6)] = 600.0  # after that time; a shorter rest gives back a part of it
+
+
+@dataclass(frozen=True, slots=True)
 class Lab:
     """Section [lab]: the devices of the rig `lab`. Image size, depth, rate and exposure are in [camera]."""
 
@@ -141,4 +151,11 @@ class Lab:
     # time without an image after which the run ends
     give_up_s: Annotated[float, Range(0.1, 1e5)] = 60.0
     amplifier: Annotated[str, AMPLIFIERS] = "serial"
-    port: str = ""  # of the amplifier: '/dev/ttyACM0', 'COM3', 'Dev1'
+    # The following four settings belong to the amplifier of that name.
+    port: str = ""  # serial: '/dev/ttyACM0'
+    baud: Annotated[int, Range(9600, 12_000_000)] = 115_200  # serial; a board with USB of its own ignores it
+    channels: str = ""  # ni: outputs of the coils x, y, z: 'cDAQ1Mod1/ao0:2'
+    ni_server: str = ""  # ni: host:port of an NI gRPC Device Server; '': the driver of this computer
+    output: OutputLimits = field(default_factory=OutputLimits)
+    # time without a step of the loop, while a field is on, after which the guardian process takes the field away
+    guardian_s: Annotated[float, Range(0.02, 1.0)] = 0.1

@@ -97,6 +97,11 @@ class Coils:
         """Rate at which the amplitude may change."""
         return self.amplitude_mt / self.ramp_s if self.ramp_s > 0.0 else math.inf
 
+    @property
+    def fade_mt(self) -> float:
+        """Amplitude below which the compensation of the bias fades with the field."""
+        return _FADE_FRACTION * self.amplitude_mt
+
     def state_and_command(self, currents: Currents) -> tuple[FieldState, FieldCommand]:
         """State of the field at the stamp of a message, and what the field does from then on."""
         c = currents
@@ -119,7 +124,7 @@ class Coils:
         means zero currents, without a step.
         """
         limits = field_limits(self)
-        weight = np.minimum(np.asarray(amplitude_mt) / (_FADE_FRACTION * self.amplitude_mt), 1.0)
+        weight = np.minimum(np.asarray(amplitude_mt) / self.fade_mt, 1.0)
         currents: NDArray[np.float64] = field_mt @ limits.inverse.T - weight[..., None] * limits.bias_a
         return currents
 
@@ -185,7 +190,7 @@ def field_limits(coils: Coils) -> FieldLimits:
     row = np.linalg.norm(inverse, axis=1)
     ohm, henry = coils.amplifier.ohm, coils.amplifier.henry
     # While the amplitude ramps, and the bias compensation with it, L di/dt is larger by at most this.
-    a_per_mt_ramp = row + np.abs(bias_a) / (_FADE_FRACTION * coils.amplitude_mt)
+    a_per_mt_ramp = row + np.abs(bias_a) / coils.fade_mt
     ramp_a_s = coils.ramp_mt_s * a_per_mt_ramp if coils.ramp_s > 0.0 else np.zeros(3)
     return FieldLimits(
         inverse=inverse,

@@ -1,9 +1,9 @@
 """The limits of current, voltage, slew and time, in one place between the loop and every amplifier.
 
-What the coils can do is bounded by one pair (amplitude, rate of rotation): below both, no coil exceeds its limits at any
-heading, phase, turn of the plane or ramp, in any order of commands. The pair is the operating point of the coil stage,
-field_limits(coils).operating_amplitude_mt, so a command of that stage is never changed. `admit` holds commands to it;
-`check_samples` refuses output samples beyond the limits, however they were made.
+What the coils can do is bounded by one pair (amplitude, rate of rotation): below both, no coil exceeds its limits at
+any heading, phase, turn of the plane or ramp, in any order of commands. The pair is the operating point of the coil
+stage, field_limits(coils).operating_amplitude_mt, so a command of that stage is never changed. `admit` holds commands
+to it; `check_samples` refuses output samples beyond the limits, however they were made.
 """
 
 from __future__ import annotations
@@ -127,6 +127,16 @@ class Limits:
             return FieldCommand(0.0, heading, 0.0, 0.0, self.off_ramp_mt_s)
         frequency = min(frequency, self.rotation_hz)
         return FieldCommand(frequency, heading, amplitude, min(limit, self.rotation_hz), self.ramp_mt_s)
+
+    def rest(self, now_ns: int) -> FieldCommand:
+        """The command that takes the field away."""
+        self._permits(now_ns, wanted=False)
+        return FieldCommand(ramp_mt_s=self.off_ramp_mt_s)
+
+    @property
+    def off_s(self) -> float:
+        """Longest time that a field takes to go."""
+        return self.amplitude_mt / self.off_ramp_mt_s
 
     def check_samples(self, currents_a: NDArray[np.float64], voltages_v: NDArray[np.float64]) -> None:
         """Refuse output samples beyond a limit.

@@ -1,0 +1,235 @@
+"""The coils of a lab's rig: limits, guardian and amplifier as one, so that no command reaches an amplifier past them.
+
+    with Drive.of(config) as drive:        # device found, limits checked, guardian started; nothing is energised
+        for frame in ...:                  # while it waits for a frame, the loop calls drive.beat() every BEAT_S
+            applied = drive.applied(stamp_ns, previous_stamp_ns)
+            drive.apply(currents)
+
+Times are those of the host's monotonic clock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from flowrec.config import ResolvedConfig
+from flowrec.control.field_log import FieldLog
+from flowrec.control.field_rotation import FieldCommand
+from flowrec.errors import RigError, UsageError
+from flowrec.messages import Applied, Currents
+from flowrec.rig_settings import AMPLIFIERS
+from flowrec.rigs.lab.amplifiers.amplifier import Amplifier, AmplifierInfo
+from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
+
+BEAT_S = 0.02  # between beats, at most, while the loop waits for a frame
+_REST = FieldCommand()
+
+
+class Drive:
+    """Coils of a lab.
+
+    Only `zero` may be called in another thread than the loop's.
+
+    Parameters
+    ----------
+    amplifier : closed.
+    limits : of every command.
+    silence_s : of the guardian.
+    patience_s : longest time from one command to the next while a field is on. A loop that only waits stops to beat.
+
+    Attributes
+    ----------
+    info : what the amplifier says of itself, inside of the context.
+    """
+
+    @classmethod
+    def of(cls, config: ResolvedConfig, tell: Callable[[str], None] = lambda _text: None) -> Self:
+        """The coils of a configuration; `tell` is called with one line when a command is changed."""
+        limits = Limits(config.coils, config.robot, config.lab.output, tell)
+        silence_s, patience_s = config.lab.guardian_s, config.safety.guard_timeout_s + config.lab.guardian_s
+        return cls(AMPLIFIERS[config.lab.amplifier].load().of(config), limits, silence_s, patience_s)
+
+    info: AmplifierInfo
+
+    def __init__(self, amplifier: Amplifier, limits: Limits, silence_s: float, patience_s: float) -> None:
+        self._amplifier, self._limits = amplifier, limits
+        self._silence_s, self._patience_s = silence_s, patience_s
+        self._stack = ExitStack()
+        self._guardian: Guardian | None = None
+        self._taken_away = False  # by zero(), in any thread: one attribute, no lock
+        self._command = _REST
+        self._commanded_s = self._on_until_s = 0.0
+        self._accounted: tuple[int, int, np.ndarray] | None = None  # the last frame's times, and its turns
+
+    def __enter__(self) -> Self:
+        """Find the amplifier, check the limits, start the guardian. The output is at zero.
+
+        Raises
+        ------
+        RigError, UsageError : one line; nothing is energised.
+        """
+        with ExitStack() as stack:
+            self.info = self._amplifier.open()
+            stack.callback(self._amplifier.close)
+            self._limits.check(self.info)
+            self._check_beats()
+            self._guardian = stack.enter_context(Guardian(*self._amplifier.guard(), silence_s=self._silence_s))
+            self._amplifier.arm()
+            stack.callback(self._amplifier.zero)
+            self._stack = stack.pop_all()
+        self._taken_away = False
+        self._command, self._accounted = _REST, None
+        self._commanded_s = time.monotonic()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.zero()
+        self._stack.close()
+        self._guardian = None
+
+    def apply(self, currents: Currents) -> None:
+        """Send a command of the loop, held to the limits. Never waits.
+
+        Raises
+        ------
+        RigError : the amplifier or the guardian has failed; the output is at zero, or its own timer takes it there.
+        """
+        if self._taken_away:
+            return
+        now_s = time.monotonic()
+        self._send(self._limits.admit(currents, time.monotonic_ns()), now_s)
+        self._commanded_s = now_s
+
+    def rest(self) -> None:
+        """Take the field away until the next command: while the camera is gone."""
+        if not self._taken_away and self._command.amplitude_mt > 0.0:
+            self._send(replace(self._limits.rest(time.monotonic_ns()), heading_rad=self._command.heading_rad))
+
+    def beat(self) -> None:
+        """Say that the loop works. To be called by the loop, and only by it, at least every BEAT_S while it waits.
+
+        Raises
+        ------
+        RigError : see `apply`.
+        """
+        now_s = time.monotonic()
+        if now_s - self._commanded_s <= self._patience_s or self._command.amplitude_mt == 0.0:
+            self._send(self._command, now_s)
+
+    def applied(self, stamp_ns: int, before_ns: int | None) -> Applied:
+        """What the coils did between two frames. What has become known of the time before is made good in the turns."""
+        log = self.put_out(stamp_ns)
+        result = log.applied(stamp_ns, before_ns)
+        late = np.zeros(2)
+        if self._accounted is not None and self._accounted[1] == before_ns:
+            late = log.turns(*self._accounted[:2]) - self._accounted[2]
+        if before_ns is not None:
+            self._accounted = (before_ns, stamp_ns, result.turns)
+        return replace(result, turns=result.turns + late)
+
+    def put_out(self, until_ns: int) -> FieldLog:
+        """What was put out up to a time of the host's monotonic clock."""
+        return self._amplifier.put_out(until_ns)
+
+    def zero(self) -> None:
+        """Take the output to zero; until the context is entered again, no command brings a field back. Any thread.
+
+        Raises
+        ------
+        RigError : neither amplifier nor guardian confirms it.
+        """
+        self._taken_away = True
+        try:
+            self._amplifier.zero()
+        except RigError:
+            guardian = self._guardian
+            if guardian is None or not guardian.trip():
+                raise
+
+    def _send(self, command: FieldCommand, now_s: float | None = None) -> None:
+        guardian = self._guardian
+        assert guardian is not None, "commands are for the inside of the context"
+        now_s = time.monotonic() if now_s is None else now_s
+        command = _REST if self._taken_away else command
+        if command.amplitude_mt > 0.0:
+            self._on_until_s = float("inf")
+        elif self._command.amplitude_mt > 0.0:
+            self._on_until_s = now_s + self._limits.off_s + self.info.latency_s
+        self._command = command
+        try:
+            # The guardian knows first, so that no field is on without it.
+            guardian.beat(energised=now_s < self._on_until_s)
+            self._amplifier.apply(command)
+        except RigError:
+            with contextlib.suppress(RigError):  # the first error says what happened
+                self.zero()
+            raise
+        if self._taken_away and command.amplitude_mt > 0.0:  # zero() came while the command was on its way
+            self._amplifier.zero()
+
+    def _check_beats(self) -> None:
+        shortest_s = min(filter(None, (self._silence_s, self.info.timer_s)))
+        if shortest_s < 2.0 * BEAT_S:
+            raise UsageError(
+                f"lab.guardian_s or the amplifier's timer = {shortest_s:g} s: the loop beats every {BEAT_S:g} s; at "
+                f"least {2.0 * BEAT_S:g} s are needed"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """What `flowrec doctor` states of the coils; nothing was energised for it.
+
+    Attributes
+    ----------
+    info : of the amplifier.
+    amplitude_mt, rotation_hz : the field that the limits permit.
+    trip_s : time from a request to the guardian until the amplifier has confirmed that it is at zero.
+    silence_s : of the guardian.
+    warnings : one line each.
+    only_hardware : what no program can do.
+    """
+
+    info: AmplifierInfo
+    amplitude_mt: float
+    rotation_hz: float
+    trip_s: float
+    silence_s: float
+    warnings: tuple[str, ...]
+    only_hardware: str = ONLY_HARDWARE
+
+
+def probe(config: ResolvedConfig) -> Probe:
+    """Open the amplifier, check the limits, start the guardian and let it take the output, which is at zero, to zero.
+
+    Raises
+    ------
+    RigError, UsageError : one line.
+    """
+    drive = Drive.of(config)
+    with drive:
+        guardian = drive._guardian  # noqa: SLF001 - of this module
+        assert guardian is not None
+        trip_s = guardian.probe()
+        limits, info = drive._limits, drive.info  # noqa: SLF001
+    warnings = []
+    if config.robot.delay_s < info.latency_s:
+        warnings.append(
+            f"robot.delay_s = {config.robot.delay_s:g}: this amplifier alone takes {info.latency_s:g} s from a command "
+            "to the output; set it to that and the camera's delay"
+        )
+    if not info.timer_s:
+        warnings.append(f"{info.model} has no timer of its own: {ONLY_HARDWARE}")
+    if limits.amplitude_mt < config.coils.amplitude_mt:
+        warnings.append(
+            f"the coils make {limits.amplitude_mt:.3g} of coils.amplitude_mt = {config.coils.amplitude_mt:g}"
+        )
+    return Probe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, config.lab.guardian_s, tuple(warnings))

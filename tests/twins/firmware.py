@@ -1,0 +1,66 @@
+"""The firmware of the package, compiled for this computer: behind a pseudo terminal, or by a clock of the caller."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flowrec
+
+SKETCH = Path(flowrec.__file__).parent / "rigs/lab/amplifiers/firmware/flowrec_coils/flowrec_coils.ino"
+_SHIM = Path(__file__).parent / "arduino"
+FULL_A = 5.0  # of the outputs
+SAMPLE = np.dtype([("at_ns", "<i8"), ("coils", "<f8", 3)])
+
+
+def compiled(folder: Path, timer_ms: int = 100) -> Path:
+    """The twin's program. With `timer_ms` = 0 the firmware does not go to zero by itself."""
+    if shutil.which("g++") is None:
+        pytest.skip("needs g++")
+    program = folder / f"twin{timer_ms}"
+    if not program.exists():
+        made = program.with_name(f"{program.name}.{os.getpid()}")
+        options = ["-Wall", "-Wextra", "-Werror", "-O1", f"-DTIMER_MS={timer_ms}", "-DPWM_FULL=1000000", f"-I{_SHIM}"]
+        files = ["-include", _SHIM / "Arduino.h", "-x", "c++", SKETCH, _SHIM / "arduino.cpp"]
+        subprocess.run(["g++", *options, *files, "-o", made], check=True)
+        made.rename(program)
+    return program
+
+
+@dataclass
+class FirmwareTwin:
+    """A running twin: the name of its port, and the file of its outputs."""
+
+    port: str
+    file: Path
+    process: subprocess.Popen[str]
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) times on CLOCK_MONOTONIC in ns, and (n, 3) currents in A from each time on."""
+        return read_samples(self.file, FULL_A)
+
+
+def read_samples(file: Path, full: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Times and outputs in a file of samples."""
+    data = file.read_bytes()
+    found = np.frombuffer(data[: len(data) // SAMPLE.itemsize * SAMPLE.itemsize], SAMPLE)
+    return found["at_ns"], found["coils"] * full
+
+
+@contextmanager
+def firmware_twin(program: Path, file: Path) -> Iterator[FirmwareTwin]:
+    """The firmware behind a pseudo terminal, in real time."""
+    with subprocess.Popen([program, "pty", file], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield FirmwareTwin(process.stdout.readline().strip(), file, process)
+        finally:
+            process.kill()
