@@ -70,8 +70,6 @@ class Guardian:
         ------
         RigError : it does not start; nothing may be energised.
         """
-        if sys.platform == "win32":
-            raise RigError("the guardian process needs Linux; nothing is energised")
         read_beats, self._beats = os.pipe()  # not inheritable: no other child keeps the pipe open
         self._status, write_status = os.pipe()
         command = [f"{self.silence_s:g}", str(read_beats), str(write_status), *self._action]
@@ -91,8 +89,9 @@ class Guardian:
         finally:
             os.close(read_beats)
             os.close(write_status)
-        for end in (self._beats, self._status):
-            os.set_blocking(end, False)
+        if sys.platform != "win32":
+            for end in (self._beats, self._status):
+                os.set_blocking(end, False)
         if self._report(b"ready", _START_S) is None:
             said = self._last_words()
             self._release()
@@ -208,10 +207,12 @@ def _line(heard: bytes, word: bytes) -> str | None:
 
 # ---- the process
 
+assert sys.platform != "win32"  # there is no termios
+import termios  # noqa: E402
+
 
 def main(arguments: Sequence[str]) -> int:
     """The guardian process; see above. Returns its exit status: 0 after an orderly end, 3 after it has acted."""
-    assert sys.platform != "win32"
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGPIPE, signal.SIGTSTP):
         signal.signal(number, signal.SIG_IGN)
     silence_s, beats, status = float(arguments[0]), int(arguments[1]), int(arguments[2])
@@ -264,8 +265,6 @@ def _try(zero: Callable[[], str]) -> str:
 
 def _serial_zero(port: int) -> Callable[[], str]:
     """Newline and Z. The newline ends a line that the recorder may have left half written."""
-    assert sys.platform != "win32"
-    import termios
 
     def zero() -> str:
         with contextlib.suppress(termios.error):
@@ -306,7 +305,6 @@ def _ni_zero(address: str, devices: Sequence[str]) -> Callable[[], str]:
 
 def _be_first() -> None:
     """Ask for a priority above that of the recorder; without the right to it the guardian is an ordinary process."""
-    assert sys.platform != "win32"
     gc.collect()
     gc.freeze()
     gc.disable()
