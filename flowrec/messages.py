@@ -29,7 +29,7 @@ from flowrec.declarations import (
     Vector2,
     Vector3,
 )
-from flowrec.enums import WorkOrder
+from flowrec.enums import Action, WorkOrder
 from flowrec.errors import RigError
 
 PIXEL_BITS = (8, 10, 12, 14, 16)
@@ -407,6 +407,11 @@ class Tick:
     true_field: Annotated[FlowField | None, Topic("/truth/flow", Source.SIMULATOR)] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
+
+    @property
+    def frames_ended(self) -> bool:
+        """Whether the observation has ended: the ticks that wait for its refinement may have no image."""
+        return self.operator is not None and self.operator.action == Action.END
 
     @property
     def field(self) -> FlowField | None:

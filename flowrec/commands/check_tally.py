@@ -6,12 +6,13 @@ Messages come in file order; those of one tick need not follow each other. Memor
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 
 from flowrec.commands.verdict import Gap
 from flowrec.declarations import Message, invalid_numbers
 from flowrec.enums import Action
-from flowrec.messages import Applied, Clocks, Frame, OperatorEvent, Timing
+from flowrec.messages import Clocks, Frame, OperatorEvent, Timing
 from flowrec.store.audit import Audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -21,8 +22,7 @@ LISTED = 100  # longest gaps, and settings of the wall clock, that are kept in m
 _PENDING = 100_000  # incomplete ticks in memory; in files of flowrec these are half a second of ticks
 _STEP_NS = 10_000  # resolution of the histogram of intervals
 _INTERVALS = 100_000  # bins of that histogram
-_FRAME, _APPLIED, _TRACK, _REPEATS = 1, 2, 4, 8
-_WHOLE = _FRAME | _APPLIED | _TRACK
+_FRAME, _APPLIED, _TRACK = 1, 2, 4
 _BITS = {"frame": _FRAME, "applied": _APPLIED, "track": _TRACK}
 
 
@@ -59,7 +59,7 @@ class Tally:
     Attributes
     ----------
     ticks : ticks with a report of the coils or a track.
-    images_missing : ticks without an image, other than those that repeat the one before.
+    images_missing : ticks without an image, before the end of the frames.
     images_alone : ticks with nothing but an image.
     inputs_missing : ticks that can not be replayed: no report of the coils, or neither image nor track.
     unfinished_ticks : ticks with inputs that no stage has answered.
@@ -84,7 +84,7 @@ class Tally:
         self._last_index: int | None = None
         self._pending: dict[int, int] = {}  # by time of the tick, which of _BITS have been seen
         self._keyframe_ns: int | None = None
-        self._ended = False  # the rig delivers no more frames
+        self._ended_ns = math.inf  # from here on ticks may have no image
 
     def begin(self, found: Audit) -> None:
         """Take the header, before the first message."""
@@ -100,11 +100,10 @@ class Tally:
             self.repeated[name] += 1
             self.repeated_ns[name] = stamp_ns
         elif name in _BITS:
-            repeats = isinstance(message, Applied) and message.repeats_image
-            self._add_to_tick(log_ns, _BITS[name] | (_REPEATS if repeats else 0))
-        if isinstance(message, OperatorEvent):
-            self._ended = message.action == Action.END
-        if name == "applied" and not self._ended:
+            self._add_to_tick(log_ns, _BITS[name])
+        if isinstance(message, OperatorEvent) and message.action == Action.END:
+            self._ended_ns = min(self._ended_ns, log_ns)
+        if name == "applied" and log_ns <= self._ended_ns:
             self._add_interval(log_ns)
         if isinstance(message, Frame):
             step = message.index - self._last_index - 1 if self._last_index is not None else 0
@@ -118,8 +117,8 @@ class Tally:
 
     def close(self) -> None:
         """Count the ticks that did not become complete."""
-        for bits in self._pending.values():
-            self._count(bits)
+        for log_ns, bits in self._pending.items():
+            self._count(log_ns, bits)
         self._pending.clear()
 
     @property
@@ -152,18 +151,18 @@ class Tally:
 
     def _add_to_tick(self, log_ns: int, bit: int) -> None:
         bits = self._pending.pop(log_ns, 0) | bit
-        if bits & _WHOLE == _WHOLE:
-            self._count(bits)
+        if bits == _FRAME | _APPLIED | _TRACK:
+            self._count(log_ns, bits)
             return
         self._pending[log_ns] = bits
         if len(self._pending) > _PENDING:
-            self._count(self._pending.pop(next(iter(self._pending))))
+            self._count(oldest_ns := next(iter(self._pending)), self._pending.pop(oldest_ns))
 
-    def _count(self, bits: int) -> None:
+    def _count(self, log_ns: int, bits: int) -> None:
         if bits == _FRAME:
             self.images_alone += 1
             return
         self.ticks += 1
-        self.unfinished_ticks += bits & _WHOLE == _FRAME | _APPLIED
-        self.images_missing += bits == _APPLIED | _TRACK
-        self.inputs_missing += not bits & _APPLIED or bits & _WHOLE == _APPLIED
+        self.unfinished_ticks += bits == _FRAME | _APPLIED
+        self.images_missing += bits == _APPLIED | _TRACK and log_ns < self._ended_ns
+        self.inputs_missing += not bits & _APPLIED or bits == _APPLIED

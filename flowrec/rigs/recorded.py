@@ -46,7 +46,7 @@ class RecordedRig:
                 if tick.track is None or tick.track is before.track:
                     before = tick
                     continue  # a crash left the inputs without an image: nothing to replay
-                self.frames_missing += not tick.applied.repeats_image
+                self.frames_missing += not tick.frames_ended
                 new["track"] = tick.track
             yield Inputs(tick.stamp_ns, **({"frame": None} | new))
             before = tick

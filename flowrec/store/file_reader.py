@@ -27,7 +27,7 @@ from flowrec.topics import BY_FIELD
 
 Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 _CACHED_MESSAGES = 64  # of restored states
-_STATE_LIMIT_BYTES = 208 << 20  # three flow fields on the largest chip, a route to all of it and an image
+_STATE_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
 _LARGE_CHUNK_BYTES = 1 << 22
 _GROWTH = 2  # of an image that is decoded ahead; JPEG compresses more and is decoded when its turn comes
 _AHEAD_BYTES, _AHEAD_CHUNKS = 32 << 20, 16  # decompressed before they are asked for

@@ -274,8 +274,7 @@ def _rewrite(
                 pass  # the keyframe was counted where it was recorded
             elif tick.applied is not before.applied and tick.track is not before.track:
                 complete += 1
-                repeats = tick.applied is not None and tick.applied.repeats_image
-                images_missing += has_images and tick.frame is before.frame and not repeats
+                images_missing += has_images and tick.frame is before.frame and not tick.frames_ended
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
             before = tick

@@ -163,7 +163,7 @@ def small_draft() -> Draft:
 
 
 # Numbers that do mean something: `flowrec check` looks at them.
-_UNTROUBLED = {"rate": 1.0, "unit": 0.0} | dict.fromkeys(
+_UNTROUBLED = {"rate": 1.0, "unit": 0.0, "bits": 8} | dict.fromkeys(
     ("dropped_frames", "wall_jumps", "passed_over", "duplicates", "disordered", "resets", "jumps"), 0
 )
 

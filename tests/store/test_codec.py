@@ -47,6 +47,8 @@ def messages(draw, kind):
             dims = {"vector": (1, 1), "array": (0, 3)}[form.kind] if kind is not Frame else (2, 2)
             shape = draw(hnp.array_shapes(min_dims=dims[0], max_dims=dims[1], min_side=0, max_side=4))
             values[form.name] = draw(bits_of(np.empty(shape, dtypes[form.name])))
+        elif kind is Frame and form.name == "bits":
+            values[form.name] = 8  # of other depths: test_frame_encodings.py
         elif kind is Frame and form.name == "index":
             values[form.name] = draw(st.integers(0, 2**32 - 1))
         elif kind in (Frame, Event, OperatorEvent) and form.kind is int:
@@ -170,7 +172,11 @@ def test_rubbish_is_a_session_error_or_a_message(kind, rubbish):
         assert isinstance(decode(kind, rubbish), kind)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in TYPES if defaulted_fields(kind)], ids=lambda kind: kind.__name__)
+# The depth of a frame is no field of its schema, but in the metadata of the channel.
+OLDER = [kind for kind in TYPES if defaulted_fields(kind) and kind is not Frame]
+
+
+@pytest.mark.parametrize("kind", OLDER, ids=lambda kind: kind.__name__)
 def test_a_file_made_before_a_field_existed_is_read_with_its_default(kind):
     needed = {
         form.name: {"vector": np.zeros(2), "array": np.zeros((2, 2))}.get(form.kind)
