@@ -7,6 +7,7 @@ only.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.errors import RigError
+
+SOFTWARE = "software"  # value of Wanted.trigger
+_NOTABLE = 0.01  # relative difference between what was asked and what is
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -142,6 +146,34 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Stop and disconnect; never raises, also when the device is gone."""
+
+
+def bits_of(pixel_format: str) -> int:
+    """Depth of a monochrome pixel format.
+
+    Raises
+    ------
+    RigError : it is another one.
+    """
+    found = re.fullmatch(r"Mono(8|10|12|14|16)(p|Packed)?", pixel_format)
+    if found is None:
+        raise RigError(
+            f"lab.pixel_format = {pixel_format!r}: must be one of Mono8, Mono10, Mono12, Mono14, Mono16, or a packed "
+            "one (Mono10p, Mono12p, Mono12Packed)"
+        )
+    return int(found[1])
+
+
+def difference(key: str, asked: float | None, got: float | None, unit: str) -> tuple[str, ...]:
+    """A note, if a setting is not what was asked; None: nothing was asked, or the camera does not have it."""
+    if asked is None:
+        return ()
+    unit = f" {unit}" if unit else ""
+    if got is None:
+        return (f"{key} = {asked:g}{unit}: the camera has no such setting; set it on the camera itself",)
+    if abs(got - asked) <= _NOTABLE * abs(asked):
+        return ()
+    return (f"{key} = {asked:g}{unit} asked, {got:.4g}{unit} reached",)
 
 
 def found(devices: dict[str, Any], wanted: str, where: str) -> Any:

@@ -22,11 +22,10 @@ from flowrec.clocks import DeviceClock, Fit
 from flowrec.errors import RigError
 from flowrec.messages import CameraLosses
 from flowrec.rigs.lab.cameras.block_ids import BlockIds
-from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Image, Wanted
+from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Image, Wanted
 from flowrec.system.processes import realtime_priority
 from flowrec.units import NS_PER_S, nanoseconds, seconds
 
-SOFTWARE = "software"  # value of Wanted.trigger
 _SLICE_S = 0.1  # longest wait in the driver, so that the thread ends promptly
 _SILENT_S = 0.7  # without a frame, at least, before a camera is taken for absent
 _SILENT_PERIODS = 3.0  # likewise, in periods of its frames
@@ -36,6 +35,8 @@ _OPEN_S = 20.0  # time for the first open()
 _CLOSE_S = 1.0  # time for close() of a camera that may hang
 _AGAIN_S = 0.05  # between two attempts to open an absent camera
 _REPORT_S = 1.0  # between two messages of losses that are the same
+_RATE_S = 2.0  # over which a rate is measured, at least
+_RATE_ERROR = 0.03  # relative difference of the rate that is worth a note
 _FROZEN = 2  # frames in a row with the same device time: the clock stands still, and is not used
 
 _T = TypeVar("_T")
@@ -135,6 +136,7 @@ class Grabber:
         self._ids = BlockIds()
         self._stamper = _Stamper()
         self._counts = _Counts()
+        self._span: tuple[tuple[int, int], tuple[int, int]] = (0, 0), (0, 0)  # index and stamp, first and last
         self._attributed = 0  # blocks of the driver's own count that are in the counts already
         self._thread = threading.Thread(target=self._work, name="camera", daemon=True)
 
@@ -147,8 +149,24 @@ class Grabber:
     @property
     def notes(self) -> tuple[str, ...]:
         """What people should know of the camera, a line each; more may come with the first frames."""
-        frozen = ("the camera's clock stands still: frames are stamped by their arrival",)
-        return self.info.notes + (frozen if self._stamper.frozen else ())
+        notes = self.info.notes
+        if not self.info.ticks_per_s:
+            notes += ("the camera has no clock: frames are stamped by their arrival",)
+        elif self._stamper.frozen:
+            notes += ("the camera's clock stands still: frames are stamped by their arrival",)
+        if not self.info.id_bits:
+            notes += ("the camera does not number its images: what it or the link loses is not seen",)
+        rate_hz, told_hz = self.rate_hz, self.info.rate_hz or self._wanted.rate_hz
+        if rate_hz and abs(rate_hz - told_hz) > _RATE_ERROR * told_hz:
+            notes += (f"camera.rate_hz = {self._wanted.rate_hz:g} Hz asked, {rate_hz:.4g} Hz measured",)
+        return notes
+
+    @property
+    def rate_hz(self) -> float:
+        """Blocks per second since the connection, by their ids and stamps; 0 during its first two seconds."""
+        (index, stamp_ns), (last_index, last_ns) = self._span
+        span_s = seconds(last_ns - stamp_ns)
+        return (last_index - index) / span_s if span_s > _RATE_S else 0.0
 
     @property
     def losses(self) -> CameraLosses | None:
@@ -240,6 +258,7 @@ class Grabber:
         self._ids.connected(info.id_bits, rate_hz)
         self._stamper.connected(info, self._wanted.exposure_s)
         self._attributed = 0
+        self._span = (0, 0), (0, 0)
         self._silent_s = max(_SILENT_S, _SILENT_PERIODS / rate_hz) + (info.exposure_s or self._wanted.exposure_s)
 
     def _acquire(self, camera: Camera) -> str:
@@ -297,6 +316,8 @@ class Grabber:
             due = round(seconds(stamp_ns - before_ns) * self._wanted.rate_hz)
             if due > step:
                 self._counts = counts = replace(counts, triggers=counts.triggers + due - step)
+        at = self._ids.index, stamp_ns
+        self._span = (self._span[0] if self._span[1] != (0, 0) else at), at
         arrival_ns = grabbed.arrival_ns - self._epoch_ns
         frame = _Waiting(grabbed.image, grabbed.bits, self._ids.index, stamp_ns, arrival_ns, fit, counts)
         with self._filled:

@@ -1,0 +1,246 @@
+"""Settings of a GenICam camera by their standard names, and by those of older cameras (SFNC, and before it).
+
+What was asked is set, read back, and compared. Image size, pixel format and trigger must be as asked, because the rest
+of a run depends on them (RigError); a difference of exposure, gain or rate is a note.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from flowrec.errors import RigError
+from flowrec.rigs.lab.cameras.camera import SOFTWARE, Wanted, bits_of, difference
+
+_US = 1e-6
+Value = int | float | bool | str
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """One setting as the device has it now.
+
+    Attributes
+    ----------
+    value : None if it can not be read, as a command.
+    low, high, step : of a number; step 0: any.
+    entries : what an enumeration takes now.
+    """
+
+    value: Value | None
+    low: float = 0.0
+    high: float = 0.0
+    step: float = 0.0
+    entries: tuple[str, ...] = ()
+    writable: bool = True
+
+
+class Features(Protocol):
+    """The settings of one device."""
+
+    def feature(self, name: str) -> Feature | None:
+        """The setting of this name; None if the device does not have it, or not now."""
+
+    def put(self, name: str, value: Value) -> None:
+        """Set it.
+
+        Raises
+        ------
+        RigError : the device refuses.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """What a device has, after it was set; the names are those of camera.CameraInfo."""
+
+    width_px: int
+    height_px: int
+    bits: int
+    pixel_format: str
+    rate_hz: float
+    exposure_s: float
+    gain: float | None
+    notes: tuple[str, ...]
+
+
+def configure(device: Features, wanted: Wanted) -> Settled:
+    """Set a device that does not acquire.
+
+    Raises
+    ------
+    RigError : image size, pixel format or trigger can not be as asked.
+    """
+    notes: list[str] = []
+    pixel_format = _pixel_format(device, wanted.pixel_format)
+    width_px, height_px = _region(device, wanted)
+    _choose(device, ("AcquisitionMode",), "Continuous")
+    _trigger(device, wanted.trigger)
+    exposure_s = _exposure(device, wanted.exposure_s, notes)
+    gain = _gain(device, wanted.gain, notes)
+    rate_hz = _rate(device, wanted, notes)
+    return Settled(width_px, height_px, bits_of(pixel_format), pixel_format, rate_hz, exposure_s, gain, tuple(notes))
+
+
+def _pixel_format(device: Features, asked: str) -> str:
+    """Set the pixel format, or a packed one of the same depth, which holds the same data."""
+    bits_of(asked)
+    have = device.feature("PixelFormat")
+    if have is None:
+        raise RigError("the camera has no setting PixelFormat; it is no area camera by GenICam")
+    same = [name for name in (asked, f"{asked}p", f"{asked}Packed") if name in have.entries]
+    if not same:
+        grey = [name for name in have.entries if name.startswith("Mono")]
+        raise RigError(f"lab.pixel_format: the camera has no {asked}; it has {', '.join(grey) or 'no grey levels'}")
+    device.put("PixelFormat", same[0])
+    return same[0]
+
+
+def _region(device: Features, wanted: Wanted) -> tuple[int, int]:
+    """Set the region of interest. The offset is taken away first, because it limits the size."""
+    axes = (("Width", "OffsetX", "width_px", wanted.width_px), ("Height", "OffsetY", "height_px", wanted.height_px))
+    sizes = []
+    for axis, (size, offset, key, asked) in enumerate(axes):
+        if _writable(device.feature(offset)):
+            device.put(offset, 0)
+        have = device.feature(size)
+        if have is None or (not have.writable and have.value != asked):
+            raise RigError(
+                f"camera.{key} = {asked}: the size of the camera's image can not be set; it is {have and have.value}"
+            )
+        if have.value != asked:
+            if not have.low <= asked <= have.high or (asked - have.low) % (have.step or 1):
+                step = have.step or 1
+                nearest = have.low + round((min(max(asked, have.low), have.high) - have.low) / step) * step
+                raise RigError(
+                    f"camera.{key} = {asked}: the camera takes {have.low:g} to {have.high:g} in steps of {step:g}; the "
+                    f"nearest is {min(nearest, have.high):g}"
+                )
+            device.put(size, asked)
+        place = device.feature(offset)
+        if place is not None and place.writable:
+            middle = place.high / 2 // (place.step or 1) * (place.step or 1)
+            at = int(middle) if wanted.offset_px is None else wanted.offset_px[axis]
+            device.put(offset, at)
+        elif wanted.offset_px is not None and wanted.offset_px[axis] != (place.value if place else 0):
+            raise RigError(f"lab.offset_{'xy'[axis]}_px: the camera has no {offset} that can be set")
+        got = device.feature(size)
+        if got is None or got.value != asked:
+            raise RigError(
+                f"camera.{key} = {asked}: the camera has set {got and got.value}; set that, or see to its binning"
+            )
+        sizes.append(asked)
+    return sizes[0], sizes[1]
+
+
+def _trigger(device: Features, asked: str) -> None:
+    """Switch the triggers off, or the one of the frame on."""
+    selector, mode = device.feature("TriggerSelector"), device.feature("TriggerMode")
+    if mode is None:
+        if asked:
+            raise RigError(f"lab.trigger = {asked!r}: the camera has no trigger")
+        return
+    for each in selector.entries if selector is not None else ():
+        if _writable(selector):
+            device.put("TriggerSelector", each)
+        if _writable(now := device.feature("TriggerMode")) and now is not None and now.value != "Off":
+            device.put("TriggerMode", "Off")
+    if selector is None:
+        device.put("TriggerMode", "Off")
+    if not asked:
+        return
+    if selector is not None and "FrameStart" in selector.entries:
+        device.put("TriggerSelector", "FrameStart")
+    source = device.feature("TriggerSource")
+    name = "Software" if asked == SOFTWARE else asked
+    if source is None or name not in source.entries:
+        entries = ", ".join(source.entries) if source is not None else "none"
+        raise RigError(f"lab.trigger = {asked!r}: the camera has no such source of a trigger; it has {entries}")
+    device.put("TriggerSource", name)
+    device.put("TriggerMode", "On")
+
+
+def _exposure(device: Features, asked_s: float, notes: list[str]) -> float:
+    """Set the exposure in s; returns what it is, 0 if the device does not say."""
+    _choose(device, ("ExposureAuto",), "Off")
+    _choose(device, ("ExposureMode",), "Timed")
+    name = _first(device, "ExposureTime", "ExposureTimeAbs")
+    if name is None:
+        notes.extend(difference("camera.exposure_s", asked_s or None, None, "s"))
+        return 0.0
+    if asked_s:
+        _put_clipped(device, name, asked_s / _US)
+    got_s = _number(device, name) * _US
+    notes.extend(difference("camera.exposure_s", asked_s or None, got_s, "s"))
+    return got_s
+
+
+def _gain(device: Features, asked: float | None, notes: list[str]) -> float | None:
+    """Set the gain; returns what it is, None if the device does not say."""
+    if asked is not None:
+        _choose(device, ("GainAuto",), "Off")
+    name = _first(device, "Gain", "GainRaw", "GainAbs")
+    if name is None:
+        notes.extend(difference("lab.gain", asked, None, ""))
+        return None
+    if asked is not None:
+        _put_clipped(device, name, asked)
+    got = _number(device, name)
+    notes.extend(difference("lab.gain", asked, got, ""))
+    return got
+
+
+def _rate(device: Features, wanted: Wanted, notes: list[str]) -> float:
+    """Set the rate in Hz; returns the one that is reached, 0 if the device does not say."""
+    free = not wanted.trigger
+    for switch in ("AcquisitionFrameRateEnable", "AcquisitionFrameRateControlEnabled"):
+        if _writable(device.feature(switch)):
+            device.put(switch, free)
+    name = _first(device, "AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+    now = device.feature(name) if name is not None else None
+    if free and name is not None and now is not None and now.writable:
+        _put_clipped(device, name, wanted.rate_hz)
+    reached = _first(device, "ResultingFrameRate", "ResultingFrameRateAbs", "AcquisitionResultingFrameRate", name or "")
+    if reached is None:
+        notes.extend(difference("camera.rate_hz", wanted.rate_hz, None, "Hz"))
+        return 0.0
+    rate_hz = _number(device, reached)
+    if free or rate_hz < wanted.rate_hz:
+        notes.extend(difference("camera.rate_hz", wanted.rate_hz, rate_hz, "Hz"))
+    return rate_hz if free else wanted.rate_hz
+
+
+def _first(device: Features, *names: str) -> str | None:
+    """The first of some names that the device has and that can be read."""
+    return next(
+        (name for name in names if (found := device.feature(name)) is not None and found.value is not None), None
+    )
+
+
+def _number(device: Features, name: str) -> float:
+    found = device.feature(name)
+    return float(found.value) if found is not None and found.value is not None else 0.0
+
+
+def _writable(feature: Feature | None) -> bool:
+    return feature is not None and feature.writable
+
+
+def _put_clipped(device: Features, name: str, value: float) -> None:
+    """Set a number to the nearest one that the device takes."""
+    have = device.feature(name)
+    if have is None or not have.writable:
+        return
+    value = min(max(value, have.low), have.high) if have.low < have.high else value
+    if isinstance(have.value, int):
+        step = have.step or 1
+        value = int(have.low + round((value - have.low) / step) * step)
+    device.put(name, value)
+
+
+def _choose(device: Features, names: tuple[str, ...], entry: str) -> None:
+    """Set those enumerations that the device has and that have the entry."""
+    for name in names:
+        have = device.feature(name)
+        if have is not None and have.writable and entry in have.entries and have.value != entry:
+            device.put(name, entry)
