@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.errors import RigError
+from flowrec.rig_settings import CameraSettings, Lab
 
 SOFTWARE = "software"  # value of Wanted.trigger
 _NOTABLE = 0.01  # relative difference between what was asked and what is
@@ -146,6 +147,30 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Stop and disconnect; never raises, also when the device is gone."""
+
+
+def wanted_of(camera: CameraSettings, lab: Lab) -> Wanted:
+    """What the sections [camera] and [lab] of a configuration ask for; the rate must be resolved.
+
+    Raises
+    ------
+    RigError : only one of the two offsets is set.
+    """
+    if (lab.offset_x_px is None) != (lab.offset_y_px is None):
+        raise RigError("lab.offset_x_px and lab.offset_y_px: set both, or none for the middle of the sensor")
+    assert camera.rate_hz is not None, "a resolved configuration"
+    return Wanted(
+        device=lab.device,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        offset_px=None if lab.offset_x_px is None or lab.offset_y_px is None else (lab.offset_x_px, lab.offset_y_px),
+        rate_hz=camera.rate_hz,
+        exposure_s=camera.exposure_s,
+        gain=lab.gain,
+        pixel_format=lab.pixel_format or f"Mono{camera.bits}",
+        trigger=lab.trigger,
+        config=lab.device_config,
+    )
 
 
 def bits_of(pixel_format: str) -> int:

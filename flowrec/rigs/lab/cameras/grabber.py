@@ -131,6 +131,7 @@ class Grabber:
         self._over = threading.Event()
         self._failure: Exception | None = None
         self._info: CameraInfo | None = None
+        self._handed: _Waiting | None = None
         self._last: CameraLosses | None = None
         # Of the thread only.
         self._ids = BlockIds()
@@ -170,8 +171,8 @@ class Grabber:
 
     @property
     def losses(self) -> CameraLosses | None:
-        """The latest message of the losses."""
-        return self._last
+        """The losses up to the latest frame that was handed on; None before the first one."""
+        return self._message(self._handed) if self._handed is not None else None
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -209,21 +210,31 @@ class Grabber:
                 return None
             frame = self._queue.popleft()
             self.frames += 1
-            losses = self._losses(frame)
+            self._handed = frame
+            losses = self._reported(frame)
         return Captured(frame.image, frame.bits, frame.index, frame.stamp_ns, frame.arrival_ns, frame.clock, losses)
 
-    def _losses(self, frame: _Waiting) -> CameraLosses:
-        """The message up to a frame. All that the queue has dropped lies before the frame, which was behind it."""
-        counts, last = frame.counts, self._last
-        by_cause = (counts.link, counts.incomplete, counts.driver, self.backlog, counts.triggers, counts.reconnections)
-        if (
-            last is not None
-            and frame.stamp_ns < last.stamp_ns + nanoseconds(_REPORT_S)
-            and by_cause == (last.link, last.incomplete, last.driver, last.backlog, last.triggers, last.reconnections)
-        ):
-            return last
-        self._last = CameraLosses(frame.stamp_ns, frame.index + 1, self.frames, *by_cause)
-        return self._last
+    def _message(self, frame: _Waiting) -> CameraLosses:
+        """The losses up to a frame. All that the queue has dropped lies before the frame, which was behind it."""
+        counts = frame.counts
+        return CameraLosses(
+            frame.stamp_ns,
+            frame.index + 1,
+            self.frames,
+            counts.link,
+            counts.incomplete,
+            counts.driver,
+            self.backlog,
+            counts.triggers,
+            counts.reconnections,
+        )
+
+    def _reported(self, frame: _Waiting) -> CameraLosses:
+        """The message for a frame: the last one, unless something was lost since then, or a second has passed."""
+        last, new = self._last, self._message(frame)
+        if last is None or new.stamp_ns >= last.stamp_ns + nanoseconds(_REPORT_S) or _lost(last) != _lost(new):
+            self._last = last = new
+        return last
 
     # ---- the thread
 
@@ -425,6 +436,10 @@ class _Stamper:
             stamp_ns = max(stamp_ns, before_ns + 1)
         self._last_ns = stamp_ns
         return stamp_ns, fit, before_ns
+
+
+def _lost(of: CameraLosses) -> tuple[int, ...]:
+    return (of.link, of.incomplete, of.driver, of.backlog, of.triggers, of.reconnections)
 
 
 def _same(known: CameraInfo, info: CameraInfo) -> bool:

@@ -1,0 +1,89 @@
+"""A look at the camera for some seconds, without a run: what is there, at which rate, and what is lost."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import dataclass
+from functools import partial
+
+from flowrec.clocks.device_clock import envelope
+from flowrec.errors import RigError
+from flowrec.messages import CameraLosses
+from flowrec.rig_settings import CAMERAS, CameraSettings, Lab
+from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
+from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
+from flowrec.units import NS_PER_S, seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """What was seen.
+
+    Attributes
+    ----------
+    rate_hz : of the camera, by its block ids: losses do not lower it; 0 with less than two frames.
+    delivered_hz : of the frames that were handed on.
+    losses : by cause; None: not one frame came.
+    clock_slope : time of the host per time of the camera's clock as it states its unit: 1 within some 1e-3 for a probe
+        of 2 s, 10 for a camera that states its unit wrongly by as much; 0: no clock.
+    arrival_ms : longest interval between two arrivals.
+    brightest : grey level of the brightest pixel of the last image; 2**bits - 1 means that it is overexposed.
+    notes : settings that differ from what was asked, and what else a person should know, a line each.
+    """
+
+    info: CameraInfo
+    rate_hz: float
+    delivered_hz: float
+    losses: CameraLosses | None
+    clock_slope: float
+    arrival_ms: float
+    brightest: int
+    notes: tuple[str, ...]
+
+
+def probe(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> Probe:
+    """Open the camera of a configuration, take its frames for some seconds, and close it.
+
+    Raises
+    ------
+    RigError : as Camera.open, or no frame comes in three seconds more than the duration.
+    UsageError : a package is not installed; the line names the command.
+    """
+    wanted = wanted_of(camera, lab)
+    driver = CAMERAS[lab.camera].load()
+    frames: list[Captured] = []
+    with Grabber(partial(driver.of, wanted), wanted, lab.queue_frames, time.monotonic_ns()) as grabber:
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s + (0.0 if frames else 3.0):
+            frame = grabber.next(0.1)
+            if frame is not None:
+                if not frames:
+                    end_s = time.monotonic() + duration_s
+                frames.append(frame)
+        info, notes, losses = grabber.info, grabber.notes, grabber.losses
+    if not frames and not wanted.trigger:
+        raise RigError(f"camera {info.model} {info.serial}: it delivers no frame; see its trigger, cable and bandwidth")
+    if not frames:
+        return Probe(info, 0.0, 0.0, losses, 0.0, 0.0, 0, (*notes, f"no trigger has come at {wanted.trigger}"))
+    first, last = frames[0], frames[-1]
+    span_s = max(seconds(last.stamp_ns - first.stamp_ns), 1e-9)
+    arrivals = [frame.arrival_ns for frame in frames]
+    return Probe(
+        info,
+        rate_hz=(last.index - first.index) / span_s,
+        delivered_hz=(len(frames) - 1) / span_s,
+        losses=losses,
+        clock_slope=_slope(frames, info),
+        arrival_ms=max((b - a for a, b in itertools.pairwise(arrivals)), default=0) / 1e6,
+        brightest=int(last.image.max()),
+        notes=notes,
+    )
+
+
+def _slope(frames: list[Captured], info: CameraInfo) -> float:
+    """Time of the host per time of the camera, along the earliest arrivals."""
+    points = {clock.device: (clock.device, clock.arrival_ns) for frame in frames if (clock := frame.clock) is not None}
+    if len(points) < 2 or not info.ticks_per_s:
+        return 0.0
+    return envelope(tuple(points[ticks] for ticks in sorted(points)))[1] * info.ticks_per_s / NS_PER_S
