@@ -37,6 +37,10 @@ class ChipError(UsageError):
     """A mask, opening or calibration that no flow can be computed on."""
 
 
+class MovieError(UsageError):
+    """A movie, the times of its images or a log of the coils that can not be read or used."""
+
+
 class FlowError(FlowrecError):
     """The flow solver has no answer."""
 

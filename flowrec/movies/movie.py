@@ -1,0 +1,243 @@
+"""A movie of any format: the table of readers, the facts that a file tells, and the interface of a reader.
+
+Nothing is converted silently: grey levels are those of the file, and what had to be assumed is a remark.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.declarations import Image
+from flowrec.errors import MovieError
+from flowrec.messages import PIXEL_BITS, pixel_type
+from flowrec.methods import Method, Methods
+from flowrec.units import NS_PER_S, seconds
+
+# A row's class is made with (path, options) and is a Movie.
+MOVIE_READERS = Methods(
+    "movie.reader",
+    Method("video", "flowrec.movies.video:VideoMovie", "AVI, MP4, MKV, MOV (PyAV)", extra="movies"),
+    Method(
+        "tiff", "flowrec.movies.tiff:TiffMovie", "TIFF stacks: plain, OME, ImageJ, BigTIFF (tifffile)", extra="movies"
+    ),
+    Method("nd2", "flowrec.movies.nikon:NikonMovie", "Nikon ND2 (nd2)", extra="movies"),
+    Method("ome_zarr", "flowrec.movies.ome_zarr:ZarrMovie", "OME-Zarr (zarr)", extra="movies"),
+    Method(
+        "folder", "flowrec.movies.folder:FolderMovie", "a folder of images, in natural order of their names (OpenCV)"
+    ),
+)
+LARGEST_PX, SMALLEST_PX = 16_384, 8  # as of camera.width_px and height_px
+MOST_PIXELS = 150_000_000
+_ONLY = "only the first"
+_MEDIAN_BYTES = 400_000_000  # of the images that a median is taken of
+_BEGINNINGS = {
+    b"II*\0": "tiff",
+    b"MM\0*": "tiff",
+    b"II+\0": "tiff",
+    b"MM\0+": "tiff",
+    b"\xda\xce\xbe\x0a": "nd2",
+    b"\x89PNG": "folder",
+    b"\xff\xd8\xff": "folder",
+    b"BM": "folder",
+    b"P5": "folder",
+    b"P6": "folder",
+}
+_ZARR_FILES = (".zgroup", ".zattrs", ".zarray", "zarr.json")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovieFrame:
+    """One image of a movie."""
+
+    index: int
+    image: Image  # (h, w) uint8 or uint16
+    time_ns: int | None  # on the clock of the file; None: the file does not tell
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """How a movie is read.
+
+    Attributes
+    ----------
+    channel : red, green, blue or grey (luma) of a movie in colour; None: a movie in colour is refused.
+    bits : depth of the pixels, where the file does not tell it; None: that of the file, or of its type.
+    partial : a movie that breaks off, or can not be decoded from some image on, ends there instead of being refused.
+    """
+
+    channel: str | None = None
+    bits: int | None = None
+    partial: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovieFacts:
+    """What a file tells of itself.
+
+    Attributes
+    ----------
+    reader, library : the row of MOVIE_READERS, and the package that decodes, with its version.
+    codec : name of the compression, '' for none.
+    lossy : whether it changes grey levels; None: not known.
+    bits : depth of the pixels.
+    frames : number of images; an estimate if `counted` is False.
+    times_ns : (n,) time of each image on the clock of the file; None: the file tells no times.
+    times : where these times come from, for people; '' without times.
+    um_per_px : as the file states it. It is shown, never used.
+    """
+
+    reader: str
+    library: str
+    codec: str
+    lossy: bool | None
+    width_px: int
+    height_px: int
+    bits: int
+    frames: int
+    counted: bool = True
+    times_ns: NDArray[np.int64] | None = None
+    times: str = ""
+    um_per_px: float | None = None
+    remarks: tuple[str, ...] = ()  # what was assumed, and what is unusual
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Frames per second, by the median interval; None: not known."""
+        times = self.times_ns
+        return None if times is None or len(times) < 2 else 1.0 / max(seconds(int(np.median(np.diff(times)))), 1e-9)
+
+    def describe(self) -> str:
+        """One line for people."""
+        known = "" if self.counted else "about "
+        return (
+            f"{self.width_px} x {self.height_px} pixels of {self.bits} bit, {known}{self.frames} images, "
+            f"{self.codec or 'uncompressed'}{' (lossy)' if self.lossy else ''}, times: {self.times or 'none'}"
+        )
+
+
+class Movie(ABC):
+    """An open movie. Memory does not grow with its length.
+
+    Attributes
+    ----------
+    path : as given.
+    facts : what the file tells.
+    remarks : those of `facts`, and what was noticed while reading.
+    """
+
+    facts: MovieFacts
+
+    def __init__(self, path: Path, options: ReadOptions) -> None:
+        self.path = path
+        self.options = options
+        self.remarks: list[str] = []
+
+    def close(self) -> None:  # noqa: B027  most readers hold no file
+        """Release the file."""
+
+    @abstractmethod
+    def image(self, index: int) -> Image:
+        """One image; MovieError if it can not be read."""
+
+    def frames(self) -> Iterator[MovieFrame]:
+        """All images in order.
+
+        Raises
+        ------
+        MovieError : an image can not be read, and `options.partial` is not set; the text says how many could.
+        """
+        times = self.facts.times_ns
+        for index in range(self.facts.frames):
+            try:
+                image = self.image(index)
+            except MovieError as error:
+                self.broken_off(index, str(error).removeprefix(f"{self.path}: "), error)
+                return
+            yield MovieFrame(index, image, None if times is None else int(times[index]))
+
+    def broken_off(self, read: int, why: str, error: Exception | None = None) -> None:
+        """Note that the movie ends early, after `read` images; or refuse it."""
+        if not self.options.partial or not read:
+            advice = f"; --partial takes the {read} images before it" if read else ""
+            raise MovieError(f"{self.path}: {why}{advice}") from error
+        self.remarks = [each for each in self.remarks if not each.startswith(_ONLY)]
+        self.remarks.append(f"{_ONLY} {read} images were taken: {why}")
+
+    def median_image(self, count: int = 31) -> Image:
+        """Median of at most `count` images spread over the movie: what does not move, such as the chip."""
+        facts = self.facts
+        affordable = _MEDIAN_BYTES // (facts.width_px * facts.height_px * pixel_type(facts.bits).itemsize)
+        count = max(min(count, facts.frames, affordable), 1)
+        chosen = np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int))
+        images = np.stack([self.image(int(index)) for index in chosen])
+        median: Image = np.median(images, axis=0, overwrite_input=True).round().astype(images.dtype)
+        return median
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def open_movie(path: Path | str, reader: str | None = None, options: ReadOptions | None = None) -> Movie:
+    """Open a movie for reading.
+
+    Parameters
+    ----------
+    path : a file, or a folder of images or of OME-Zarr.
+    reader : a name of MOVIE_READERS; None: by the content of the file, whatever its name is.
+
+    Raises
+    ------
+    MovieError : one line: there is no such file, or it is no movie that can be read.
+    UsageError : a package is not installed; the text has the command.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise MovieError(f"{path}: no such movie; it is a file, or a folder of images")
+    name = reader or _reader_by_content(path)
+    movie: Movie = MOVIE_READERS[name].load()(path, options or ReadOptions())
+    movie.remarks[:0] = movie.facts.remarks
+    return movie
+
+
+def _reader_by_content(path: Path) -> str:
+    if path.is_dir():
+        return "ome_zarr" if any((path / name).exists() for name in _ZARR_FILES) else "folder"
+    try:
+        with path.open("rb") as file:
+            begin = file.read(8)
+    except OSError as error:
+        raise MovieError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
+    if not begin:
+        raise MovieError(f"{path}: is empty; the recording or the copy has failed")
+    return next((name for magic, name in _BEGINNINGS.items() if begin.startswith(magic)), "video")
+
+
+def checked_size(path: Path, width_px: int, height_px: int) -> tuple[int, int]:
+    """Width and height, before anything of that size is decoded; MovieError if they are no image's."""
+    sides = min(width_px, height_px) >= SMALLEST_PX and max(width_px, height_px) <= LARGEST_PX
+    if not sides or width_px * height_px > MOST_PIXELS:
+        raise MovieError(
+            f"{path}: images of {width_px} x {height_px} pixels; from {SMALLEST_PX} to {LARGEST_PX} on each side can "
+            f"be read, and {MOST_PIXELS / 1e6:g} million in all; crop or bin them"
+        )
+    return width_px, height_px
+
+
+def depth_of(significant: int, asked: int | None) -> int:
+    """The depth of PIXEL_BITS that holds so many significant bits; the one that was asked for, if any."""
+    return asked if asked is not None else next(bits for bits in PIXEL_BITS if bits >= significant)
+
+
+def whole_ns(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Times in s as ns."""
+    return np.rint(np.asarray(times_s, np.float64) * NS_PER_S).astype(np.int64)

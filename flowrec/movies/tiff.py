@@ -1,0 +1,172 @@
+"""TIFF stacks by tifffile: plain pages, OME (also over several files), ImageJ, BigTIFF."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from flowrec.declarations import Image
+from flowrec.errors import MovieError
+from flowrec.movies.grey import grey_image, refuse_other_type
+from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_size, depth_of, whole_ns
+from flowrec.movies.ome import OmeFacts, ome_facts, um_per
+
+_LOSSY = ("JPEG", "JPEG_LOSSY", "OJPEG", "WEBP", "JPEGXR", "JPEGXL", "JPEG2000", "JETRAW")
+_MINISWHITE, _PALETTE = 0, 3
+
+
+class TiffMovie(Movie):
+    """A stack of images. One page is decoded at a time."""
+
+    def __init__(self, path: Path, options: ReadOptions) -> None:
+        super().__init__(path, options)
+        with ExitStack() as refused:
+            try:
+                with _logged() as complaints:
+                    self._file = refused.enter_context(tifffile.TiffFile(path))
+                    self._pages = self._pages_of(self._file)
+                    self.facts = self._facts()
+                if complaints:
+                    found = len(self._pages)
+                    self.broken_off(found, f"is damaged or breaks off, {found} images are there ({complaints[0]})")
+            except MovieError:
+                raise
+            except Exception as error:  # of many kinds
+                raise self._unreadable(error) from error
+            refused.pop_all()
+
+    def _unreadable(self, error: Exception) -> MovieError:
+        return MovieError(f"{self.path}: is no TIFF that can be read ({error}); the file is damaged or cut short")
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _pages_of(self, file: tifffile.TiffFile) -> list[Any]:
+        """The pages of the movie in order; of those that are not there, None. Or frames of contiguous pixels."""
+        series = file.series
+        if not series:
+            raise MovieError(f"{self.path}: holds no image")
+        if len({each.shape for each in series}) > 1 or len(series) > 1:
+            sizes = list(
+                dict.fromkeys(f"{each.sizes.get('width', 0)} x {each.sizes.get('height', 0)}" for each in series)
+            )
+            what = f"images of different sizes ({', '.join(sizes[:3])})" if len(sizes) > 1 else f"{len(series)} series"
+            raise MovieError(f"{self.path}: holds {what}; a movie has one: export it alone")
+        first = series[0]
+        checked_size(self.path, first.keyframe.imagewidth, first.keyframe.imagelength)
+        axes = first.axes.removesuffix("S")
+        long = {
+            axis: length for axis, length in zip(axes, first.shape, strict=False) if length > 1 and axis not in "YX"
+        }
+        if len(long) > 1:
+            named = ", ".join(f"{axis} {length}" for axis, length in long.items())
+            raise MovieError(
+                f"{self.path}: has more than one series of images ({named}); export one channel and one plane"
+            )
+        return self._whole_pages(first, next(iter(long.values()), 1))
+
+    def _whole_pages(self, series: Any, count: int) -> list[Any]:
+        pages = list(series.pages)
+        if len(pages) == 1 < count and series.dataoffset is not None:  # ImageJ: one page, then nothing but pixels
+            shape, dtype = (count, *series.keyframe.shape), series.keyframe.dtype.newbyteorder(self._file.byteorder)
+            there = (self.path.stat().st_size - series.dataoffset) // (series.keyframe.size * dtype.itemsize)
+            if there < count:
+                self.broken_off(there, f"breaks off: its header promises {count} images, {there} are there")
+            return list(np.memmap(self.path, dtype, "r", series.dataoffset, (min(there, count), *shape[1:])))
+        there = next((n for n, page in enumerate(pages) if page is None), len(pages))
+        if there < count:
+            self.broken_off(there, f"breaks off: its header promises {count} images, {there} are there")
+        return pages[: min(there, count)]
+
+    def _facts(self) -> MovieFacts:
+        file, page, count = self._file, self._file.series[0].keyframe, len(self._pages)
+        refuse_other_type(self.path, page.dtype)
+        remarks = []
+        ome = ome_facts(file.ome_metadata or "", count) if file.is_ome else OmeFacts()
+        imagej: dict[str, Any] = dict(file.imagej_metadata or {})
+        micromanager: dict[str, Any] = dict(file.micromanager_metadata or {}) if file.is_micromanager else {}
+        stated = ome.bits or _whole(micromanager.get("Summary", {}).get("BitDepth"))
+        bits = depth_of(
+            stated or page.dtype.itemsize * 8 if page.bitspersample == 16 else page.bitspersample, self.options.bits
+        )
+        if bits == 16 and stated is None and self.options.bits is None:
+            remarks.append("the file does not say how many of its 16 bits the camera used; 16 are assumed (movie.bits)")
+        if int(page.photometric) == _PALETTE:
+            raise MovieError(f"{self.path}: its pixels are numbers of colours (a palette); export grey levels")
+        if int(page.photometric) == _MINISWHITE:
+            remarks.append("it declares 0 as white; grey levels are used as they are stored")
+        axis = file.series[0].axes[:1]
+        if axis == "Z" and count > 1:
+            remarks.append("its images are numbered as planes of depth (Z); they are taken as a movie")
+        times, text = _times(ome, imagej, count)
+        compression = page.compression.name if hasattr(page.compression, "name") else str(page.compression)
+        return MovieFacts(
+            reader="tiff",
+            library=f"tifffile {tifffile.__version__}",
+            codec="" if compression == "NONE" else compression.lower(),
+            lossy=compression in _LOSSY,
+            width_px=page.imagewidth,
+            height_px=page.imagelength,
+            bits=bits,
+            frames=count,
+            times_ns=times,
+            times=text,
+            um_per_px=ome.um_per_px if ome.um_per_px is not None else _imagej_um_per_px(page, imagej),
+            remarks=tuple(remarks),
+        )
+
+    def image(self, index: int) -> Image:
+        page = self._pages[index]
+        try:
+            array = np.asarray(page if isinstance(page, np.ndarray) else page.asarray())
+        except Exception as error:  # of many kinds, by the codec
+            raise MovieError(f"{self.path}: image {index} can not be decoded ({error})") from error
+        if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[2] not in (3, 4):  # one plane per colour
+            array = np.moveaxis(array, 0, 2)
+        return grey_image(array, self.options.channel, self.facts.bits, self.path, index)
+
+
+@contextmanager
+def _logged() -> Iterator[list[str]]:
+    """What tifffile logs as an error: it goes on with the pages that it has found."""
+    complaints: list[str] = []
+    handler = logging.Handler(logging.ERROR)
+    handler.emit = lambda record: complaints.append(record.getMessage().rpartition("> ")[2])  # type: ignore[method-assign]
+    tifffile.logger().addHandler(handler)
+    try:
+        yield complaints
+    finally:
+        tifffile.logger().removeHandler(handler)
+
+
+def _times(ome: OmeFacts, imagej: dict[str, Any], count: int) -> tuple[NDArray[np.int64] | None, str]:
+    """Times of the images, and where they come from."""
+    if ome.times_s is not None and (count == 1 or ome.times_s.any()):  # some writers leave all of them 0
+        return whole_ns(ome.times_s), "OME DeltaT of each image"
+    interval_s, text = ome.interval_s, "OME TimeIncrement"
+    if not interval_s:
+        interval_s, text = imagej.get("finterval"), "the interval that ImageJ states"
+    if not isinstance(interval_s, (int, float)) or not interval_s > 0.0:
+        return None, ""
+    return whole_ns(
+        np.arange(count, dtype=np.float64) * float(interval_s)
+    ), f"{text}, every {1e3 * interval_s:.4g} ms; nominal"
+
+
+def _imagej_um_per_px(page: Any, imagej: dict[str, Any]) -> float | None:
+    factor, tag = um_per(str(imagej.get("unit", "")).replace("\\u00B5", "µ")), page.tags.get("XResolution")
+    if factor is None or tag is None:
+        return None
+    pixels, units = tag.value
+    return factor * units / pixels if pixels else None
+
+
+def _whole(number: Any) -> int | None:
+    return int(number) if isinstance(number, (int, float)) and 1 <= number <= 16 else None

@@ -1,0 +1,283 @@
+"""AVI, MP4, MKV, MOV by PyAV. Grey levels are the luma plane as it is stored, without a conversion of its range."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.declarations import Image
+from flowrec.errors import MovieError
+from flowrec.messages import pixel_type
+from flowrec.movies.grey import CHANNELS, grey_image, refuse_colour
+from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, ReadOptions, checked_size, depth_of
+from flowrec.units import NS_PER_S
+
+_LOSSLESS = {
+    "ffv1",
+    "huffyuv",
+    "ffvhuff",
+    "rawvideo",
+    "utvideo",
+    "png",
+    "qtrle",
+    "zlib",
+    "lagarith",
+    "magicyuv",
+    "tiff",
+}
+_LOSSLESS |= {"v210", "v410", "r210", "flashsv", "bmp", "cscd", "msrle", "rle", "y41p", "yuv4", "zmbv", "targa", "sgi"}
+_NOMINAL = ("avi",)  # containers that state a rate only, not the time of each image
+_RANGES = {1: "limited range, 16 to 235 as stored", 2: "full range"}
+_GREY_CHROMA = 4  # largest deviation of a chroma sample from its middle in a grey movie, in 8-bit levels
+_COLOURED_SHARE = 1e-3  # fraction of chroma samples beyond it from which on the movie is in colour
+_PLANAR_LUMA = (
+    "gray",
+    "yuv",
+    "nv12",
+    "nv16",
+    "nv21",
+    "nv24",
+    "p010",
+    "p012",
+    "p016",
+    "p210",
+    "p216",
+    "p410",
+    "p416",
+    "ya",
+)
+_PACKED_LUMA = {"yuyv422": 0, "yvyu422": 0, "uyvy422": 1}  # byte of the first luma sample
+_HIGH_BITS = ("p010", "p012", "p210")  # samples are in the upper bits of 16
+
+
+class VideoMovie(Movie):
+    """A movie in a container. Packets are listed when it is opened; images are decoded when they are asked for."""
+
+    def __init__(self, path: Path, options: ReadOptions) -> None:
+        super().__init__(path, options)
+        self._container, self._stream = _opened(path)
+        try:
+            self.facts = self._facts()
+        except BaseException:
+            self._container.close()
+            raise
+
+    def close(self) -> None:
+        self._container.close()
+
+    def _facts(self) -> MovieFacts:
+        path, stream, container = self.path, self._stream, self._container
+        codec = stream.codec_context
+        width, height = checked_size(path, codec.width, codec.height)
+        if codec.pix_fmt is None:
+            raise MovieError(f"{path}: no pixel format is known of {codec.name}; the file is damaged or was cut short")
+        bits = av.VideoFormat(codec.pix_fmt).components[0].bits
+        pts, damaged = self._packets()
+        if not pts:
+            raise MovieError(f"{path}: holds no image; the file is damaged or was cut short")
+        self._pts = sorted(p for p in pts if p is not None)
+        timed = len(self._pts) == len(pts)
+        rate = stream.average_rate or stream.guessed_rate
+        nominal = container.format.name in _NOMINAL
+        times, text = None, ""
+        if timed and (not nominal or rate):
+            times = np.array([self._time_ns(p) for p in self._pts], np.int64)
+            text = _times_text(times, nominal, float(rate) if rate else 0.0)
+        promised = self._promised(times)
+        if promised > len(pts) or damaged:
+            why = f"breaks off: its header promises {max(promised, len(pts))} images, {len(pts) - damaged} are there"
+            self.broken_off(len(pts) - damaged, why)
+            pts = pts[: len(pts) - damaged]
+            self._pts = sorted(p for p in pts if p is not None)
+            times = times[: len(pts)] if times is not None else None
+        colour_range = _RANGES.get(int(codec.color_range), "")
+        if codec.pix_fmt.startswith("yuvj"):
+            colour_range = _RANGES[2]
+        lossy = codec.name not in _LOSSLESS
+        return MovieFacts(
+            reader="video",
+            library=f"PyAV {av.__version__} (libavcodec {'.'.join(map(str, av.library_versions['libavcodec']))})",
+            codec=f"{codec.name} {codec.pix_fmt}" + (f", luma of {colour_range}" if colour_range else ""),
+            lossy=lossy,
+            width_px=width,
+            height_px=height,
+            bits=depth_of(bits, self.options.bits),
+            frames=len(pts),
+            counted=False,
+            times_ns=times,
+            times=text,
+            remarks=tuple(self._unusual()),
+        )
+
+    def _packets(self) -> tuple[list[int | None], int]:
+        """Presentation times of all packets with an image, in file order, and how many at the end are cut off."""
+        pts: list[int | None] = []
+        damaged = 0
+        try:
+            for packet in self._container.demux(self._stream):
+                if packet.size:
+                    pts.append(packet.pts)
+                    damaged = damaged + 1 if packet.is_corrupt else 0
+        except av.FFmpegError as error:
+            self.broken_off(len(pts), f"breaks off after {len(pts)} images ({_text(error)})", error)
+        return pts, damaged
+
+    def _promised(self, times: NDArray[np.int64] | None) -> int:
+        """How many images the header promises; 0 if it does not."""
+        if self._stream.frames:
+            return int(self._stream.frames)
+        # Matroska states a duration, which ends with the last image or, of unequal intervals, near it.
+        duration = self._container.duration
+        if times is None or len(times) < 3 or duration is None or len(self._container.streams) > 1:
+            return 0
+        interval = float(np.diff(times).mean())
+        missing = (duration * (NS_PER_S / av.time_base) - float(times[-1])) / interval
+        return len(times) + round(missing) - 1 if missing > 3.5 else 0
+
+    def _unusual(self) -> Iterator[str]:
+        stream = self._stream
+        aspect = stream.sample_aspect_ratio
+        if aspect is not None and aspect not in (0, 1):
+            yield f"its pixels are said to be {aspect.numerator}:{aspect.denominator}; they are taken as square"
+        if len(self._container.streams.video) > 1:
+            yield f"it has {len(self._container.streams.video)} video streams; the best one is read"
+
+    def _time_ns(self, pts: int) -> int:
+        """A presentation time since the first image: containers begin at times that the encoder's delay determines."""
+        base: Fraction = self._stream.time_base
+        return round(Fraction((pts - self._pts[0]) * base.numerator * NS_PER_S, base.denominator))
+
+    def frames(self) -> Iterator[MovieFrame]:
+        count = 0
+        container, stream = _opened(self.path)
+        try:
+            for frame in self._decoded(container, stream):
+                if count == self.facts.frames:
+                    break  # what follows is cut off
+                time_ns = (
+                    self._time_ns(frame.pts) if frame.pts is not None and self.facts.times_ns is not None else None
+                )
+                yield MovieFrame(count, self._grey(frame, count), time_ns)
+                count += 1
+        except av.FFmpegError as error:
+            self.broken_off(count, f"image {count} can not be decoded ({_text(error)})", error)
+        finally:
+            container.close()
+        if self.options.partial and count < self.facts.frames:
+            self.broken_off(count, "the rest can not be decoded")
+        if not count:
+            raise MovieError(f"{self.path}: no image of it can be decoded; the file is damaged")
+
+    def _decoded(self, container: Any, stream: Any) -> Iterator[Any]:
+        for frame in container.decode(stream):
+            if frame.is_corrupt:
+                raise av.InvalidDataError(0, "its data is damaged")
+            yield frame
+
+    def image(self, index: int) -> Image:
+        if not self._pts:
+            return next(each.image for each in self.frames() if each.index == index)
+        target = self._pts[index]
+        container, stream = _opened(self.path)
+        try:
+            container.seek(target, stream=stream, backward=True)
+            for frame in self._decoded(container, stream):
+                if frame.pts is not None and frame.pts >= target:
+                    return self._grey(frame, index)
+        except av.FFmpegError as error:
+            raise MovieError(f"{self.path}: image {index} can not be decoded ({_text(error)})") from error
+        finally:
+            container.close()
+        raise MovieError(f"{self.path}: image {index} is not there; the movie ends before it")
+
+    def _grey(self, frame: Any, index: int) -> Image:
+        """Grey levels (h, w) of a decoded image."""
+        facts, channel, name = self.facts, self.options.channel, frame.format.name
+        if (frame.width, frame.height) != (facts.width_px, facts.height_px):
+            raise MovieError(
+                f"{self.path}: image {index} has {frame.width} x {frame.height} pixels, the first one "
+                f"{facts.width_px} x {facts.height_px}; cut the movie where its size changes"
+            )
+        if channel in CHANNELS[:3] and not name.startswith("gray"):
+            return grey_image(frame.to_ndarray(format="rgb24"), channel, facts.bits, self.path, index)
+        luma = _luma(frame)
+        if luma is None:
+            array = frame.to_ndarray(format="rgb24" if frame.format.components[0].bits <= 8 else "rgb48le")
+            return grey_image(array, channel, facts.bits, self.path, index)
+        if channel is None and _coloured(frame):
+            raise refuse_colour(self.path, index)
+        return grey_image(luma, channel, facts.bits, self.path, index)
+
+
+def _opened(path: Path) -> tuple[Any, Any]:
+    """The container and its video stream, with a decoder that reports damaged data instead of concealing it."""
+    try:
+        container = av.open(str(path), options={"err_detect": "explode"})
+    except (av.FFmpegError, OSError) as error:
+        raise MovieError(
+            f"{path}: is no movie that can be read ({_text(error)}); if it was cut short, ffmpeg may repair it"
+        ) from error
+    stream = container.streams.best("video")
+    if stream is None:
+        container.close()
+        raise MovieError(f"{path}: has no video stream")
+    stream.thread_type = "AUTO"
+    stream.codec_context.options = {"err_detect": "explode"}
+    return container, stream
+
+
+def _times_text(times: NDArray[np.int64], nominal: bool, rate_hz: float) -> str:
+    """Where the times come from."""
+    if nominal:
+        return f"the file's nominal rate, {rate_hz:g} Hz; it does not say when each image was taken"
+    steps_ms = np.diff(times) / 1e6
+    if not len(steps_ms):
+        return "presentation times"
+    low, high = steps_ms.min(), steps_ms.max()
+    spread = f"intervals of {low:.4g} to {high:.4g} ms" if high - low > 1.1 else f"every {steps_ms.mean():.4g} ms"
+    return f"presentation times, {spread}"
+
+
+def _luma(frame: Any) -> NDArray[Any] | None:
+    """The luma samples (h, w) as they are stored; None for other formats, such as RGB."""
+    name, width, height = frame.format.name, frame.width, frame.height
+    if name.endswith("be"):
+        frame = frame.reformat(format=name[:-2] + "le")
+    dtype = pixel_type(frame.format.components[0].bits)
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[:height]
+    if name in _PACKED_LUMA:
+        return rows[:, _PACKED_LUMA[name] : 2 * width : 2]
+    if not name.startswith(_PLANAR_LUMA) or name.startswith(("ya8", "ya16")):
+        return None
+    samples: NDArray[Any] = rows[:, : width * dtype.itemsize].view(dtype)
+    return samples >> (16 - frame.format.components[0].bits) if name.startswith(_HIGH_BITS) else samples
+
+
+def _coloured(frame: Any) -> bool:
+    """Whether chroma samples differ from grey by more than the noise of a lossy codec."""
+    name, bits = frame.format.name, frame.format.components[0].bits
+    if name.startswith("gray"):
+        return False
+    if name in _PACKED_LUMA:
+        plane, first = frame.planes[0], 1 - _PACKED_LUMA[name]
+        rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+        samples = [rows[: frame.height, first : 2 * frame.width : 2]]
+    else:
+        if bits > 8 or name.endswith("be"):  # compared with 8 bit
+            frame = frame.reformat(format="yuv444p")
+        samples = []
+        for plane in frame.planes[1:3]:
+            used = plane.width * (2 if name.startswith("nv") else 1)
+            samples.append(np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: plane.height, :used])
+    return any(float((np.abs(each.astype(np.int16) - 128) > _GREY_CHROMA).mean()) > _COLOURED_SHARE for each in samples)
+
+
+def _text(error: Exception) -> str:
+    return (getattr(error, "strerror", "") or str(error)).strip().lower()

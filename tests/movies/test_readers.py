@@ -1,0 +1,247 @@
+"""Movies of other people's encoders: grey levels, times and depth come out as they went in, or the movie is refused."""
+
+import struct
+import zlib
+
+import av
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from flowrec.errors import MovieError
+from flowrec.movies import ReadOptions, open_movie
+from tests.movies import makers
+
+COUNT, HEIGHT, WIDTH = 12, 48, 64
+TIMES_MS = [0, 30, 65, 100, 101, 150, 200, 230, 260, 300, 333, 400]
+
+
+def pictures(bits=8, count=COUNT):
+    """Noise on a slope, over the whole range of levels."""
+    rng, top = np.random.default_rng(3), 2**bits - 1
+    slope = np.linspace(0, top, WIDTH)[None, :] * np.ones((HEIGHT, 1))
+    dtype = np.uint8 if bits == 8 else np.uint16
+    return [np.clip(slope + rng.normal(0, top / 20, slope.shape), 0, top).astype(dtype) for _ in range(count)]
+
+
+def read(path, **options):
+    with open_movie(path, options=ReadOptions(**options)) as movie:
+        frames = list(movie.frames())
+        return movie.facts, frames, movie.remarks
+
+
+LOSSLESS = {
+    "png folder": (8, lambda d, images: makers.folder(d / "pngs", images)),
+    "16-bit tif folder": (16, lambda d, images: makers.folder(d / "tifs", images, "a{}.tif")),
+    "12-bit ome-tiff": (12, lambda d, images: makers.ome_tiff(d / "a.ome.tif", images, bits=12)),
+    "big-endian tiff": (
+        16,
+        lambda d, images: tifffile.imwrite(d / "b.tif", np.stack(images), byteorder=">") or d / "b.tif",
+    ),
+    "imagej": (16, lambda d, images: tifffile.imwrite(d / "i.tif", np.stack(images), imagej=True) or d / "i.tif"),
+    "lzw pages": (
+        8,
+        lambda d, images: tifffile.imwrite(d / "l.tif", np.stack(images), compression="lzw") or d / "l.tif",
+    ),
+    "ffv1": (8, lambda d, images: makers.video(d / "a.mkv", "ffv1", images)),
+    "12-bit ffv1": (12, lambda d, images: makers.video(d / "a12.mkv", "ffv1_12", images)),
+    "raw avi": (8, lambda d, images: makers.video(d / "a.avi", "raw", images)),
+    "luma of h264": (8, lambda d, images: makers.video(d / "a.mp4", "h264_lossless", images)),
+    "ome-zarr 0.5": (16, lambda d, images: makers.ome_zarr(d / "a.zarr", images, 0.05)),
+    "ome-zarr 0.4": (8, lambda d, images: makers.ome_zarr(d / "b.zarr", images, 0.05, "0.4", "tyx", 5)),
+}
+
+
+@pytest.mark.parametrize("kind", LOSSLESS)
+def test_grey_levels_come_out_as_they_went_in(kind, tmp_path):
+    bits, make = LOSSLESS[kind]
+    images = pictures(bits)
+    facts, frames, _ = read(make(tmp_path, images))
+    assert (facts.width_px, facts.height_px, facts.bits) == (WIDTH, HEIGHT, bits)
+    assert facts.frames == len(frames) == COUNT
+    for frame, image in zip(frames, images, strict=True):
+        np.testing.assert_array_equal(frame.image, image)
+        assert frame.image.dtype == image.dtype
+    with open_movie(make_again := tmp_path / next(tmp_path.iterdir())) as movie:  # one image alone, in any order
+        for index in (7, 0, 11):
+            np.testing.assert_array_equal(movie.image(index), images[index], err_msg=str(make_again))
+        assert movie.median_image(5).shape == (HEIGHT, WIDTH)
+
+
+def test_times_are_those_of_the_file_where_it_has_them(tmp_path):
+    images, times_ns = pictures(), np.array(TIMES_MS) * 1_000_000
+    made = [
+        makers.video(tmp_path / "v.mkv", "ffv1", images, times_ms=TIMES_MS),
+        makers.video(tmp_path / "v.mp4", "h264", images, times_ms=TIMES_MS),
+        makers.ome_tiff(tmp_path / "v.ome.tif", images, np.array(TIMES_MS) / 1e3),
+    ]
+    for path in made:
+        facts, frames, _ = read(path)
+        assert [frame.time_ns for frame in frames] == times_ns.tolist() == facts.times_ns.tolist(), path
+        assert "nominal" not in facts.times
+
+
+def test_a_rate_that_no_clock_has_measured_is_called_nominal(tmp_path):
+    images = pictures()
+    rates = {
+        makers.video(tmp_path / "r.avi", "xvid", images, 25.0): 40.0,
+        makers.ome_zarr(tmp_path / "r.zarr", images, 0.05): 50.0,
+    }
+    tifffile.imwrite(tmp_path / "r.tif", np.stack(images), imagej=True, metadata={"axes": "TYX", "finterval": 0.025})
+    for path, step_ms in (rates | {tmp_path / "r.tif": 25.0}).items():
+        facts, frames, _ = read(path)
+        assert "nominal" in facts.times
+        np.testing.assert_allclose(np.diff([frame.time_ns for frame in frames]) / 1e6, step_ms, rtol=1e-6)
+    for path in (makers.folder(tmp_path / "pngs", images), makers.ome_zarr(tmp_path / "n.zarr", images, None)):
+        facts, frames, _ = read(path)
+        assert facts.times == "" and frames[3].time_ns is None
+
+
+def cut(path, share):
+    data = path.read_bytes()
+    short = path.with_name("cut_" + path.name)
+    head = 6144 if path.suffix == ".avi" else 0
+    short.write_bytes(data[: head + int(share * (len(data) - head))])
+    return short
+
+
+def test_a_movie_that_breaks_off_is_refused_and_its_whole_images_can_be_asked_for(tmp_path):
+    images = pictures()
+    stack = tifffile.TiffWriter(tmp_path / "t.tif", imagej=True)
+    stack.write(np.stack(images), contiguous=True)
+    stack.close()
+    for path in (
+        makers.video(tmp_path / "a.avi", "mjpeg", images),
+        makers.video(tmp_path / "x.avi", "xvid", images),
+        makers.video(tmp_path / "a.mkv", "ffv1", images),
+    ):
+        whole = [frame.image for frame in read(path)[1]]
+        with pytest.raises(MovieError, match=r"breaks off.* 12 images, \d are there; --partial takes"):
+            read(cut(path, 0.6))
+        _, frames, remarks = read(cut(path, 0.6), partial=True)
+        assert 1 <= len(frames) <= 8 and f"only the first {len(frames)} images" in remarks[-1]
+        for frame, image in zip(frames, whole, strict=False):
+            np.testing.assert_array_equal(frame.image, image)
+    for path in (makers.video(tmp_path / "a.mp4", "h264", images), tmp_path / "t.tif"):  # their index is at the end
+        with pytest.raises(MovieError, match=str(tmp_path)):
+            read(cut(path, 0.6))
+
+
+def test_colour_is_refused_unless_it_is_said_what_to_take_of_it(tmp_path):
+    colours = np.random.default_rng(1).integers(0, 255, (3, HEIGHT, WIDTH, 3)).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "c.tif", colours, photometric="rgb")
+    makers.folder(tmp_path / "c", [image[..., ::-1] for image in colours])
+    with av.open(str(tmp_path / "c.mov"), "w") as container:
+        stream = container.add_stream("qtrle", rate=30)
+        stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "rgb24"
+        for image in colours:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+    for name in ("c.tif", "c", "c.mov"):
+        with pytest.raises(MovieError, match=r"in colour; choose what is used with --set movie\.channel=grey"):
+            read(tmp_path / name)
+        for channel, expected in (("green", colours[..., 1]), ("blue", colours[..., 2])):
+            frames = read(tmp_path / name, channel=channel)[1]
+            np.testing.assert_array_equal([frame.image for frame in frames], expected)
+        luma = read(tmp_path / name, channel="grey")[1][0].image
+        np.testing.assert_array_equal(luma, cv2.cvtColor(colours[0], cv2.COLOR_RGB2GRAY))
+    tifffile.imwrite(tmp_path / "g.tif", np.repeat(colours[..., :1], 3, -1), photometric="rgb")
+    np.testing.assert_array_equal(read(tmp_path / "g.tif")[1][1].image, colours[1, ..., 0])  # grey in all channels
+
+
+def test_a_colour_movie_of_a_lossy_codec_is_refused_and_a_grey_one_is_not(tmp_path):
+    planes = np.full((HEIGHT * 3 // 2, WIDTH), 90, np.uint8)
+    for name, chroma in (("grey.mp4", 128), ("tinted.mp4", 150)):
+        planes[HEIGHT:] = chroma
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream("libx264", rate=30)
+            stream.height, stream.width, stream.pix_fmt = HEIGHT, WIDTH, "yuv420p"
+            for _ in range(3):
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(planes, format="yuv420p")))
+            container.mux(stream.encode(None))
+    assert len(read(tmp_path / "grey.mp4")[1]) == 3
+    with pytest.raises(MovieError, match="in colour"):
+        read(tmp_path / "tinted.mp4")
+    assert abs(int(read(tmp_path / "tinted.mp4", channel="grey")[1][0].image[5, 5]) - 90) <= 1
+
+
+def png_head(width, height):
+    """A PNG that declares a size and holds a few bytes."""
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", zlib.compress(bytes(9)))]
+    data = b"".join(struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + data
+
+
+def test_sizes_are_refused_from_the_header_before_anything_is_decoded(tmp_path, monkeypatch):
+    (tmp_path / "bomb").mkdir()
+    (tmp_path / "bomb" / "a.png").write_bytes(png_head(60_000, 60_000))
+    tifffile.imwrite(tmp_path / "bomb.tif", np.zeros((2, HEIGHT, WIDTH), np.uint8), compression="zlib")
+    with tifffile.TiffFile(tmp_path / "bomb.tif", mode="r+b") as file:
+        for page in file.pages:
+            page.tags["ImageWidth"].overwrite(100_000)
+            page.tags["ImageLength"].overwrite(100_000)
+    makers.folder(tmp_path / "tiny", [np.zeros((1, 1), np.uint8)])
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr(tifffile.TiffPage, "asarray", lambda *_: pytest.fail("decoded"))
+    for name in ("bomb", "bomb.tif", "tiny"):
+        with pytest.raises(MovieError, match=r"from 8 to 16384 on each side|more than 150 million pixels"):
+            open_movie(tmp_path / name)
+
+
+def test_images_of_one_movie_have_one_size(tmp_path):
+    images = [*pictures(count=3), np.zeros((HEIGHT + 2, WIDTH), np.uint8)]
+    makers.folder(tmp_path / "mixed", images)
+    with tifffile.TiffWriter(tmp_path / "mixed.tif") as stack:
+        for image in images:
+            stack.write(image, contiguous=False, metadata=None)
+    with pytest.raises(MovieError, match=r"img_3\.png: has 64 x 50 pixels, img_0\.png 64 x 48"):
+        read(tmp_path / "mixed")
+    with pytest.raises(MovieError, match=r"different sizes \(64 x 48, 64 x 50\)"):
+        read(tmp_path / "mixed.tif")
+
+
+def test_a_file_is_what_it_holds_whatever_it_is_called(tmp_path):
+    images = pictures()
+    makers.ome_tiff(tmp_path / "a.ome.tif", images).rename(tmp_path / "stack.avi")
+    makers.video(tmp_path / "b.mkv", "ffv1", images).rename(tmp_path / "film.tif")
+    (tmp_path / "text.avi").write_text("frame,time_s\n" * 50)
+    (tmp_path / "nothing.tif").touch()
+    for name, reader in (("stack.avi", "tiff"), ("film.tif", "video")):
+        facts, frames, _ = read(tmp_path / name)
+        assert facts.reader == reader and len(frames) == COUNT
+    for name, why in (("text.avi", "no movie"), ("nothing.tif", "is empty"), ("absent.avi", "no such movie")):
+        with pytest.raises(MovieError, match=why):
+            read(tmp_path / name)
+
+
+def test_a_folder_is_read_in_natural_order_also_with_odd_names(tmp_path):
+    odd = tmp_path / "Fläschchen 測定 №1"
+    makers.folder(odd, pictures(count=12), "Bild µ{}.png")
+    (odd / "notes.txt").write_text("not an image")
+    (odd / ".hidden.png").write_text("nor this")
+    huge = odd / f"Bild µ{10**25}.png"
+    (odd / "Bild µ3.png").rename(huge)
+    with open_movie(odd) as movie:
+        order = [*pictures()[:3], *pictures()[4:], pictures()[3]]
+        for frame, image in zip(movie.frames(), order, strict=True):
+            np.testing.assert_array_equal(frame.image, image)
+        assert movie.remarks == ["2 other files in the folder are no images by their names"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MovieError, match="no image is in this folder"):
+        open_movie(tmp_path / "empty")
+
+
+def test_what_can_not_be_kept_exactly_is_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "f.tif", np.zeros((2, HEIGHT, WIDTH), np.float32))
+    tifffile.imwrite(
+        tmp_path / "two.tif", np.zeros((4, 2, HEIGHT, WIDTH), np.uint8), imagej=True, metadata={"axes": "TCYX"}
+    )
+    tifffile.imwrite(tmp_path / "deep.tif", np.full((2, HEIGHT, WIDTH), 4096, np.uint16))
+    for name, why in (("f.tif", "float32 pixels"), ("two.tif", r"\(T 4, C 2\); export one channel")):
+        with pytest.raises(MovieError, match=why):
+            read(tmp_path / name)
+    with pytest.raises(MovieError, match=r"grey level of 4096, more than 12 bit hold"):
+        read(tmp_path / "deep.tif", bits=12)
+    facts, _, remarks = read(tmp_path / "deep.tif")
+    assert facts.bits == 16 and "16 are assumed" in remarks[0]
