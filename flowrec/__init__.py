@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.commands.check import check as check
     from flowrec.commands.compare import compare as compare
     from flowrec.commands.export import export as export
+    from flowrec.commands.import_movie import import_movie as import_movie
     from flowrec.commands.info import info as info
     from flowrec.commands.record import record as record
     from flowrec.commands.replay import Change as Change
@@ -41,6 +42,7 @@ _MODULES = {
     "check": "commands.check",
     "compare": "commands.compare",
     "export": "commands.export",
+    "import_movie": "commands.import_movie",
     "info": "commands.info",
     "load_config": "config",
     "open": "session",

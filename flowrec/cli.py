@@ -1,6 +1,6 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in session_verbs.py and calibrate_verbs.py. Each function parses, calls
+The other verbs are in import_verb.py, session_verbs.py and calibrate_verbs.py. Each function parses, calls
 and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
@@ -23,6 +23,7 @@ import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
 from flowrec.calibrate_verbs import calibrate
 from flowrec.errors import FlowrecError, printable
+from flowrec.import_verb import import_movie
 from flowrec.session_verbs import (
     HelpWithMethods,
     SessionFile,
@@ -110,12 +111,14 @@ def record(
     from flowrec.commands.interactive import AtTerminal
     from flowrec.commands.record import prepare
     from flowrec.commands.run_summary import print_summary
+    from flowrec.rig_settings import MOVIE
     from flowrec.system.stderr import said_within
 
     if dry_run:
         typer.echo(to_toml(prepare(chosen)[0]))
         return
     inputs = [config] if config is not None else []
+    realtime = realtime or chosen.rig == MOVIE  # `import` takes a movie as fast as it can be read
     recorded = flowrec.record(chosen, out, view, realtime, overwrite, AtTerminal(), inputs)
 
     def summarize() -> None:
@@ -189,6 +192,7 @@ def replay(
         say(line)
 
 
+app.command("import")(import_movie)
 for _verb in (view, export, info, list_directory, check, recover, compare):
     app.command("ls" if _verb is list_directory else None, cls=HelpWithMethods)(_verb)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 from flowrec.methods import Method, Methods
+from flowrec.movies import MOVIE_READERS
 from flowrec.ranges import OneOf, Range, Seed, Share
 
 SIMULATED, MOVIE, LAB = "simulated", "movie", "lab"
@@ -35,6 +36,8 @@ _Rate = Annotated[float, Range(0.1, 5e3)]
 _Scale = Annotated[float, Range(1e-3, 1e3)]
 Angle = Annotated[float, Range(-360.0, 360.0)]
 _Coordinate = Annotated[float, Range(-1e7, 1e7)]
+# See Columns.
+Column = str | float | tuple[str, float] | tuple[str, float, float]
 PointUm = tuple[_Coordinate, _Coordinate]
 
 
@@ -116,10 +119,44 @@ class Safety:
 
 
 @dataclass(frozen=True, slots=True)
-class Movie:
-    """Section [movie]: the movie and the log that the rig `movie` plays."""
+class Columns:
+    """Section [movie.columns]: where a log of the coils has what. None: the column of that name, if there is one.
 
-    path: str = ""
+    A value is the name of a column; or name and factor, or name, factor and offset, as in `["phi", -1.0, 90.0]` for
+    90 - phi; or a number that holds throughout. See control/coil_log.py for what a log must tell.
+    """
+
+    time_s: Column | None = None
+    frequency_hz: Column | None = None
+    heading_deg: Column | None = None  # 0 to the right of the chip, 90 downwards
+    amplitude_mt: Column | None = None
+    i_x_a: Column | None = None  # or the currents
+    i_y_a: Column | None = None
+    i_z_a: Column | None = None
+    b_x_mt: Column | None = None  # or the field
+    b_y_mt: Column | None = None
+    b_z_mt: Column | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Movie:
+    """Section [movie]: the movie that the rig `movie` plays, and the log of what its coils did."""
+
+    path: str = ""  # of a file, or of a folder of images
+    reader: Annotated[str, MOVIE_READERS] | None = None  # None: by the content of the file
+    channel: Literal["red", "green", "blue", "grey"] | None = None  # what is used of a movie in colour
+    bits: Annotated[int, OneOf(8, 10, 12, 14, 16)] | None = None  # depth of the pixels, where the file does not tell it
+    partial: bool = False  # a movie that breaks off is used up to there
+    times: str = ""  # CSV with a column time_s, a row for each image; '': as the movie tells
+    rate_hz: Annotated[float, Range(1e-4, 1e6)] | None = None  # of the images, instead of their times
+    coils: str = ""  # log of the coils, CSV or Excel; '': there is none
+    columns: Columns = field(default_factory=Columns)
+    # Seconds of the log per second of the movie, and time of the log minus time of the movie at the first image.
+    clock_rate: Annotated[float, Range(0.01, 100.0)] = 1.0
+    clock_offset_s: Annotated[float, Range(-1e10, 1e10)] = 0.0
+    # The heading in the chip is that of the log, with the opposite sign if it is mirrored, plus this.
+    heading_offset_deg: Angle = 0.0
+    heading_mirrored: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,8 @@ def session_writer(
     live: bool = False,
     in_pieces: bool = False,
     derived: Mapping[str, float] | None = None,
+    facts: Mapping[str, str] | None = None,
+    keep_failed: bool = True,
 ) -> SessionWriter:
     """Create a session file and write its header.
 
@@ -44,10 +46,14 @@ def session_writer(
     live : drop images rather than wait for the disk.
     in_pieces : split the run, or record only around events, as the settings `recording.split_*` and `.snapshot_*` say.
     derived : settings that were derived because they were not given, by key, for the header.
+    facts : about devices or files that the session is made of, for the header.
+    keep_failed : False: an exception leaves no file.
     """
     header = session_header(config, chip)
     if derived:
         header = replace(header, provenance={**header.provenance, "derived": json.dumps(dict(derived))})
+    if facts:
+        header = replace(header, provenance={**header.provenance, **facts})
     if parent is not None:
         files = files_of(parent)
         named = {"file": parent.name, "sha256": session_sha256(files)}
@@ -64,6 +70,7 @@ def session_writer(
         region=region_of(config, chip, again=parent is not None),
         leave_out=config.recording.leave_out,
         bits=config.camera.bits,
+        keep_failed=keep_failed,
     )
     inputs = (*output.inputs, *(files_behind(parent) if parent is not None else ()))
     return SessionWriter(output.path, header, options, inputs=inputs)

@@ -101,7 +101,7 @@ def paced_run(
 
 def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] = 900) -> Results:
     """Time of a tick in ms by kind of run, their ratios, and the speed of a replay without refinement."""
-    config, chip, pipeline, _ = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
+    config, chip, pipeline, *_ = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
     prepared = prepare_inputs(config, pipeline, ticks)
     timings: dict[str, list[Timing]] = {kind: [] for kind in KINDS}
     with tempfile.TemporaryDirectory() as folder:

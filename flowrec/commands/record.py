@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from datetime import datetime
 from functools import partial
@@ -27,7 +27,8 @@ from flowrec.messages import FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
-from flowrec.rig_settings import RIGS
+from flowrec.rig_settings import MOVIE, RIGS
+from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
 from flowrec.rigs.rig import Rig
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.loop import Sink, run
@@ -61,12 +62,14 @@ class Prepared(NamedTuple):
     Attributes
     ----------
     derived : settings that were derived because they were not given, by key.
+    facts : about the source of a movie, for the head of the session.
     """
 
     config: ResolvedConfig
     chip: Chip
     pipeline: Pipeline
     derived: dict[str, float]
+    facts: Mapping[str, str]
 
 
 def prepare(asked: Config) -> Prepared:
@@ -83,11 +86,19 @@ def prepare(asked: Config) -> Prepared:
             f"sampler.method = {asked.sampler.method!r} needs the whole recording: use it in flowrec replay --refine; "
             f"a run takes {able}"
         )
+    given, facts = asked, dict[str, str]()
+    if asked.rig == MOVIE:
+        asked, found, remarks = fitted_to_movie(given)
+        facts |= found
+        say(f"{given.movie.path}: {facts['source.images']}, {facts['source.codec']}, times: {facts['source.times']}")
+        for remark in remarks:
+            warn(remark)
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
-    made = derived(asked, config)
+    made = derived(given, config)
     if made:
-        say(f"derived to fit the chip: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
+        what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
+        say(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
     refuse_adrift(config, chip)
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:
@@ -108,7 +119,7 @@ def prepare(asked: Config) -> Prepared:
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
-    return Prepared(config, chip, assemble(config, chip), made)
+    return Prepared(config, chip, assemble(config, chip), made, facts)
 
 
 def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
@@ -171,6 +182,7 @@ def record(
     overwrite: bool = False,
     control: Unattended | None = None,
     inputs: Sequence[Path] = (),
+    keep_failed: bool = True,
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -182,6 +194,7 @@ def record(
     realtime : keep the rig to the wall clock, with a watchdog of its ticks (run/watchdog.py).
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     inputs : files that were read besides those that `config` names; no output may be one of them.
+    keep_failed : False: a run that ends by an exception leaves no file, and one that it was to replace stays.
 
     Raises
     ------
@@ -190,8 +203,8 @@ def record(
     inputs = (*inputs, *_files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
-    resolved, chip, pipeline, made = prepare(config)
-    timeout_s = _guard_timeout_s(resolved) if realtime else None
+    resolved, chip, pipeline, made, source = prepare(config)
+    timeout_s = _guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
     path = _place(resolved, out, overwrite)
     output = Output(path, MCAP, inputs, overwrite)
     if view == "rrd":
@@ -215,7 +228,16 @@ def record(
         # From the first byte of the file to the last, every way to end the run leaves a complete file.
         stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
         writer = stack.enter_context(
-            session_writer(output, resolved, chip, live=realtime, in_pieces=True, derived=made)
+            session_writer(
+                output,
+                resolved,
+                chip,
+                live=realtime,
+                in_pieces=True,
+                derived=made,
+                facts=source,
+                keep_failed=keep_failed,
+            )
         )
         opened.append(writer)
         sinks: list[Sink] = [writer, statistics]
@@ -259,6 +281,8 @@ def record(
             facts["tracking_error_um"] = finite(statistics.tracking_error_um)
         if control.note:
             facts["note_not_finished"] = control.note
+        if isinstance(rig, MovieRig) and rig.noticed:
+            facts["note_movie"] = "; ".join(rig.noticed)
         outcome = as_text(facts) | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
@@ -322,7 +346,8 @@ def _files_of(config: Config) -> list[Path]:
         files += [chip, chip.with_suffix(".png"), chip.with_suffix(".toml")]
     if config.start.field:
         files += files_behind(Path(config.start.field))
-    return files
+    movie = config.movie
+    return [*files, *(Path(name) for name in (movie.path, movie.times, movie.coils) if name)]
 
 
 def _report_remarks(writer: SessionWriter) -> None:

@@ -18,7 +18,7 @@ from flowrec.declarations import Image
 from flowrec.errors import MovieError
 from flowrec.messages import PIXEL_BITS, pixel_type
 from flowrec.methods import Method, Methods
-from flowrec.units import NS_PER_S, seconds
+from flowrec.units import NS_PER_S
 
 # A row's class is made with (path, options) and is a Movie.
 MOVIE_READERS = Methods(
@@ -106,12 +106,6 @@ class MovieFacts:
     times: str = ""
     um_per_px: float | None = None
     remarks: tuple[str, ...] = ()  # what was assumed, and what is unusual
-
-    @property
-    def rate_hz(self) -> float | None:
-        """Frames per second, by the median interval; None: not known."""
-        times = self.times_ns
-        return None if times is None or len(times) < 2 else 1.0 / max(seconds(int(np.median(np.diff(times)))), 1e-9)
 
     def describe(self) -> str:
         """One line for people."""

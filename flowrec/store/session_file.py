@@ -82,6 +82,7 @@ class WriterOptions:
     region : record only the window around the robot of most images (roi.py); None: all of all images.
     leave_out : topics that are not recorded, as names or patterns such as `/view/*`.
     bits : depth of the images; another one is refused.
+    keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
     """
 
     frames: str = "zstd"
@@ -94,6 +95,7 @@ class WriterOptions:
     region: Region | None = None
     leave_out: tuple[str, ...] = ()
     bits: int = 8
+    keep_failed: bool = True
 
     @property
     def left_out_topics(self) -> frozenset[str]:

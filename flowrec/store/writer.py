@@ -84,6 +84,7 @@ class SessionWriter:
         self.remarks: deque[str] = deque()
         options = options or WriterOptions()
         self._block = options.block
+        self._keep_failed = options.keep_failed
         self._flush_ns = nanoseconds(options.flush_s)
         self._decimation = FrameDecimation()
         self._selector = WindowSelector(options.region) if options.region is not None else None
@@ -214,6 +215,18 @@ class SessionWriter:
             self._output.close(f"{self._failure}" if self._failure is not None else "")
         self._raise_failure()
 
+    def discard(self) -> None:
+        """Leave no file of this run; earlier files of its name stay. Does nothing after `close`."""
+        if self._closed:
+            return
+        self._closed = True
+        self._queue.abandon()
+        self._thread.join()
+        unfinished = self.partial_path
+        self._output.close()
+        for file in (unfinished, *self.files):
+            file.unlink(missing_ok=True)
+
     def __enter__(self) -> Self:
         return self
 
@@ -222,6 +235,9 @@ class SessionWriter:
     ) -> None:
         if error is None:
             self.close()
+            return
+        if not self._keep_failed:
+            self.discard()
             return
         stopped = isinstance(error, KeyboardInterrupt)
         reason = f"{type(error).__name__}: {error}".rstrip(": ")

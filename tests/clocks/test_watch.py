@@ -86,7 +86,7 @@ def stamped(arrived: Inputs, stamp_ns: int) -> Inputs:
 
 
 def flown(path, rig_of=Stumbling, watch=None, **more):
-    config, chip, pipeline, _ = prepare(load_config(None, SHORT))
+    config, chip, pipeline, *_ = prepare(load_config(None, SHORT))
     rig = rig_of.of(pipeline, config, config.duration_s)
     for name, value in more.items():
         setattr(rig, name, value)
@@ -216,7 +216,7 @@ def test_a_clock_really_set_back_an_hour_neither_delays_a_flush_nor_touches_a_st
 
 
 def test_the_same_seed_gives_the_same_camera_clock_and_real_time_dates_frames_by_it():
-    config, _, pipeline, _ = prepare(load_config(None, SHORT))
+    config, _, pipeline, *_ = prepare(load_config(None, SHORT))
     first, again = (list(SimulatedRig.of(pipeline, config, 1.0).inputs()) for _ in range(2))
     assert [one.clock for one in first] == [one.clock for one in again]
     quick = replace(

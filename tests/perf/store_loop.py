@@ -68,7 +68,7 @@ def stall(folder: Path, duration_s: float, rounds: int) -> dict[str, Any]:
     With the priority that `record --realtime` gives the loop. The step is what the loop times: tracking, observing,
     control, and the hand-over to the sinks of the tick before.
     """
-    config, _chip, pipeline, _ = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
+    config, _chip, pipeline, *_ = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
     prepared = prepare_inputs(config, pipeline, round(duration_s * RATE_HZ))
     images = pictures(_WIDTH, _HEIGHT)
     ring = [np.ones_like(images[0]) for _ in range(_RING)]

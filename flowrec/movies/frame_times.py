@@ -1,0 +1,110 @@
+"""Times of the images of a movie: as its file tells them, from a table, or from a rate that somebody states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.errors import MovieError
+from flowrec.movies.movie import MovieFacts, whole_ns
+from flowrec.system.table_file import Table, read_table
+from flowrec.units import NS_PER_S
+
+_UNITS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
+_MOST_IMAGES = 1 << 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameTimes:
+    """Times of the images of one movie, on the clock of the log if that is known.
+
+    Attributes
+    ----------
+    text : where the times come from.
+    times_ns : (n,) of the images in order; None: by the rate, or by each image itself.
+    numbers : (n,) the camera's numbers of the images, by which gaps are losses; None: they are counted.
+    rate_hz : None: not by a rate.
+    exact : `times_ns` has exactly as many rows as there are images.
+    """
+
+    text: str
+    times_ns: NDArray[np.int64] | None = None
+    numbers: NDArray[np.int64] | None = None
+    rate_hz: float | None = None
+    exact: bool = False
+
+    def of(self, place: int, time_ns: int | None, where: Path) -> tuple[int, int]:
+        """Time and number of the image at a place, to which the file gives `time_ns`; MovieError if there is none."""
+        if self.rate_hz is not None:
+            return round(place * NS_PER_S / self.rate_hz), place
+        if self.exact and self.times_ns is not None:
+            if place >= len(self.times_ns):
+                raise MovieError(f"{where}: has more images than the {len(self.times_ns)} rows of {self.text}")
+            return int(self.times_ns[place]), int(self.numbers[place]) if self.numbers is not None else place
+        if time_ns is None:
+            raise MovieError(f"{where}: image {place} has no time; give them with --times FRAMES.csv or --fps F")
+        return time_ns, place
+
+
+def frame_times(path: Path, facts: MovieFacts, table: str = "", rate_hz: float | None = None) -> FrameTimes:
+    """The times of a movie.
+
+    Parameters
+    ----------
+    table : CSV or Excel file with a column time_s (or time_ms, time_us, time_ns) and a row for each image in order; '':
+        none. A column frame holds the camera's own numbers, so that a gap is a loss.
+    rate_hz : images per second, instead.
+
+    Raises
+    ------
+    MovieError : in one line: no times at all, both kinds of them, times that go back, more or fewer rows than images.
+    """
+    if table and rate_hz is not None:
+        raise MovieError(f"{path}: times are given by {table} and by a rate; give one of --times and --fps")
+    if rate_hz is not None:
+        return FrameTimes(f"the rate that was given, {rate_hz:g} Hz", rate_hz=rate_hz)
+    if table:
+        times = _from_table(read_table(Path(table)))
+    elif facts.times_ns is not None:
+        times = FrameTimes(facts.times, facts.times_ns)
+    else:
+        raise MovieError(
+            f"{path}: does not tell when its images were taken; give the times with --times FRAMES.csv (frame,time_s) "
+            "or the rate with --fps F"
+        )
+    stamps = times.times_ns
+    assert stamps is not None
+    back = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(back):
+        place = int(back[0])
+        now_s, before_s = 1e-9 * stamps[place + 1], 1e-9 * stamps[place]
+        raise MovieError(
+            f"{table or path}: the time of image {place + 1} is {now_s:.6f} s, not after that of the one before, "
+            f"{before_s:.6f} s; correct it with --times FRAMES.csv or --fps F"
+        )
+    if table and facts.counted and len(stamps) != facts.frames:
+        raise MovieError(f"{table}: has {len(stamps)} rows, and {path} {facts.frames} images; give each image its row")
+    return times
+
+
+def _from_table(table: Table) -> FrameTimes:
+    name = next((name for name in _UNITS if table.index(name) is not None), None)
+    if name is None:
+        raise MovieError(
+            f"{table.where}: no column time_s (or {', '.join(list(_UNITS)[1:])}); the header is frame,time_s"
+        )
+    if not table.rows:
+        raise MovieError(f"{table.where}: has no rows below its header")
+    times_ns = whole_ns(table.numbers(name) * _UNITS[name])
+    numbers = None
+    if table.index("frame") is not None:
+        given = table.numbers("frame")
+        back = np.flatnonzero(np.diff(given) <= 0.0)
+        if len(back) or given[0] < 0.0 or given[-1] > _MOST_IMAGES or (given != np.rint(given)).any():
+            line = table.lines[int(back[0]) + 1] if len(back) else table.lines[0]
+            raise MovieError(f"{table.where}: line {line}: frame numbers are whole, and increase; correct that line")
+        numbers = given.astype(np.int64)
+    return FrameTimes(f"{Path(table.where).name}, column {name}", times_ns, numbers, exact=True)

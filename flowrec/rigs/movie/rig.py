@@ -1,0 +1,147 @@
+"""The rig of a movie: its images, and of a log what the coils did. Nothing is sent.
+
+`Applied` at an image holds what acts on the robot: what the log says of the time robot.delay_s before it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, replace
+from typing import Any
+
+from flowrec.config import Config, ResolvedConfig
+from flowrec.control.field_log import FieldLog
+from flowrec.control.mission import PHASES
+from flowrec.enums import Phase
+from flowrec.errors import UsageError
+from flowrec.messages import Currents
+from flowrec.pipeline import Inputs, Pipeline
+from flowrec.rigs.movie.source import MovieSource
+from flowrec.units import nanoseconds, seconds
+
+_MARGIN = 1.2  # of the robot's top speed over the fastest rotation in the log
+_ASKED = {
+    "camera.um_per_px": ("camera", "um_per_px = 2.0  # size of a pixel of the movie in the plane of the robot"),
+    "robot.radius_um": ("robot", "radius_um = 25.0"),
+    "chip.path": ("chip", 'path = "chip.png"  # mask of the channels; openings in chip.toml beside it'),
+}
+
+
+class MovieRig:
+    """Plays a movie; see rigs.rig.Rig.
+
+    Parameters
+    ----------
+    source : the movie and the log, already on one clock. It is closed with the rig.
+    delay_s : from the log to the motion.
+    duration_s : None: all of it.
+    realtime : pace the images by their stamps.
+    """
+
+    @classmethod
+    def of(
+        cls, pipeline: Pipeline, config: ResolvedConfig, duration_s: float | None = None, realtime: bool = False
+    ) -> MovieRig:
+        """The rig of a resolved configuration."""
+        source = MovieSource(config.movie, config.coils)
+        return cls(source, config.robot.delay_s, duration_s, realtime)
+
+    def __init__(
+        self, source: MovieSource, delay_s: float, duration_s: float | None = None, realtime: bool = False
+    ) -> None:
+        self._source = source
+        self._log = (source.log if source.log is not None else FieldLog()).shifted(nanoseconds(delay_s))
+        self._end_ns = None if duration_s is None else nanoseconds(duration_s)
+        self._realtime = realtime
+        self._known = len(source.remarks)
+
+    @property
+    def noticed(self) -> list[str]:
+        """What was noticed while the images were read, such as an early end."""
+        return self._source.remarks[self._known :]
+
+    def __enter__(self) -> MovieRig:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._source.close()
+
+    def inputs(self) -> Iterator[Inputs]:
+        """Image after image; MovieError if one can not be read, or does not come after the one before."""
+        before_ns: int | None = None
+        began_s = time.monotonic()
+        for frame in self._source.frames():
+            if self._end_ns is not None and frame.stamp_ns > self._end_ns:
+                return
+            if self._realtime:
+                time.sleep(max(0.0, began_s + seconds(frame.stamp_ns) - time.monotonic()))
+            yield Inputs(frame.stamp_ns, frame, self._log.applied(frame.stamp_ns, before_ns))
+            before_ns = frame.stamp_ns
+
+    def apply(self, currents: Currents) -> None:
+        """Do nothing: what happened has happened."""
+
+    def zero(self) -> None:
+        """Do nothing: there are no coils."""
+
+
+def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str]]:
+    """Settings that a movie and its log determine, the provenance of both, and remarks for people.
+
+    The movie sets size, depth and rate of the camera. Without other phases the robot is observed. Its top speed, which
+    only bounds what is plausible, is that of the fastest rotation in the log. A delay that is not given is 0.
+
+    Raises
+    ------
+    UsageError : what no file tells is missing: um_per_px, the radius of the robot, the chip; all of it in one line.
+    MovieError : the movie or its log can not be used.
+    """
+    with MovieSource(config.movie, config.coils) as source:
+        _refuse_missing(config, source)
+        facts, log, robot = source.facts, source.log, config.robot
+        camera: dict[str, Any] = {"width_px": facts.width_px, "height_px": facts.height_px, "bits": facts.bits}
+        if config.camera.rate_hz is None:
+            camera["rate_hz"] = round(min(max(source.rate_hz or 1.0, 0.1), 5e3), 6)
+        known: dict[str, Any] = {}
+        if robot.delay_s is None:
+            known["delay_s"] = 0.0
+        if log is not None and robot.max_speed_um_s is None:
+            fastest_hz = float(log.frequency_hz[log.amplitude_mt > 0.0].max())
+            known["max_speed_um_s"] = round(_MARGIN * robot.um_per_rev * fastest_hz, 3)
+        if log is not None and robot.step_out_hz is None:
+            known["step_out_hz"] = round(_MARGIN * float(log.frequency_hz.max()), 6)
+        mission = config.mission
+        if mission.phases == PHASES:
+            mission = replace(mission, phases=(Phase.OBSERVE,))
+        remarks = list(source.remarks)
+        if facts.um_per_px is not None and config.camera.um_per_px is not None:
+            ratio = config.camera.um_per_px / facts.um_per_px
+            if abs(ratio - 1.0) > 0.01:
+                used = config.camera.um_per_px
+                remarks.append(f"the file says {facts.um_per_px:.6g} um per pixel; camera.um_per_px = {used:g} is used")
+        changed = replace(
+            config, camera=replace(config.camera, **camera), robot=replace(robot, **known), mission=mission
+        )
+        return changed, source.provenance(), remarks
+
+
+def _refuse_missing(config: Config, source: MovieSource) -> None:
+    given = {
+        f"{section}.{key}": value
+        for section in ("camera", "robot", "chip")
+        for key, value in asdict(getattr(config, section)).items()
+    }
+    missing = [key for key in _ASKED if given[key] in (None, "")]
+    if not missing:
+        return
+    sections: dict[str, list[str]] = {}
+    for key in missing:
+        section, line = _ASKED[key]
+        sections.setdefault(section, []).append(line.partition("  #")[0])
+    example = " ".join(f"[{section}] {' '.join(lines)}" for section, lines in sections.items())
+    hint = f" (the file says {source.facts.um_per_px:.6g} um per pixel)" if source.facts.um_per_px is not None else ""
+    raise UsageError(
+        f"{source.path}: {source.facts.describe()}; it does not tell {', '.join(missing)}{hint}; give them in a TOML "
+        f"configuration, as in {example}"
+    )
