@@ -90,7 +90,7 @@ def prepare(asked: Config) -> Prepared:
     if asked.rig == MOVIE:
         asked, found, remarks = fitted_to_movie(given)
         facts |= found
-        say(f"{given.movie.path}: {facts['source.images']}, {facts['source.codec']}, times: {facts['source.times']}")
+        say(f"{given.movie.path}: {facts['source_images']}, {facts['source_codec']}, times: {facts['source_times']}")
         for remark in remarks:
             warn(remark)
     chip = load_chip(asked.chip)

@@ -113,27 +113,27 @@ class MovieSource:
         """Facts for the head of the session; reads all files once, for their hashes."""
         facts, settings = self.facts, self._settings
         stated = {
-            "source.file": self.path.name,
-            "source.bytes": str(sum(file.stat().st_size for file in files_of(self.path))),
-            "source.sha256": sha256_of(self.path),
-            "source.reader": f"{facts.reader}, {facts.library}",
-            "source.codec": (facts.codec or "uncompressed") + (", lossy" if facts.lossy else ""),
-            "source.images": f"{facts.width_px} x {facts.height_px} x {facts.bits} bit",
-            "source.times": self.times_text,
-            "source.first_image_s": f"{seconds(self._first_ns):.9f}",
+            "source_file": self.path.name,
+            "source_bytes": str(sum(file.stat().st_size for file in files_of(self.path))),
+            "source_sha256": sha256_of(self.path),
+            "source_reader": f"{facts.reader}, {facts.library}",
+            "source_codec": (facts.codec or "uncompressed") + (", lossy" if facts.lossy else ""),
+            "source_images": f"{facts.width_px} x {facts.height_px} x {facts.bits} bit",
+            "source_times": self.times_text,
+            "source_first_image_s": f"{seconds(self._first_ns):.9f}",
         }
         if facts.um_per_px is not None:
-            stated["source.um_per_px"] = f"{facts.um_per_px:.6g}"
+            stated["source_um_per_px"] = f"{facts.um_per_px:.6g}"
         if settings.channel is not None:
-            stated["source.channel"] = settings.channel
+            stated["source_channel"] = settings.channel
         for key, file in (("times", settings.times), ("coil_log", settings.coils)):
             if file:
-                stated[f"{key}.file"] = Path(file).name
-                stated[f"{key}.sha256"] = sha256_of(Path(file))
+                stated[f"{key}_file"] = Path(file).name
+                stated[f"{key}_sha256"] = sha256_of(Path(file))
         if self.log is None:
-            stated["coil_log.file"] = "none: the motion of the robot itself counts as flow"
+            stated["coil_log_file"] = "none: the motion of the robot itself counts as flow"
         if self.remarks:
-            stated["source.remarks"] = "; ".join(self.remarks)
+            stated["source_remarks"] = "; ".join(self.remarks)
         return stated
 
     def close(self) -> None:
