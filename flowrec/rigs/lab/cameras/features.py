@@ -83,15 +83,15 @@ def configure(device: Features, wanted: Wanted) -> Settled:
 
 
 def _pixel_format(device: Features, asked: str) -> str:
-    """Set the pixel format, or a packed one of the same depth, which holds the same data."""
-    bits_of(asked)
+    """Set the pixel format, or another one of the same depth: packed or not, it holds the same data."""
+    plain = f"Mono{bits_of(asked)}"
     have = device.feature("PixelFormat")
     if have is None:
         raise RigError("the camera has no setting PixelFormat; it is no area camera by GenICam")
-    same = [name for name in (asked, f"{asked}p", f"{asked}Packed") if name in have.entries]
+    same = [name for name in (asked, plain, f"{plain}p", f"{plain}Packed") if name in have.entries]
     if not same:
         grey = [name for name in have.entries if name.startswith("Mono")]
-        raise RigError(f"lab.pixel_format: the camera has no {asked}; it has {', '.join(grey) or 'no grey levels'}")
+        raise RigError(f"lab.pixel_format: the camera has no {plain}; it has {', '.join(grey) or 'no grey levels'}")
     device.put("PixelFormat", same[0])
     return same[0]
 

@@ -31,8 +31,8 @@ class MmcoreCamera:
         self._wanted = wanted
         self._core: CMMCorePlus | None = None
         self._bits = 8
-        self._base = self._next = self._lost = 0  # first block id of this sequence, the next one, estimated losses
-        self._rate_hz = wanted.rate_hz
+        self._next: int | None = None  # number of the next image
+        self._discarded = 0  # missing numbers
 
     @classmethod
     def of(cls, wanted: Wanted) -> MmcoreCamera:
@@ -145,36 +145,24 @@ class MmcoreCamera:
         try:
             while not core.getRemainingImageCount():
                 if not core.isSequenceRunning():
-                    self._restart(core)
+                    raise RigError("the camera is gone: its sequence of images has ended")
                 if time.monotonic() > end_s:
                     return None
                 time.sleep(_POLL_S)
             image, facts = core.popNextImageAndMD()
         except (RuntimeError, IndexError) as error:
             raise RigError(f"the camera is gone: {' '.join(str(error).split())}") from error
-        number = facts.get("ImageNumber")
-        self._next = self._base + int(number) + 1 if number is not None else self._next + 1
-        return Grabbed(image, self._bits, self._next - 1, None, _arrival_ns(facts.get("TimeReceivedByCore")))
-
-    def _restart(self, core: CMMCorePlus) -> None:
-        """Go on after the buffer was full, which ends a sequence of Micro-Manager.
-
-        How many images were lost meanwhile is not known; what follows is numbered as if it was one.
-
-        Raises
-        ------
-        RigError : it has ended for another reason.
-        """
-        if not core.isBufferOverflowed():
-            raise RigError("the camera is gone: its sequence of images has ended")
-        self._base, self._lost = self._next + 1, self._lost + 1
-        core.startContinuousSequenceAcquisition(1e3 / self._wanted.rate_hz)
+        number = int(facts.get("ImageNumber", self._next or 0))
+        # Micro-Manager numbers what it puts into its buffer, which it empties when it is full.
+        self._discarded += max(number - self._next, 0) if self._next is not None else 0
+        self._next = number + 1
+        return Grabbed(image, self._bits, number, None, _arrival_ns(facts.get("TimeReceivedByCore")))
 
     def alive(self) -> bool:
         return self._core is not None and self._core.isSequenceRunning()
 
     def discarded(self) -> int:
-        return self._lost
+        return self._discarded
 
     def trigger(self) -> None:
         raise RigError("with mmcore, set the trigger in the configuration file")

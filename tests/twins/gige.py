@@ -1,0 +1,87 @@
+"""GigE Vision cameras on the loopback: the fake of Aravis, a program that nobody here wrote, and that of viva-genicam.
+
+Both want UDP port 3956, so they are used by one test at a time.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PROGRAM = "arv-fake-gv-camera-0.8"
+# Registers of the fake of Aravis, as its GenICam description states them.
+WIDTH, HEIGHT, OFFSET_X, OFFSET_Y, PIXEL_FORMAT = 0x100, 0x104, 0x130, 0x134, 0x128
+EXPOSURE_US, PERIOD_US = 0x120, 0x138
+MONO16 = 0x01100007  # PFNC
+installed = shutil.which(PROGRAM) is not None
+
+
+@contextmanager
+def port() -> Iterator[None]:
+    """The port, for one test of this machine."""
+    with (Path(tempfile.gettempdir()) / "gige-port-3956.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def register(address: int, host: str = "127.0.0.1") -> int:
+    """A register of a GigE camera, read by the standard's own READREG: by nobody who may have cached it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+        line.settimeout(5.0)
+        line.sendto(struct.pack(">BBHHHI", 0x42, 1, 0x80, 4, 7, address), (host, 3956))
+        status, command, _, _, value = struct.unpack(">HHHHI", line.recv(100))
+    assert (status, command) == (0, 0x81)
+    return int(value)
+
+
+class Aravis:
+    """The fake of Aravis in its process; a context manager.
+
+    Parameters
+    ----------
+    lost_packets : of a thousand.
+    """
+
+    def __init__(self, lost_packets: int = 0, serial: str = "T1", address: str = "127.0.0.1") -> None:
+        self._command = [PROGRAM, "-i", address, "-s", serial, "-r", str(lost_packets)]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> Aravis:
+        self.plug_in()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.unplug()
+
+    def plug_in(self) -> None:
+        """Start it; it answers after some hundredths of a second."""
+        silent = subprocess.DEVNULL
+        self._process = subprocess.Popen(self._command, stdout=silent, stderr=silent)
+        time.sleep(0.1)
+        assert self._process.poll() is None, f"{PROGRAM} has ended; is port 3956 in use?"
+
+    def unplug(self) -> None:
+        """kill -9: nothing is said to anybody."""
+        assert self._process is not None
+        self._process.kill()
+        self._process.wait()
+
+    def freeze(self) -> None:
+        """It does nothing any more, as behind a cable that is pulled."""
+        assert self._process is not None
+        os.kill(self._process.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """It goes on."""
+        assert self._process is not None
+        os.kill(self._process.pid, signal.SIGCONT)
