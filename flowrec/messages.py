@@ -161,6 +161,28 @@ class Track(Message):
     radius_px: float  # of the robot's image, low-pass filtered
     roi_px: Annotated[Vector, Shape(4)]  # x0, y0, x1, y1 of the searched region
     seen_ns: int | None = None  # stamp of the latest frame in which it was seen; None: never, or not recorded
+    # Motion of a robot that is tracked by its learned appearance, and the objects around it.
+    velocity_px_s: Annotated[Vector, Shape("n")] = field(default_factory=lambda: np.zeros(0))  # (2,) mean; (0,): none
+    spread_px: float = 0.0  # mean distance from where it was expected
+    energy: float = 0.0  # mean of its squared foreground, in units of the noise's variance
+    # x, y and energy of each object nearby, (3 k,)
+    neighbours_px: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Appearance(Message):
+    """How the robot looks, as far as the tracker has found out."""
+
+    stamp_ns: int
+    polarity: str  # dark, bright or mixed, relative to the background
+    noise: float  # of a pixel, one standard deviation in grey levels
+    foreground_noise: float  # of the foreground (vision/foreground.py), likewise
+    radius_px: float  # of the object in `views`, in camera px
+    centre_px: Vector2  # where it was when it was learned
+    # Foreground around the centre, in blocks of whole camera pixels: the first look, a slow mean, other looks.
+    # n = 0: nothing was learned, the robot is a disc.
+    views: Annotated[Raster, Shape("n", "p", "p")]
+    note: str = ""  # why nothing was found at the given place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -405,6 +427,7 @@ class Tick:
     drops: Annotated[Drops | None, Topic("/run/drops", Source.LOOP)] = None
     truth: Annotated[Truth | None, Topic("/truth/robot", Source.SIMULATOR)] = None
     true_field: Annotated[FlowField | None, Topic("/truth/flow", Source.SIMULATOR)] = None
+    appearance: Annotated[Appearance | None, Topic("/robot/appearance", Source.STAGE, 1e-4, {"views": 1e-3})] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
 

@@ -25,6 +25,7 @@ from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
 from flowrec.messages import (
+    Appearance,
     Applied,
     CameraLosses,
     FlowField,
@@ -57,6 +58,7 @@ class Inputs:
     truth: Truth | None = None  # for the record only, no stage reads it
     true_field: FlowField | None = None  # likewise
     track: Track | None = None  # the recorded one, if `frame` was dropped
+    appearance: Appearance | None = None  # likewise, if it changed then
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
 
@@ -64,7 +66,7 @@ class Inputs:
 # Fields of a Tick that arrive from outside, and those of them that stay known until the next message.
 ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.TRUTH))
 HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
-if {each.name for each in fields(Inputs)} != {"stamp_ns", "track", "clock", "losses", *ARRIVING}:
+if {each.name for each in fields(Inputs)} != {"stamp_ns", "track", "appearance", "clock", "losses", *ARRIVING}:
     raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
 
 
@@ -131,18 +133,19 @@ def _strength(coils: Coils, last: Tick) -> float:
     return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
 
 
-def _seen(p: Pipeline, previous: Track | None, inputs: Inputs) -> Track:
-    """Position of the robot, and when it was last seen. A repeated image counts as not seen."""
+def _seen(p: Pipeline, last: Tick, inputs: Inputs) -> tuple[Track, Appearance | None]:
+    """Position of the robot, when it was last seen, and how it looks. A repeated image counts as not seen."""
+    previous, known = last.track, last.appearance
     if inputs.applied.repeats_image and previous is not None:
-        return unseen(previous, inputs.stamp_ns)
+        return unseen(previous, inputs.stamp_ns), known
     if inputs.frame is None:
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
-        return inputs.track
-    track = p.tracker.track(previous, inputs.frame, p.chip, p.calibration, p.robot)
+        return inputs.track, inputs.appearance if inputs.appearance is not None else known
+    track, appearance = p.tracker.follow(previous, known, inputs.frame, p.chip, p.calibration, p.robot)
     if inputs.applied.image_since_ns is None:
-        return track
+        return track, appearance
     before_ns = previous.seen_ns if previous is not None else None
-    return replace(track, seen_ns=track.stamp_ns if track.seen else before_ns)
+    return replace(track, seen_ns=track.stamp_ns if track.seen else before_ns), appearance
 
 
 def _no_lap(_stage: str) -> None:
@@ -160,7 +163,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     p = pipeline
     tick = with_inputs(last, inputs)
     flow, route = tick.field, tick.route
-    track = _seen(p, last.track, inputs)
+    track, appearance = _seen(p, last, inputs)
     lap("track")
     estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow)
     # The robot with the estimated um_per_rev, if the observer estimates it.
@@ -185,6 +188,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         last.demand,
         robot,
         inputs.applied,
+        p.tracker.not_found_note(appearance),
+        appearance is not None and bool(appearance.note),
     )
     demand = p.controller.control(
         last.demand,
@@ -206,6 +211,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     tick = replace(
         tick,
         track=track,
+        appearance=appearance,
         estimate=estimate,
         health=health,
         observations=observations,

@@ -105,8 +105,10 @@ def ring(radius: float, focus_per_frame: float = 0.0) -> Drawing:
     def draw(dx: NDArray[np.float64], dy: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
         rho, focus = np.hypot(dx, dy) / radius, focus_per_frame * frame
         centre = (1.0 - 0.6 * focus) * np.exp(-((rho / (0.55 + 0.25 * focus)) ** 2))
-        return centre - (0.7 + 0.3 * focus) * np.exp(-(((rho - 1.0) / 0.3) ** 2)) + 0.15 * np.exp(
-            -(((rho - 1.6) / 0.25) ** 2)
+        return (
+            centre
+            - (0.7 + 0.3 * focus) * np.exp(-(((rho - 1.0) / 0.3) ** 2))
+            + 0.15 * np.exp(-(((rho - 1.6) / 0.25) ** 2))
         )
 
     return draw
@@ -182,21 +184,29 @@ def judges(frames: int = 60) -> dict[str, RobotMovie]:
         "spot, 12 bit": movie(spot(2.0), walk, 4.0, bits=12, gain=8.0, contrast=12.0, seed=1, **dark),
         "spot, 16 bit": movie(spot(2.0), walk, 4.0, bits=16, gain=150.0, contrast=100.0, seed=2, **dark),
         "spot, 8 bit, faint": movie(spot(2.5), walk, 5.0, level=8.0, contrast=4.0, electrons=10.0, seed=3),
-        "spot, bleaching by 70 %": movie(spot(2.0), walk, 4.0, bits=16, gain=60.0, contrast=12.0, fade=0.7, seed=4, **dark),
+        "spot, bleaching by 70 %": movie(
+            spot(2.0), walk, 4.0, bits=16, gain=60.0, contrast=12.0, fade=0.7, seed=4, **dark
+        ),
         "ring": movie(ring(6.0), walk, 8.0, seed=5),
         "ring, drifting out of focus": movie(ring(6.0, 1.0 / frames), walk, 8.0, seed=6),
         "Janus, 20 degrees a frame": movie(janus(8.0, 0.35), walk, 8.0, contrast=45.0, seed=7),
         "Janus, 60 degrees a frame": movie(janus(8.0, 1.05), walk, 8.0, contrast=45.0, seed=8),
         "helix, rolling slowly": movie(helix(36, 8, 12, 0.5, 0.01), slow, 19.0, box=True, contrast=50.0, seed=9),
         "helix, rolling and turning": movie(helix(36, 8, 12, 2.0, 0.06), slow, 19.0, box=True, contrast=50.0, seed=10),
-        "helix, bright": movie(helix(30, 7, 10, 1.3, -0.04, 1.0), slow, 16.0, box=True, bits=12, gain=8.0, contrast=20.0, seed=11, **dark),
+        "helix, bright": movie(
+            helix(30, 7, 10, 1.3, -0.04, 1.0), slow, 16.0, box=True, bits=12, gain=8.0, contrast=20.0, seed=11, **dark
+        ),
         "dark disc, vignette": movie(disc(5.0), walk, 5.0, contrast=-30.0, vignette=0.8, seed=12),
         "radius 1.5 px": movie(disc(1.5), walk, 1.5, contrast=-60.0, seed=13),
         "radius 1.5 px, bright": movie(disc(1.5), walk, 1.5, contrast=40.0, level=20.0, seed=14),
-        "radius 40 px": movie(disc(40.0), wander(30, (150.0, 130.0), (4.0, 1.0), 3.0), 40.0, size=(300, 400), contrast=-50.0, seed=15),
+        "radius 40 px": movie(
+            disc(40.0), wander(30, (150.0, 130.0), (4.0, 1.0), 3.0), 40.0, size=(300, 400), contrast=-50.0, seed=15
+        ),
         "ring of 40 px": movie(ring(30.0), wander(30, (150.0, 130.0), (4.0, 1.0), 3.0), 40.0, size=(300, 400), seed=16),
         "jumps of 5 radii": movie(spot(2.0), _jumps(frames, 4.0, 5.0), 4.0, contrast=40.0, level=20.0, seed=17),
-        "3 radii a frame": movie(disc(3.0), wander(frames, (20.0, 80.0), (9.0, 0.5), 0.5), 3.0, size=(160, 640), contrast=-50.0, seed=18),
+        "3 radii a frame": movie(
+            disc(3.0), wander(frames, (20.0, 80.0), (9.0, 0.5), 0.5), 3.0, size=(160, 640), contrast=-50.0, seed=18
+        ),
         "crossing neighbours": movie(spot(1.5), robot, 3.0, contrast=60.0, level=30.0, neighbours=others, seed=19),
         "crossing dark neighbours": movie(disc(3.0), robot, 3.0, contrast=-50.0, neighbours=others, seed=20),
     }

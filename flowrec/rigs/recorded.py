@@ -48,6 +48,8 @@ class RecordedRig:
                     continue  # a crash left the inputs without an image: nothing to replay
                 self.frames_missing += not tick.frames_ended
                 new["track"] = tick.track
+                if tick.appearance is not before.appearance:
+                    new["appearance"] = tick.appearance
             yield Inputs(tick.stamp_ns, **({"frame": None} | new))
             before = tick
 

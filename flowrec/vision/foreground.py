@@ -247,7 +247,7 @@ def patch_at(c: NDArray[np.float32], x: float, y: float, half: int) -> NDArray[n
 
 
 @compiled
-def correlations(
+def most_similar(
     c: NDArray[np.float32],
     x: float,
     y: float,
@@ -331,7 +331,7 @@ def registered(
             return x, y, -1.0
         if abs(step_x) < 2e-3 and abs(step_y) < 2e-3:
             break
-    return at_x, at_y, _ncc(patch_at(c, at_x, at_y, half), view, window)
+    return at_x, at_y, correlation(patch_at(c, at_x, at_y, half), view, window)
 
 
 @compiled
@@ -351,7 +351,8 @@ def _gain(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray
 
 
 @compiled
-def _ncc(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> float:
+def correlation(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> float:
+    """Weighted correlation of two views."""
     sw, si, st, sii, stt, sit = 1e-12, 0.0, 0.0, 0.0, 0.0, 0.0
     for v in range(patch.shape[0]):
         for u in range(patch.shape[1]):
