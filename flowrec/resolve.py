@@ -66,7 +66,9 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
             goal=_point(chip, config.mission.goal, "goal", robot),
         )
         _refuse_apart(chip, mission)
-    return _narrowed(ResolvedConfig, config, robot=robot, camera=camera, plan=plan, survey=survey, mission=mission)
+    tracker = replace(config.tracker, polarity=config.tracker.polarity or "auto")
+    sections = {"tracker": tracker, "plan": plan, "survey": survey}
+    return _narrowed(ResolvedConfig, config, robot=robot, camera=camera, mission=mission, **sections)
 
 
 def derived(asked: Config, resolved: ResolvedConfig) -> dict[str, float]:

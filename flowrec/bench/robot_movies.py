@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from flowrec.declarations import Image
+from flowrec.messages import pixel_type
 
 _FINE = 4  # samples per pixel side
 
@@ -21,7 +24,7 @@ _FINE = 4  # samples per pixel side
 class RobotMovie:
     """Images (uint8 up to 8 bits, else uint16), true centres (n, 2) in px, and what a user knows."""
 
-    images: list[NDArray[np.uint8] | NDArray[np.uint16]]
+    images: list[Image]
     centres_px: NDArray[np.float64]
     radius_px: float
     bits: int = 8
@@ -34,6 +37,23 @@ class RobotMovie:
         return x - self.radius_px, y - self.radius_px, x + self.radius_px, y + self.radius_px
 
 
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Light and camera. Levels are in units of 8-bit grey levels, which `gain` and `bits` turn into counts.
+
+    `fade` is the part of the contrast that is lost by the end, `vignette` the part of the light lost in the corners.
+    """
+
+    contrast: float = 60.0
+    level: float = 120.0
+    bits: int = 8
+    gain: float = 1.0
+    electrons: float = 20.0  # per grey level
+    read_noise: float = 1.0
+    fade: float = 0.0
+    vignette: float = 0.0
+
+
 Drawing = Callable[[NDArray[np.float64], NDArray[np.float64], int], NDArray[np.float64]]
 
 
@@ -41,32 +61,23 @@ def movie(
     draw: Drawing,
     path: NDArray[np.float64],
     radius_px: float,
+    exposure: Exposure,
     *,
     size: tuple[int, int] = (160, 200),
-    level: float = 120.0,
-    contrast: float = 60.0,
     blur_px: float = 0.9,
-    bits: int = 8,
-    gain: float = 1.0,
-    electrons: float = 20.0,
-    read_noise: float = 1.0,
-    vignette: float = 0.0,
-    fade: float = 0.0,
     neighbours: NDArray[np.float64] | None = None,
     box: bool = False,
     seed: int = 0,
 ) -> RobotMovie:
     """A robot drawn by `draw(dx, dy, frame)` (offsets in px from its centre; about -1 to 1) on its path (n, 2) in px.
 
-    Levels and contrast are in units of 8-bit grey levels, which `gain` and `bits` turn into counts. `fade` is the part
-    of the contrast lost by the end, `vignette` the part of the light lost in the corners, `neighbours` (m, n, 2) are
-    paths of objects that look the same.
+    `size` is (rows, columns) of the images; `neighbours` (m, n, 2) are paths of objects that look the same.
     """
     rng = np.random.default_rng(seed)
     rows, columns = size
     x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
-    light = 1.0 - vignette * 0.5 * (x**2 + y**2)
-    images = []
+    light = 1.0 - exposure.vignette * 0.5 * (x**2 + y**2)
+    images: list[Image] = []
     reach = math.ceil(2.5 * radius_px + 4 * blur_px) + 1
     for frame, centre in enumerate(path):
         scene = np.zeros(size)
@@ -76,17 +87,18 @@ def movie(
             n = 2 * reach + 1
             axis = (np.arange(n * _FINE) + 0.5) / _FINE - 0.5
             fine = draw(axis[None] + left - px, axis[:, None] + top - py, frame)
-            fine = cv2.GaussianBlur(fine, (0, 0), blur_px * _FINE)
+            fine = np.asarray(cv2.GaussianBlur(fine, (0, 0), blur_px * _FINE), np.float64)
             patch = fine.reshape(n, _FINE, n, _FINE).mean(axis=(1, 3))
             i0, i1, j0, j1 = max(left, 0), min(left + n, columns), max(top, 0), min(top + n, rows)
             if i0 < i1 and j0 < j1:
                 scene[j0:j1, i0:i1] += patch[j0 - top : j1 - top, i0 - left : i1 - left]
-        strength = contrast * (1.0 - fade * frame / max(len(path) - 1, 1))
-        ideal = np.maximum((level + strength * scene) * light, 0.0)
-        grey = rng.poisson(ideal * electrons) / electrons + read_noise * rng.standard_normal(size)
-        counts = np.rint(np.clip(grey * gain, 0, 2**bits - 1))
-        images.append(counts.astype(np.uint8 if bits <= 8 else np.uint16))
-    return RobotMovie(images, path, radius_px, bits, box)
+        strength = exposure.contrast * (1.0 - exposure.fade * frame / max(len(path) - 1, 1))
+        ideal = np.maximum((exposure.level + strength * scene) * light, 0.0)
+        grey = rng.poisson(ideal * exposure.electrons) / exposure.electrons
+        grey = grey + exposure.read_noise * rng.standard_normal(size)
+        counts = np.rint(np.clip(grey * exposure.gain, 0, 2**exposure.bits - 1))
+        images.append(counts.astype(pixel_type(exposure.bits)))
+    return RobotMovie(images, path, radius_px, exposure.bits, box)
 
 
 def disc(radius: float) -> Drawing:
@@ -166,7 +178,7 @@ def _crossing(frames: int, apart_px: float) -> tuple[NDArray[np.float64], NDArra
     """The robot passes between and beside objects that look the same, two of which cross its way."""
     rng = np.random.default_rng(5)
     robot = wander(frames, (30.0, 80.0), (2.0, 0.0), 0.25)
-    meeting = np.stack([robot[::-1] + [0.0, apart_px], wander(frames, (130.0, 20.0), (-0.6, 1.8), 0.25, 7)])
+    meeting = np.stack([robot[::-1] + np.array([0.0, apart_px]), wander(frames, (130.0, 20.0), (-0.6, 1.8), 0.25, 7)])
     still = np.stack(
         [wander(frames, tuple(at), (0.0, 0.0), 0.4, 20 + n) for n, at in enumerate(rng.uniform(10, 150, (10, 2)))]
     )
@@ -178,35 +190,39 @@ def judges(frames: int = 60) -> dict[str, RobotMovie]:
     """The movies by name."""
     walk = wander(frames, (50.0, 60.0), (1.2, 0.8), 0.6)
     slow = wander(frames, (80.0, 70.0), (0.5, 0.3), 0.3)
-    dark = {"level": 3.0, "electrons": 4.0, "read_noise": 0.6}
+    far = wander(min(frames, 30), (150.0, 130.0), (4.0, 1.0), 3.0)
+    fast = wander(frames, (20.0, 80.0), (9.0, 0.5), 0.5)
     robot, others = _crossing(frames, 9.0)
+    night = Exposure(level=3.0, electrons=4.0, read_noise=0.6)
+    wide = (300, 400)
     return {
-        "spot, 12 bit": movie(spot(2.0), walk, 4.0, bits=12, gain=8.0, contrast=12.0, seed=1, **dark),
-        "spot, 16 bit": movie(spot(2.0), walk, 4.0, bits=16, gain=150.0, contrast=100.0, seed=2, **dark),
-        "spot, 8 bit, faint": movie(spot(2.5), walk, 5.0, level=8.0, contrast=4.0, electrons=10.0, seed=3),
+        "spot, 12 bit": movie(spot(2.0), walk, 4.0, replace(night, contrast=12.0, bits=12, gain=8.0), seed=1),
+        "spot, 16 bit": movie(spot(2.0), walk, 4.0, replace(night, contrast=100.0, bits=16, gain=150.0), seed=2),
+        "spot, faint": movie(spot(2.5), walk, 5.0, Exposure(4.0, level=8.0, electrons=10.0), seed=3),
         "spot, bleaching by 70 %": movie(
-            spot(2.0), walk, 4.0, bits=16, gain=60.0, contrast=12.0, fade=0.7, seed=4, **dark
+            spot(2.0), walk, 4.0, replace(night, contrast=12.0, bits=16, gain=60.0, fade=0.7), seed=4
         ),
-        "ring": movie(ring(6.0), walk, 8.0, seed=5),
-        "ring, drifting out of focus": movie(ring(6.0, 1.0 / frames), walk, 8.0, seed=6),
-        "Janus, 20 degrees a frame": movie(janus(8.0, 0.35), walk, 8.0, contrast=45.0, seed=7),
-        "Janus, 60 degrees a frame": movie(janus(8.0, 1.05), walk, 8.0, contrast=45.0, seed=8),
-        "helix, rolling slowly": movie(helix(36, 8, 12, 0.5, 0.01), slow, 19.0, box=True, contrast=50.0, seed=9),
-        "helix, rolling and turning": movie(helix(36, 8, 12, 2.0, 0.06), slow, 19.0, box=True, contrast=50.0, seed=10),
+        "ring": movie(ring(6.0), walk, 8.0, Exposure(), seed=5),
+        "ring, drifting out of focus": movie(ring(6.0, 1.0 / frames), walk, 8.0, Exposure(), seed=6),
+        "Janus, 20 degrees a frame": movie(janus(8.0, 0.35), walk, 8.0, Exposure(45.0), seed=7),
+        "Janus, 60 degrees a frame": movie(janus(8.0, 1.05), walk, 8.0, Exposure(45.0), seed=8),
+        "helix, rolling slowly": movie(helix(36, 8, 12, 0.5, 0.01), slow, 19.0, Exposure(50.0), box=True, seed=9),
+        "helix, rolling and turning": movie(helix(36, 8, 12, 2.0, 0.06), slow, 19.0, Exposure(50.0), box=True, seed=10),
         "helix, bright": movie(
-            helix(30, 7, 10, 1.3, -0.04, 1.0), slow, 16.0, box=True, bits=12, gain=8.0, contrast=20.0, seed=11, **dark
+            helix(30, 7, 10, 1.3, -0.04, 1.0),
+            slow,
+            16.0,
+            replace(night, contrast=20.0, bits=12, gain=8.0),
+            box=True,
+            seed=11,
         ),
-        "dark disc, vignette": movie(disc(5.0), walk, 5.0, contrast=-30.0, vignette=0.8, seed=12),
-        "radius 1.5 px": movie(disc(1.5), walk, 1.5, contrast=-60.0, seed=13),
-        "radius 1.5 px, bright": movie(disc(1.5), walk, 1.5, contrast=40.0, level=20.0, seed=14),
-        "radius 40 px": movie(
-            disc(40.0), wander(30, (150.0, 130.0), (4.0, 1.0), 3.0), 40.0, size=(300, 400), contrast=-50.0, seed=15
-        ),
-        "ring of 40 px": movie(ring(30.0), wander(30, (150.0, 130.0), (4.0, 1.0), 3.0), 40.0, size=(300, 400), seed=16),
-        "jumps of 5 radii": movie(spot(2.0), _jumps(frames, 4.0, 5.0), 4.0, contrast=40.0, level=20.0, seed=17),
-        "3 radii a frame": movie(
-            disc(3.0), wander(frames, (20.0, 80.0), (9.0, 0.5), 0.5), 3.0, size=(160, 640), contrast=-50.0, seed=18
-        ),
-        "crossing neighbours": movie(spot(1.5), robot, 3.0, contrast=60.0, level=30.0, neighbours=others, seed=19),
-        "crossing dark neighbours": movie(disc(3.0), robot, 3.0, contrast=-50.0, neighbours=others, seed=20),
+        "dark disc, vignette": movie(disc(5.0), walk, 5.0, Exposure(-30.0, vignette=0.8), seed=12),
+        "radius 1.5 px": movie(disc(1.5), walk, 1.5, Exposure(-60.0), seed=13),
+        "radius 1.5 px, bright": movie(disc(1.5), walk, 1.5, Exposure(40.0, level=20.0), seed=14),
+        "radius 40 px": movie(disc(40.0), far, 40.0, Exposure(-50.0), size=wide, seed=15),
+        "ring of 40 px": movie(ring(30.0), far, 40.0, Exposure(), size=wide, seed=16),
+        "jumps of 5 radii": movie(spot(2.0), _jumps(frames, 4.0, 5.0), 4.0, Exposure(40.0, level=20.0), seed=17),
+        "3 radii a frame": movie(disc(3.0), fast, 3.0, Exposure(-50.0), size=(160, 640), seed=18),
+        "crossing neighbours": movie(spot(1.5), robot, 3.0, Exposure(60.0, level=30.0), neighbours=others, seed=19),
+        "crossing dark neighbours": movie(disc(3.0), robot, 3.0, Exposure(-50.0), neighbours=others, seed=20),
     }

@@ -26,6 +26,7 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
     lines = [
         *_results(last, tick, needs_time_to_go),
         *_visibility(last, tick),
+        *_look(last, tick),
         *_health(last.health, tick.health),
         *_operator(last, tick),
         *_mission(last, tick),
@@ -63,6 +64,18 @@ def _visibility(last: Tick, tick: Tick) -> Iterator[Line]:
     if any(each.applied is not None and each.applied.repeats_image for each in (last, tick)):
         return
     yield ("robot seen", Level.INFO) if tick.track.seen else ("robot lost from view", Level.WARNING)
+
+
+def _look(last: Tick, tick: Tick) -> Iterator[Line]:
+    """How the robot looks, when the tracker has found out, or why it could not."""
+    look = tick.appearance
+    if look is None or last.appearance is not None:
+        return
+    if look.note:
+        yield look.note, Level.ERROR
+    else:
+        learned = f", its look learned ({look.radius_px:.1f} px)" if len(look.views) else ""
+        yield f"the robot is {look.polarity}{learned}", None
 
 
 def _health(before: Health | None, health: Health | None) -> Iterator[Line]:

@@ -22,6 +22,7 @@ PHASES: tuple[PhaseName, ...] = get_args(PhaseName)[:4]  # of a robot that is dr
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Point = tuple[Coordinate, Coordinate]
 Place = Point | str
+_IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
 _SWEPT_RADII, _RETURNED_RADII = 2.0, 1.0  # from its position, of a held robot
 _EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
 
@@ -39,6 +40,12 @@ class _Frame:
     demand: Demand | None  # of the frame before; its error is the distance of the robot from its route
     robot: Robot
     applied: Applied | None
+    not_found_note: str
+    refused: bool
+
+    def with_advice(self, note: str) -> str:
+        """A note on a robot that was not found, with the tracker's advice."""
+        return f"{note} {self.not_found_note}" if self.not_found_note else note
 
     @property
     def now_ns(self) -> int:
@@ -104,13 +111,19 @@ class MissionStateMachine:
         demand: Demand | None,
         robot: Robot,
         applied: Applied | None = None,
+        not_found_note: str = "",
+        refused: bool = False,
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
         `demand` is that of the frame before: its error is the distance of the robot from its route. Where `applied`
         does not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
+
+        `not_found_note` is the tracker's advice for a robot that is not found; `refused`: it can not be found.
         """
-        now = _Frame(track, estimate, assumed, refined, route, operator, demand, robot, applied)
+        now = _Frame(
+            track, estimate, assumed, refined, route, operator, demand, robot, applied, not_found_note, refused
+        )
         if self.observes:
             return self._observe(previous if previous is not None else self._first(now), now)
         if previous is None:
@@ -165,6 +178,8 @@ class MissionStateMachine:
             return _finish(mission, now, Outcome.STOPPED, note or f"operator: {now.command}")
         if now.command == Action.END and not mission.input_ended:
             mission = replace(mission, stamp_ns=now.now_ns, input_ended=True)
+        if now.refused:
+            return _finish(mission, now, Outcome.NOT_FOUND, now.not_found_note)
         if mission.wanted and now.result(mission) is None:
             return mission
         if mission.wanted == WorkOrder.REFINE:
@@ -172,8 +187,7 @@ class MissionStateMachine:
         if not mission.input_ended:
             return replace(mission, stamp_ns=now.now_ns, wanted="") if mission.wanted else mission
         if now.track.seen_ns is None:
-            note = "the robot was never seen; is it in view (camera.um_per_px), and of the size in robot.radius_um?"
-            return _finish(mission, now, Outcome.NOT_FOUND, note)
+            return _finish(mission, now, Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {_IN_VIEW}"))
         return _order(mission, now, Phase.OBSERVE, WorkOrder.REFINE)
 
     def _after_command(self, mission: Mission, now: _Frame) -> Mission:
@@ -197,12 +211,11 @@ class MissionStateMachine:
         if now.track.seen:
             return None
         if previous.phase == Phase.START:
+            if now.refused:
+                return _finish(previous, now, Outcome.NOT_FOUND, now.not_found_note)
             if _elapsed_s(previous, now) > self.find_limit_s:
-                note = (
-                    f"no robot seen in the image for {self.find_limit_s:g} s; is it in view (camera.um_per_px), "
-                    "and of the size in robot.radius_um?"
-                )
-                return _finish(previous, now, Outcome.NOT_FOUND, note)
+                note = f"no robot seen in the image for {self.find_limit_s:g} s; {_IN_VIEW}"
+                return _finish(previous, now, Outcome.NOT_FOUND, now.with_advice(note))
         elif now.track.lost_frames > self.lost_limit_frames:
             why = f"{previous.blind}, " if previous.blind else "robot not seen in "
             return _finish(previous, now, Outcome.LOST, f"{why}{now.track.lost_frames} frames")

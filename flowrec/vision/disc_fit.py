@@ -46,7 +46,7 @@ def initial_edge_px(radius_px: float) -> float:
 
 @compiled
 def fit_disc(
-    image: Image,
+    image: Image | NDArray[np.float32],
     distance_px: NDArray[np.float32],
     margin_px: float,
     x: float,
@@ -113,7 +113,7 @@ def fit_radius(radius_px: float, edge_px: float) -> float:
 
 @compiled
 def block_means(
-    image: Image,
+    image: Image | NDArray[np.float32],
     distance_px: NDArray[np.float32],
     margin_px: float,
     x: float,

@@ -12,7 +12,7 @@ more precise; its views are centred by their own centroid, so that does not drif
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -31,8 +31,8 @@ from flowrec.vision.foreground import (
     registered,
     silhouette_centroid,
 )
+from flowrec.vision.walls import Box
 
-Box = tuple[int, int, int, int]  # x0, y0, x1, y1 in camera px, the latter two exclusive
 SIGNS = {"dark": -1, "bright": 1, "mixed": 0}
 BLUR_PX = 1.0  # an image is larger than the object by about this much
 VIEWS = 8  # at most
@@ -47,7 +47,6 @@ _ENERGY_SPREAD = 0.7  # of ln(energy / expected energy)
 _ISOLATED_RADII = 2.2  # no neighbour is nearer
 _KNOWN_LOOK = 0.8  # correlation from which on a look is one of the views
 _GAIN, _RECENT_GAIN = 0.3, 0.2  # of the velocity; of the recent view, energy and spread
-_EARLIEST_UPDATE_S = 0.1  # between two updates of the recent view, if the look is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +116,7 @@ class Region:
 
     def to_px(self, blocks: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (..., 2) in blocks to camera pixels."""
-        return blocks * self.scale.step + np.array([self.x0, self.y0])
+        return np.asarray(blocks * self.scale.step + np.array([self.x0, self.y0]))
 
     def to_blocks(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (..., 2) in camera pixels to blocks."""
@@ -254,7 +253,8 @@ def located(region: Region, found: Candidates, which: int, appearance: Appearanc
     scale, window = region.scale, region.scale.window()
     view = appearance.views[found.view[which]]
     centroid, similarity = found.blocks[which], float(found.similarity[which])
-    x, y, correlated = registered(region.c, *found.start[which].tolist(), view, window, 1.5)
+    start_x, start_y = found.start[which].tolist()
+    x, y, correlated = registered(region.c, start_x, start_y, view, window, 1.5)
     half = view.shape[0] // 2
     sign, radius = SIGNS[appearance.polarity], _CENTROID_RADII * scale.radius
     ax, ay, _, _ = silhouette_centroid(view, appearance.foreground_noise, sign, float(half), float(half), radius, 6)
@@ -277,7 +277,8 @@ def updated_views(
     known = similarity >= _KNOWN_LOOK
     if known and not due:
         return None
-    patch = patch_at(region.c, *place.tolist(), half)
+    x, y = place.tolist()
+    patch = patch_at(region.c, x, y, half)
     if len(views) == 1:
         return np.stack([views[0], patch])
     if known:
@@ -287,19 +288,26 @@ def updated_views(
     return np.concatenate([views[:1], patch[None], older])
 
 
-def updated_state(
-    previous: Track, motion: Motion, place_px: NDArray[np.float64], to_px: NDArray[np.float64], energy: float, dt: float
-) -> dict[str, NDArray[np.float64] | float]:
-    """The fields of a Track on the motion, after the robot went from one place to another in `dt` seconds."""
+def with_motion(
+    track: Track,
+    previous: Track,
+    motion: Motion,
+    place_px: NDArray[np.float64],
+    to_px: NDArray[np.float64],
+    energy: float,
+    dt: float,
+) -> Track:
+    """The track with its fields on the motion, after the robot went from one place to another in `dt` seconds."""
     frames = 1 + previous.lost_frames
     velocity = (to_px - place_px) / (dt * frames) if dt > 0.0 else previous.velocity_px_s
     missed_px = math.dist(to_px, motion.expected_px) / frames
     ratio = max(energy, 1e-6) / max(previous.energy, 1e-6)
-    return {
-        "velocity_px_s": previous.velocity_px_s + _GAIN * (velocity - previous.velocity_px_s),
-        "spread_px": previous.spread_px + _RECENT_GAIN * (missed_px - previous.spread_px),
-        "energy": max(previous.energy, 1e-6) * ratio**_RECENT_GAIN,
-    }
+    return replace(
+        track,
+        velocity_px_s=previous.velocity_px_s + _GAIN * (velocity - previous.velocity_px_s),
+        spread_px=previous.spread_px + _RECENT_GAIN * (missed_px - previous.spread_px),
+        energy=max(previous.energy, 1e-6) * ratio**_RECENT_GAIN,
+    )
 
 
 def neighbours_of(found: Candidates, robot: int | None) -> NDArray[np.float64]:

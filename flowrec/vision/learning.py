@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flowrec.declarations import Image
 from flowrec.messages import Appearance
 from flowrec.vision.foreground import energy_map, patch_at, peaks, silhouette_centroid
-from flowrec.vision.learned import BLUR_PX, SIGNS, Box, Region, Scale, region_of
+from flowrec.vision.learned import BLUR_PX, SIGNS, Region, Scale, region_of
 
 _QUANTUM = 0.29  # standard deviation of rounding to whole grey levels
 _SMOOTHED = 0.375  # noise of a foreground's block relative to that of a block's mean
@@ -113,6 +113,3 @@ def box_of(box_px: tuple[float, float, float, float]) -> tuple[tuple[float, floa
     """Centre and radius of a box that a user drew around the robot, in px."""
     x0, y0, x1, y1 = box_px
     return (0.5 * (x0 + x1), 0.5 * (y0 + y1)), 0.5 * max(abs(x1 - x0), abs(y1 - y0))
-
-
-__all__ = ["Box", "box_of", "energy_of", "learn", "pixel_noise"]

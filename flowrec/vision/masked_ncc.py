@@ -41,7 +41,7 @@ def template(radius_px: float, step: int) -> NDArray[np.float32]:
 
 @compiled
 def masked_ncc(
-    image: Image,
+    image: Image | NDArray[np.float32],
     distance_px: NDArray[np.float32],
     box: tuple[int, int, int, int],
     step: int,

@@ -14,25 +14,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
-from flowrec.declarations import Image
-from flowrec.interpolation import nearest_pixel
 from flowrec.messages import Appearance, Frame, Track
 from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
-from flowrec.vision.disc_fit import fit_disc, fit_radius, initial_edge_px
+from flowrec.vision.disc_search import LARGEST, Disc, Limits, Search, best_disc, best_disc_normalised, disc_pad_px
 from flowrec.vision.learned import (
     BLUR_PX,
-    Box,
     Scale,
     alone,
     assigned,
@@ -43,54 +37,18 @@ from flowrec.vision.learned import (
     neighbours_of,
     region_of,
     similar,
-    updated_state,
     updated_views,
+    with_motion,
 )
 from flowrec.vision.learning import box_of, energy_of, learn, pixel_noise
-from flowrec.vision.masked_ncc import masked_ncc, template
+from flowrec.vision.walls import Box, Walls, walls_in_view
 
 Polarity = Literal["dark", "bright", "auto"]
 _Pixel = Annotated[float, Range(-1e5, 1e5)]
-_COARSE_RADIUS_PX = 2.5  # of the robot in the reduced image in which candidates are found
-_FINE_RADIUS_PX = 6.0  # of the robot in the image that the disc is fitted to, unless it is smaller in the camera's
-_LEAST_CORRELATION = 0.35  # of a candidate
-_SIZE_PX = 0.5  # uncertainty of any disc's radius because of blur
-_SURE = 0.92  # a score that needs no comparison
-_SMALLEST, _LARGEST = 0.75, 1.35  # expected radius relative to the robot's own
-_DISTANCE_PENALTY = 0.1  # at the end of the search range
+_SMALLEST = 0.75  # least expected radius relative to the robot's own
 _RADIUS_WEIGHT = 0.05  # of the newest radius in the tracked one: focus drifts, single frames are unreliable
-_FAR_PX = 1e4  # distance to the walls of a chip without walls
-_NOISE_LEVELS = 2.0  # of a normalised image: least_contrast is three times its default noise
-_WALL_ERROR_RADII = 0.5
 _ENERGY_SHARE = 0.05  # least energy of a candidate relative to the robot's
 _UPDATE_NS = 100_000_000  # least time between two updates of a known look
-
-
-@dataclass(frozen=True, slots=True)
-class _Disc:
-    """A fitted disc, in camera pixels and grey levels."""
-
-    x: float
-    y: float
-    radius_px: float
-    darkness: float
-    likeness: float
-    score: float  # likeness times agreement of size
-
-
-@dataclass(frozen=True, slots=True)
-class _Search:
-    """Where to search for discs, and how similar to the robot they must be. Lengths in camera pixels."""
-
-    box: Box  # of possible centres
-    centre: tuple[float, float]
-    range_px: float  # from the centre; inf: everywhere
-    nominal_px: float
-    expected_px: float
-    margin_px: float
-    least_score: float
-    least_likeness: float
-    slack_px: float = 0.0  # the walls may be off by this much
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,14 +57,6 @@ class Footprint:
 
     pad_px: int
     everywhere_px: Box  # roi_px of a search in the whole channel
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Walls:
-    """Distance to the walls in the camera's image, and the bounding box of the fluid."""
-
-    distance_px: NDArray[np.float32]  # (h, w), negative in solid
-    box: Box
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,13 +94,19 @@ class Tracker:
     click_px: tuple[_Pixel, _Pixel] | None = None  # a point (column, row) on the robot: its look is learned there
     box_px: tuple[_Pixel, _Pixel, _Pixel, _Pixel] | None = None  # the same by a box around it: x0, y0, x1, y1
     click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
-    # the walls of the mask may be off by this many robot radii; None: 0.5 in a new run
-    wall_error_radii: Annotated[float, Range(0.0, 2.0)] | None = None
+    # the walls of the mask may be off by this many robot radii; ignored where polarity is None
+    wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
 
-    def for_a_new_run(self) -> Tracker:
-        """The settings that are None chosen."""
-        wall_error = _WALL_ERROR_RADII if self.wall_error_radii is None else self.wall_error_radii
-        return replace(self, polarity=self.polarity or "auto", wall_error_radii=wall_error)
+    def not_found_note(self, appearance: Appearance | None) -> str:
+        """What to do if the robot is not found; '' in a session that had no such note."""
+        if self.polarity is None:
+            return ""
+        if appearance is not None and appearance.note:
+            return appearance.note
+        return (
+            f"it is searched as a disc, tracker.polarity = {self.polarity!r}; for any other look name a point on it in "
+            "the first image, as in tracker.click_px = [320, 256]"
+        )
 
     def follow(
         self,
@@ -182,26 +138,15 @@ class Tracker:
         walls = walls_in_view(chip, calibration, (frame.image.shape[0], frame.image.shape[1]))
         scene = _Scene(frame, walls, calibration, robot)
         search = self._plan(previous, frame, walls, calibration, robot)
-        found = self.best_disc(frame.image, walls, search)
+        found = best_disc(frame.image, walls, search)
         return _not_seen(previous, scene, search) if found is None else _seen(scene, search, found)
 
     def footprint(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Footprint:
         """The pixels of an image of `shape` that can influence a track, whatever the image shows."""
-        pad_px = self.disc_pad_px(robot.radius_um / calibration.um_per_px)
+        pad_px = disc_pad_px(robot.radius_um / calibration.um_per_px)
         if self.polarity is not None:
             pad_px = max(pad_px, Scale(self._radius_px(calibration, robot) + BLUR_PX).pad_px)
         return Footprint(pad_px, walls_in_view(chip, calibration, shape).box)
-
-    def disc_pad_px(self, nominal: float) -> int:
-        """How far around a searched box the search for a disc of a radius, in px, reads."""
-        coarse = _coarse_step(nominal)
-        # Blocks of the reduced image that a template on the outermost block of the region covers; the last of them may
-        # exceed the region by all but a pixel.
-        correlated = coarse * (len(template(nominal, coarse)) // 2 + 1) - 1
-        # A disc is fitted around the middle of a block, to blocks that begin on whole pixels.
-        largest = _LARGEST * nominal
-        fitted = 0.5 * (coarse - 1) + fit_radius(largest, initial_edge_px(largest)) + 1.0
-        return max(correlated, math.ceil(fitted))
 
     def _radius_px(self, calibration: Calibration, robot: Robot) -> float:
         """Radius of what is learned: that of the user's box, or the robot's."""
@@ -221,7 +166,7 @@ class Tracker:
             return self._learned(previous, scene, at_px, assumed, f"{what} of image {frame.index}")
         noise = pixel_noise(frame.image)
         dark = self._dark_disc(scene, search, noise) if assumed != "bright" else None
-        bright = _normalised(self, scene, search, noise, bright=True) if assumed != "dark" else None
+        bright = self._normalised(scene, search, noise, bright=True) if assumed != "dark" else None
         if bright is not None and (dark is None or bright.score * bright.darkness > dark.score * dark.darkness):
             return self._learned(previous, scene, (bright.x, bright.y), "bright", "the brightest disc")
         if dark is None:
@@ -249,7 +194,7 @@ class Tracker:
         region = region_of(frame.image, walls.distance_px, _padded(box, scale.margin_px), scale, solid_px)
         found = candidates(region, appearance, box, walls.distance_px, 0.0, appearance.centre_px)
         near = np.hypot(*(found.px - appearance.centre_px).T) < 0.7 * appearance.radius_px
-        track = _seen(scene, search, _Disc(x, y, search.expected_px, 0.0, 1.0, 1.0))
+        track = _seen(scene, search, Disc(x, y, search.expected_px, 0.0, 1.0, 1.0))
         return replace(
             track,
             velocity_px_s=np.zeros(2),
@@ -312,23 +257,27 @@ class Tracker:
             lost_frames=0,
             roi_px=roi,
             neighbours_px=neighbours,
-            **updated_state(previous, motion, place_px, to_px, float(found.energy[which]), dt),
         )
+        track = with_motion(track, previous, motion, place_px, to_px, float(found.energy[which]), dt)
         return track, appearance if views is None else replace(appearance, stamp_ns=frame.stamp_ns, views=views)
 
     def _solid_px(self, radius_px: float) -> float:
         """Distance to the mask's walls (negative: depth in the solid) from which on a pixel may show fluid."""
-        return -(self.wall_error_radii or 0.0) * radius_px
+        return -self.wall_error_radii * radius_px
 
-    def _dark_disc(self, scene: _Scene, search: _Search, noise: float) -> _Disc | None:
+    def _dark_disc(self, scene: _Scene, search: Search, noise: float) -> Disc | None:
         """The dark disc; where there is none, one that is paler, or nearer to the walls than they permit if exact."""
         frame, walls = scene.frame, scene.walls
         found = None
         if frame.bits == 8:
-            found = self.best_disc(frame.image, walls, search)
-        return found or _normalised(self, scene, search, noise, bright=False)
+            found = best_disc(frame.image, walls, search)
+        return found or self._normalised(scene, search, noise, bright=False)
 
-    def _everywhere(self, previous: Track | None, scene: _Scene) -> _Search:
+    def _normalised(self, scene: _Scene, search: Search, noise: float, *, bright: bool) -> Disc | None:
+        slack_px = self.wall_error_radii * search.nominal_px
+        return best_disc_normalised(scene.frame.image, scene.walls, search, noise, slack_px, bright=bright)
+
+    def _everywhere(self, previous: Track | None, scene: _Scene) -> Search:
         """A search in the whole channel."""
         return self._plan(
             None if previous is None else replace(previous, score=0.0),
@@ -338,18 +287,21 @@ class Tracker:
             scene.robot,
         )
 
+    @property
+    def _limits(self) -> Limits:
+        return Limits(self.least_contrast, self.size_tolerance, self.candidates)
+
     def _plan(
         self, previous: Track | None, frame: Frame, walls: Walls, calibration: Calibration, robot: Robot
-    ) -> _Search:
+    ) -> Search:
         """Where to search, from the previous message."""
         nominal = robot.radius_um / calibration.um_per_px
         margin = min(max(self.wall_margin_um / calibration.um_per_px, 1.0), 0.5 * nominal)
         # A score of 0 means that the robot was never seen.
         if previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after:
             expected = nominal if previous is None else previous.radius_px
-            return _Search(
-                walls.box, (0.0, 0.0), math.inf, nominal, expected, margin, self.acquire_score, self.acquire_likeness
-            )
+            least = (self.acquire_score, self.acquire_likeness)
+            return Search(walls.box, (0.0, 0.0), math.inf, nominal, expected, margin, *least, self._limits)
         x, y = calibration.to_px(previous.position_um).tolist()
         frames = 1 + previous.lost_frames
         dt = seconds(frame.stamp_ns - previous.stamp_ns) / frames
@@ -360,102 +312,10 @@ class Tracker:
         box = (left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1))
         # While the robot is lost, an object of low likeness is more probably a piece of debris.
         least = (self.acquire_score, self.acquire_likeness) if previous.lost_frames else (self.least_score, 0.0)
-        return _Search(box, (x, y), range_px, nominal, previous.radius_px, margin, *least)
-
-    def best_disc(self, image: Image, walls: Walls, search: _Search) -> _Disc | None:
-        """The best disc within the search range."""
-        x0, y0, x1, y1 = search.box
-        if x1 <= x0 or y1 <= y0:
-            return None
-        nominal = search.nominal_px
-        step = _coarse_step(nominal)
-        clearance = 0.7 * nominal - search.slack_px
-        match = masked_ncc(
-            image, walls.distance_px, search.box, step, search.margin_px, clearance, template(nominal, step)
-        )
-        rows, columns = match.shape
-        offset = 0.5 * (step - 1)
-        near = math.isfinite(search.range_px)
-        if near:
-            dx = x0 + offset - search.centre[0] + step * np.arange(columns, dtype=np.float32)
-            dy = y0 + offset - search.centre[1] + step * np.arange(rows, dtype=np.float32)
-            distance2 = ((dx * dx)[None] + (dy * dy)[:, None]) / np.float32(search.range_px**2)
-            match = np.where(distance2 <= 1.0, match - np.float32(_DISTANCE_PENALTY) * distance2, np.float32(-1.0))
-        best, best_rank = None, 0.0
-        suppressed = max(1, round(nominal / step))  # around a candidate
-        for _ in range(self.candidates):
-            row, column = divmod(int(match.argmax()), columns)
-            if match[row, column] < _LEAST_CORRELATION:
-                break
-            top, left = max(row - suppressed, 0), max(column - suppressed, 0)
-            match[top : row + suppressed + 1, left : column + suppressed + 1] = -1.0
-            found = self._measure(image, walls, x0 + offset + step * column, y0 + offset + step * row, search)
-            if found is None or found.score < search.least_score or found.likeness < search.least_likeness:
-                continue
-            rank = found.score * found.darkness
-            if near:
-                moved2 = (found.x - search.centre[0]) ** 2 + (found.y - search.centre[1]) ** 2
-                rank = found.score - _DISTANCE_PENALTY * moved2 / search.range_px**2
-            if rank > best_rank:
-                best, best_rank = found, rank
-            if near and found.score > _SURE:
-                break
-        return best
-
-    def _measure(self, image: Image, walls: Walls, x: float, y: float, search: _Search) -> _Disc | None:
-        """Fit a disc near a candidate; None if the result can not be the robot."""
-        expected = search.expected_px
-        step = max(1, int(search.nominal_px / _FINE_RADIUS_PX))
-        fx, fy, radius_px, darkness, likeness = fit_disc(
-            image, walls.distance_px, search.margin_px, x, y, expected, initial_edge_px(expected), step
-        )
-        if darkness < self.least_contrast or math.hypot(fx - x, fy - y) > max(1.2 * expected, 2.0):
-            return None
-        if walls.distance_px[nearest_pixel(fx, fy, image.shape)] < 0.6 * search.nominal_px - search.slack_px:
-            return None
-        size = math.log(radius_px / expected) / math.hypot(self.size_tolerance, _SIZE_PX / expected)
-        return _Disc(fx, fy, radius_px, darkness, likeness, likeness * math.exp(-0.5 * size * size))
+        return Search(box, (x, y), range_px, nominal, previous.radius_px, margin, *least, self._limits)
 
 
-@lru_cache(maxsize=4)
-def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, int]) -> Walls:
-    """Walls of a chip (compared by identity) in an image of `shape` (rows, columns)."""
-    height, width = shape
-    scale = calibration.um_per_px / chip.um_per_px  # mask pixels per camera pixel
-    to_mask = calibration.matrix / chip.um_per_px  # of (column, row, 1) in the image
-    # Distances interpolate smoothly, while an interpolated mask would have stairs.
-    distance = cv2.warpAffine(
-        _mask_distance_px(chip.mask) / np.float32(scale),
-        to_mask,
-        (width, height),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,  # a channel that the border cuts continues straight
-    )
-    rows, columns = chip.mask.shape
-    right, down = np.arange(width), np.arange(height)[:, None]
-    x, y = (row[2] + row[0] * right + row[1] * down for row in to_mask)
-    fluid = (distance > 0) & (y >= -0.5) & (y <= rows - 0.5) & (x >= -0.5) & (x <= columns - 0.5)
-    across, down = np.flatnonzero(fluid.any(axis=0)), np.flatnonzero(fluid.any(axis=1))
-    box = (int(across[0]), int(down[0]), int(across[-1]) + 1, int(down[-1]) + 1) if len(across) else (0, 0, 0, 0)
-    return Walls(np.ascontiguousarray(distance, np.float32), box)
-
-
-def _mask_distance_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Signed distance (h, w) to the walls of a mask in its pixels, as `clearance_um` defines it.
-
-    It differs from `clearance_um` in the last bits: it is not rounded, and far from any wall it is finite. The two are
-    kept apart because a replay compares the tracks of recorded sessions.
-    """
-    if mask.all():
-        return np.full(mask.shape, _FAR_PX, np.float32)
-    pad = 16
-    fluid = np.pad(mask, pad, mode="edge").astype(np.uint8)
-    inside = cv2.distanceTransform(fluid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    outside = cv2.distanceTransform(1 - fluid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(np.where(fluid, inside - 0.5, 0.5 - outside)[pad:-pad, pad:-pad], np.float32)
-
-
-def _seen(scene: _Scene, search: _Search, found: _Disc) -> Track:
+def _seen(scene: _Scene, search: Search, found: Disc) -> Track:
     radius_px = search.expected_px + _RADIUS_WEIGHT * (found.radius_px - search.expected_px)
     return Track(
         stamp_ns=scene.frame.stamp_ns,
@@ -463,12 +323,12 @@ def _seen(scene: _Scene, search: _Search, found: _Disc) -> Track:
         position_um=scene.calibration.to_um((found.x, found.y)),
         score=found.score,
         lost_frames=0,
-        radius_px=min(max(radius_px, _SMALLEST * search.nominal_px), _LARGEST * search.nominal_px),
+        radius_px=min(max(radius_px, _SMALLEST * search.nominal_px), LARGEST * search.nominal_px),
         roi_px=np.array(search.box, np.float64),
     )
 
 
-def _not_seen(previous: Track | None, scene: _Scene, search: _Search) -> Track:
+def _not_seen(previous: Track | None, scene: _Scene, search: Search) -> Track:
     height, width = scene.frame.image.shape
     middle = scene.calibration.to_um(((width - 1) / 2, (height - 1) / 2))
     return Track(
@@ -480,29 +340,6 @@ def _not_seen(previous: Track | None, scene: _Scene, search: _Search) -> Track:
         radius_px=search.expected_px,
         roi_px=np.array(search.box, np.float64),
     )
-
-
-def _normalised(tracker: Tracker, scene: _Scene, search: _Search, noise: float, *, bright: bool) -> _Disc | None:
-    """The best disc in an image whose noise is 2 grey levels, with walls that may be off."""
-    image, (x0, y0, x1, y1) = scene.frame.image, search.box
-    pad = tracker.disc_pad_px(search.nominal_px)
-    left, top = max(x0 - pad, 0), max(y0 - pad, 0)
-    part = image[top : y1 + pad, left : x1 + pad].astype(np.float32)
-    if not part.size:
-        return None
-    gain = np.float32((-1.0 if bright else 1.0) * _NOISE_LEVELS / noise)
-    part = np.float32(128.0) + gain * (part - np.median(part[:: max(1, len(part) // 64)]))
-    slack_px = (tracker.wall_error_radii or 0.0) * search.nominal_px
-    distance = np.ascontiguousarray(scene.walls.distance_px[top : y1 + pad, left : x1 + pad])
-    shifted = replace(
-        search,
-        box=(x0 - left, y0 - top, x1 - left, y1 - top),
-        centre=(search.centre[0] - left, search.centre[1] - top),
-        margin_px=search.margin_px - slack_px,
-        slack_px=slack_px,
-    )
-    found = tracker.best_disc(part, Walls(distance, shifted.box), shifted)
-    return None if found is None else replace(found, x=found.x + left, y=found.y + top)
 
 
 def unseen(previous: Track, stamp_ns: int) -> Track:
@@ -520,7 +357,3 @@ def _clipped(centre: tuple[float, float], range_px: float, box: Box) -> Box:
 
 def _padded(box: Box, margin_px: int) -> Box:
     return box[0] - margin_px, box[1] - margin_px, box[2] + margin_px, box[3] + margin_px
-
-
-def _coarse_step(nominal_px: float) -> int:
-    return max(1, int(nominal_px / _COARSE_RADIUS_PX))

@@ -9,7 +9,7 @@ from flowrec.commands.record import record
 from flowrec.config import calibration_of, load_config
 from flowrec.interpolation import bilinear
 from flowrec.resolve import resolve
-from flowrec.vision.tracker import walls_in_view
+from flowrec.vision.walls import walls_in_view
 from tests.conftest import SMALL
 
 SURVEY = [*SMALL, "mission.phases=survey,refine"]
