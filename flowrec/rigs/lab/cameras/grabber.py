@@ -55,7 +55,8 @@ class Captured:
         transfer, which is constant) remains in it.
     arrival_ns : on the session clock.
     clock : the fit, with which the stamp was made; None: the device has no clock, or it stands still.
-    losses : up to this frame; the same object until something changes, or a second has passed.
+    losses : by cause; the same message until something more is lost, or a second has passed, so that few are written.
+        `Grabber.losses` is that of this frame.
     """
 
     image: Image
@@ -131,8 +132,8 @@ class Grabber:
         self._over = threading.Event()
         self._failure: Exception | None = None
         self._info: CameraInfo | None = None
-        self._handed: _Waiting | None = None
-        self._last: CameraLosses | None = None
+        self._exact: CameraLosses | None = None  # up to the latest frame that was handed on
+        self._reported: CameraLosses | None = None  # the latest one that a frame came with
         # Of the thread only.
         self._ids = BlockIds()
         self._stamper = _Stamper()
@@ -172,13 +173,16 @@ class Grabber:
     @property
     def losses(self) -> CameraLosses | None:
         """The losses up to the latest frame that was handed on; None before the first one."""
-        return self._message(self._handed) if self._handed is not None else None
+        return self._exact
 
     def __enter__(self) -> Self:
         self._thread.start()
-        if not self._opened.wait(_OPEN_S):
+        try:
+            if not self._opened.wait(_OPEN_S):
+                raise RigError(f"the camera does not answer for {_OPEN_S:g} s; switch it off and on, then try again")
+        except BaseException:  # Ctrl-C too
             self._over.set()
-            raise RigError(f"the camera does not answer for {_OPEN_S:g} s; switch it off and on, then try again")
+            raise
         if self._info is None and self._failure is not None:
             raise self._failure
         return self
@@ -210,9 +214,11 @@ class Grabber:
                 return None
             frame = self._queue.popleft()
             self.frames += 1
-            self._handed = frame
-            losses = self._reported(frame)
-        return Captured(frame.image, frame.bits, frame.index, frame.stamp_ns, frame.arrival_ns, frame.clock, losses)
+            exact = self._exact = self._message(frame)
+        last = self._reported
+        if last is None or exact.stamp_ns >= last.stamp_ns + nanoseconds(_REPORT_S) or _lost(last) != _lost(exact):
+            self._reported = last = exact
+        return Captured(frame.image, frame.bits, frame.index, frame.stamp_ns, frame.arrival_ns, frame.clock, last)
 
     def _message(self, frame: _Waiting) -> CameraLosses:
         """The losses up to a frame. All that the queue has dropped lies before the frame, which was behind it."""
@@ -229,13 +235,6 @@ class Grabber:
             counts.reconnections,
         )
 
-    def _reported(self, frame: _Waiting) -> CameraLosses:
-        """The message for a frame: the last one, unless something was lost since then, or a second has passed."""
-        last, new = self._last, self._message(frame)
-        if last is None or new.stamp_ns >= last.stamp_ns + nanoseconds(_REPORT_S) or _lost(last) != _lost(new):
-            self._last = last = new
-        return last
-
     # ---- the thread
 
     def _work(self) -> None:
@@ -246,6 +245,7 @@ class Grabber:
                 self._connected(camera.open())
             except Exception as error:  # noqa: BLE001  raised in the thread that waits for the camera
                 self._failure = error
+                _within(_CLOSE_S, camera.close)
                 self._opened.set()
                 return
             self._opened.set()

@@ -198,8 +198,10 @@ def test_the_end_is_prompt_even_if_a_call_of_the_driver_hangs() -> None:
 
 
 def test_an_error_when_it_is_opened_is_that_of_the_driver() -> None:
+    camera = Scripted(info=RigError("no camera found"))
     with pytest.raises(RigError, match="no camera found"):
-        grabbing(Scripted(info=RigError("no camera found"))).__enter__()
+        grabbing(camera).__enter__()
+    assert camera.closed.is_set()  # it may be connected already
 
 
 def test_a_defect_of_a_driver_reaches_the_loop() -> None:
