@@ -29,7 +29,7 @@ from flowrec.declarations import (
     Vector2,
     Vector3,
 )
-from flowrec.enums import Action, WorkOrder
+from flowrec.enums import WorkOrder
 from flowrec.errors import RigError
 
 PIXEL_BITS = (8, 10, 12, 14, 16)
@@ -97,11 +97,19 @@ class Applied(Message):
     # image is new. Images are compared on arrival, because a file may hold them in part or with losses. None: not
     # compared (older files); then only the number of frames decides on a loss of the robot.
     image_since_ns: int | None = None
+    # Stamp of the last tick to which the camera had no image to give, because it was absent or had delivered its last
+    # one. None: there was none.
+    absent_until_ns: int | None = None
 
     @property
     def repeats_image(self) -> bool:
-        """Whether the camera repeated the image of the previous frame."""
+        """Whether the camera repeated the image of the previous frame, or gave none."""
         return self.image_since_ns is not None and self.image_since_ns < self.stamp_ns
+
+    @property
+    def without_image(self) -> bool:
+        """Whether the camera had no image to give to this tick."""
+        return self.absent_until_ns == self.stamp_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -430,11 +438,6 @@ class Tick:
     appearance: Annotated[Appearance | None, Topic("/robot/appearance", Source.STAGE, 1e-4, {"views": 1e-3})] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
-
-    @property
-    def frames_ended(self) -> bool:
-        """Whether the observation has ended: the ticks that wait for its refinement may have no image."""
-        return self.operator is not None and self.operator.action == Action.END
 
     @property
     def field(self) -> FlowField | None:

@@ -183,8 +183,8 @@ class Lab:
     gain: Annotated[float, Range(-100.0, 1e4)] | None = None  # in the camera's unit; None: as the camera has it
     trigger: str = ""  # '': the camera runs freely; 'software'; else the line that triggers it, such as 'Line1'
     queue_frames: Annotated[int, Range(1, 1000)] = 8  # images that may wait for the loop; more are dropped and counted
-    # time without an image after which the coils are switched off and the camera is asked for again
-    camera_timeout_s: Annotated[float, Range(0.05, 60.0)] = 0.5
+    # time without an image after which the field is off until there is one again; less than safety.guard_timeout_s
+    camera_timeout_s: Annotated[float, Range(0.01, 60.0)] = 0.3
     # time without an image after which the run ends
     give_up_s: Annotated[float, Range(0.1, 1e5)] = 60.0
     amplifier: Annotated[str, AMPLIFIERS] = "serial"

@@ -6,13 +6,11 @@ Messages come in file order; those of one tick need not follow each other. Memor
 from __future__ import annotations
 
 import heapq
-import math
 from collections import Counter
 
 from flowrec.commands.verdict import Gap
 from flowrec.declarations import Message, invalid_numbers
-from flowrec.enums import Action
-from flowrec.messages import Clocks, Frame, OperatorEvent, Timing
+from flowrec.messages import Applied, Clocks, Frame, Timing
 from flowrec.store.audit import Audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -22,7 +20,7 @@ LISTED = 100  # longest gaps, and settings of the wall clock, that are kept in m
 _PENDING = 100_000  # incomplete ticks in memory; in files of flowrec these are half a second of ticks
 _STEP_NS = 10_000  # resolution of the histogram of intervals
 _INTERVALS = 100_000  # bins of that histogram
-_FRAME, _APPLIED, _TRACK = 1, 2, 4
+_FRAME, _APPLIED, _TRACK, _NO_IMAGE = 1, 2, 4, 8
 _BITS = {"frame": _FRAME, "applied": _APPLIED, "track": _TRACK}
 
 
@@ -59,7 +57,7 @@ class Tally:
     Attributes
     ----------
     ticks : ticks with a report of the coils or a track.
-    images_missing : ticks without an image, before the end of the frames.
+    images_missing : ticks without an image, where the camera had one.
     images_alone : ticks with nothing but an image.
     inputs_missing : ticks that can not be replayed: no report of the coils, or neither image nor track.
     unfinished_ticks : ticks with inputs that no stage has answered.
@@ -84,7 +82,6 @@ class Tally:
         self._last_index: int | None = None
         self._pending: dict[int, int] = {}  # by time of the tick, which of _BITS have been seen
         self._keyframe_ns: int | None = None
-        self._ended_ns = math.inf  # from here on ticks may have no image
 
     def begin(self, found: Audit) -> None:
         """Take the header, before the first message."""
@@ -100,10 +97,9 @@ class Tally:
             self.repeated[name] += 1
             self.repeated_ns[name] = stamp_ns
         elif name in _BITS:
-            self._add_to_tick(log_ns, _BITS[name])
-        if isinstance(message, OperatorEvent) and message.action == Action.END:
-            self._ended_ns = min(self._ended_ns, log_ns)
-        if name == "applied" and log_ns <= self._ended_ns:
+            without_image = isinstance(message, Applied) and message.without_image
+            self._add_to_tick(log_ns, _BITS[name] | (_NO_IMAGE if without_image else 0))
+        if isinstance(message, Applied) and not message.without_image:
             self._add_interval(log_ns)
         if isinstance(message, Frame):
             step = message.index - self._last_index - 1 if self._last_index is not None else 0
@@ -117,8 +113,8 @@ class Tally:
 
     def close(self) -> None:
         """Count the ticks that did not become complete."""
-        for log_ns, bits in self._pending.items():
-            self._count(log_ns, bits)
+        for bits in self._pending.values():
+            self._count(bits)
         self._pending.clear()
 
     @property
@@ -151,18 +147,18 @@ class Tally:
 
     def _add_to_tick(self, log_ns: int, bit: int) -> None:
         bits = self._pending.pop(log_ns, 0) | bit
-        if bits == _FRAME | _APPLIED | _TRACK:
-            self._count(log_ns, bits)
+        if bits in (_FRAME | _APPLIED | _TRACK, _NO_IMAGE | _APPLIED | _TRACK):
+            self._count(bits)
             return
         self._pending[log_ns] = bits
         if len(self._pending) > _PENDING:
-            self._count(oldest_ns := next(iter(self._pending)), self._pending.pop(oldest_ns))
+            self._count(self._pending.pop(next(iter(self._pending))))
 
-    def _count(self, log_ns: int, bits: int) -> None:
+    def _count(self, bits: int) -> None:
         if bits == _FRAME:
             self.images_alone += 1
             return
         self.ticks += 1
         self.unfinished_ticks += bits == _FRAME | _APPLIED
-        self.images_missing += bits == _APPLIED | _TRACK and log_ns < self._ended_ns
+        self.images_missing += bits == _APPLIED | _TRACK
         self.inputs_missing += not bits & _APPLIED or bits == _APPLIED

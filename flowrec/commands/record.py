@@ -27,9 +27,9 @@ from flowrec.messages import FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
-from flowrec.rig_settings import MOVIE, RIGS
+from flowrec.rig_settings import LAB, MOVIE, RIGS
 from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
-from flowrec.rigs.rig import Rig
+from flowrec.rigs.rig import Connecting, Rig
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.loop import Sink, run
 from flowrec.run.watchdog import Watchdog
@@ -191,7 +191,8 @@ def record(
     Parameters
     ----------
     view : spawn, serve, rrd or none.
-    realtime : keep the rig to the wall clock, with a watchdog of its ticks (run/watchdog.py).
+    realtime : keep the rig to the wall clock, with a watchdog of its ticks (run/watchdog.py); devices of a lab know no
+        other time.
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     inputs : files that were read besides those that `config` names; no output may be one of them.
     keep_failed : False: a run that ends by an exception leaves no file, and one that it was to replace stays.
@@ -204,6 +205,7 @@ def record(
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
     resolved, chip, pipeline, made, source = prepare(config)
+    realtime = realtime or resolved.rig == LAB
     timeout_s = _guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
     path = _place(resolved, out, overwrite)
     output = Output(path, MCAP, inputs, overwrite)
@@ -211,6 +213,8 @@ def record(
         Output(path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
     fields = field_of_session(Path(resolved.start.field), chip) if resolved.start.field else {}
     rig: Rig = RIGS[resolved.rig].load().of(pipeline, resolved, resolved.duration_s, realtime)
+    if isinstance(rig, Connecting):
+        rig.tell = warn
     folder, floor_gb = path.resolve().parent, resolved.recording.disk_floor_gb
     control = control if control is not None else Unattended()
     run_control = control.run_control
@@ -227,6 +231,8 @@ def record(
     with ExitStack() as stack:
         # From the first byte of the file to the last, every way to end the run leaves a complete file.
         stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
+        if isinstance(rig, Connecting):
+            stack.enter_context(rig.connected())  # before there is a file
         writer = stack.enter_context(
             session_writer(
                 output,

@@ -46,7 +46,7 @@ class RecordedRig:
                 if tick.track is None or tick.track is before.track:
                     before = tick
                     continue  # a crash left the inputs without an image: nothing to replay
-                self.frames_missing += not tick.frames_ended
+                self.frames_missing += not tick.applied.without_image
                 new["track"] = tick.track
                 if tick.appearance is not before.appearance:
                     new["appearance"] = tick.appearance

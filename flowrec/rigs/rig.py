@@ -6,8 +6,9 @@ The table of rigs is in rig_settings.py, because the configuration names one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Protocol, Self
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -44,6 +45,21 @@ class Rig(Protocol):
         Raises
         ------
         RigError : the hardware has refused; it is called again.
+        """
+
+
+@runtime_checkable
+class Connecting(Protocol):
+    """A rig with devices. They are found before the file of a run is made."""
+
+    tell: Callable[[str], None]  # called with one line for a person; to be set by who makes the rig
+
+    def connected(self) -> AbstractContextManager[None]:
+        """Context in which the devices are open. Nothing is energised before the rig itself is entered, inside of it.
+
+        Raises
+        ------
+        RigError, UsageError : on entering; one line says which device is missing, busy or not as configured.
         """
 
 
@@ -84,8 +100,8 @@ def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int], bits:
     since_ns = 0
     for arrived in inputs:
         frame = arrived.frame
-        if frame is None:
-            yield arrived
+        if frame is None:  # the camera is absent
+            yield replace(arrived, applied=replace(arrived.applied, image_since_ns=since_ns)) if last else arrived
             continue
         if frame.image.shape != image_shape:
             height, width = frame.image.shape

@@ -204,7 +204,7 @@ def _and_afterwards(arriving: Iterator[Inputs], state: Callable[[], Tick], *, pa
         if paced and ended:
             time.sleep(seconds(_AFTER_NS))
         stamp_ns, zeros = last.stamp_ns + (_AFTER_NS if ended else _END_NS), np.zeros(3)
-        nothing = Applied(stamp_ns, 0.0, 0.0, 0.0, zeros, np.zeros(2), applied.image_since_ns)
+        nothing = Applied(stamp_ns, 0.0, 0.0, 0.0, zeros, np.zeros(2), applied.image_since_ns, stamp_ns)
         event = None if ended else OperatorEvent(stamp_ns, Action.END, "the frames have ended")
         yield Inputs(stamp_ns, None, nothing, operator=event)
         ended = True

@@ -274,7 +274,8 @@ def _rewrite(
                 pass  # the keyframe was counted where it was recorded
             elif tick.applied is not before.applied and tick.track is not before.track:
                 complete += 1
-                images_missing += has_images and tick.frame is before.frame and not tick.frames_ended
+                lacks = has_images and tick.frame is before.frame
+                images_missing += lacks and not (tick.applied is not None and tick.applied.without_image)
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
             before = tick

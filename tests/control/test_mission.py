@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from flowrec.control.mission import MissionStateMachine
-from flowrec.messages import Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
+from flowrec.messages import Applied, Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
 from flowrec.robot import Robot
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0)
@@ -35,8 +35,9 @@ class World:
         self.time_s = 0.0
         self.results: dict[str, object] = {"assumed": None, "refined": None, "route": None}
         self.seen_ns: int | None = None
+        self.absent_ns: int | None = None
 
-    def tick(self, at=(0.0, 500.0), seen=True, error_um=0.0, operator="", lost=0, **results) -> Mission:  # type: ignore[no-untyped-def]
+    def tick(self, at=(0.0, 500.0), seen=True, error_um=0.0, operator="", lost=0, absent=None, **results) -> Mission:  # type: ignore[no-untyped-def]
         self.results |= results
         stamp = round(self.time_s * 1e9)
         self.seen_ns = stamp if seen else self.seen_ns
@@ -44,6 +45,9 @@ class World:
         estimate = Estimate(stamp, at, np.zeros(2), np.eye(4), math.nan, at, seen)
         demand = Demand(stamp, np.zeros(2), at, 0.0, error_um, False, np.zeros((0, 2)))
         event = OperatorEvent(stamp, operator, "") if operator else None
+        self.absent_ns = stamp if absent else self.absent_ns
+        since_ns = self.seen_ns if not seen else stamp
+        applied = Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2), since_ns, self.absent_ns)
         self.mission = self.machine.update(
             self.mission,
             track,
@@ -52,6 +56,7 @@ class World:
             event,
             demand,
             ROBOT,  # type: ignore[arg-type]
+            applied if self.absent_ns is not None else None,
         )
         self.time_s += 1.0
         return self.mission
@@ -220,3 +225,24 @@ def test_a_robot_that_was_never_seen_until_the_frames_end_is_not_found() -> None
     world.tick(seen=False)
     world.tick(seen=False, assumed=field(1))
     assert world.tick(seen=False, operator="end").outcome == "not found"
+
+
+def test_while_the_camera_is_absent_the_field_is_off_and_the_robot_is_not_lost_before_it_could_be_found() -> None:
+    machine = MissionStateMachine(start=(0.0, 500.0), goal=GOAL, find_limit_s=3.0, lost_limit_frames=5)
+    world = World()
+    world.machine = machine
+    world.tick()
+    world.tick(assumed=field(1))
+    world.tick()
+    assert world.tick(route=route(2)).phase == "survey"
+    for _ in range(60):
+        blind = world.tick(seen=False, lost=50, absent=True)
+        assert blind.field_off and "the camera is absent" in blind.blind and not blind.finished
+    assert not world.tick(seen=False, lost=51).finished, "it has just come back"
+    back = world.tick(seen=True)
+    assert (back.field_off, back.blind_since_ns, back.phase) == (False, None, "survey")
+    for _ in range(3):
+        world.tick(seen=False, lost=50, absent=True)
+    for _ in range(4):
+        ended = world.tick(seen=False, lost=60)
+    assert ended.outcome == "lost"

@@ -1,0 +1,300 @@
+"""The rig of a lab: a camera behind its queue, and coils behind their limits and their guardian.
+
+See cameras/grabber.py and amplifiers/drive.py. Stamps are on the session clock, which is the host's monotonic clock
+less the stamp of the first frame: the middle of the exposure, by the fit of the camera's own clock. `Applied` is made
+of what the amplifier put out, not of what it was told.
+
+While no image comes, the field is off, and there are ticks without an image: the run stays alive, its operator can end
+it, and it goes on when the camera is back. A mission that only observes has no use for the coils, and does not open
+them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from flowrec.clocks import Fit
+from flowrec.config import ResolvedConfig
+from flowrec.errors import RigError, UsageError
+from flowrec.messages import Applied, CameraLosses, Currents, Frame
+from flowrec.pipeline import Inputs, Pipeline
+from flowrec.rig_settings import CAMERAS
+from flowrec.rigs.lab.amplifiers.drive import BEAT_S, Drive
+from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
+from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
+from flowrec.units import nanoseconds
+
+_ABSENT_S = 0.1  # between ticks without an image
+_FIRST_S = 10.0  # for the first frame of a run
+_LEAST_PERIODS = 3.0  # of the camera, before it is taken for absent
+_RATE_TOLERANCE = 0.05
+
+
+class LabRig:
+    """Camera and coils; see rigs.rig.Rig and Connecting.
+
+    Parameters
+    ----------
+    make_grabber : makes the camera's queue, not yet entered.
+    drive : the coils, not yet entered; None: they are not used.
+    config : for what the camera must deliver, and the limits of time.
+    duration_s : None: without end.
+
+    Raises UsageError for settings that exclude each other, and for a missing package.
+    """
+
+    @classmethod
+    def of(
+        cls,
+        pipeline: Pipeline,
+        config: ResolvedConfig,
+        duration_s: float | None = None,
+        realtime: bool = True,  # devices know no other time
+    ) -> LabRig:
+        """The rig of a resolved configuration."""
+        wanted = wanted_of(config.camera, config.lab)
+        make = partial(CAMERAS[config.lab.camera].load().of, wanted)
+        rig = cls(partial(Grabber, make, wanted, config.lab.queue_frames), None, config, duration_s)
+        if not config.mission.observes:
+            rig.drive = Drive.of(config, lambda text: rig.tell(text))
+        return rig
+
+    def __init__(
+        self,
+        make_grabber: Callable[[], Grabber],
+        drive: Drive | None,
+        config: ResolvedConfig,
+        duration_s: float | None = None,
+    ) -> None:
+        lab, guard_s = config.lab, config.safety.guard_timeout_s
+        least_s = _LEAST_PERIODS / config.camera.rate_hz
+        if not least_s <= lab.camera_timeout_s < guard_s:
+            raise UsageError(
+                f"lab.camera_timeout_s = {lab.camera_timeout_s:g}: must be at least {_LEAST_PERIODS:g} frames "
+                f"({least_s:.3g} s at camera.rate_hz = {config.camera.rate_hz:g}) and less than "
+                f"safety.guard_timeout_s = {guard_s:g}"
+            )
+        self.tell: Callable[[str], None] = lambda _text: None
+        self.drive = drive
+        self._make_grabber = make_grabber
+        self._grabber: Grabber | None = None
+        self._config = config
+        self._duration_ns = None if duration_s is None else nanoseconds(duration_s)
+        self._connection = ExitStack()
+        self._absent = False  # for the loop's thread only
+
+    @property
+    def info(self) -> CameraInfo:
+        """What the camera says of itself; inside of `connected`."""
+        assert self._grabber is not None, "the devices are open"
+        return self._grabber.info
+
+    @contextmanager
+    def connected(self) -> Iterator[None]:
+        with ExitStack() as stack:
+            # The camera first: a guardian that waits for a camera is of no use.
+            grabber = self._grabber = stack.enter_context(self._make_grabber())
+            stack.callback(self._forget)
+            self._check(grabber.info)
+            if self.drive is not None:
+                stack.enter_context(self.drive)
+            yield
+
+    def __enter__(self) -> LabRig:
+        if self._grabber is None:
+            self._connection.enter_context(self.connected())
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        try:
+            if self.drive is not None:
+                self.drive.zero()
+        finally:
+            self._connection.close()
+
+    def apply(self, currents: Currents) -> None:
+        """Send a command; while no image comes, none that makes a field."""
+        if self.drive is None:
+            return
+        if self._absent:
+            self.drive.rest()
+            self.drive.beat()
+        else:
+            self.drive.apply(currents)
+
+    def zero(self) -> None:
+        """Switch the field off at once, until the devices are connected again."""
+        if self.drive is not None:
+            self.drive.zero()
+
+    def inputs(self) -> Iterator[Inputs]:
+        """Frame after frame; while there is none, ticks without an image.
+
+        Raises
+        ------
+        RigError : the camera or the coils can not be used any more, or no image has come for lab.give_up_s.
+        """
+        grabber = self._grabber
+        assert grabber is not None, "the rig has been entered"
+        first = self._first(grabber)
+        session = _Session(first)
+        frame: Captured | None = first
+        last_ns, absent_until_ns = session.stamp_ns(first.stamp_ns), None
+        before_ns: int | None = None
+        while True:
+            if frame is not None:
+                self._absent = False
+                stamp_ns = last_ns = session.stamp_ns(frame.stamp_ns)
+            else:
+                stamp_ns = absent_until_ns = max(self._absent_ns(session), last_ns + 1)
+            if self._duration_ns is not None and stamp_ns > self._duration_ns:
+                return
+            applied = self._applied(session, stamp_ns, before_ns)
+            applied = replace(applied, absent_until_ns=absent_until_ns)
+            if frame is None:
+                yield Inputs(stamp_ns, None, applied)
+            else:
+                yield Inputs(
+                    stamp_ns,
+                    Frame(stamp_ns, session.index(frame), frame.image, frame.bits),
+                    applied,
+                    clock=session.fit(frame.clock),
+                    losses=session.losses(frame.losses),
+                )
+            before_ns = stamp_ns
+            frame = self._next(grabber)
+
+    # ---- the camera
+
+    def _check(self, info: CameraInfo) -> None:
+        """Refuse a camera that delivers other images than configured; tell about its other settings."""
+        camera = self._config.camera
+        name = " ".join(filter(None, (info.model, info.serial))) or "camera"
+        if (info.width_px, info.height_px) != (camera.width_px, camera.height_px):
+            raise RigError(
+                f"{name}: images of {info.width_px} x {info.height_px} pixels, where camera.width_px x camera.height_px"
+                f" = {camera.width_px} x {camera.height_px}; set them to what the camera can deliver"
+            )
+        if info.bits != camera.bits:
+            raise RigError(
+                f"{name}: images of {info.bits} bit ({info.pixel_format}), where camera.bits = {camera.bits}; set it, "
+                "or lab.pixel_format"
+            )
+        notes = list(info.notes)
+        if info.rate_hz and abs(info.rate_hz / camera.rate_hz - 1.0) > _RATE_TOLERANCE:
+            notes.append(f"it states {info.rate_hz:.4g} frames per second, camera.rate_hz = {camera.rate_hz:g}")
+        for note in notes:
+            self.tell(f"{name}: {note}")
+
+    def _first(self, grabber: Grabber) -> Captured:
+        """The newest frame: those that came while the run was prepared belong to no run."""
+        end_s, frame = time.monotonic() + _FIRST_S, None
+        while (newer := grabber.next(0.0 if frame is not None else BEAT_S)) is not None or frame is None:
+            frame = newer if newer is not None else frame
+            if frame is None and time.monotonic() > end_s:
+                raise RigError(
+                    f"no image in {_FIRST_S:g} s: {grabber.absent or 'the camera waits'}; see to its trigger "
+                    "(lab.trigger) and its cable"
+                )
+            if newer is None:
+                self._beat()
+        return frame
+
+    def _next(self, grabber: Grabber) -> Captured | None:
+        """The next frame; None when it is time for a tick without one."""
+        begin_s = time.monotonic()
+        patience_s = _ABSENT_S if self._absent else self._config.lab.camera_timeout_s
+        while (frame := grabber.next(BEAT_S)) is None:
+            self._beat()
+            waited_s = time.monotonic() - begin_s
+            if waited_s < patience_s:
+                continue
+            why = grabber.absent or "no image comes"
+            if not self._absent:
+                self._absent, self._absent_s = True, begin_s
+                self.tell(f"{why}: the field is off until there is an image again")
+            if self.drive is not None:
+                self.drive.rest()
+            if time.monotonic() - self._absent_s > self._config.lab.give_up_s:
+                raise RigError(f"no image for {self._config.lab.give_up_s:g} s (lab.give_up_s): {why}")
+            return None
+        if self._absent:
+            self.tell(f"the camera is back after {time.monotonic() - self._absent_s:.1f} s")
+        return frame
+
+    def _absent_ns(self, session: _Session) -> int:
+        """Stamp of a tick without an image: before that of a frame whose exposure has begun."""
+        return session.stamp_ns(time.monotonic_ns() - nanoseconds(self._config.camera.exposure_s + BEAT_S))
+
+    def _forget(self) -> None:
+        self._grabber = None
+
+    # ---- the coils
+
+    def _beat(self) -> None:
+        if self.drive is not None:
+            self.drive.beat()
+
+    def _applied(self, session: _Session, stamp_ns: int, before_ns: int | None) -> Applied:
+        if self.drive is None:
+            return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
+        begin_ns = None if before_ns is None else session.monotonic_ns(before_ns)
+        return replace(self.drive.applied(session.monotonic_ns(stamp_ns), begin_ns), stamp_ns=stamp_ns)
+
+
+class _Session:
+    """From the camera's queue, which runs before the run does, to the run's clock and counts."""
+
+    def __init__(self, first: Captured) -> None:
+        self._epoch_ns = first.stamp_ns
+        self._first_index = first.index
+        self._before = first.losses
+        self._known: tuple[CameraLosses, CameraLosses] | None = None
+
+    def stamp_ns(self, monotonic_ns: int) -> int:
+        return monotonic_ns - self._epoch_ns
+
+    def monotonic_ns(self, stamp_ns: int) -> int:
+        return stamp_ns + self._epoch_ns
+
+    def index(self, frame: Captured) -> int:
+        return frame.index - self._first_index
+
+    def fit(self, fit: Fit | None) -> Fit | None:
+        """The fit of the camera's clock, with its arrival times on the session clock."""
+        if fit is None:
+            return None
+        epoch_ns = self._epoch_ns
+        return replace(
+            fit,
+            stamp_ns=fit.stamp_ns - epoch_ns,
+            arrival_ns=fit.arrival_ns - epoch_ns,
+            fitted_ns=fit.fitted_ns - epoch_ns,
+        )
+
+    def losses(self, losses: CameraLosses) -> CameraLosses:
+        """The losses since the run began; the same object for the same one."""
+        if self._known is None or self._known[0] is not losses:
+            first = self._before
+            self._known = (
+                losses,
+                replace(
+                    losses,
+                    stamp_ns=max(self.stamp_ns(losses.stamp_ns), 0),
+                    ids=losses.ids - first.ids + 1,
+                    frames=losses.frames - first.frames + 1,
+                    link=losses.link - first.link,
+                    incomplete=losses.incomplete - first.incomplete,
+                    driver=losses.driver - first.driver,
+                    backlog=losses.backlog - first.backlog,
+                    triggers=losses.triggers - first.triggers,
+                    reconnections=losses.reconnections - first.reconnections,
+                ),
+            )
+        return self._known[1]

@@ -1,0 +1,199 @@
+"""The rig of a lab: what it makes of a camera that comes and goes, and what it lets through to the coils."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import pytest
+
+from flowrec.chip import load_chip
+from flowrec.commands.record import record
+from flowrec.config import ResolvedConfig, load_config
+from flowrec.errors import FlowrecError, RigError, UsageError
+from flowrec.messages import Applied, Currents
+from flowrec.resolve import resolve
+from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
+from flowrec.rigs.lab.cameras.grabber import Grabber
+from flowrec.rigs.lab.rig import LabRig
+from flowrec.rigs.rig import checked_images
+
+SHAPE = (48, 64)
+MEASURED = (
+    "rig=lab",
+    "camera.width_px=64",
+    "camera.height_px=48",
+    "camera.um_per_px=100.0",
+    "camera.rate_hz=50.0",
+    "robot.radius_um=70.0",
+    "robot.max_speed_um_s=900.0",
+    "robot.step_out_hz=40.0",
+    "robot.delay_s=0.05",
+)
+
+
+class Paced:
+    """A camera of 50 Hz that is absent while `gone` holds times in s since it was first opened."""
+
+    def __init__(self, gone: tuple[float, float], info: CameraInfo) -> None:
+        self.began_s, self.gone, self.info, self.number = 0.0, gone, info, 0
+
+    def open(self) -> CameraInfo:
+        self.began_s = self.began_s or time.monotonic()
+        if self._absent():
+            raise RigError("unplugged")
+        return self.info
+
+    def _absent(self) -> bool:
+        return self.gone[0] <= time.monotonic() - self.began_s < self.gone[1]
+
+    def grab(self, timeout_s: float) -> Grabbed | None:
+        time.sleep(min(0.02, timeout_s))
+        if self._absent():
+            raise RigError("unplugged")
+        self.number += 1
+        image = np.full(SHAPE, self.number % 251, np.uint8)
+        return Grabbed(image, 8, self.number, None, time.monotonic_ns())
+
+    def alive(self) -> bool:
+        return not self._absent()
+
+    def discarded(self) -> int:
+        return 0
+
+    def trigger(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Noted:
+    """Coils that note what they are asked for."""
+
+    def __init__(self) -> None:
+        self.calls: deque[str] = deque()
+        self.beats: list[float] = []
+
+    def __enter__(self) -> Noted:
+        self.calls.append("enter")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.calls.append("exit")
+
+    def beat(self) -> None:
+        self.beats.append(time.monotonic())
+
+    def apply(self, currents: Currents) -> None:
+        self.calls.append(f"apply {currents.amplitude_mt:g}")
+
+    def rest(self) -> None:
+        self.calls.append("rest")
+
+    def zero(self) -> None:
+        self.calls.append("zero")
+
+    def applied(self, stamp_ns: int, before_ns: int | None) -> Applied:
+        lasted_s = 0.0 if before_ns is None else (stamp_ns - before_ns) / 1e9
+        return Applied(stamp_ns, 2.0, 0.0, 4.0, np.zeros(3), [2.0 * lasted_s, 0.0])
+
+
+def config_of(*sets: str) -> ResolvedConfig:
+    config = load_config(None, [*MEASURED, *sets])
+    return resolve(config, load_chip(config.chip))
+
+
+def rig_of(config: ResolvedConfig, gone: tuple[float, float], duration_s: float | None) -> tuple[LabRig, Noted]:
+    info = CameraInfo("Paced", "1", config.camera.width_px, config.camera.height_px, 8, 50.0, id_bits=64)
+    camera, coils = Paced(gone, info), Noted()
+    wanted = Wanted(width_px=64, height_px=48, rate_hz=50.0)
+    return LabRig(lambda: Grabber(lambda: camera, wanted), coils, config, duration_s), coils  # type: ignore[arg-type, return-value]
+
+
+FIELD = Currents(0, 2.0, 0.0, 4.0, 0.0, [0.0, 0.0, 1.0], False)
+
+
+def driven(rig: LabRig) -> Iterator[tuple[object, list[str]]]:
+    with rig.connected(), rig:
+        for inputs in checked_images(rig.inputs(), SHAPE):
+            before = len(rig.drive.calls)  # type: ignore[union-attr]
+            rig.apply(FIELD)
+            yield inputs, list(rig.drive.calls)[before:]  # type: ignore[union-attr]
+
+
+def test_while_a_camera_is_absent_the_field_is_off_and_ticks_without_an_image_go_on_until_it_is_back() -> None:
+    rig, coils = rig_of(config_of(), gone=(0.6, 1.8), duration_s=2.4)
+    told: list[str] = []
+    rig.tell = told.append
+    seen = list(driven(rig))
+    assert coils.calls[0] == "enter" and list(coils.calls)[-2:] == ["zero", "exit"]
+    stamps = [inputs.stamp_ns for inputs, _ in seen]
+    assert stamps[0] == 0 and all(np.diff(stamps) > 0)
+    blind = [inputs.frame is None for inputs, _ in seen]
+    first, last = blind.index(True), len(blind) - blind[::-1].index(True)
+    assert all(blind[first:last]) and last < len(blind), "it goes on with images"
+    assert all(inputs.applied.without_image and inputs.applied.repeats_image for inputs, _ in seen[first:last])
+    assert all(calls == ["rest"] for _, calls in seen[first:last])
+    assert all(calls == ["apply 4"] for _, calls in seen[:first] + seen[last:])
+    assert not any(inputs.applied.without_image for inputs, _ in seen[last:])
+    assert {inputs.applied.absent_until_ns for inputs, _ in seen[last:]} == {stamps[last - 1]}
+    assert max(np.diff(coils.beats)) < 1.0, "the guardian hears the loop throughout"
+    turns = sum(inputs.applied.turns[0] for inputs, _ in seen)
+    assert turns == pytest.approx(2.0 * stamps[-1] / 1e9), "no turn is lost between frames"
+    assert seen[-1][0].losses.reconnections == 1
+    assert "the field is off until" in told[0] and "back after" in told[1]
+
+
+def test_a_camera_that_stays_away_ends_the_run_with_the_coils_at_zero() -> None:
+    rig, coils = rig_of(config_of("lab.give_up_s=0.5"), gone=(0.3, 60.0), duration_s=None)
+    with pytest.raises(RigError, match=r"no image for 0\.5 s \(lab\.give_up_s\): unplugged"):
+        list(driven(rig))
+    assert list(coils.calls)[-2:] == ["zero", "exit"]
+
+
+@pytest.mark.parametrize(
+    ("sets", "told"),
+    [
+        (("camera.width_px=32",), "images of 64 x 48 pixels, where camera.width_px x camera.height_px = 32 x 48"),
+        (("camera.bits=12",), r"images of 8 bit \(\), where camera.bits = 12"),
+    ],
+)
+def test_a_camera_that_delivers_other_images_is_refused_before_the_coils_are_opened(
+    sets: tuple[str, ...], told: str
+) -> None:
+    info = CameraInfo("Paced", "1", 64, 48, 8, 50.0)
+    coils = Noted()
+    make = lambda: Grabber(lambda: Paced((60.0, 61.0), info), Wanted(rate_hz=50.0))  # noqa: E731
+    rig = LabRig(make, coils, config_of(*sets))  # type: ignore[arg-type]
+    with pytest.raises(RigError, match=told), rig.connected():
+        pass
+    assert not coils.calls
+
+
+@pytest.mark.parametrize(
+    ("sets", "told"),
+    [
+        (("lab.camera=opencv", "lab.device=nowhere.avi"), "nowhere.avi"),
+        (("lab.camera_timeout_s=0.6",), r"lab\.camera_timeout_s = 0\.6: must be .* less than safety\.guard_timeout_s"),
+        (("lab.offset_x_px=4",), "lab.offset_x_px and lab.offset_y_px: set both"),
+    ],
+)
+def test_a_lab_that_is_not_ready_is_one_line_and_leaves_no_file(
+    sets: tuple[str, ...], told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(FlowrecError, match=told) as caught:
+        record(load_config(None, [*MEASURED, "lab.camera=opencv", *sets]), tmp_path / "s.mcap")
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_package_that_is_not_installed_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pypylon", None)
+    monkeypatch.delitem(__import__("sys").modules, "flowrec.rigs.lab.cameras.pylon", raising=False)
+    with pytest.raises(UsageError, match=r"method pylon needs pypylon, .* pip install 'flowrec\[pylon\]'"):
+        record(load_config(None, [*MEASURED, "lab.camera=pylon"]), Path("never.mcap"))
