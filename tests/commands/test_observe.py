@@ -51,7 +51,7 @@ def test_a_replay_of_an_observation_is_exact_and_its_file_is_whole(observed: Pat
 
 
 def test_a_robot_out_of_sight_ends_no_observation(tmp_path: Path) -> None:
-    config = load_config(GOLDEN, [*OBSERVE, "tracker.least_contrast=255.0", "mission.find_limit_s=0.5"])
+    config = load_config(GOLDEN, [*OBSERVE, "camera.background=1.0", "mission.find_limit_s=0.5"])
     done = record(config, tmp_path / "s.mcap")
     assert done.report.outcome == "not found"
     assert done.report.duration_s >= 3.0

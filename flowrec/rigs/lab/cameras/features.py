@@ -123,7 +123,8 @@ def _region(device: Features, wanted: Wanted) -> tuple[int, int]:
             at = int(middle) if wanted.offset_px is None else wanted.offset_px[axis]
             device.put(offset, at)
         elif wanted.offset_px is not None and wanted.offset_px[axis] != (place.value if place else 0):
-            raise RigError(f"lab.offset_{'xy'[axis]}_px: the camera has no {offset} that can be set")
+            setting = ("lab.offset_x_px", "lab.offset_y_px")[axis]
+            raise RigError(f"{setting}: the camera has no {offset} that can be set")
         got = device.feature(size)
         if got is None or got.value != asked:
             raise RigError(
