@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from flowrec import pipeline
 from flowrec.chip import load_chip
 from flowrec.commands.check import check
 from flowrec.commands.record import record
 from flowrec.commands.replay import replay
 from flowrec.config import load_config
 from flowrec.errors import UsageError
-from flowrec.messages import Frame, Track
+from flowrec.messages import Track
 from flowrec.resolve import resolve
 from flowrec.session import Session
 from flowrec.store.reader import SessionReader
-from flowrec.vision import Tracker
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.toml"
 OBSERVE = ("mission.phases=observe", "duration_s=3.0")
@@ -53,11 +55,13 @@ def test_a_replay_of_an_observation_is_exact_and_its_file_is_whole(observed: Pat
 
 
 def test_a_robot_out_of_sight_ends_no_observation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def blind(_self: Tracker, previous: Track | None, frame: Frame, *_: object) -> Track:
-        lost = previous.lost_frames + 1 if previous is not None else 1
-        return Track(frame.stamp_ns, False, np.zeros(2), 0.0, lost, 2.0, np.zeros(4))
+    found = pipeline._seen
 
-    monkeypatch.setattr(Tracker, "track", blind)
+    def blind(*known: Any) -> tuple[Track, Any]:
+        track, appearance = found(*known)
+        return replace(track, seen=False, seen_ns=None), appearance
+
+    monkeypatch.setattr(pipeline, "_seen", blind)
     limits = ("mission.find_limit_s=0.5", "mission.lost_limit_frames=3")
     done = record(load_config(GOLDEN, [*OBSERVE, *limits]), tmp_path / "s.mcap")
     assert done.report.outcome == "not found"
