@@ -12,6 +12,7 @@ from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig, calibration_of, to_toml
 from flowrec.messages import pixel_type
 from flowrec.provenance import provenance
+from flowrec.rig_settings import SIMULATED
 from flowrec.session import files_behind, session_sha256
 from flowrec.store.frame_encodings import encoding_for
 from flowrec.store.roi import Region
@@ -140,8 +141,9 @@ def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:
         "operator": config.recording.operator,
         "sample": config.recording.sample,
         "notes": config.recording.notes,
-        "seed": str(config.simulated.seed),
     }
+    if config.rig == SIMULATED:
+        facts["seed"] = str(config.simulated.seed)
     if config.refine.weights_sha256:
         facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
     return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]))

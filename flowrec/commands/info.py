@@ -26,6 +26,7 @@ _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and th
 _PNG_SIZE_AT = 16
 _REPEATED = ("reason", "duration")  # the second is a sentence of older files
 _STATED = ("seed", "operator", "sample", "notes")  # in the provenance
+_OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
 _CLOCK_READINGS = ("wall_ns", "monotonic_ns")
 
 
@@ -56,6 +57,7 @@ def info(session: Session | Path | str) -> dict[str, Any]:
         "derived": _derived(provenance.get("derived", "{}")),
         "piece": _piece(run.part, path) if run.part is not None else None,
         "replay_of": header.parent.get("file", "?") if header.parent else None,
+        **of_text({key: text for key, text in provenance.items() if key.startswith(_OF_SOURCE)}),
     }
     for key, code in provenance.items():
         if key.startswith("weights."):
@@ -83,6 +85,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         "derived": ", ".join(f"{key} = {value}" for key, value in facts["derived"].items()),
         "flowrec": facts["flowrec"] + _in_brackets((facts["commit"] or "")[:10] + changed),
     }
+    words |= {key: str(code)[:16] for key, code in facts.items() if key.endswith("_sha256")}
     names = {"observer": "stages", "flowrec": "by flowrec"}
     without = (
         "note",

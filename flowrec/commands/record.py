@@ -98,7 +98,8 @@ def prepare(asked: Config) -> Prepared:
     made = derived(given, config)
     if made:
         what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
-        say(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items())}")
+        unused = ("survey.", "plan.") if config.mission.observes else ()
+        say(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items() if not key.startswith(unused))}")
     refuse_adrift(config, chip)
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:

@@ -133,7 +133,8 @@ def _excel_rows(path: Path) -> Iterator[tuple[int, list[Any]]]:
         with zipfile.ZipFile(path) as parts:
             if sum(part.file_size for part in parts.infolist()) > _UNPACKED_LIMIT_BYTES:
                 raise UsageError(f"{path}: unpacks to more than 1 GB; save it as CSV")
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        data = io.BytesIO(path.read_bytes())  # of a path it would look at the suffix
+        book = openpyxl.load_workbook(data, read_only=True, data_only=True)
     except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
         raise UsageError(f"{path}: is no Excel file that can be read ({error}); save it as CSV in UTF-8") from error
     try:
