@@ -14,7 +14,7 @@ from flowrec.commands.record import prepare, record
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import Config
 from flowrec.control.field_log import FieldLog
-from flowrec.messages import Track
+from flowrec.messages import Appearance, Track
 from flowrec.rig_settings import MOVIE
 from flowrec.rigs.movie.source import MovieSource
 
@@ -44,10 +44,12 @@ def tracks_of(asked: Config) -> MovieTracks:
     """Track the robot through the movie of a configuration; FlowrecError as `import_movie`."""
     config, chip, pipeline, *_ = prepare(asked)
     track: Track | None = None
+    appearance: Appearance | None = None
     tracks: list[Track] = []
     with MovieSource(config.movie, config.coils) as source:
         for frame in source.frames():
-            track = config.tracker.track(track, frame, chip, pipeline.calibration, config.robot)
+            found = config.tracker.follow(track, appearance, frame, chip, pipeline.calibration, config.robot)
+            track, appearance = found
             tracks.append(track)
         return MovieTracks(
             np.array([each.stamp_ns for each in tracks], np.int64),

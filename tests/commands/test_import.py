@@ -318,18 +318,18 @@ def test_a_rig_that_plays_a_movie_is_paced_by_its_stamps(lab: Laboratory, tmp_pa
 
 def test_a_failure_while_the_file_grows_leaves_nothing(lab: Laboratory, tmp_path: Path, monkeypatch) -> None:
     """Whatever stage fails: the partial file has the name of no session, and goes."""
-    from flowrec.vision import Tracker
+    from flowrec.estimation import Sampler
 
     seen: list[list[str]] = []
-    real = Tracker.track
+    real = Sampler.collect
 
-    def failing(self: Tracker, previous: object, frame: object, *more: object) -> object:
-        if frame.index == 20:
+    def failing(self: Sampler, previous: object, before: object, estimate: object, robot: object) -> object:
+        if estimate.stamp_ns > 0.7e9:
             seen.append([each.name for each in tmp_path.iterdir()])
             raise MovieError("planted")
-        return real(self, previous, frame, *more)
+        return real(self, previous, before, estimate, robot)
 
-    monkeypatch.setattr(Tracker, "track", failing)
+    monkeypatch.setattr(Sampler, "collect", failing)
     with pytest.raises(MovieError, match="planted"):
         flowrec.import_movie(lab.folder / "film.avi", tmp_path / "a.mcap", lab.config, coils=lab.log)
     assert seen == [["a.mcap.partial"]] and not list(tmp_path.iterdir())
