@@ -123,7 +123,13 @@ class OperatorEvent(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlowField(Message):
-    """A steady flow on the pixels of the chip's mask. `request` is the number of the work order that it answers."""
+    """A steady flow on the pixels of the chip's mask. `request` is the number of the work order that it answers.
+
+    Velocities are values at the centres of the pixels, never means over them. The speed between centres is what
+    `flow.sample` gives: it follows the profile of the channel and is zero at its walls, for which it needs `wall_px`.
+    Sums over pixels are sums over points: the flow rate through a section is not theirs, but that of the boundary
+    values, which are means over an opening. In a field without `wall_px`, from numerics 1, velocities are means.
+    """
 
     stamp_ns: int
     request: int
@@ -137,6 +143,9 @@ class FlowField(Message):
     viscosity_mpa_s: float
     density_kg_m3: float
     note: str  # human-readable remark of the method on its result
+    # Signed distance from the pixel centres to the wall in pixels, negative in solid; exact near the wall only, and
+    # the wall lies where it is 0 between two centres. None: not stated.
+    wall_px: Annotated[Raster, Shape("h", "w")] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

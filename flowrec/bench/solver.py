@@ -28,7 +28,7 @@ _PITCH_PX, _RADIUS_PX = 32, 13  # of the posts
 _TABLES = {
     "channel": (
         "Plane Poiseuille flow along the pixels",
-        ("width_px", "k", "profile_error_percent", "resistance_error_percent"),
+        ("width_px", "k", "profile_error_percent", "sampled_error_percent", "resistance_error_percent"),
     ),
     "oblique": (
         "Plane Poiseuille flow at an angle to the pixels, drawn as a mask; undecided: by the mask",

@@ -178,7 +178,11 @@ class Replayed:
             lines.append(f"first difference: {first}")
         differs = self.comparison.other_numerics if self.digest[0] else ""
         conclusion = "every tick identical" if self.identical else "the same within tolerance"
-        lines.append(f"{self.comparison.ticks} ticks: {conclusion if self.same else differs or 'NOT the same'}")
+        if not self.same:
+            conclusion = differs or "NOT the same"
+            if differs and self.comparison.same:
+                conclusion = f"the same within tolerance; results of the worker {differs}"
+        lines.append(f"{self.comparison.ticks} ticks: {conclusion}")
         return lines
 
     def as_json(self) -> dict[str, Any]:

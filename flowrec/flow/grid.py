@@ -1,4 +1,4 @@
-"""Staggered (MAC) grid: which faces carry flow, their numbering, and averages over pixels."""
+"""Staggered (MAC) grid: which faces carry flow, their numbering, and the pressure on pixels."""
 
 from __future__ import annotations
 
@@ -84,12 +84,10 @@ class Grid:
             fraction[faces.number[numbered]] = (faces.high - faces.low)[numbered]
         return fraction
 
-    def velocity(self, flux: Floats) -> Floats:
-        """Pixel averages (h, w, 2) of the velocity for fluxes (faces,): zero in solid."""
-        padded = np.append(flux, 0.0)
-        u, v = padded[self.u.number], padded[self.v.number]
-        cells = np.stack([0.5 * (u[:, 1:] + u[:, :-1]), 0.5 * (v[1:] + v[:-1])], axis=-1)
-        return np.asarray(self._blocks(cells).mean(axis=(1, 3)) * self.mask[..., None])
+    @property
+    def wall_px(self) -> NDArray[np.float32]:
+        """Signed distance (h, w) of the pixel centres to the wall, as in FlowField."""
+        return self.walls.at_centres(self.k)
 
     def pressure(self, cells: Floats) -> Floats:
         """Averages (h, w) over the fluid cells of each pixel of cell values (cells,): zero in solid."""

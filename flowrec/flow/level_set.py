@@ -15,6 +15,7 @@ SEGMENTS_PER_GATE = 2  # straight segments of the contour from one gate to the n
 REACH_PX = 0.7  # largest distance of the contour from the edges of the pixels
 LEAST_REACH = 2.2  # in half subcells: one whole subcell and a margin between a face and the wall beside it
 CHUNK = 200_000  # pairs of a segment and a sample in one batch, so that the arrays stay in the processor's cache
+FARTHEST_PX = 0.5 * LEAST_REACH  # largest level of a pixel centre
 CLEARANCE_PX = 0.1  # least distance between the contour and pixel centres, and midpoints of equal neighbours
 
 
@@ -23,7 +24,7 @@ class LevelSet:
     """The wall on a grid of h x w subcells.
 
     `level` (2 h + 1, 2 w + 1) is sampled at the corners, edge midpoints and centres of the subcells. Near the wall it
-    is the signed distance in any unit: only the zero crossings between neighbouring samples are used.
+    is the signed distance in pixels; farther away only its sign counts.
     """
 
     level: Floats
@@ -33,6 +34,10 @@ class LevelSet:
     def shape(self) -> tuple[int, int]:
         """Rows and columns of subcells."""
         return (self.level.shape[0] - 1) // 2, (self.level.shape[1] - 1) // 2
+
+    def at_centres(self, k: int) -> NDArray[np.float32]:
+        """Level (h, w) at the centres of pixels of k x k subcells, not beyond FARTHEST_PX."""
+        return np.clip(self.level[k :: 2 * k, k :: 2 * k], -FARTHEST_PX, FARTHEST_PX).astype(np.float32)
 
 
 def from_distance(distance: Callable[[Floats, Floats], Floats], shape: tuple[int, int], k: int) -> LevelSet:
@@ -66,7 +71,7 @@ def _staircase(mask: NDArray[np.bool_], k: int) -> LevelSet:
 
 
 def _smooth(mask: NDArray[np.bool_], k: int) -> LevelSet:
-    """Signed distance, in half subcells, to the smoothed contour of the mask."""
+    """Signed distance to the smoothed contour of the mask, computed in half subcells."""
     unit = 2 * k
     shape = (mask.shape[0] * unit + 1, mask.shape[1] * unit + 1)
     begin, end = ((points + 0.5) * unit for points in contour_segments(mask, SEGMENTS_PER_GATE))
@@ -92,7 +97,7 @@ def _smooth(mask: NDArray[np.bool_], k: int) -> LevelSet:
         flat = level.ravel()
         flat[sample] = np.copysign(nearest[sample], np.where(sign[sample] == 0.0, flat[sample], sign[sample]))
     _keep_topology(level, mask, k)
-    return LevelSet(level, staircase=False)
+    return LevelSet(level / unit, staircase=False)
 
 
 def _distances(a: Floats, b: Floats, window: Ints, shape: tuple[int, int], reach: float) -> tuple[Ints, Floats, Floats]:

@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from flowrec.flow.centre_values import centre_operator
 from flowrec.flow.contour_smoothing import Floats, Ints
 from flowrec.flow.grid import INLET, OPEN, OUTLET, WALL, Faces, Grid
 from flowrec.flow.level_set import LevelSet
-from flowrec.flow.wall_stencils import line_profiles
+from flowrec.flow.wall_stencils import Profiles, line_profiles
 
 # A wall that is nearer than this, in cells, would make a face infinitely stiff.
 NEAREST = 0.02
@@ -44,6 +45,7 @@ class Momentum:
     side_velocity: Any  # (6 faces, faces) velocity at those sides
     gradient: Any  # G (faces, cells)
     outlet: Floats  # P (faces, openings)
+    centre: Any  # (2 n, faces) velocity at the centres of the n fluid pixels: x and y of each in turn
     # (faces, 4) viscous drag of the image's left, right, top and bottom border per unit of its speed along x or y
     sliding: Floats
 
@@ -116,10 +118,10 @@ def assemble(grid: Grid) -> Momentum:
     fraction = grid.open_fraction
     operators = _Operators(_Triplets((n, n)), _Sides(n), _Sides(n), _Triplets((n, grid.cells)), fraction)
     sliding = np.zeros((n, 4))
-    _add_component(operators, sliding[:, 2:], grid.u, grid.v, grid.number_p, grid.walls)
+    upright = _add_component(operators, sliding[:, 2:], grid.u, grid.v, grid.number_p, grid.walls)
     # The balance of v is that of u with rows and columns exchanged.
     transposed = LevelSet(grid.walls.level.T, grid.walls.staircase)
-    _add_component(operators, sliding[:, :2], grid.v.T, grid.u.T, grid.number_p.T, transposed)
+    level = _add_component(operators, sliding[:, :2], grid.v.T, grid.u.T, grid.number_p.T, transposed)
     volume, outlet = np.ones(n), np.zeros((n, len(grid.openings)))
     for index, opening in enumerate(grid.openings):
         if opening.kind == "outlet":
@@ -132,6 +134,7 @@ def assemble(grid: Grid) -> Momentum:
         _per_flux(operators.side_velocity.matrix(), fraction),
         operators.gradient.matrix(),
         outlet,
+        _per_flux(centre_operator(grid, upright, level), fraction),
         sliding,
     )
 
@@ -144,8 +147,8 @@ def _per_flux(per_velocity: Any, open_fraction: Floats) -> Any:
 
 def _add_component(
     operators: _Operators, sliding: Floats, own: Faces, cross: Faces, cells: Ints, walls: LevelSet
-) -> None:
-    """Add the balance of upright faces `own` (h, w + 1); `cross` are the level faces (h + 1, w)."""
+) -> Profiles:
+    """Add the balance of upright faces `own` (h, w + 1), and return their profiles; `cross` are the level faces."""
     kind = own.kind
     w = cells.shape[1]
     profiles = line_profiles(own, walls, cross.kind)
@@ -209,6 +212,7 @@ def _add_component(
             operators.side_flux.put(side, me, 0, cross_numbers[place], 0.5 * step * scale)
             operators.side_velocity.put(side, me, 0, me, np.where(opened, 0.5, 1.0 * (cross_kinds[place] == OUTLET)))
             operators.side_velocity.put(side, me, 1, neighbour, 0.5 * opened)
+    return profiles
 
 
 def _level_at(level: Floats, j: Ints, i: Ints, t: Floats) -> Floats:

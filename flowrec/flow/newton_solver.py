@@ -93,6 +93,10 @@ class System:
         convection = inertia * self.momentum.convection(flux)
         return np.asarray(self.resistance @ flux + convection - (self.momentum.outlet @ drive + push))
 
+    def velocity(self, flux: Floats) -> Floats:
+        """Velocity (n, 2) at the centres of the fluid pixels in m/s, of fluxes (faces,)."""
+        return np.asarray((self.momentum.centre @ flux).reshape(-1, 2))
+
     def unbalanced(self, flux: Floats, load: Floats) -> float:
         """Largest part of a load (faces,) that no pressure can balance, relative to the largest viscous term."""
         left = self.stream.curl.T @ load

@@ -9,18 +9,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.errors import FlowError
+from flowrec.flow.velocity_stencil import velocities_at, velocity_at
 from flowrec.interpolation import cell_at, cells_at
 from flowrec.messages import FlowField
 
+_NO_WALLS = np.zeros((0, 0), np.float32)
+_NO_WALLS.flags.writeable = False
+
 
 def sample(field: FlowField, points_um: ArrayLike) -> NDArray[np.float64]:
-    """Velocity (..., 2) in um/s at points (..., 2) in um, by bilinear interpolation; zero outside the mask's image.
+    """Velocity (..., 2) in um/s at points (..., 2) in um; zero in solid and outside the mask's image.
 
-    In the outer half pixel the value of the border pixel holds. A single point takes a few microseconds, for use in
-    the control loop.
+    It follows the profile of the channel between pixel centres (velocity_stencil); a field that does not state its
+    walls is bilinear. In the outer half pixel the value of the border pixel holds. A single point takes a few
+    microseconds, for use in the control loop.
     """
     points = np.asarray(points_um, np.float64)
-    velocity = field.velocity_um_s
+    velocity, wall_px = field.velocity_um_s, walls_of(field)
+    if wall_px.size:
+        if points.ndim == 1:
+            x, y = (points / field.um_per_px).tolist()
+            h, w = wall_px.shape
+            inside = -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5
+            return np.array(velocity_at(velocity, wall_px, x, y) if inside else (0.0, 0.0))
+        flat = np.ascontiguousarray(points.reshape(-1, 2) / field.um_per_px)
+        return velocities_at(velocity, wall_px, flat).reshape(points.shape)
     if points.ndim == 1:
         x_um, y_um = points.tolist()
         return np.array(_at_point(velocity, x_um / field.um_per_px, y_um / field.um_per_px))
@@ -28,8 +41,13 @@ def sample(field: FlowField, points_um: ArrayLike) -> NDArray[np.float64]:
     return np.where(cells.inside[..., None], cells.interpolate(velocity), 0.0)
 
 
+def walls_of(field: FlowField) -> NDArray[np.float32]:
+    """`wall_px` of a field for the kernels of velocity_stencil: of no pixels where the field is to be bilinear."""
+    return field.wall_px if field.wall_px is not None and min(field.wall_px.shape) > 1 else _NO_WALLS
+
+
 def _at_point(velocity: NDArray[np.float32], x: float, y: float) -> tuple[float, float]:
-    """The same at one point (x, y) in pixels, in the same order of operations, without numpy's overhead."""
+    """Bilinear at one point (x, y) in pixels, in the same order of operations as Cells, without numpy's overhead."""
     h, w = velocity.shape[:2]
     if not (-0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5):
         return 0.0, 0.0
@@ -53,9 +71,9 @@ class FieldError:
 
 
 def relative_rmse(field: FlowField, truth: FlowField, mask: NDArray[np.bool_]) -> FieldError:
-    """sqrt(sum |v - v*|^2 / sum |v*|^2) over the fluid pixels of a mask (h, w), as in the paper's Table I.
+    """sqrt(sum |v - v*|^2 / sum |v*|^2) at the centres of the fluid pixels of a mask (h, w): Table I of the paper.
 
-    A true field at rest gives NaN.
+    Both sums are over points, so both fields must hold values at pixel centres. A true field at rest gives NaN.
 
     Raises
     ------

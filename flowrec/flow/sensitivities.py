@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
-from flowrec.flow.contour_smoothing import Floats, Ints
+from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.grid import Grid, GridOpening
 from flowrec.flow.linear_solver import Factors
 from flowrec.flow.newton_solver import Scales, System
@@ -37,7 +38,7 @@ class Sensitivities:
 
     Parameters: one per opening (inlet: mean speed, um/s; outlet: pressure at the chip's own viscosity, Pa), ln nu with
     nu = mu / rho, then, where requested, ln of the depth friction, and a skew and a flat part (um/s) per inlet.
-    Velocities are compact: (..., n, 2) um/s on the n fluid pixels of the mask in raster order.
+    Velocities are compact: (..., n, 2) um/s at the centres of the n fluid pixels of the mask in raster order.
     """
 
     equations: System
@@ -46,10 +47,14 @@ class Sensitivities:
     with_friction: bool  # ln of the depth friction is a parameter
     flux: Floats  # (faces,) the chip's own flow, m/s
     flux_modes: Floats  # (faces, P) m/s per unit
-    pixel_average: Any  # (2 n, faces) face fluxes to pixel velocities, um/s per m/s
     cell_average: Any  # (n, cells) cell values to pixels
     base: Floats  # (n, 2) the chip's own flow
     modes: Floats  # (P, n, 2) per unit
+
+    @property
+    def wall_px(self) -> NDArray[np.float32]:
+        """Signed distance (h, w) of the pixel centres to the wall, as in FlowField."""
+        return self.equations.grid.wall_px
 
     @property
     def openings(self) -> int:
@@ -88,8 +93,8 @@ class Sensitivities:
         return np.asarray(self.cell_average @ self.equations.pressure(load)) * self.scales.pressure
 
     def pixels(self, flux: Floats) -> Floats:
-        """Pixel velocities (n, 2) in um/s of fluxes (faces,) in m/s."""
-        return np.asarray((self.pixel_average @ flux).reshape(-1, 2))
+        """Velocities (n, 2) at the pixel centres in um/s of fluxes (faces,) in m/s."""
+        return self.equations.velocity(flux) * UM_PER_M
 
 
 def sensitivities(equations: System, scales: Scales, flux: Floats, friction: bool, shapes: bool) -> Sensitivities:
@@ -115,7 +120,6 @@ def sensitivities(equations: System, scales: Scales, flux: Floats, friction: boo
     prescribed = np.concatenate(given, axis=1)
     force = stream.curl.T @ (np.concatenate(push, axis=1) - operator @ prescribed)
     modes = np.asarray(stream.curl @ factors.solve(np.ascontiguousarray(force)) + prescribed)
-    pixel_average, cell_average = _averages(grid)
     return Sensitivities(
         equations,
         factors,
@@ -123,39 +127,22 @@ def sensitivities(equations: System, scales: Scales, flux: Floats, friction: boo
         friction,
         flux,
         modes,
-        pixel_average,
-        cell_average,
-        np.asarray(pixel_average @ flux).reshape(-1, 2),
-        np.ascontiguousarray((pixel_average @ modes).T).reshape(modes.shape[1], -1, 2),
+        _cell_average(grid),
+        equations.velocity(flux) * UM_PER_M,
+        np.ascontiguousarray((momentum.centre @ modes).T).reshape(modes.shape[1], -1, 2) * UM_PER_M,
     )
 
 
-def _averages(grid: Grid) -> tuple[Any, Any]:
-    """The averages of Grid.velocity (2 n, faces), in um/s per m/s, and Grid.pressure (n, cells) as matrices.
-
-    Rows of the first are x and y of each fluid pixel in turn.
-    """
-    k, n = grid.k, int(np.count_nonzero(grid.mask))
+def _cell_average(grid: Grid) -> Any:
+    """The averages of Grid.pressure as a matrix (n, cells)."""
+    n = int(np.count_nonzero(grid.mask))
     number = np.full(grid.mask.shape, -1, np.int64)
     number[grid.mask] = np.arange(n)
-    pixel = np.repeat(np.repeat(number, k, axis=0), k, axis=1)
-
-    def matrix(rows: list[Ints], columns: list[Ints], values: Floats, shape: tuple[int, int]) -> Any:
-        return sp.csr_array((values, (np.concatenate(rows), np.concatenate(columns))), shape=shape)
-
-    u, v = grid.u.number, grid.v.number
-    rows, columns = [], []
-    for axis, faces in ((0, u[:, :-1]), (0, u[:, 1:]), (1, v[:-1]), (1, v[1:])):
-        inside = (pixel >= 0) & (faces >= 0)
-        rows.append(2 * pixel[inside] + axis)
-        columns.append(faces[inside])
-    weights = np.full(sum(map(len, rows)), 0.5 / k**2)
+    pixel = np.repeat(np.repeat(number, grid.k, axis=0), grid.k, axis=1)
     inside = (pixel >= 0) & (grid.number_p >= 0)
     count = np.bincount(pixel[inside], minlength=n)
-    return (
-        matrix(rows, columns, weights, (2 * n, grid.faces)) * UM_PER_M,
-        matrix([pixel[inside]], [grid.number_p[inside]], 1.0 / count[pixel[inside]], (n, grid.cells)),
-    )
+    weights = 1.0 / count[pixel[inside]]
+    return sp.csr_array((weights, (pixel[inside], grid.number_p[inside])), shape=(n, grid.cells))
 
 
 def _shape(grid: Grid, opening: GridOpening, skew: bool) -> Floats:

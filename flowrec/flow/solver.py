@@ -12,6 +12,7 @@ from flowrec.errors import FlowError
 from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.linear_solver import cached, cell_count, chip_key
 from flowrec.flow.newton_solver import NotConvergedError, Scales, System, system
+from flowrec.flow.sampling import fluid_image
 from flowrec.flow.sensitivities import Sensitivities, sensitivities
 from flowrec.messages import FlowField
 from flowrec.ranges import OneOf, Range
@@ -45,13 +46,14 @@ class FlowSolver:
             request=0,
             method="fvm",
             um_per_px=chip.um_per_px,
-            velocity_um_s=(equations.grid.velocity(flux) * UM_PER_M).astype(np.float32),
+            velocity_um_s=fluid_image(chip.mask, equations.velocity(flux) * UM_PER_M).astype(np.float32),
             pressure_pa=(equations.grid.pressure(equations.pressure(load)) * scales.pressure).astype(np.float32),
             std_um_s=None,
             boundary_values=chip.boundary_values,
             viscosity_mpa_s=chip.viscosity_mpa_s,
             density_kg_m3=chip.density_kg_m3,
             note=f"residual {'below 1e-9' if residual < ROUNDING else f'{residual:.0e}'}",
+            wall_px=equations.grid.wall_px,
         )
 
     def sensitivities(self, chip: Chip, friction: bool = False, shapes: bool = False) -> Sensitivities:

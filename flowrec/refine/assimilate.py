@@ -94,7 +94,7 @@ class Assimilate(PriorSettings):
         """The most probable flow of a chip. Observations in its solid are predicted to be at rest."""
         model = self._linear_model(chip, solver)
         expansion, prior = model.expansion, model.prior
-        here = operator.on_fluid(chip.mask)
+        here = operator.with_walls(expansion.wall_px).on_fluid(chip.mask)
         design = here.predict(model.columns)
         misfit = operator.flow_um_s - here.predict(model.base)
         variance = _variance(operator, here.predict(model.error_std)[:, 0])
@@ -224,9 +224,9 @@ def _variance(operator: ObservationOperator, error_std: Floats) -> Floats:
     Neighbours share the model's error, so their mean is not more accurate. An observation that was given several times
     counts once.
     """
-    cell = np.stack(np.divmod(operator.pixels[:, 0], operator.width)) // CLUSTER_PX
+    cell = np.floor(operator.points.T).astype(np.int64) // CLUSTER_PX
     _, cluster, neighbours = np.unique(cell, axis=1, return_inverse=True, return_counts=True)
-    identity = np.concatenate([operator.pixels[:, :1], operator.weights, operator.flow_um_s], axis=1)
+    identity = np.concatenate([operator.points, operator.flow_um_s], axis=1)
     _, copy, copies = np.unique(identity, axis=0, return_inverse=True, return_counts=True)
     # A std of 0 in solid would be a contradiction that no noise explains.
     least = (LEAST_STD**2) * float(np.median((operator.flow_um_s**2).sum(axis=1))) + 1e-12

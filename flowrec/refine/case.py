@@ -77,8 +77,8 @@ class Case:
     openings: tuple[Opening, ...]
     velocity: Floats  # (h, w, 2) initial, in units of `speed`
     pressure: Floats  # (h, w) initial, in units of `unit_pressure`
-    pixels: NDArray[np.intp]  # (n, 4) as in ObservationOperator
-    weights: Floats  # (n, 4)
+    pixels: NDArray[np.intp]  # (n, m) as in ObservationOperator
+    weights: Floats  # (n, m)
     flow: Floats  # (n, 2) observed, in units of `speed`
     noise: Floats  # (n,) its standard deviation, in units of `speed`
     speed: float  # V, um/s
@@ -144,7 +144,7 @@ class Case:
     def at_nearest(self, values: Floats) -> Floats:
         """(h, w, c) values (n, c) on the pixel nearest to each observation, 0 elsewhere; of two the later counts."""
         image = np.zeros((self.fluid.size, values.shape[1]))
-        image[np.take_along_axis(self.pixels, self.weights.argmax(axis=1)[:, None], axis=1)[:, 0]] = values
+        image[self.pixels[:, 0]] = values
         return image.reshape(*self.fluid.shape, -1)
 
     def innovations(self) -> Floats:

@@ -14,7 +14,6 @@ from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
 POISEUILLE = 12.0  # dp/dx of Poiseuille flow in units of mu V / L^2
 
-_SUBPIXELS = np.array([[x, y] for x in (-0.25, 0.25) for y in (-0.25, 0.25)])
 _INWARD = {"left": (1.0, 0.0), "right": (-1.0, 0.0), "top": (0.0, 1.0), "bottom": (0.0, -1.0)}
 
 
@@ -72,11 +71,6 @@ class Collocation:
         edge = rng.integers(len(self.walls), size=count // 2) if len(self.walls) else np.zeros(0, np.intp)
         return inside, self.walls[edge] + rng.uniform(-0.5, 0.5, (len(edge), 1)) * self.along[edge]
 
-    @property
-    def subpixels(self) -> Floats:
-        """(4, n, 2) points whose mean over the first axis is the mean over each fluid pixel."""
-        return np.asarray(self.fluid + _SUBPIXELS[:, None])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PinnCase:
@@ -98,7 +92,6 @@ class PinnCase:
     def of(cls, speed: float, operator: ObservationOperator, chip: Chip) -> PinnCase:
         """Case of a chip in which observations have this root mean square speed (um/s)."""
         points = Collocation.of(chip)
-        rows, columns = np.divmod(operator.pixels, operator.width)
         length_px = median_width_um(chip) / chip.um_per_px
         length_um = length_px * chip.um_per_px
         mu = chip.viscosity_mpa_s * PA_S_PER_MPA_S
@@ -111,7 +104,7 @@ class PinnCase:
             0.0 if chip.depth_um is None else 12.0 * (length_um / chip.depth_um) ** 2,
             0.5 * POISEUILLE * float(np.ptp(points.fluid, axis=0).max() + 1.0) / length_px,
             unit_pressure,
-            np.stack([(at * operator.weights).sum(axis=1) for at in (columns, rows)], axis=1),
+            operator.points,
             operator.flow_um_s / speed,
             points.inlet_um_s / speed,
             points.outlet_pa / unit_pressure,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.flow.velocity_stencil import pixel_weights
 from flowrec.interpolation import cells_at, nearest_pixels
 from flowrec.messages import Observations
 
@@ -18,10 +19,11 @@ RELATIVE_NOISE = 0.03  # of the measured speed, in addition to its std: what pix
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservationOperator:
-    """The usable observations of a mask. Each is a weighted mean of four pixels (bilinear interpolation)."""
+    """The usable observations of a mask. Each is a weighted sum of pixels: what `flow.sample` gives there."""
 
-    pixels: NDArray[np.intp]  # (n, 4) indices into the raster, row by row
-    weights: Floats  # (n, 4) whose sum is 1, less where pixels are left out
+    points: Floats  # (n, 2) x and y in pixels of the mask
+    pixels: NDArray[np.intp]  # (n, m) indices into the raster, row by row; the first is the nearest one
+    weights: Floats  # (n, m), 0 where pixels are left out
     width: int  # columns of the raster
     flow_um_s: Floats  # (n, 2)
     std_um_s: Floats  # (n,)
@@ -52,6 +54,11 @@ class ObservationOperator:
         number[mask] = np.arange(np.count_nonzero(mask))
         return self.renumbered(number)
 
+    def with_walls(self, wall_px: NDArray[np.float32]) -> ObservationOperator:
+        """The operator in a field with the walls of a raster (h, w), see FlowField."""
+        pixels, weights = _stencils(self.points, wall_px.shape, wall_px)
+        return replace(self, pixels=pixels, weights=weights)
+
     def misfit(self, velocity: NDArray[np.floating]) -> Floats:
         """(n,) squared distance of the prediction of a field (h, w, 2), in standard deviations.
 
@@ -67,8 +74,16 @@ class ObservationOperator:
         return np.asarray(np.hypot(self.std_um_s, RELATIVE_NOISE * np.maximum(speed, 0.1 * speed.max()) + 1e-9))
 
 
-def observation_operator(observations: Observations, mask: NDArray[np.bool_], um_per_px: float) -> ObservationOperator:
-    """Operator of the observations that are finite, have a standard deviation and lie in a fluid pixel of a mask."""
+def observation_operator(
+    observations: Observations,
+    mask: NDArray[np.bool_],
+    um_per_px: float,
+    wall_px: NDArray[np.float32] | None,
+) -> ObservationOperator:
+    """Operator of the observations that are finite, have a standard deviation and lie in a fluid pixel of a mask.
+
+    `wall_px` (h, w) is that of the field in which they are predicted; without it the operator is bilinear.
+    """
     points = observations.position_um / um_per_px
     finite = (
         np.isfinite(points).all(axis=1)
@@ -78,16 +93,30 @@ def observation_operator(observations: Observations, mask: NDArray[np.bool_], um
     )
     usable = finite & cells_at(points, mask.shape).inside
     usable[usable] = mask[nearest_pixels(points[usable], mask.shape)]
-    cells = cells_at(points[usable], mask.shape)
+    pixels, weights = _stencils(points[usable], mask.shape, wall_px)
     unusable = ((~finite, "without finite numbers"), (finite & ~usable, "outside the fluid"))
     return ObservationOperator(
-        cells.rows * mask.shape[1] + cells.columns,
-        cells.weights,
+        points[usable],
+        pixels,
+        weights,
         mask.shape[1],
         observations.flow_um_s[usable],
         observations.std_um_s[usable],
         " and ".join(f"{which.sum()} {why}" for which, why in unusable if which.any()),
     )
+
+
+def _stencils(
+    points: Floats, shape: tuple[int, ...], wall_px: NDArray[np.float32] | None
+) -> tuple[NDArray[np.intp], Floats]:
+    """Pixels (n, m) and weights (n, m) of `flow.sample` at points (n, 2) in px."""
+    if wall_px is not None and min(shape) > 1:
+        return pixel_weights(wall_px, points)
+    cells = cells_at(points, shape)
+    # The nearest pixel, that of the largest weight, goes first.
+    order = np.argsort(-cells.weights, axis=1, kind="stable")
+    pixels = cells.rows * shape[1] + cells.columns
+    return np.take_along_axis(pixels, order, axis=1), np.take_along_axis(cells.weights, order, axis=1)
 
 
 def student_t_loss(misfits: Floats) -> float:

@@ -99,7 +99,7 @@ class Refiner:
                 f"the assumed field has {assumed.velocity_um_s.shape[:2]} pixels and the mask of chip '{chip.name}' "
                 f"{chip.mask.shape}: solve the flow again for this chip"
             )
-        operator = observation_operator(observations, chip.mask, chip.um_per_px)
+        operator = observation_operator(observations, chip.mask, chip.um_per_px, assumed.wall_px)
 
         def assimilated() -> FlowField:
             return self.assimilate.fit(problem)

@@ -51,7 +51,7 @@ def test_a_verification_by_other_numerics_says_so_instead_of_different(
 ) -> None:
     status, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
     assert status == 3
-    assert "made by other numerics (recorded: version 1, replayed: version 2)" in said.splitlines()[-1]
+    assert f"made by other numerics (recorded: version 1, replayed: version {NUMERICS_VERSION + 1})" in said.splitlines()[-1]
     assert "DIFFERENT" not in said and "NOT the same" not in said
     found = json.loads(run(["replay", GOLDEN, "--verify", "--json"], monkeypatch, capsys)[1])
     assert not found["same"]
@@ -66,11 +66,11 @@ def test_two_sessions_of_other_numerics_are_compared_as_such_and_check_names_the
     flowrec.replay(GOLDEN, out=again)
     status, said = run(["compare", GOLDEN, again], monkeypatch, capsys)
     assert status == 3
-    assert "made by other numerics (first: version 1, second: version 2)" in said
+    assert f"made by other numerics (first: version 1, second: version {NUMERICS_VERSION + 1})" in said
     assert "DIFFERENT" not in said
     verdict = flowrec.check(GOLDEN)
     assert verdict.word == "good"
-    assert "made by other numerics (version 1; this is 2)" in verdict.facts["written"]
+    assert f"made by other numerics (version 1; this is {NUMERICS_VERSION + 1})" in verdict.facts["written"]
 
 
 @pytest.mark.usefixtures("other_numerics")
@@ -84,13 +84,13 @@ def test_an_edited_file_is_told_as_such_whatever_its_numerics(
 
 
 def test_a_difference_by_the_same_numerics_is_one(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     honest = Kalman.estimate
     monkeypatch.setattr(
         Kalman, "estimate", lambda self, *arguments: replace(e := honest(self, *arguments), flow_um_s=e.flow_um_s + 1.0)
     )
-    status, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
+    status, said = run(["replay", session, "--verify"], monkeypatch, capsys)
     assert status == 3
     assert "NOT the same" in said and "DIFFERENT" in said
 

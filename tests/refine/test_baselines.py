@@ -24,7 +24,7 @@ QUICK = {
 
 
 def misfit(case, field):
-    operator = observation_operator(case.observations, case.chip.mask, case.chip.um_per_px)
+    operator = observation_operator(case.observations, case.chip.mask, case.chip.um_per_px, case.true.wall_px)
     return float(((operator.predict(field.velocity_um_s.reshape(-1, 2)) - operator.flow_um_s) ** 2).sum())
 
 

@@ -22,7 +22,11 @@ def observed(twin):
 
 def operator_of(observed):
     case, velocity, observations = observed
-    return case.chip.mask, velocity, observation_operator(observations, case.chip.mask, case.chip.um_per_px)
+    return (
+        case.chip.mask,
+        velocity,
+        observation_operator(observations, case.chip.mask, case.chip.um_per_px, case.true.wall_px),
+    )
 
 
 def test_the_prediction_is_the_sampled_field(observed):

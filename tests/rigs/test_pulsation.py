@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flowrec.messages import FlowField
 from flowrec.rig_settings import Simulated
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.robot import Robot
@@ -15,7 +16,8 @@ def drifter(share: float) -> Swimmer:
     velocity = np.zeros((40, 200, 2), np.float32)
     velocity[..., 0] = 100.0
     quiet = Simulated(pulsation_share=share, pulsation_hz=2.0, position_noise_um=0.0)
-    return Swimmer((400.0, 400.0), robot, quiet, velocity, np.full((40, 200), 500.0, np.float32), 20.0)
+    field = FlowField(0, 0, "made up", 20.0, velocity, np.zeros((40, 200)), None, np.zeros(0), 1.0, 1000.0, "")
+    return Swimmer((400.0, 400.0), robot, quiet, field, np.full((40, 200), 500.0, np.float32), 20.0)
 
 
 def test_a_pulsating_flow_swings_about_the_steady_one_and_carries_as_far() -> None:

@@ -18,6 +18,7 @@ from flowrec.chip.vessel_case import NOISES, SHARES, read_true_velocity, read_ve
 from flowrec.errors import FlowrecError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Observations
+from flowrec.refine.observation_operator import ObservationOperator, observation_operator
 from flowrec.refine.training.vessels import MASK_ERRORS, draw_mask, make_case, with_mask_error
 
 _MASK_ERROR_PROBABILITY = 0.15
@@ -51,6 +52,10 @@ class Lesson:
         points = self.route_px[at][:, ::-1].astype(np.float64) * self.chip.um_per_px
         return Observations(0, points, flow, np.full(len(at), std))
 
+    def operator(self, rng: np.random.Generator) -> ObservationOperator:
+        """The operator of such observations."""
+        return observation_operator(self.observe(rng), self.chip.mask, self.chip.um_per_px, self.assumed.wall_px)
+
 
 def prepare(folder: Path, count: int, seed: int = 0) -> Iterator[Path]:
     """Yield the paths of `count` lessons in the folder; a missing one is made first."""
@@ -77,6 +82,7 @@ def _make(path: Path, rng: np.random.Generator) -> None:
         except FlowrecError:  # a wall that is one pixel off may close an opening
             continue
         case |= {"wrong": error, "assumed_v": assumed.velocity_um_s, "assumed_p": assumed.pressure_pa}
+        case["assumed_walls"] = assumed.wall_px
         with part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **case)
         part.replace(path)
@@ -93,13 +99,17 @@ def read_lesson(path: Path) -> Lesson:
     """
     chip = read_vessel_case(path)
     with np.load(path, allow_pickle=False) as data:
-        if "assumed_v" not in data.files:
+        if "assumed_walls" not in data.files:
             raise UsageError(f"{path}: a vessel case but not a lesson; give an empty folder to make lessons in")
         chip = replace(with_mask_error(chip, str(data["wrong"])), name=path.stem)
         parameters = chip.boundary_values, chip.viscosity_mpa_s, chip.density_kg_m3
+        assumed = FlowField(
+            *(0, 0, "fvm", chip.um_per_px, data["assumed_v"], data["assumed_p"], None, *parameters, ""),
+            wall_px=data["assumed_walls"],
+        )
         return Lesson(
             chip,
-            FlowField(0, 0, "fvm", chip.um_per_px, data["assumed_v"], data["assumed_p"], None, *parameters, ""),
+            assumed,
             read_true_velocity(path).astype(np.float32),
             (data["p"] * float(data["mu_assumed"] / data["mu"])).astype(np.float32),
             data["route_ij"].astype(np.intp),

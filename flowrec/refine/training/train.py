@@ -19,7 +19,6 @@ import numpy as np
 from flowrec.errors import UsageError
 from flowrec.refine.case import Case
 from flowrec.refine.network_fit import Device, torch_run
-from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.training.lessons import Lesson, prepare, read_lesson
 from flowrec.system.outputs import WEIGHTS, Output
 
@@ -137,7 +136,7 @@ def _batch(lessons: list[Lesson], rng: np.random.Generator, training: Training) 
 
     cases, truths = [], []
     for lesson in lessons:
-        seen = observation_operator(lesson.observe(rng), lesson.chip.mask, lesson.chip.um_per_px)
+        seen = lesson.operator(rng)
         case = Case.of(lesson.assumed, seen, lesson.chip, cropped=False)
         cases.append(case)
         truth = [lesson.velocity_um_s / case.speed, lesson.pressure_pa[..., None] / case.unit_pressure]

@@ -15,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
+from flowrec.flow.sampling import sample, walls_of
+from flowrec.flow.velocity_stencil import velocity_at
 from flowrec.interpolation import bilinear
+from flowrec.messages import FlowField
 from flowrec.rig_settings import Simulated
 from flowrec.robot import Robot
 from flowrec.system.numba_setup import compiled
@@ -32,8 +35,8 @@ def _swim(
     own_y: float,
     dt: float,
     noise: NDArray[np.float64],
-    vx: NDArray[np.float32],
-    vy: NDArray[np.float32],
+    velocity: NDArray[np.float32],
+    wall_px: NDArray[np.float32],
     strength: float,
     clearance: NDArray[np.float32],
     um_per_px: float,
@@ -44,10 +47,12 @@ def _swim(
     free = 0.0
     for n in range(noise.shape[0]):
         # Midpoint rule in the flow, then the random walk.
-        mx = x + 0.5 * dt * (own_x + strength * bilinear(vx, x / um_per_px, y / um_per_px))
-        my = y + 0.5 * dt * (own_y + strength * bilinear(vy, x / um_per_px, y / um_per_px))
-        x += dt * (own_x + strength * bilinear(vx, mx / um_per_px, my / um_per_px)) + noise[n, 0]
-        y += dt * (own_y + strength * bilinear(vy, mx / um_per_px, my / um_per_px)) + noise[n, 1]
+        vx, vy = velocity_at(velocity, wall_px, x / um_per_px, y / um_per_px)
+        mx = x + 0.5 * dt * (own_x + strength * vx)
+        my = y + 0.5 * dt * (own_y + strength * vy)
+        vx, vy = velocity_at(velocity, wall_px, mx / um_per_px, my / um_per_px)
+        x += dt * (own_x + strength * vx) + noise[n, 0]
+        y += dt * (own_y + strength * vy) + noise[n, 1]
         free = bilinear(clearance, x / um_per_px, y / um_per_px)
         if free < radius:
             touched += 1
@@ -75,7 +80,7 @@ class Swimmer:
         position_um: tuple[float, float],
         robot: Robot,
         simulated: Simulated,
-        velocity_um_s: NDArray[np.float32],
+        field: FlowField,
         clearance_um: NDArray[np.float32],
         um_per_px: float,
     ) -> None:
@@ -86,8 +91,7 @@ class Swimmer:
         self._time_s = 0.0
         self._robot = replace(robot, step_out_hz=simulated.step_out_share * robot.step_out_hz)
         self._simulated = simulated
-        self._vx = np.ascontiguousarray(velocity_um_s[..., 0])
-        self._vy = np.ascontiguousarray(velocity_um_s[..., 1])
+        self._field = field
         self._clearance = clearance_um
         self._um_per_px = um_per_px
         self._rng = np.random.default_rng([simulated.seed, 1])
@@ -99,8 +103,7 @@ class Swimmer:
         """(2,) true flow at the centre; zero after it has left the chip."""
         if self.gone:
             return np.zeros(2)
-        x, y = self.position_um / self._um_per_px
-        return self._strength(self._time_s) * np.array([bilinear(self._vx, x, y), bilinear(self._vy, x, y)])
+        return self._strength(self._time_s) * sample(self._field, self.position_um)
 
     def _strength(self, time_s: float) -> float:
         """Pulsating flow divided by the steady one."""
@@ -149,8 +152,8 @@ class Swimmer:
             own_y,
             dt,
             noise,
-            self._vx,
-            self._vy,
+            self._field.velocity_um_s,
+            walls_of(self._field),
             self._strength(self._time_s - 0.5 * dt * len(noise)),
             self._clearance,
             self._um_per_px,
@@ -163,20 +166,21 @@ class Swimmer:
 @compiled
 def _drift(
     points: NDArray[np.float64],
-    vx: NDArray[np.float32],
-    vy: NDArray[np.float32],
+    velocity: NDArray[np.float32],
+    wall_px: NDArray[np.float32],
     clearance: NDArray[np.float32],
     um_per_px: float,
     dt: float,
     lost: NDArray[np.bool_],
 ) -> None:
     """Move points (n, 2) in um with the flow by dt in two steps; `lost` (n,) becomes True outside the fluid."""
-    height, width = vx.shape
+    height, width = clearance.shape
     for n in range(points.shape[0]):
         for _ in range(2):
             i, j = points[n, 0] / um_per_px, points[n, 1] / um_per_px
-            points[n, 0] += 0.5 * dt * bilinear(vx, i, j)
-            points[n, 1] += 0.5 * dt * bilinear(vy, i, j)
+            vx, vy = velocity_at(velocity, wall_px, i, j)
+            points[n, 0] += 0.5 * dt * vx
+            points[n, 1] += 0.5 * dt * vy
         i, j = points[n, 0] / um_per_px, points[n, 1] / um_per_px
         lost[n] = not (-0.5 <= i <= width - 0.5 and -0.5 <= j <= height - 0.5) or bilinear(clearance, i, j) < 0.0
 
@@ -189,7 +193,7 @@ class Debris:
         chip: Chip,
         count: int,
         robot_radius_um: float,
-        velocity_um_s: NDArray[np.float32],
+        field: FlowField,
         clearance_um: NDArray[np.float32],
         seed: int,
     ) -> None:
@@ -207,8 +211,7 @@ class Debris:
         self.points_um = places * chip.um_per_px
         self._chip = chip
         self._inlets = [o for o in chip.openings if o.kind == "inlet"]
-        self._vx = np.ascontiguousarray(velocity_um_s[..., 0])
-        self._vy = np.ascontiguousarray(velocity_um_s[..., 1])
+        self._field = field
         self._clearance = clearance_um
         self._lost = np.zeros(count, np.bool_)
 
@@ -217,8 +220,8 @@ class Debris:
         moving = len(self.points_um) - self.still
         _drift(
             self.points_um[:moving],
-            self._vx,
-            self._vy,
+            self._field.velocity_um_s,
+            walls_of(self._field),
             self._clearance,
             self._chip.um_per_px,
             dt_s,

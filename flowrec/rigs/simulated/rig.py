@@ -186,8 +186,8 @@ class SimulatedRig:
         field = self._true_field()
         walls = clearance_um(self._chip.mask, self._chip.um_per_px)
         radius, seed, px = self._robot.radius_um, self._simulated.seed, self._chip.um_per_px
-        swimmer = Swimmer(self._start_um, self._robot, self._simulated, field.velocity_um_s, walls, px)
-        debris = Debris(self._chip, self._camera.debris, radius, field.velocity_um_s, walls, seed)
+        swimmer = Swimmer(self._start_um, self._robot, self._simulated, field, walls, px)
+        debris = Debris(self._chip, self._camera.debris, radius, field, walls, seed)
         microscope = Microscope(self._chip.mask, px, self._calibration, self._camera, seed)
         moving = slice(0, len(debris.points_um) - debris.still)
         for n in range(moving.stop, len(debris.points_um)):

@@ -10,7 +10,6 @@ from flowrec.refine import weights
 from flowrec.refine.case import Case
 from flowrec.refine.network import trained_network
 from flowrec.refine.network_inputs import NetworkInputs
-from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.training.lessons import prepare, read_lesson
 from flowrec.refine.training.train import Training, train, turn, turn_inputs
 
@@ -48,7 +47,7 @@ def test_a_vessel_case_is_not_taken_for_a_lesson(lessons, tmp_path):
 
 def test_a_turned_scene_is_the_scene_of_the_turned_flow(lessons):
     lesson = read_lesson(lessons[1][0])
-    seen = observation_operator(lesson.observe(np.random.default_rng(0)), lesson.chip.mask, lesson.chip.um_per_px)
+    seen = lesson.operator(np.random.default_rng(0))
     inputs = NetworkInputs.of([Case.of(lesson.assumed, seen, lesson.chip, cropped=False)])
     back = inputs
     for quarters, mirrored in ((1, False), (2, True), (0, True), (1, False)):
