@@ -25,7 +25,7 @@ from flowrec.messages import Observations
 NOISES = {"00": 0.0, "02": 0.02, "05": 0.05, "10": 0.1}
 SHARES = {"05": 0.05, "10": 0.1, "20": 0.2}
 KEYS = ("mask", "px", "rho_assumed", "mu_assumed", "op_side", "op_a", "op_b", "op_type", "op_u_assumed", "op_p_assumed")
-_CENTRES, _MEANS = ("vx_c", "vy_c"), ("vx", "vy")
+_HALVES, _MEANS = ("vx_c", "vy_c"), ("vx", "vy")
 _LIMIT_BYTES = 256 << 20  # of the arrays that are read at a time; those of a case have some 10 MB
 # Row 0 is their south (y grows with the row), and our top (y points down): the same array, no flip.
 _SIDES: dict[str, Side] = {"W": "left", "E": "right", "S": "top", "N": "bottom"}
@@ -69,8 +69,7 @@ def read_observations(path: Path, noise: str, share: str) -> Observations:
     measured = known[f"route_v_n{noise}"]
     if _holds_means(path):
         # A robot measures at a point: the means that the noise was added to are replaced by the values there.
-        centres, means = (_velocity(path, keys) for keys in (_CENTRES, _MEANS))
-        measured = measured + (centres - means)[*known["route_ij"].T]
+        measured = measured + (_at_centres(path) - _velocity(path, _MEANS))[*known["route_ij"].T]
     seen = known[f"obs_idx_{share}"].astype(np.intp)
     sigma_um_s = float(known["route_v_sigma"][list(NOISES).index(noise)]) * 1e6
     return Observations(
@@ -93,7 +92,16 @@ def read_true_chip(path: Path, believed: Chip) -> Chip:
 
 def read_true_velocity(path: Path) -> NDArray[np.float64]:
     """The true velocity (h, w, 2) in um/s at the pixel centres, for scoring alone."""
-    return _velocity(path, _CENTRES if _holds_means(path) else _MEANS) * 1e6
+    return (_at_centres(path) if _holds_means(path) else _velocity(path, _MEANS)) * 1e6
+
+
+def _at_centres(path: Path) -> NDArray[np.float64]:
+    """Values at the pixel centres where vx, vy are means over a pixel, and vx_c, vy_c over half of its width.
+
+    A mean over a square of width h is the value in its middle plus h^2 / 24 lap v: the two means give both terms.
+    """
+    half = _velocity(path, _HALVES)
+    return half + (half - _velocity(path, _MEANS)) / 3.0
 
 
 def _velocity(path: Path, keys: tuple[str, str]) -> NDArray[np.float64]:
@@ -102,10 +110,10 @@ def _velocity(path: Path, keys: tuple[str, str]) -> NDArray[np.float64]:
 
 
 def _holds_means(path: Path) -> bool:
-    """Whether vx, vy are means over pixels, as where the values at the centres are given beside them."""
+    """Whether vx, vy are means over pixels, as where means over their middle are given beside them."""
     try:
         with np.load(path, allow_pickle=False) as case:
-            return set(_CENTRES) <= set(case.files)
+            return set(_HALVES) <= set(case.files)
     except (OSError, ValueError, EOFError, zipfile.BadZipFile):
         return False  # told by whoever reads what is needed
 

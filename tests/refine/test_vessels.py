@@ -33,7 +33,8 @@ def vessel(index, parameters):
         seen = data["obs_idx_10"]
         positions = data["route_ij"][seen][:, ::-1] * um_per_px
         std = np.full(len(seen), float(data["route_v_sigma"][2]) * 1e6)
-        centres, means = (np.stack([data[x], data[y]], axis=-1) for x, y in (("vx_c", "vy_c"), ("vx", "vy")))
+        halves, means = (np.stack([data[x], data[y]], axis=-1) for x, y in (("vx_c", "vy_c"), ("vx", "vy")))
+        centres = halves + (halves - means) / 3.0  # means over half a pixel and over a pixel, to means over none
         # The noise was added to means over pixels; a robot measures at a point.
         measured = data["route_v_n05"] + (centres - means)[*data["route_ij"].T]
         return chip, centres * 1e6, Observations(0, positions, measured[seen] * 1e6, std)
