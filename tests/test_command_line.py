@@ -149,10 +149,10 @@ def test_planners_that_are_not_installed_are_left_out_and_named(
 
 
 def test_a_refinement_that_changes_nothing_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "again.mcap"
-    assert run(["replay", SESSIONS / "golden.mcap", "--refine", "--out", out], monkeypatch) == 0
+    assert run(["replay", session, "--refine", "--out", out], monkeypatch) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "the refined map is the recorded one, unchanged" in said
     assert "--set refine.pi_unet.start=fvm" in said

@@ -209,8 +209,8 @@ def _largest_change(was: FlowField, now: FlowField) -> float:
 
 def _flow_error(done: Replayed, flow: FlowField | None) -> float | None:
     truth = done.recorded.true_field
-    if flow is None or truth is None:
-        return None
+    if flow is None or truth is None or (flow.wall_px is None) != (truth.wall_px is None):
+        return None  # means over pixels, of numerics 1, are not compared with values at their centres
     return finite(float(relative_rmse(flow, truth, done.session.chip.mask).v))
 
 

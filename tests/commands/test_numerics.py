@@ -51,7 +51,10 @@ def test_a_verification_by_other_numerics_says_so_instead_of_different(
 ) -> None:
     status, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
     assert status == 3
-    assert f"made by other numerics (recorded: version 1, replayed: version {NUMERICS_VERSION + 1})" in said.splitlines()[-1]
+    assert (
+        f"made by other numerics (recorded: version 1, replayed: version {NUMERICS_VERSION + 1})"
+        in said.splitlines()[-1]
+    )
     assert "DIFFERENT" not in said and "NOT the same" not in said
     found = json.loads(run(["replay", GOLDEN, "--verify", "--json"], monkeypatch, capsys)[1])
     assert not found["same"]
