@@ -213,6 +213,20 @@ class _FileCheck:
         unseen = tally.index_steps - tally.images_missing
         if unseen > 0:
             verdict.odd("drops", f"{unseen} images of the camera never arrived, as their numbers show")
+        losses = tally.losses
+        if losses is not None:
+            lost = {
+                "on the link": losses.link,
+                "incomplete": losses.incomplete,
+                "by the driver": losses.driver,
+                "by the queue before the loop": losses.backlog,
+            }
+            causes = ", ".join(f"{count} {cause}" for cause, count in lost.items() if count) or "none lost"
+            verdict.fact("losses", f"{losses.ids} images numbered, {losses.frames} handed on; {causes}")
+            if losses.triggers:
+                verdict.odd("drops", f"{losses.triggers} triggers that the camera has not answered")
+            if losses.reconnections:
+                verdict.odd("drops", f"the camera was absent {losses.reconnections} times, and came back")
 
     def _numbers(self) -> None:
         for what, count in self.tally.not_finite.most_common(_LISTED):

@@ -10,7 +10,7 @@ from collections import Counter
 
 from flowrec.commands.verdict import Gap
 from flowrec.declarations import Message, invalid_numbers
-from flowrec.messages import Applied, Clocks, Frame, Timing
+from flowrec.messages import Applied, CameraLosses, Clocks, Frame, Timing
 from flowrec.store.audit import Audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds
@@ -66,6 +66,7 @@ class Tally:
     not_finite : NaN and infinity where they do not belong, by topic and field.
     repeated, repeated_ns : messages of the keyframe of a part, by field of Tick: number, and own stamp.
     latest_ns : own stamp of the last message, by field of Tick.
+    losses : what the camera had lost at the last count; None: it does not count.
     """
 
     def __init__(self) -> None:
@@ -76,6 +77,7 @@ class Tally:
         self.repeated_ns: dict[str, int] = {}
         self.latest_ns: dict[str, int] = {}
         self.clocks = ClockTally()
+        self.losses: CameraLosses | None = None
         self._intervals: Counter[int] = Counter()
         self._longest: list[tuple[int, int]] = []  # a heap of length and beginning in ns
         self._last_ns: int | None = None
@@ -110,6 +112,8 @@ class Tally:
             self.dropped = max(self.dropped, message.dropped_frames)
         elif isinstance(message, Clocks):
             self.clocks.add(message)
+        elif isinstance(message, CameraLosses):
+            self.losses = message
 
     def close(self) -> None:
         """Count the ticks that did not become complete."""

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.errors import SessionError
+from flowrec.messages import CameraLosses
 from flowrec.store.channels import SLOTS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
@@ -131,6 +132,19 @@ def test_images_that_were_dropped_are_told_apart_from_those_that_are_missing(tmp
         ("drops", "2 images were dropped because the disk was too slow (counted by the writer)")
     ]
     assert ("drops", "2 images are missing without having been counted") in found(check(file_of(tmp_path, two_missing)))
+
+
+def test_what_a_camera_has_lost_is_told_by_cause(tmp_path):
+    losses = [CameraLosses(0, 10, 10, 0, 0, 0, 0, 0, 0), CameraLosses(1, 90, 60, 3, 20, 0, 7, 2, 1)]
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
+        for number, tick in enumerate(ticks_of(20)):
+            writer.write(replace(tick, losses=losses[number >= 10]))
+    verdict = check(tmp_path / "s.mcap")
+    assert verdict.facts["losses"] == (
+        "90 images numbered, 60 handed on; 3 on the link, 20 incomplete, 7 by the queue before the loop"
+    )
+    said = " ".join(text for _, text in found(verdict))
+    assert "2 triggers that the camera has not answered" in said and "the camera was absent 1 times" in said
 
 
 def test_ticks_that_lack_inputs_are_counted(tmp_path):

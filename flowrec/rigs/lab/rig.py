@@ -33,7 +33,6 @@ from flowrec.units import nanoseconds
 _ABSENT_S = 0.1  # between ticks without an image
 _FIRST_S = 10.0  # for the first frame of a run
 _LEAST_PERIODS = 3.0  # of the camera, before it is taken for absent
-_RATE_TOLERANCE = 0.05
 
 
 class LabRig:
@@ -87,6 +86,7 @@ class LabRig:
         self._config = config
         self._duration_ns = None if duration_s is None else nanoseconds(duration_s)
         self._connection = ExitStack()
+        self._told: set[str] = set()  # notes about the camera
         self._absent = False  # for the loop's thread only
 
     @property
@@ -102,6 +102,7 @@ class LabRig:
             grabber = self._grabber = stack.enter_context(self._make_grabber())
             stack.callback(self._forget)
             self._check(grabber.info)
+            self._tell_notes(grabber)
             if self.drive is not None:
                 stack.enter_context(self.drive)
             yield
@@ -143,10 +144,12 @@ class LabRig:
         grabber = self._grabber
         assert grabber is not None, "the rig has been entered"
         first = self._first(grabber)
-        session = _Session(first)
+        assert grabber.losses is not None, "a frame was handed on"
+        session = _Session(first, grabber.losses)
         frame: Captured | None = first
         last_ns, absent_until_ns = session.stamp_ns(first.stamp_ns), None
         before_ns: int | None = None
+        losses: CameraLosses | None = None
         while True:
             if frame is not None:
                 self._absent = False
@@ -160,12 +163,15 @@ class LabRig:
             if frame is None:
                 yield Inputs(stamp_ns, None, applied)
             else:
+                losses, before = session.losses(frame.losses), losses
+                if losses is not before:  # about once a second
+                    self._tell_notes(grabber)
                 yield Inputs(
                     stamp_ns,
                     Frame(stamp_ns, session.index(frame), frame.image, frame.bits),
                     applied,
                     clock=session.fit(frame.clock),
-                    losses=session.losses(frame.losses),
+                    losses=losses,
                 )
             before_ns = stamp_ns
             frame = self._next(grabber)
@@ -173,7 +179,7 @@ class LabRig:
     # ---- the camera
 
     def _check(self, info: CameraInfo) -> None:
-        """Refuse a camera that delivers other images than configured; tell about its other settings."""
+        """Refuse a camera that delivers other images than configured."""
         camera = self._config.camera
         name = " ".join(filter(None, (info.model, info.serial))) or "camera"
         if (info.width_px, info.height_px) != (camera.width_px, camera.height_px):
@@ -186,11 +192,16 @@ class LabRig:
                 f"{name}: images of {info.bits} bit ({info.pixel_format}), where camera.bits = {camera.bits}; set it, "
                 "or lab.pixel_format"
             )
-        notes = list(info.notes)
-        if info.rate_hz and abs(info.rate_hz / camera.rate_hz - 1.0) > _RATE_TOLERANCE:
-            notes.append(f"it states {info.rate_hz:.4g} frames per second, camera.rate_hz = {camera.rate_hz:g}")
-        for note in notes:
-            self.tell(f"{name}: {note}")
+
+    def _tell_notes(self, grabber: Grabber) -> None:
+        """Tell what the camera does otherwise than asked, each once; some is only known after seconds."""
+        info = grabber.info
+        name = " ".join(filter(None, (info.model, info.serial))) or "camera"
+        for note in grabber.notes:
+            about = note.partition(" asked")[0]
+            if about not in self._told:
+                self._told.add(about)
+                self.tell(f"{name}: {note}")
 
     def _first(self, grabber: Grabber) -> Captured:
         """The newest frame: those that came while the run was prepared belong to no run."""
@@ -251,10 +262,10 @@ class LabRig:
 class _Session:
     """From the camera's queue, which runs before the run does, to the run's clock and counts."""
 
-    def __init__(self, first: Captured) -> None:
+    def __init__(self, first: Captured, losses: CameraLosses) -> None:
         self._epoch_ns = first.stamp_ns
         self._first_index = first.index
-        self._before = first.losses
+        self._before = losses  # up to the first frame; those that come with frames may be some frames older
         self._known: tuple[CameraLosses, CameraLosses] | None = None
 
     def stamp_ns(self, monotonic_ns: int) -> int:
@@ -282,19 +293,20 @@ class _Session:
         """The losses since the run began; the same object for the same one."""
         if self._known is None or self._known[0] is not losses:
             first = self._before
+            since = losses if losses.ids > first.ids else first
             self._known = (
                 losses,
                 replace(
-                    losses,
-                    stamp_ns=max(self.stamp_ns(losses.stamp_ns), 0),
-                    ids=losses.ids - first.ids + 1,
-                    frames=losses.frames - first.frames + 1,
-                    link=losses.link - first.link,
-                    incomplete=losses.incomplete - first.incomplete,
-                    driver=losses.driver - first.driver,
-                    backlog=losses.backlog - first.backlog,
-                    triggers=losses.triggers - first.triggers,
-                    reconnections=losses.reconnections - first.reconnections,
+                    since,
+                    stamp_ns=self.stamp_ns(since.stamp_ns),
+                    ids=since.ids - first.ids + 1,
+                    frames=since.frames - first.frames + 1,
+                    link=since.link - first.link,
+                    incomplete=since.incomplete - first.incomplete,
+                    driver=since.driver - first.driver,
+                    backlog=since.backlog - first.backlog,
+                    triggers=since.triggers - first.triggers,
+                    reconnections=since.reconnections - first.reconnections,
                 ),
             )
         return self._known[1]
