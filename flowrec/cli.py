@@ -1,7 +1,7 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in import_verb.py, session_verbs.py and calibrate_verbs.py. Each function parses, calls
-and prints, with late imports.
+The other verbs are in import_verb.py, doctor_verb.py, session_verbs.py and calibrate_verbs.py. Each function parses,
+calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
@@ -22,6 +22,7 @@ import typer
 import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
 from flowrec.calibrate_verbs import calibrate
+from flowrec.doctor_verb import doctor, look_at_lab
 from flowrec.errors import FlowrecError, printable
 from flowrec.import_verb import import_movie
 from flowrec.session_verbs import (
@@ -78,7 +79,12 @@ def record(
     view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",
     realtime: Annotated[bool, typer.Option("--realtime", help="Run the simulated rig in real time.")] = False,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this many seconds.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Check and print the resolved configuration.")] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Energise nothing: check mission and devices, print the resolved configuration."
+        ),
+    ] = False,
     split: Annotated[
         str | None,
         typer.Option(metavar="SIZE|TIME", help="Begin another file after this size or time, or both: 2GB,10min."),
@@ -115,8 +121,10 @@ def record(
     from flowrec.system.stderr import said_within
 
     if dry_run:
-        typer.echo(to_toml(prepare(chosen)[0]))
-        return
+        resolved = prepare(chosen).config
+        failed = chosen.rig == "lab" and look_at_lab(chosen, config, out)
+        typer.echo(to_toml(resolved))
+        raise typer.Exit(int(failed))
     inputs = [config] if config is not None else []
     realtime = realtime or chosen.rig == MOVIE  # `import` takes a movie as fast as it can be read
     recorded = flowrec.record(chosen, out, view, realtime, overwrite, AtTerminal(), inputs)
@@ -193,7 +201,7 @@ def replay(
 
 
 app.command("import")(import_movie)
-for _verb in (view, export, info, list_directory, check, recover, compare):
+for _verb in (doctor, view, export, info, list_directory, check, recover, compare):
     app.command("ls" if _verb is list_directory else None, cls=HelpWithMethods)(_verb)
 
 

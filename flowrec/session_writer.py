@@ -79,7 +79,7 @@ def session_writer(
 
 def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
     """Largest loss if the process is killed, in s of stamps; of a snapshot, counted from its event."""
-    bytes_s, flush_s = _image_bytes_s(config), config.recording.flush_s
+    bytes_s, flush_s = image_bytes_s(config), config.recording.flush_s
     waiting_s = queue_bytes_of(config) / bytes_s if live and bytes_s else 0.0  # only if the disk is too slow
     return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
 
@@ -115,11 +115,12 @@ def queue_bytes_of(config: ResolvedConfig) -> int:
     chosen_mb = config.recording.queue_mb
     if chosen_mb is not None:
         return int(chosen_mb * 1e6)
-    images = int(_QUEUE_S * _image_bytes_s(config))
+    images = int(_QUEUE_S * image_bytes_s(config))
     return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
 
 
-def _image_bytes_s(config: ResolvedConfig) -> float:
+def image_bytes_s(config: ResolvedConfig) -> float:
+    """Bytes of the camera's images per second, before they are compressed."""
     camera = config.camera
     return camera.width_px * camera.height_px * pixel_type(camera.bits).itemsize * camera.rate_hz
 

@@ -226,7 +226,7 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     begin_s = time.monotonic()
     how = _try(zero)
-    _say(status, f"tripped {cause}; {how} in {1e3 * (time.monotonic() - begin_s):.1f} ms")
+    _say(status, f"tripped {cause}; {how} in {1e3 * (time.monotonic() - begin_s):.0f} ms")
     return 3
 
 

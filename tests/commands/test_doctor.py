@@ -1,0 +1,107 @@
+"""`flowrec doctor`: each device in a line, what to do about it, and an exit status that a script can use."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flowrec.cli import main
+from flowrec.commands import doctor
+from flowrec.commands.doctor import FAILURE, OK, WARNING, diagnose
+from flowrec.config import Config, load_config
+from flowrec.messages import CameraLosses
+from flowrec.rigs.lab.cameras import probe as camera
+from flowrec.rigs.lab.cameras.camera import CameraInfo
+
+MEASURED = (
+    "rig=lab",
+    "camera.um_per_px=20.0",
+    "camera.rate_hz=20.0",
+    "robot.radius_um=70.0",
+    "robot.max_speed_um_s=900.0",
+    "robot.step_out_hz=40.0",
+    "robot.delay_s=0.05",
+)
+SEEN = camera.Probe(
+    CameraInfo("Maker Model", "7", 640, 512, 8, 20.0, pixel_format="Mono8"),
+    rate_hz=20.0,
+    delivered_hz=20.0,
+    losses=CameraLosses(0, 1000, 1000, 0, 0, 0, 0, 0, 0),
+    clock_slope=1.0,
+    arrival_ms=51.0,
+    brightest=200,
+    notes=(),
+)
+
+
+def levels(config: Config, folder: Path) -> dict[str, str]:
+    order = [OK, WARNING, FAILURE]
+    worst: dict[str, str] = {}
+    for finding in diagnose(config, folder=folder):
+        assert "\n" not in finding.text
+        worst[finding.what] = max(worst.get(finding.what, OK), finding.level, key=order.index)
+    return worst
+
+
+@pytest.mark.parametrize(
+    ("seen", "what", "level"),
+    [
+        (SEEN, "camera", OK),
+        (replace(SEEN, notes=("the gain is 3 dB",)), "camera", WARNING),
+        (replace(SEEN, info=replace(SEEN.info, bits=12)), "camera", FAILURE),
+        (SEEN, "rate", OK),
+        (replace(SEEN, rate_hz=15.0), "rate", WARNING),
+        (SEEN, "losses", OK),
+        (replace(SEEN, losses=replace(SEEN.losses, link=20, frames=980)), "losses", WARNING),
+        (replace(SEEN, losses=replace(SEEN.losses, backlog=200, frames=800)), "losses", FAILURE),
+        (SEEN, "clock", OK),
+        (replace(SEEN, clock_slope=0.0), "clock", WARNING),
+        (replace(SEEN, clock_slope=10.0), "clock", WARNING),
+        (SEEN, "image", OK),
+        (replace(SEEN, brightest=255), "image", WARNING),
+        (replace(SEEN, brightest=9), "image", WARNING),
+    ],
+)
+def test_what_a_camera_shows_is_judged(
+    seen: camera.Probe, what: str, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(camera, "probe", lambda *_: seen)
+    monkeypatch.setattr(doctor, "_write_speed", lambda _folder: 1e9)
+    config = load_config(None, [*MEASURED, "mission.phases=observe"])
+    assert levels(config, tmp_path)[what] == level
+
+
+@pytest.mark.parametrize(("speed", "level"), [(1e9, OK), (5e6, WARNING), (1e6, FAILURE)])
+def test_a_disk_is_judged_by_what_the_camera_delivers(
+    speed: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "_write_speed", lambda _folder: speed)
+    assert levels(load_config(None, ["camera.rate_hz=20.0"]), tmp_path)["disk"] == level
+
+
+def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "_TRIAL_BYTES", 1 << 20)
+    sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.port=/dev/nothing"]
+    words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["level"] == "failure"
+    failures = {one["what"]: one["text"] for one in found["findings"] if one["level"] == "failure"}
+    assert set(failures) == {"camera", "coils"}
+    assert "nowhere.avi" in failures["camera"] and "/dev/nothing" in failures["coils"]
+    assert {"settings", "mission", "disk", "viewer"} <= {one["what"] for one in found["findings"]}
+    assert not list(tmp_path.iterdir())
+
+
+def test_settings_that_are_not_measured_are_a_failure_that_names_them(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["doctor", "--rig", "lab"])
+    assert ended.value.code == 1
+    assert "robot.radius_um" in capsys.readouterr().out
