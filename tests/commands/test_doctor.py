@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from flowrec.cli import main
+from flowrec.cli import app
 from flowrec.commands import doctor
 from flowrec.commands.doctor import FAILURE, OK, WARNING, diagnose
 from flowrec.config import Config, load_config
@@ -83,15 +84,14 @@ def test_a_disk_is_judged_by_what_the_camera_delivers(
 
 
 def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor, "_TRIAL_BYTES", 1 << 20)
+    monkeypatch.setattr(doctor, "_TRIAL_BYTES", 1 << 22)
     sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.port=/dev/nothing"]
     words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
-    with pytest.raises(SystemExit) as ended:
-        main(words)
-    assert ended.value.code == 1
-    found = json.loads(capsys.readouterr().out)
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
     assert found["level"] == "failure"
     failures = {one["what"]: one["text"] for one in found["findings"] if one["level"] == "failure"}
     assert set(failures) == {"camera", "coils"}
@@ -100,8 +100,7 @@ def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_
     assert not list(tmp_path.iterdir())
 
 
-def test_settings_that_are_not_measured_are_a_failure_that_names_them(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["doctor", "--rig", "lab"])
-    assert ended.value.code == 1
-    assert "robot.radius_um" in capsys.readouterr().out
+def test_settings_that_are_not_measured_are_a_failure_that_names_them() -> None:
+    done = CliRunner().invoke(app, ["doctor", "--rig", "lab"])
+    assert done.exit_code == 1
+    assert "x settings" in done.stdout and "robot.radius_um" in done.stdout
