@@ -228,7 +228,8 @@ def _silence(config: ResolvedConfig) -> Finding:
     amplifier = AMPLIFIERS[config.lab.amplifier].load().of(config)
     amplifier.open()
     try:
-        with Guardian(*amplifier.guard(), silence_s=config.lab.guardian_s) as guardian:
+        action, descriptors = amplifier.guard()
+        with Guardian(action, descriptors, config.lab.guardian_s) as guardian:
             guardian.beat(energised=True)
             time.sleep(config.lab.guardian_s + _SILENT_S)
             try:
