@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -186,8 +187,8 @@ def _crossing(frames: int, apart_px: float) -> tuple[NDArray[np.float64], NDArra
     return robot, np.concatenate([meeting, still[clear]])
 
 
-def judges(frames: int = 60) -> dict[str, RobotMovie]:
-    """The movies by name."""
+def judges(frames: int = 60) -> dict[str, Callable[[], RobotMovie]]:
+    """What makes each movie, by name."""
     walk = wander(frames, (50.0, 60.0), (1.2, 0.8), 0.6)
     slow = wander(frames, (80.0, 70.0), (0.5, 0.3), 0.3)
     far = wander(min(frames, 30), (150.0, 130.0), (4.0, 1.0), 3.0)
@@ -196,19 +197,26 @@ def judges(frames: int = 60) -> dict[str, RobotMovie]:
     night = Exposure(level=3.0, electrons=4.0, read_noise=0.6)
     wide = (300, 400)
     return {
-        "spot, 12 bit": movie(spot(2.0), walk, 4.0, replace(night, contrast=12.0, bits=12, gain=8.0), seed=1),
-        "spot, 16 bit": movie(spot(2.0), walk, 4.0, replace(night, contrast=100.0, bits=16, gain=150.0), seed=2),
-        "spot, faint": movie(spot(2.5), walk, 5.0, Exposure(4.0, level=8.0, electrons=10.0), seed=3),
-        "spot, bleaching by 70 %": movie(
-            spot(2.0), walk, 4.0, replace(night, contrast=12.0, bits=16, gain=60.0, fade=0.7), seed=4
+        "spot, 12 bit": partial(movie, spot(2.0), walk, 4.0, replace(night, contrast=12.0, bits=12, gain=8.0), seed=1),
+        "spot, 16 bit": partial(
+            movie, spot(2.0), walk, 4.0, replace(night, contrast=100.0, bits=16, gain=150.0), seed=2
         ),
-        "ring": movie(ring(6.0), walk, 8.0, Exposure(), seed=5),
-        "ring, drifting out of focus": movie(ring(6.0, 1.0 / frames), walk, 8.0, Exposure(), seed=6),
-        "Janus, 20 degrees a frame": movie(janus(8.0, 0.35), walk, 8.0, Exposure(45.0), seed=7),
-        "Janus, 60 degrees a frame": movie(janus(8.0, 1.05), walk, 8.0, Exposure(45.0), seed=8),
-        "helix, rolling slowly": movie(helix(36, 8, 12, 0.5, 0.01), slow, 19.0, Exposure(50.0), box=True, seed=9),
-        "helix, rolling and turning": movie(helix(36, 8, 12, 2.0, 0.06), slow, 19.0, Exposure(50.0), box=True, seed=10),
-        "helix, bright": movie(
+        "spot, faint": partial(movie, spot(2.5), walk, 5.0, Exposure(4.0, level=8.0, electrons=10.0), seed=3),
+        "spot, bleaching by 70 %": partial(
+            movie, spot(2.0), walk, 4.0, replace(night, contrast=12.0, bits=16, gain=60.0, fade=0.7), seed=4
+        ),
+        "ring": partial(movie, ring(6.0), walk, 8.0, Exposure(), seed=5),
+        "ring, drifting out of focus": partial(movie, ring(6.0, 1.0 / frames), walk, 8.0, Exposure(), seed=6),
+        "Janus, 20 degrees a frame": partial(movie, janus(8.0, 0.35), walk, 8.0, Exposure(45.0), seed=7),
+        "Janus, 60 degrees a frame": partial(movie, janus(8.0, 1.05), walk, 8.0, Exposure(45.0), seed=8),
+        "helix, rolling slowly": partial(
+            movie, helix(36, 8, 12, 0.5, 0.01), slow, 19.0, Exposure(50.0), box=True, seed=9
+        ),
+        "helix, rolling and turning": partial(
+            movie, helix(36, 8, 12, 2.0, 0.06), slow, 19.0, Exposure(50.0), box=True, seed=10
+        ),
+        "helix, bright": partial(
+            movie,
             helix(30, 7, 10, 1.3, -0.04, 1.0),
             slow,
             16.0,
@@ -216,13 +224,17 @@ def judges(frames: int = 60) -> dict[str, RobotMovie]:
             box=True,
             seed=11,
         ),
-        "dark disc, vignette": movie(disc(5.0), walk, 5.0, Exposure(-30.0, vignette=0.8), seed=12),
-        "radius 1.5 px": movie(disc(1.5), walk, 1.5, Exposure(-60.0), seed=13),
-        "radius 1.5 px, bright": movie(disc(1.5), walk, 1.5, Exposure(40.0, level=20.0), seed=14),
-        "radius 40 px": movie(disc(40.0), far, 40.0, Exposure(-50.0), size=wide, seed=15),
-        "ring of 40 px": movie(ring(30.0), far, 40.0, Exposure(), size=wide, seed=16),
-        "jumps of 5 radii": movie(spot(2.0), _jumps(frames, 4.0, 5.0), 4.0, Exposure(40.0, level=20.0), seed=17),
-        "3 radii a frame": movie(disc(3.0), fast, 3.0, Exposure(-50.0), size=(160, 640), seed=18),
-        "crossing neighbours": movie(spot(1.5), robot, 3.0, Exposure(60.0, level=30.0), neighbours=others, seed=19),
-        "crossing dark neighbours": movie(disc(3.0), robot, 3.0, Exposure(-50.0), neighbours=others, seed=20),
+        "dark disc, vignette": partial(movie, disc(5.0), walk, 5.0, Exposure(-30.0, vignette=0.8), seed=12),
+        "radius 1.5 px": partial(movie, disc(1.5), walk, 1.5, Exposure(-60.0), seed=13),
+        "radius 1.5 px, bright": partial(movie, disc(1.5), walk, 1.5, Exposure(40.0, level=20.0), seed=14),
+        "radius 40 px": partial(movie, disc(40.0), far, 40.0, Exposure(-50.0), size=wide, seed=15),
+        "ring of 40 px": partial(movie, ring(30.0), far, 40.0, Exposure(), size=wide, seed=16),
+        "jumps of 5 radii": partial(
+            movie, spot(2.0), _jumps(frames, 4.0, 5.0), 4.0, Exposure(40.0, level=20.0), seed=17
+        ),
+        "3 radii a frame": partial(movie, disc(3.0), fast, 3.0, Exposure(-50.0), size=(160, 640), seed=18),
+        "crossing neighbours": partial(
+            movie, spot(1.5), robot, 3.0, Exposure(60.0, level=30.0), neighbours=others, seed=19
+        ),
+        "crossing dark neighbours": partial(movie, disc(3.0), robot, 3.0, Exposure(-50.0), neighbours=others, seed=20),
     }

@@ -1,11 +1,14 @@
 """`flowrec bench track`: the tracking study of the paper, how closely each law follows a lemniscate in a vortex.
 
+Besides, the tracker on movies of robots of many looks.
+
 The Observer and Controller stages run on a plant that is integrated exactly (lemniscate.py).
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,6 +19,7 @@ from scipy.spatial import KDTree
 from flowrec.bench.figures import draw_track
 from flowrec.bench.harness import FigureFile, Results, print_rows
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, Flight, World, fly, lemniscate
+from flowrec.bench.robot_tracking import measured, show_rows
 from flowrec.control import Controller
 from flowrec.control.controller import CONTROLLERS
 from flowrec.estimation import Kalman, Observer
@@ -69,9 +73,14 @@ PACES = {
 
 
 def measure(
-    seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5, figure: FigureFile = None
+    seeds: Annotated[int, typer.Option(min=1, help="Runs with noise per law.")] = 5,
+    figure: FigureFile = None,
+    movies: Annotated[Path | None, typer.Option(metavar="DIR", help="Recorded movies: NAME/*.png, NAME.csv.")] = None,
 ) -> Results:
-    """Every law in both worlds; two laws with a step-out speed below what the reference needs, at each pace."""
+    """Every law in both worlds; two laws with a step-out speed below what the reference needs, at each pace.
+
+    Besides, the tracker on robots of many looks, and on the recorded movies of a folder.
+    """
     flown: dict[tuple[str, str], list[Flight]] = {}
     step_out: list[dict[str, Any]] = []
     bounded = ("paper, with compensation", "vector, kalman_map")
@@ -100,6 +109,7 @@ def measure(
         "worlds": {name: asdict(world) for name, world in WORLDS.items()},
         "rows": [score(name, world, made) for (name, world), made in flown.items()],
         "step_out": step_out,
+        "looks": list(measured(movies)),
     }
 
 
@@ -152,7 +162,7 @@ def _mean(values: list[float]) -> float:
 
 
 def show(results: Results) -> None:
-    """Print both tables."""
+    """Print the tables."""
     rows = {(row["law"], row["world"]): row for row in results["rows"]}
 
     def cells(row: dict[str, Any]) -> tuple[str, ...]:
@@ -172,3 +182,4 @@ def show(results: Results) -> None:
             **{"steady": "{steady_um:.1f}", "off the curve": "{off_curve_um:.1f}", "progress": "{progress:.1%}"},
         },
     )
+    show_rows(results["looks"])

@@ -15,7 +15,7 @@ BENCHES = {
     "flow": "Refinement: error of the flow before and after each method (Table I and Fig. 4 of the paper).",
     "plan": "Planning: path length and travel time of each planner, upstream and downstream, over the least time.",
     "observer": "Estimation: error of each observer on the paper's lemniscate; settings that suit a recording.",
-    "track": "Control: how closely each law tracks the paper's lemniscate in a vortex.",
+    "track": "Control: how closely each law tracks the paper's lemniscate in a vortex; vision: robots of many looks.",
     "missions": "Whole simulated missions: arrivals, wall contacts and time over the least time, policies in pairs.",
     "solver": "The flow solver: deviation from exact and published solutions, time and memory.",
     "loop": "The control loop: time of one tick with recording and viewing on and off, and the speed of a replay.",

@@ -116,9 +116,9 @@ def _measure(image: Image | NDArray[np.float32], walls: Walls, x: float, y: floa
 
 
 def best_disc_normalised(
-    image: Image | NDArray[np.float32], walls: Walls, search: Search, noise: float, slack_px: float, *, bright: bool
+    image: Image | NDArray[np.float32], walls: Walls, search: Search, noise: float, slack_px: float
 ) -> Disc | None:
-    """The best disc in an image scaled so that the noise of a pixel is 2 grey levels; inverted for a bright one.
+    """The best disc in an image scaled so that the noise of a pixel is 2 grey levels.
 
     The contrast is then relative to the noise, and the depth of the image does not matter. The walls may be off by
     `slack_px`. The darkness of the result is the difference to the background in grey levels of the image.
@@ -129,7 +129,7 @@ def best_disc_normalised(
     part = image[top : y1 + pad, left : x1 + pad].astype(np.float32)
     if not part.size:
         return None
-    gain = (-1.0 if bright else 1.0) * _NOISE_LEVELS / noise
+    gain = _NOISE_LEVELS / noise
     level = np.median(part[:: max(1, len(part) // 64)])
     part = np.float32(128.0) + np.float32(gain) * (part - level)
     distance = np.ascontiguousarray(walls.distance_px[top : y1 + pad, left : x1 + pad])
@@ -143,7 +143,7 @@ def best_disc_normalised(
     found = best_disc(part, Walls(distance, shifted.box), shifted)
     if found is None:
         return None
-    return replace(found, x=found.x + left, y=found.y + top, darkness=found.darkness / abs(gain))
+    return replace(found, x=found.x + left, y=found.y + top, darkness=found.darkness / gain)
 
 
 def disc_pad_px(nominal: float) -> int:

@@ -17,6 +17,8 @@ _SMOOTHED = 0.375  # noise of a foreground's block relative to that of a block's
 _CLUTTER = 0.5  # other objects and texture are noise, too: this part of the foreground's usual size
 _SAMPLES = 200_000
 _LEAST_ENERGY = 6.0  # of an object, in units of the noise's variance; noise alone has 4 once in 3000 places
+_SPOT_ENERGY = 10.0  # the same of a spot that no one has pointed at
+_MIDDLE_SHARE = 0.6  # least brightness in the middle of such a spot relative to its greatest
 _FOUND_WITHIN = 1.5  # radii of the given point
 _ONE_SIGNED = 0.9  # share of one polarity in the energy of the core, from which on the object has that polarity
 
@@ -73,6 +75,43 @@ def learn(
     name = next(name for name, value in SIGNS.items() if value == sign)
     view = patch_at(whole.c, x, y, scale.window().shape[0] // 2)
     return _appearance(stamp_ns, name, pixel, noise, scale, whole.to_px(np.array([x, y])), view, "")
+
+
+def brightest_spot(
+    image: Image, distance_px: NDArray[np.float32], radius_px: float, clear_px: float, *, outstanding: bool
+) -> tuple[tuple[float, float], float] | None:
+    """Centre and contrast (grey levels) of the bright object of most energy that is brightest in its middle.
+
+    Only its middle must be bright, so it may be a Gaussian spot or have a dark ring. Nothing nearer to a wall than
+    `clear_px` is looked at, because walls have bright fringes. `outstanding`: no other object, bright or dark, has half
+    its energy; else it may be light between dark objects.
+    """
+    scale = Scale(radius_px + BLUR_PX)
+    height, width = image.shape
+    whole = region_of(image, distance_px, (0, 0, width, height), scale, clear_px)
+    usual = 1.4826 * float(np.median(np.abs(whole.c)))
+    noise = max(_SMOOTHED * pixel_noise(image) / scale.step, _CLUTTER * usual)
+    spots: list[tuple[float, float, float, float]] = []
+    for column, row, _ in peaks(energy_map(whole.c, noise, 1, scale.energy), _SPOT_ENERGY, scale.apart, 16).tolist():
+        x, y, energy, _ = silhouette_centroid(whole.c, noise, 1, column, row, 1.15 * scale.radius, 6)
+        patch = patch_at(whole.c, x, y, math.ceil(scale.radius))
+        middle, highest = float(patch[len(patch) // 2, len(patch) // 2]), float(patch.max())
+        known = any(math.hypot(x - spot[1], y - spot[2]) < scale.radius for spot in spots)
+        if middle > _MIDDLE_SHARE * highest and energy > _SPOT_ENERGY and not known:
+            spots.append((energy, x, y, middle))
+    if not spots:
+        return None
+    spots.sort(reverse=True)
+    energy, x, y, contrast = spots[0]
+    if outstanding:
+        if len(spots) > 1 and spots[1][0] > 0.5 * energy:
+            return None
+        for column, row, _ in peaks(energy_map(whole.c, noise, -1, scale.energy), 0.0, scale.apart, 8).tolist():
+            dark = silhouette_centroid(whole.c, noise, -1, column, row, 1.15 * scale.radius, 6)[2]
+            if dark > 0.5 * energy and math.hypot(column - x, row - y) > 2.0 * scale.radius:
+                return None
+    px, py = whole.to_px(np.array([x, y])).tolist()
+    return (px, py), contrast
 
 
 def _core_sign(region: Region, x: float, y: float) -> int:

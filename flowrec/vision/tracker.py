@@ -40,13 +40,14 @@ from flowrec.vision.learned import (
     updated_views,
     with_motion,
 )
-from flowrec.vision.learning import box_of, energy_of, learn, pixel_noise
+from flowrec.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
 from flowrec.vision.walls import Box, Walls, walls_in_view
 
 Polarity = Literal["dark", "bright", "auto"]
 _Pixel = Annotated[float, Range(-1e5, 1e5)]
 _SMALLEST = 0.75  # least expected radius relative to the robot's own
 _RADIUS_WEIGHT = 0.05  # of the newest radius in the tracked one: focus drifts, single frames are unreliable
+_LENIENT_SCORE, _LENIENT_LIKENESS = 0.85, 0.9  # of a disc that may be pale or beside a wall: debris has less
 _ENERGY_SHARE = 0.05  # least energy of a candidate relative to the robot's
 _UPDATE_NS = 100_000_000  # least time between two updates of a known look
 
@@ -166,9 +167,13 @@ class Tracker:
             return self._learned(previous, scene, at_px, assumed, f"{what} of image {frame.index}")
         noise = pixel_noise(frame.image)
         dark = self._dark_disc(scene, search, noise) if assumed != "bright" else None
-        bright = self._normalised(scene, search, noise, bright=True) if assumed != "dark" else None
-        if bright is not None and (dark is None or bright.score * bright.darkness > dark.score * dark.darkness):
-            return self._learned(previous, scene, (bright.x, bright.y), "bright", "the brightest disc")
+        if assumed != "dark":
+            radius_px = self._radius_px(scene.calibration, scene.robot)
+            clear_px = (1.0 + self.wall_error_radii) * radius_px
+            distance_px, outstanding = scene.walls.distance_px, assumed == "auto"
+            spot = brightest_spot(frame.image, distance_px, radius_px, clear_px, outstanding=outstanding)
+            if spot is not None and (dark is None or spot[1] > dark.darkness):
+                return self._learned(previous, scene, spot[0], "bright", "the brightest spot")
         if dark is None:
             return _not_seen(previous, scene, search), None
         nothing = np.zeros((0, 1, 1), np.float32)
@@ -227,9 +232,12 @@ class Tracker:
                 which = alone(found, previous.energy, self.acquire_score)
             else:
                 which = assigned(found, previous, motion, range_px)
-                least = self.acquire_score if previous.lost_frames else self.least_score
-                if which is not None and not (
-                    found.similarity[which] >= least or similar(found, which, previous, motion, scale.radius_px)
+            if which is not None and not everywhere:
+                known = found.similarity[which] >= (self.acquire_score if previous.lost_frames else self.least_score)
+                far = math.dist(found.px[which], expected) > near_px
+                # The neighbours of the frame before are known nearby only: farther away the robot must be the only one.
+                if not (known or similar(found, which, previous, motion, scale.radius_px)) or (
+                    far and alone(found, previous.energy, self.acquire_score) != which
                 ):
                     which = None
             if which is not None:
@@ -271,11 +279,11 @@ class Tracker:
         found = None
         if frame.bits == 8:
             found = best_disc(frame.image, walls, search)
-        return found or self._normalised(scene, search, noise, bright=False)
-
-    def _normalised(self, scene: _Scene, search: Search, noise: float, *, bright: bool) -> Disc | None:
-        slack_px = self.wall_error_radii * search.nominal_px
-        return best_disc_normalised(scene.frame.image, scene.walls, search, noise, slack_px, bright=bright)
+        if found is None:
+            score, likeness = max(search.least_score, _LENIENT_SCORE), max(search.least_likeness, _LENIENT_LIKENESS)
+            search = replace(search, least_score=score, least_likeness=likeness)
+            found = best_disc_normalised(frame.image, walls, search, noise, self.wall_error_radii * search.nominal_px)
+        return found
 
     def _everywhere(self, previous: Track | None, scene: _Scene) -> Search:
         """A search in the whole channel."""
