@@ -1,4 +1,4 @@
-"""Processes of flowrec: how a child is started, and real-time (SCHED_FIFO) priority for the control loop."""
+"""Processes of flowrec: how a child is started, and real-time (SCHED_FIFO) priority."""
 
 from __future__ import annotations
 
@@ -46,3 +46,18 @@ def realtime_priority(priority: int = _PRIORITY) -> Iterator[bool]:
                 stack.callback(os.sched_setscheduler, 0, *before)
                 granted = True
         yield granted
+
+
+def prioritise_process(priority: int) -> bool:
+    """Give every thread of this process real-time priority, and those that it starts later; whether that is allowed.
+
+    For processes that wait nearly always, with libraries whose own threads do a part of the work.
+    """
+    if sys.platform != "linux":
+        return False
+    try:
+        for thread in Path("/proc/self/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+    except OSError:
+        return False
+    return True

@@ -48,9 +48,11 @@ class FirmwareTwin:
         return read_samples(self.file, FULL_A)
 
 
-def read_samples(file: Path, full: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def read_samples(file: Path, full: float = 1.0, from_byte: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Times and outputs in a file of samples."""
-    data = file.read_bytes()
+    with file.open("rb") as stream:
+        stream.seek(from_byte)
+        data = stream.read()
     found = np.frombuffer(data[: len(data) // SAMPLE.itemsize * SAMPLE.itemsize], SAMPLE)
     return found["at_ns"], found["coils"] * full
 

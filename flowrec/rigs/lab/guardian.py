@@ -10,7 +10,7 @@ raises an error, and the recorder takes the output to zero itself.
 
 The child is `python -m flowrec.rigs.lab.guardian SILENCE_S BEATS STATUS KIND ...`, with one of
     serial FD                 newline and Z on a descriptor of the open port
-    ni ADDRESS DEVICE...      reset of the devices, by the local driver ('') or the gRPC server at host:port
+    ni SERVER CHANNELS        reset of the devices, by the local driver ('') or the gRPC server at host:port
 
 What it can not do: it is a process of the same computer. It can not help when the kernel, the computer's power or the
 cable fails. A serial amplifier then has its own timer; an NI device holds its last voltage. Only an interlock in
@@ -31,7 +31,7 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 from flowrec.errors import RigError
-from flowrec.system.processes import child_command, child_environment
+from flowrec.system.processes import child_command, child_environment, prioritise_process
 
 SILENCE_S = 0.1
 ONLY_HARDWARE = (
@@ -217,8 +217,14 @@ def main(arguments: Sequence[str]) -> int:
         signal.signal(number, signal.SIG_IGN)
     silence_s, beats, status = float(arguments[0]), int(arguments[1]), int(arguments[2])
     kind, words = arguments[3], arguments[4:]
-    zero = _serial_zero(int(words[0])) if kind == "serial" else _ni_zero(words[0], words[1:])
-    _be_first()
+    zero = _serial_zero(int(words[0])) if kind == "serial" else _ni_zero(words[0], words[1])
+    rehearsal = _try(zero)  # the output is at zero; whatever loads late, or does not work, does so now
+    if "failed" in rehearsal:
+        sys.stderr.write(rehearsal)
+        return 1
+    gc.freeze()
+    gc.disable()
+    prioritise_process(3)  # above the recorder; without the right to it the guardian is an ordinary process
     os.set_blocking(status, False)
     _say(status, "ready")
     cause = watch(beats, silence_s, lambda: _say(status, ".", end=""), lambda: _say(status, f"probed {_try(zero)}"))
@@ -281,35 +287,17 @@ def _serial_zero(port: int) -> Callable[[], str]:
     return zero
 
 
-def _ni_zero(address: str, devices: Sequence[str]) -> Callable[[], str]:
-    """Reset of the devices: it aborts every task of theirs, whoever owns it, and takes their outputs to zero."""
-    from nidaqmx.system import Device
+def _ni_zero(server: str, channels: str) -> Callable[[], str]:
+    """Reset of the devices, which aborts every task of theirs, whoever owns it; then zero volts."""
+    from flowrec.rigs.lab.amplifiers.ni_device import grpc_options, reset
 
-    options = None
-    if address:
-        import grpc
-        from nidaqmx import GrpcSessionOptions
-
-        channel = grpc.insecure_channel(address)
-        grpc.channel_ready_future(channel).result(timeout=10.0)
-        options = GrpcSessionOptions(channel, "")
-    known = [Device(name, grpc_options=options) for name in devices]
+    options = grpc_options(server) if server else None
 
     def zero() -> str:
-        for device in known:
-            device.reset_device()
+        reset(channels, options)
         return "zero confirmed"
 
     return zero
-
-
-def _be_first() -> None:
-    """Ask for a priority above that of the recorder; without the right to it the guardian is an ordinary process."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    with contextlib.suppress(OSError, AttributeError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(3))
 
 
 def _say(status: int, text: str, end: str = "\n") -> None:

@@ -25,7 +25,7 @@ from flowrec.errors import RigError, UsageError
 from flowrec.messages import Applied, CameraLosses, Currents, Frame
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rig_settings import CAMERAS
-from flowrec.rigs.lab.amplifiers.drive import BEAT_S, Drive
+from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.units import nanoseconds

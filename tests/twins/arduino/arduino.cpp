@@ -9,6 +9,7 @@
 #include <errno.h>
 #include <fcntl.h>
 #include <poll.h>
+#include <sched.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -61,7 +62,7 @@ int SerialPort::read() {
   given.pop_front();
   return (unsigned char)first;
 }
-int SerialPort::availableForWrite() { return 64; }
+int SerialPort::availableForWrite() { return real_time ? 64 : 4096; }
 size_t SerialPort::write(const uint8_t *bytes, size_t count) {
   if (!real_time) return fwrite(bytes, 1, count, stdout);
   const ssize_t done = ::write(terminal, bytes, count);
@@ -90,6 +91,9 @@ static int behind_a_terminal() {
   setvbuf(samples, NULL, _IONBF, 0);
   printf("%s\n", ptsname(terminal));
   fflush(stdout);
+  // A board does not wait for the computer's other work.
+  const sched_param first = {4};
+  sched_setscheduler(0, SCHED_FIFO, &first);
   setup();
   const int owner = getppid();
   while (getppid() == owner) {
@@ -116,9 +120,9 @@ static int by_a_clock() {
       loop();
       record();
     }
+    fflush(samples);
     fputs(".\n", stdout);
     fflush(stdout);
-    fflush(samples);
   }
   return 0;
 }

@@ -1,7 +1,7 @@
 """The interface of an amplifier, and the table of amplifiers.
 
-LabRig never uses a row of this table directly, but through `drive.Drive`, which puts the limits and the guardian above
-it: with Drive.of(config) as drive: drive.beat(), drive.apply(currents), drive.put_out(until_ns), drive.zero().
+A rig never uses a row of the table directly, but through rigs/lab/drive.py, which puts the limits and the guardian
+above it.
 """
 
 from __future__ import annotations

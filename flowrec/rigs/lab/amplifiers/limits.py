@@ -22,7 +22,7 @@ from flowrec.messages import Currents
 from flowrec.rig_settings import OutputLimits
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.robot import Robot
-from flowrec.units import seconds
+from flowrec.units import seconds, wrap_rad
 
 _TURN_RAD = 2.0 * math.pi
 _ROUNDING = 1e-9  # relative
@@ -113,6 +113,7 @@ class Limits:
         """
         given = (currents.frequency_hz, currents.heading_rad, currents.amplitude_mt, currents.limit_hz)
         frequency, heading, amplitude, limit = given
+        heading = wrap_rad(heading) if math.isfinite(heading) else heading
         if not all(map(math.isfinite, given)) or frequency < 0.0 or amplitude < 0.0 or limit < 0.0:
             self._say("invalid", f"a command with impossible numbers (Hz, rad, mT, Hz: {given}) is taken as zero field")
             frequency = heading = amplitude = limit = 0.0
@@ -150,18 +151,11 @@ class Limits:
         ------
         RigError : which limit, and by how much. None of the samples may be put out.
         """
-        limits = [
-            ("current", currents_a, self.coils.max_current_a, "A"),
-            ("voltage", voltages_v, self.coils.amplifier.max_voltage_v, "V"),
-        ]
+        _refuse_beyond("current", currents_a, self.coils.max_current_a, "A")
+        _refuse_beyond("voltage", voltages_v, self.coils.amplifier.max_voltage_v, "V")
         if self.output.slew_a_s is not None:
             rate = np.diff(currents_a, axis=0) * self.coils.amplifier.output_hz
-            limits.append(("slew", rate, self.output.slew_a_s, "A/s"))
-        for name, values, limit, unit in limits:
-            # A comparison with NaN is false, so this refuses NaN too.
-            if not (np.abs(values) <= limit * (1.0 + 1e-6)).all():
-                worst = float(np.abs(values).max())
-                raise RigError(f"an output sample has a {name} of {worst:.4g} {unit}; the limit is {limit:g} {unit}")
+            _refuse_beyond("slew", rate, self.output.slew_a_s, "A/s")
 
     @property
     def _turning_a_s(self) -> NDArray[np.float64]:
@@ -191,3 +185,10 @@ class Limits:
         if cause not in self._told:
             self._told.add(cause)
             self.tell(text)
+
+
+def _refuse_beyond(name: str, values: NDArray[np.float64], limit: float, unit: str) -> None:
+    # A comparison with NaN is false, so this refuses NaN too. The tolerance is for rounding.
+    if not (np.abs(values) <= limit * (1.0 + 1e-6)).all():
+        worst = float(np.abs(values).max())
+        raise RigError(f"an output sample has a {name} of {worst:.4g} {unit}; the limit is {limit:g} {unit}")

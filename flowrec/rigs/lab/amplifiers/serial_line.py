@@ -39,11 +39,13 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
     reply,
     telemetry,
 )
+from flowrec.system.processes import realtime_priority
 from flowrec.units import NS_PER_S, seconds
 
 _BOOT_S = 4.0  # many boards start anew when their port is opened
 _ASK_S = 0.25
 _CONFIRM_S = 0.25
+_CONFIGURE_S = 2.0
 _SILENT_S = 0.4  # a board that answers no command for so long does not answer
 _LEAST_S = 0.008  # between two lines: a line and its answer take that long at 115200 baud
 _KEEP_S = 120.0
@@ -111,7 +113,7 @@ class SerialAmplifier:
 
     def arm(self) -> None:
         for verb, numbers in configuration(self._coils):
-            answer = self._asked(verb, *numbers)
+            answer = self._asked(verb, *numbers, timeout_s=_CONFIGURE_S)
             if answer is None or answer.verb != verb:
                 raise RigError(f"{self._name}: the amplifier refuses its configuration ({_words(answer)})")
         self._permitted = True
@@ -256,6 +258,10 @@ class SerialAmplifier:
     # ---- the reader's thread
 
     def _read(self) -> None:
+        with realtime_priority(2):  # what it reads is stamped on arrival
+            self._read_lines()
+
+    def _read_lines(self) -> None:
         assert self._port is not None
         descriptor, rest = self._port.fileno(), b""
         while not self._closing:
@@ -263,14 +269,14 @@ class SerialAmplifier:
                 if not select.select([descriptor], [], [], 0.05)[0]:
                     continue
                 received = os.read(descriptor, 4096)
-            except BlockingIOError:  # the guardian was faster
+            except BlockingIOError:
                 continue
-            except OSError as error:
-                received, why = b"", error.strerror
-            else:
-                why = "end of file"
+            except OSError:
+                received = b""
             if not received:
-                self._fault = f"{self._name}: the amplifier is gone ({why}); see to its cable"
+                if os.isatty(descriptor):  # the guardian, which has the same port, was faster
+                    continue
+                self._fault = f"{self._name}: the amplifier is gone; see to its cable"
                 return
             arrival_ns = time.monotonic_ns()
             *lines, rest = (rest + received).split(b"\n")

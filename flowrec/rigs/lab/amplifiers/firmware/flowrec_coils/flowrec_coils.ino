@@ -371,7 +371,9 @@ void loop() {
     }
   }
   drain();
-  if (TIMER_MS && armed && millis() - heard_ms >= (uint32_t)TIMER_MS) zero('T');
+#if TIMER_MS > 0
+  if (armed && millis() - heard_ms >= (uint32_t)TIMER_MS) zero('T');
+#endif
   const uint32_t now_us = micros();
   const uint32_t elapsed_us = now_us - updated_us;
   if (elapsed_us < UPDATE_US) return;

@@ -1,0 +1,195 @@
+"""Amplifier `ni`: three analog outputs of an NI device, kept in samples by a process of their own (ni_process.py)."""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import time
+from collections import deque
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from typing import Any, Self
+
+import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
+import numpy as np
+
+from flowrec.config import ResolvedConfig
+from flowrec.control.field_log import FieldLog
+from flowrec.control.field_rotation import FieldCommand
+from flowrec.errors import RigError
+from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
+from flowrec.rigs.lab.amplifiers.ni_orders import Played, Settings
+from flowrec.system.processes import child_command, child_environment
+from flowrec.units import NS_PER_S
+
+_START_S = 60.0  # the package of NI takes seconds to load on a busy computer, and so does a device
+_ZERO_S = 0.5
+_SILENT_S = 0.5  # a process that has written no block for so long is stuck
+_END_S = 5.0
+_KEEP_S = 120.0
+
+
+class NiAmplifier:
+    """See amplifier.Amplifier.
+
+    Attributes
+    ----------
+    underruns : how often the output ran dry.
+    """
+
+    @classmethod
+    def of(cls, config: ResolvedConfig) -> Self:
+        """The amplifier of a configuration."""
+        lab = config.lab
+        return cls(Settings(lab.channels, lab.ni_server, config.coils, config.robot, lab.output, lab.guardian_s))
+
+    def __init__(self, settings: Settings) -> None:
+        self.underruns = 0
+        self._settings = settings
+        self._process: subprocess.Popen[bytes] | None = None
+        self._connection: Connection | None = None
+        self._zero_pipe = self._done_pipe = -1
+        self._permitted = False
+        self._fault = ""
+        self._played_s = 0.0
+        self._played: deque[Played] = deque()  # blocks whose time has not come
+        self._cuts: deque[int] = deque()  # when zero() took the output to zero; any thread appends
+        self._log = FieldLog()
+
+    def open(self) -> AmplifierInfo:
+        self._fault = ""
+        here, there = os.pipe(), os.pipe()
+        ours, theirs = Pipe()
+        descriptors = (theirs.fileno(), here[0], there[1])
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - our own module
+                child_command("flowrec.rigs.lab.amplifiers.ni_process", *map(str, descriptors)),
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C ends the run, which takes the field down its ramp, and then this
+                env=child_environment(),
+            )
+        finally:
+            theirs.close()
+            os.close(here[0])
+            os.close(there[1])
+        self._zero_pipe, self._done_pipe, self._connection = here[1], there[0], ours
+        try:
+            ours.send(("open", self._settings))
+            info: AmplifierInfo = self._wait("info", _START_S)
+        except BaseException:
+            self.close()
+            raise
+        return info
+
+    def guard(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        return ("ni", self._settings.server, self._settings.channels), ()
+
+    def arm(self) -> None:
+        assert self._connection is not None
+        self._connection.send(("arm",))
+        self._wait("armed", _START_S)
+        self._played_s = time.monotonic()
+        self._permitted = True
+
+    def apply(self, command: FieldCommand) -> None:
+        if not self._permitted or self._connection is None:
+            return
+        self._hear()
+        if self._fault:
+            raise RigError(f"NI output: {self._fault}")
+        if time.monotonic() - self._played_s > _SILENT_S:
+            raise RigError(f"the process of the NI output has written nothing for {_SILENT_S:g} s")
+        try:
+            self._connection.send(("command", command))
+        except OSError as error:
+            raise RigError("the process of the NI output has ended") from error
+
+    def put_out(self, until_ns: int) -> FieldLog:
+        self._hear()
+        while self._cuts:
+            self._cut(self._cuts.popleft())
+        while self._played and self._played[0].from_ns <= until_ns:
+            one = self._played.popleft()
+            self._log.extend(self._not_before(one.from_ns), one.segments, one.amplitude_mt, one.currents_a)
+        self._log.forget(until_ns - round(_KEEP_S * NS_PER_S))
+        return self._log
+
+    def zero(self) -> None:
+        self._permitted = False
+        if self._process is None:
+            return
+        try:
+            # Pipes, and no lock: the loop may be stuck in the middle of anything.
+            os.write(self._zero_pipe, b"Z")
+            answered = select.select([self._done_pipe], [], [], _ZERO_S)[0]
+            confirmed = bool(answered) and os.read(self._done_pipe, 1) != b""
+        except OSError:
+            confirmed = False
+        if not confirmed:
+            raise RigError("the process of the NI output does not confirm that the output is at zero")
+        self._cuts.append(time.monotonic_ns())
+
+    def close(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        if self._process is not None:
+            try:
+                self._process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process = None
+        for end in (self._zero_pipe, self._done_pipe):
+            if end >= 0:
+                os.close(end)
+        self._zero_pipe = self._done_pipe = -1
+
+    def _hear(self) -> None:
+        """Take in what the process reports. Does not wait."""
+        while self._connection is not None and not self._fault:
+            try:
+                if not self._connection.poll():
+                    return
+                self._report(*self._connection.recv())
+            except (EOFError, OSError):
+                self._fault = "its process has ended"
+
+    def _report(self, what: str, *given: Any) -> tuple[str, Any]:
+        if what == "block":
+            self._played.append(given[0])
+            self._played_s = time.monotonic()
+        elif what == "fault":
+            self._fault = given[0]
+            self.underruns += "ran dry" in self._fault
+            self._cuts.append(time.monotonic_ns())
+        return what, given[0] if given else None
+
+    def _wait(self, wanted: str, timeout_s: float) -> Any:
+        assert self._connection is not None
+        end_s = time.monotonic() + timeout_s
+        while not self._fault:
+            if not self._connection.poll(max(end_s - time.monotonic(), 0.0)):
+                raise RigError(f"the process of the NI output does not answer in {timeout_s:g} s")
+            try:
+                what, given = self._report(*self._connection.recv())
+            except (EOFError, OSError) as error:
+                raise RigError("the process of the NI output has ended") from error
+            if what == wanted:
+                return given
+        raise RigError(self._fault)
+
+    def _cut(self, at_ns: int) -> None:
+        """End the log at a time: blocks that were written for later were not put out."""
+        while self._played and self._played[0].from_ns < at_ns:
+            one = self._played.popleft()
+            self._log.extend(self._not_before(one.from_ns), one.segments, one.amplitude_mt, one.currents_a)
+        self._played.clear()
+        self._log.append(self._not_before(at_ns), 0.0, 0.0, 0.0, np.zeros(3))
+
+    def _not_before(self, stamp_ns: int) -> int:
+        times = self._log.times_ns
+        return max(stamp_ns, int(times[-1])) if len(times) else stamp_ns

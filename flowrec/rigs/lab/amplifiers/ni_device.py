@@ -1,0 +1,192 @@
+"""Three analog outputs of an NI device, through NI-DAQmx of this computer or an NI gRPC Device Server."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from typing import Any
+
+import nidaqmx
+import numpy as np
+from nidaqmx.constants import AcquisitionType, RegenerationMode
+from nidaqmx.errors import DaqError, DaqNotFoundError, DaqNotSupportedError, RpcError
+from nidaqmx.system import Device
+from numpy.typing import NDArray
+
+from flowrec.control.amplifier import Amplifier
+from flowrec.errors import RigError
+from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
+
+_COILS = 3
+_CONNECT_S = 10.0
+UNDERFLOWS = (-200290, -200621, -200018, -200016)  # of the buffer in the computer, and of those in devices
+_NO_DEVICE, _NO_CHANNEL, _RESERVED = (-200220, -201003), (-200170,), (-50103, -200022)
+
+
+class NiDevice:
+    """The outputs, at zero or playing.
+
+    Parameters
+    ----------
+    channels : as NI-DAQmx names them: 'cDAQ1Mod1/ao0:2'.
+    server : host:port of a gRPC server; '': the local driver.
+    amplifier : range and rate of the outputs.
+    latency_s : that is stated in `info`.
+
+    Raises
+    ------
+    RigError : no driver, server or device, or not three outputs; one line.
+    """
+
+    def __init__(self, channels: str, server: str, amplifier: Amplifier, latency_s: float) -> None:
+        self._channels, self._amplifier = channels, amplifier
+        if not channels:
+            raise RigError("lab.channels: which outputs drive the coils x, y, z? For instance 'cDAQ1Mod1/ao0:2'")
+        self._options = grpc_options(server) if server else None
+        self._task: nidaqmx.Task | None = None
+        try:
+            self.info = self._described(latency_s)
+        except (DaqNotFoundError, DaqNotSupportedError) as error:
+            raise RigError(
+                "NI-DAQmx is not installed on this computer; install it from ni.com, or set lab.ni_server"
+            ) from error
+        except DaqError as error:
+            raise RigError(f"lab.channels = {channels!r}: {reason(error)}") from error
+
+    def start(self, block_s: float) -> float:
+        """Prepare the output of blocks; returns the sample rate, which the device may have rounded."""
+        task = self._task = self._new_task()
+        rate_hz = self._amplifier.output_hz
+        count = round(block_s * rate_hz)
+        task.timing.cfg_samp_clk_timing(rate_hz, sample_mode=AcquisitionType.CONTINUOUS, samps_per_chan=4 * count)
+        task.out_stream.regen_mode = RegenerationMode.DONT_ALLOW_REGENERATION
+        task.out_stream.output_buf_size = 4 * count
+        return float(task.timing.samp_clk_rate)
+
+    def run(self) -> int:
+        """Start the output of what is written. Returns when, in ns of the host's monotonic clock."""
+        assert self._task is not None
+        before_ns = time.monotonic_ns()
+        self._task.start()
+        return (before_ns + time.monotonic_ns()) // 2
+
+    def write(self, voltages_v: NDArray[np.float64]) -> None:
+        """Append samples (n, 3)."""
+        assert self._task is not None
+        self._task.write(np.ascontiguousarray(voltages_v.T), auto_start=False)
+
+    def generated(self) -> tuple[int, int]:
+        """Number of samples put out so far, and when that was, in ns of the host's monotonic clock.
+
+        Raises
+        ------
+        DaqError : the output ran dry. RigError : it was stopped.
+        """
+        assert self._task is not None
+        before_ns = time.monotonic_ns()
+        generated = int(self._task.out_stream.total_samp_per_chan_generated)
+        arrival_ns = (before_ns + time.monotonic_ns()) // 2
+        if self._task.is_task_done():
+            raise RigError("the output was stopped by another program, or by the guardian")
+        return generated, arrival_ns
+
+    def zero(self) -> None:
+        """Stop the output and take it to zero. If that fails, reset the device."""
+        task, self._task = self._task, None
+        try:
+            if task is not None:
+                with contextlib.suppress(DaqError):  # a task that has failed
+                    task.stop()
+                task.close()
+            write_zeros(self._channels, self._options)
+        except Exception:  # noqa: BLE001  whatever it was, a reset is the next thing to try
+            reset(self._channels, self._options)
+
+    def _described(self, latency_s: float) -> AmplifierInfo:
+        with self._new_task() as task:
+            names = task.ao_channels.channel_names
+        if len(names) != _COILS:
+            raise RigError(f"lab.channels = {self._channels!r}: {len(names)} outputs, where three coils need {_COILS}")
+        device = Device(devices(self._channels)[0], grpc_options=self._options)
+        return AmplifierInfo(
+            model=device.product_type,
+            serial=f"{device.serial_num:X}",
+            max_current_a=np.inf,
+            max_voltage_v=float(min(abs(edge) for edge in device.ao_voltage_rngs[:2])),
+            max_output_hz=float(device.ao_max_rate),
+            latency_s=latency_s,
+            timer_s=0.0,
+        )
+
+    def _new_task(self) -> nidaqmx.Task:
+        task = nidaqmx.Task(grpc_options=self._options)
+        try:
+            most_v = self._amplifier.max_voltage_v
+            task.ao_channels.add_ao_voltage_chan(self._channels, min_val=-most_v, max_val=most_v)
+        except BaseException:
+            task.close()
+            raise
+        return task
+
+
+def devices(channels: str) -> list[str]:
+    """Names of the devices in a list of channels."""
+    return sorted({part.strip().partition("/")[0] for part in channels.split(",")})
+
+
+def grpc_options(server: str) -> Any:
+    """Options of a session on a gRPC server.
+
+    Raises
+    ------
+    RigError : no server there.
+    """
+    import grpc
+
+    channel = grpc.insecure_channel(server)
+    try:
+        grpc.channel_ready_future(channel).result(timeout=_CONNECT_S)
+    except grpc.FutureTimeoutError as error:
+        raise RigError(f"lab.ni_server = {server!r}: no NI gRPC Device Server answers there") from error
+    return nidaqmx.GrpcSessionOptions(channel, "")
+
+
+def write_zeros(channels: str, options: Any) -> None:
+    """Zero volts on outputs that no task uses."""
+    with nidaqmx.Task(grpc_options=options) as task:
+        task.ao_channels.add_ao_voltage_chan(channels)
+        task.write([[0.0]] * len(task.ao_channels.channel_names), auto_start=True)
+
+
+def reset(channels: str, options: Any) -> None:
+    """Abort every task of the devices, whoever owns it, and take the outputs to zero.
+
+    A reset itself takes the outputs of C, M and X Series to zero, and leaves those of others as they are (NI-DAQmx
+    Device Considerations, "Initialized States for Terminals and Output Channels").
+    """
+    for name in devices(channels):
+        Device(name, grpc_options=options).reset_device()
+    write_zeros(channels, options)
+
+
+def reason(error: Exception) -> str:
+    """An error of NI-DAQmx in one line."""
+    if isinstance(error, DaqError):
+        code = int(error.error_code)
+        if code in UNDERFLOWS:
+            return f"the output ran dry (NI error {code}): the computer was too busy"
+        if code in _NO_DEVICE:
+            return f"NI knows no such device (error {code}); see NI MAX or nilsdev for its name"
+        if code in _NO_CHANNEL:
+            return f"the device has no such output (error {code})"
+        if code in _RESERVED:
+            return f"another program uses the outputs (NI error {code}); close it"
+        return f"NI error {code}: {_first_line(error)}"
+    if isinstance(error, RpcError):
+        return f"the NI gRPC Device Server: {_first_line(error)}"
+    return f"{type(error).__name__}: {_first_line(error)}"
+
+
+def _first_line(error: Exception) -> str:
+    return re.sub(r"\s+", " ", str(error)).strip()[:160]

@@ -1,0 +1,263 @@
+"""`python -m tests.perf.guardian`: how long the coils stay on after the recorder is killed, stopped or stuck.
+
+A real recorder process drives the compiled firmware behind a pseudo terminal, or by NI's client a twin of the gRPC
+server; the outputs are read from the twins' files. A row per device and fault: the distribution of the time from the
+fault to zero, beside the largest delay of a sleep as long as the guardian's timer, measured meanwhile by a process.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from flowrec.bench.harness import Results, run
+from flowrec.terminal import progress, table
+from tests.twins.firmware import SAMPLE, compiled, firmware_twin, read_samples
+
+TIMER_S = 0.1
+_START_S, _AFTER_S = 90.0, 0.6
+_ROOT = Path(__file__).parents[2]
+_SLEEPER = """
+import sys, time
+while True:
+    begin = time.monotonic()
+    time.sleep(float(sys.argv[1]))
+    print(time.monotonic() - begin - float(sys.argv[1]), flush=True)
+"""
+
+
+@dataclass(frozen=True)
+class Device:
+    """A twin with coils on it."""
+
+    kind: str  # serial or ni
+    address: str
+    file: Path
+
+    def off_ns(self, since_ns: int, from_byte: int = 0) -> int | None:
+        """From when on all outputs were zero, for good; None: they are not."""
+        times, outputs = read_samples(self.file, from_byte=from_byte)
+        on = np.flatnonzero((outputs != 0.0).any(axis=1))
+        if on.size == 0 or on[-1] + 1 == len(times):
+            return None if on.size else since_ns
+        return max(int(times[on[-1] + 1]), since_ns)
+
+
+@contextmanager
+def device(kind: str, folder: Path) -> Iterator[Device]:
+    """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`."""
+    file = folder / f"{kind}.samples"
+    if kind != "ni":
+        with firmware_twin(compiled(folder, 100 if kind.endswith("timer") else 0), file) as twin:
+            yield Device("serial", twin.port, file)
+        return
+    command = [sys.executable, "-m", "tests.twins.ni", file]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True, cwd=_ROOT, env=_env()) as server:
+        try:
+            assert server.stdout is not None
+            yield Device("ni", f"127.0.0.1:{server.stdout.readline().strip()}", file)
+        finally:
+            server.kill()
+
+
+@dataclass
+class Ended:
+    """What became of one recorder."""
+
+    off_s: float | None  # from the fault to zero
+    said: str  # the last line of the recorder
+    stayed_off: bool = True
+
+
+def trial(on: Device, fault: str, silence_s: float = TIMER_S) -> Ended | None:
+    """Start a recorder, wait until its field is on, do that to it. None: its field did not come on.
+
+    Faults: kill, stop, hang and spin of the recorder; `kill both`: the process of the NI output with it;
+    `guardian`: kill of the guardian alone; `signals`: SIGINT, SIGTERM and SIGHUP to the guardian, then the kill.
+    """
+    own = fault if fault in ("hang", "spin") else ""
+    words = [sys.executable, "-m", "tests.perf.guardian_trial", on.kind, on.address, str(silence_s), own]
+    begin = on.file.stat().st_size // SAMPLE.itemsize * SAMPLE.itemsize
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=_ROOT, env=_env()) as recorder:
+        try:
+            helpers = _wait_on(recorder)
+            if helpers is None:
+                return None
+            said = ""
+            if own:
+                fault_ns = int(_line(recorder, "fault").split()[1])
+            else:
+                time.sleep(random.uniform(0.05, 0.3))
+                fault_ns = _harm(fault, recorder, helpers)
+            time.sleep(_AFTER_S)
+            off_ns = on.off_ns(fault_ns, begin)
+            if fault == "stop":
+                recorder.send_signal(signal.SIGCONT)
+                said = _line(recorder, "failed")
+            elif fault == "guardian":
+                said = _line(recorder, "failed")
+            again_ns = on.off_ns(fault_ns, begin)
+            return Ended(None if off_ns is None else 1e-9 * (off_ns - fault_ns), said, off_ns == again_ns)
+        finally:
+            recorder.kill()
+
+
+def _harm(fault: str, recorder: subprocess.Popen[str], helpers: dict[str, int]) -> int:
+    if fault == "signals":
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            os.kill(helpers["guardian"], number)
+    victim = helpers["guardian"] if fault == "guardian" else recorder.pid
+    fault_ns = time.monotonic_ns()
+    os.kill(victim, signal.SIGSTOP if fault == "stop" else signal.SIGKILL)
+    if fault == "kill both" and "process" in helpers:
+        os.kill(helpers["process"], signal.SIGKILL)
+    return fault_ns
+
+
+def _wait_on(recorder: subprocess.Popen[str]) -> dict[str, int] | None:
+    helpers: dict[str, int] = {}
+    while True:
+        line = _line(recorder)
+        if line == "on":
+            return helpers
+        name, _, number = line.partition(" ")
+        if name not in ("guardian", "process"):
+            print(line, file=sys.stderr)
+            return None
+        helpers[name] = int(number)
+
+
+def _line(recorder: subprocess.Popen[str], word: str = "") -> str:
+    """The next line of the recorder that begins with a word; it is killed when none comes."""
+    assert recorder.stdout is not None
+    timer = threading.Timer(_START_S, recorder.kill)
+    timer.start()
+    try:
+        for line in recorder.stdout:
+            if line.startswith(word):
+                return line.strip()
+        return "it has ended"
+    finally:
+        timer.cancel()
+
+
+def _env() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+
+
+@contextmanager
+def sleeper(timer_s: float = TIMER_S) -> Iterator[list[float]]:
+    """Context in which another process measures sleeps; the list holds their delays in s."""
+    worst: list[float] = []
+    with subprocess.Popen([sys.executable, "-c", _SLEEPER, str(timer_s)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        lines = process.stdout
+        thread = threading.Thread(target=lambda: worst.extend(float(line) for line in lines), daemon=True)
+        thread.start()
+        try:
+            yield worst
+        finally:
+            process.kill()
+            thread.join()
+
+
+@contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Context in which so many processes compute."""
+    load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for one in load:
+            one.kill()
+            one.wait()
+
+
+def measure(
+    kills: Annotated[int, typer.Option(help="of the recorder by SIGKILL, for each device")] = 100,
+    stops: Annotated[int, typer.Option(help="of the recorder by SIGSTOP, for each device")] = 20,
+    others: Annotated[int, typer.Option(help="trials of each other fault")] = 5,
+    load: Annotated[int, typer.Option(help="processes that compute meanwhile")] = 0,
+    kinds: Annotated[str, typer.Option(help="devices, separated by commas")] = "serial,serial+timer,ni",
+) -> Results:
+    """Times from the fault to zero, by device and fault."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder, busy(load):
+        for kind in kinds.split(","):
+            faults = {"kill": kills, "stop": stops, "hang": others, "spin": others, "signals": others}
+            faults |= {"guardian": others} | ({"kill both": others} if kind == "ni" else {})
+            with device(kind, Path(folder)) as on:
+                for fault, count in faults.items():
+                    with sleeper() as worst, progress(f"{kind} {fault}", count) as done:
+                        ends, refused = [], 0
+                        for number in range(count):
+                            while (ended := trial(on, fault)) is None:
+                                refused += 1  # it lost its coils, and they were at zero, before its field was up
+                            ends.append(ended)
+                            done(number + 1)
+                    jitter_s = max(worst, default=0.0)
+                    off_s = [one.off_s if one.off_s is not None and one.stayed_off else np.inf for one in ends]
+                    rows.append(
+                        {
+                            "device": kind,
+                            "fault": fault,
+                            "off_s": sorted(off_s),
+                            "sleep_s": jitter_s,
+                            "late": sum(one > TIMER_S + jitter_s for one in off_s),
+                            "not_started": refused,
+                            "said": ends[-1].said if ends else "",
+                        }
+                    )
+                    print(f"{kind} {fault}: {np.round(1e3 * np.array(sorted(off_s)), 1).tolist()}", file=sys.stderr)
+    return {"rows": rows, "load": os.getloadavg()[0]}
+
+
+def show(results: Results) -> None:
+    """Print the table."""
+    table(
+        f"time from the fault to zero; the timer is {1e3 * TIMER_S:.0f} ms; load {results['load']:.1f}",
+        (
+            "device",
+            "fault",
+            "trials",
+            "least, ms",
+            "median",
+            "95 %",
+            "most",
+            "delay of a sleep",
+            "late or on",
+            "not started",
+        ),
+        [
+            (
+                row["device"],
+                row["fault"],
+                str(len(row["off_s"])),
+                *(f"{1e3 * np.percentile(row['off_s'], q):.1f}" for q in (0, 50, 95, 100)),
+                f"{1e3 * row['sleep_s']:.1f}",
+                str(row["late"]),
+                str(row["not_started"]),
+            )
+            for row in results["rows"]
+            if row["off_s"]
+        ],
+    )
+
+
+if __name__ == "__main__":
+    run(measure, show)

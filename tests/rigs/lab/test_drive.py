@@ -1,0 +1,174 @@
+"""The coils of a lab on twins: the log is what was put out, and whatever happens to the recorder they go to zero."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flowrec.control.coils import field_limits
+from flowrec.errors import FlowrecError, RigError
+from flowrec.rig_settings import OutputLimits
+from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.drive import Drive
+from flowrec.rigs.lab.guardian import Guardian
+from tests.conftest import until
+from tests.perf.guardian import Device, device, sleeper, trial
+from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, currents
+from tests.twins.firmware import FULL_A, read_samples
+
+SLACK_S = 0.25  # of a busy machine, besides the delay of a sleep that is measured meanwhile
+
+
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
+    """The firmware without its own timer: what goes to zero does so by the guardian."""
+    with device("serial", tmp_path_factory.mktemp("serial")) as on:
+        yield on
+
+
+@pytest.fixture(scope="module")
+def ni(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
+    pytest.importorskip("nidaqmx")
+    with device("ni", tmp_path_factory.mktemp("ni")) as on:
+        yield on
+
+
+@pytest.fixture(params=["serial", "ni"])
+def on(request: pytest.FixtureRequest) -> Device:
+    found: Device = request.getfixturevalue(request.param)
+    return found
+
+
+@contextlib.contextmanager
+def driven(on: Device, seconds: float = 0.0) -> Iterator[tuple[Drive, int, int]]:
+    """A drive after so many seconds of commands, and the times of its first and last command."""
+    with Drive(amplifier(on.kind, on.address), Limits(COILS, ROBOT, OUTPUT), 1.0, 5.0) as drive:
+        begin_ns, number = time.monotonic_ns(), 0
+        while time.monotonic_ns() < begin_ns + seconds * 1e9:
+            drive.apply(currents(8.0 + 6.0 * math.sin(0.05 * number), 0.03 * number))
+            number += 1
+            time.sleep(0.015)
+        yield drive, begin_ns, time.monotonic_ns()
+
+
+def test_the_turns_that_are_logged_are_those_of_the_field_that_was_put_out(on: Device) -> None:
+    """The judge integrates the rotation of the field from the outputs alone."""
+    begin = on.file.stat().st_size // 32 * 32
+    with driven(on, 2.0) as (drive, begin_ns, _):
+        drive.apply(currents(8.0, 1.0))
+        now_ns = time.monotonic_ns() - 300_000_000
+        found = drive.put_out(time.monotonic_ns()).turns(begin_ns, now_ns)
+    times, outputs = read_samples(on.file, FULL_A if on.kind == "serial" else 1.0, begin)
+    kept = (times >= begin_ns) & (times <= now_ns)
+    bias = field_limits(COILS).bias_a
+    field = (outputs[kept] + bias) @ np.array(COILS.mt_per_a).T
+    size = np.linalg.norm(field, axis=1)
+    field = field[size > 3.9]  # at the full amplitude: the bias compensation is complete
+    # The horizontal heading h of a roller: z turns towards h, so z x h is the axis, and b x db its direction.
+    b = field / np.linalg.norm(field, axis=1)[:, None]
+    axis = np.cross(b[:-1], b[1:]).sum(axis=0) / (2 * math.pi)
+    wanted = np.array([axis[1], -axis[0]])
+    assert np.hypot(*wanted) > 5.0
+    ramp = 0.25 * 8.0  # turns on the ramp, which the judge leaves out
+    assert np.hypot(*(found - wanted)) < ramp
+    assert abs(math.remainder(math.atan2(found[1], found[0]) - math.atan2(wanted[1], wanted[0]), math.tau)) < 0.15
+
+
+def test_a_recorder_that_is_killed_stopped_or_stuck_has_no_field_within_the_timer(on: Device) -> None:
+    faults = ["kill"] * 3 + ["stop", "hang"] if on.kind == "serial" else ["kill", "stop"]
+    with sleeper() as delays:
+        ended = [(fault, trial(on, fault)) for fault in faults]
+    for fault, one in ended:
+        assert one is not None and one.off_s is not None, fault
+        assert one.off_s < 0.1 + max(delays) + SLACK_S, fault
+        assert one.stayed_off, fault
+        assert "guardian has switched the coils off: no beat" in one.said or fault != "stop"
+
+
+def test_a_recorder_whose_guardian_is_killed_takes_the_field_away_itself(serial: Device) -> None:
+    ended = trial(serial, "guardian")
+    assert ended is not None and ended.off_s is not None and ended.stayed_off
+    assert "guardian process has ended" in ended.said
+
+
+def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
+    begin = serial.file.stat().st_size // 32 * 32
+    limits = Limits(COILS, ROBOT, OUTPUT)
+    with Drive(amplifier("serial", serial.address), limits, 0.1, 0.3) as drive:
+        drive.apply(currents(5.0, 0.0))
+        begin_s = time.monotonic()
+        while time.monotonic() < begin_s + 1.0:
+            drive.beat()
+            time.sleep(0.01)
+        with pytest.raises(RigError, match="no beat of the loop for 100 ms"):
+            drive.apply(currents(5.0, 0.0))
+    assert serial.off_ns(0, begin) is not None
+
+
+def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
+    begin = on.file.stat().st_size // 32 * 32
+    with driven(on, 0.4) as (drive, begin_ns, _):
+        drive.zero()
+        off_ns = on.off_ns(begin_ns, begin)
+        for _ in range(20):
+            drive.apply(currents(5.0, 0.0))
+            drive.beat()
+            time.sleep(0.01)
+        drive.zero()
+        log = drive.put_out(time.monotonic_ns())
+        assert log.at(time.monotonic_ns()).amplitude_mt == 0.0 and log.at(begin_ns + 390_000_000).amplitude_mt > 3.0
+    assert off_ns is not None and on.off_ns(begin_ns, begin) == off_ns
+
+
+def test_an_ni_output_that_runs_dry_is_counted_and_ends_in_zero(ni: Device) -> None:
+    begin = ni.file.stat().st_size // 32 * 32
+    with driven(ni, 0.4) as (drive, begin_ns, _):
+        process = drive._amplifier._process  # type: ignore[attr-defined]
+        process.send_signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        process.send_signal(signal.SIGCONT)
+        until(lambda: drive._amplifier._hear() or drive._amplifier.underruns)  # type: ignore[attr-defined]
+        with pytest.raises(RigError, match="ran dry"):
+            drive.beat()
+    assert ni.off_ns(begin_ns, begin) is not None
+
+
+def test_a_guardian_that_can_not_act_does_not_start() -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with pytest.raises(RigError, match=r"does not start: .*zero failed.*nothing is energised"):
+        Guardian(("serial", str(write)), (write,)).__enter__()
+    os.close(write)
+
+
+def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
+    serial: Device, ni: Device, tmp_path: Path
+) -> None:
+    begins = {one: one.file.stat().st_size // 32 * 32 for one in (serial, ni)}
+    master, slave = os.openpty()
+    strong = replace(COILS, max_current_a=7.0)
+    cases = [
+        (amplifier("serial", ""), COILS, "lab.port: which serial port"),
+        (amplifier("serial", str(tmp_path / "ttyNone")), COILS, "ports here"),
+        (amplifier("serial", serial.address), strong, "coils.max_current_a = 7 A: flowrec-coils makes at most 5 A"),
+        (amplifier("ni", "127.0.0.1:1"), COILS, "no NI gRPC Device Server"),
+    ]
+    for given, coils, words in cases:
+        with pytest.raises(FlowrecError) as refused, Drive(given, Limits(coils, ROBOT, OutputLimits()), 0.1, 1.0):
+            pytest.fail("it opened")
+        assert words in str(refused.value) and "\n" not in str(refused.value)
+    with driven(serial), pytest.raises(RigError, match="another program uses this port"), driven(serial):
+        pass
+    for one, begin in begins.items():
+        assert not read_samples(one.file, from_byte=begin)[1].any()
+    os.close(master)
+    os.close(slave)
