@@ -1,6 +1,6 @@
 """The rig of a lab: a camera behind its queue, and coils behind their limits and their guardian.
 
-See cameras/grabber.py and amplifiers/drive.py. Stamps are on the session clock, which is the host's monotonic clock
+See cameras/grabber.py and drive.py. Stamps are on the session clock, which is the host's monotonic clock
 less the stamp of the first frame: the middle of the exposure, by the fit of the camera's own clock. `Applied` is made
 of what the amplifier put out, not of what it was told.
 
@@ -25,9 +25,9 @@ from flowrec.errors import RigError, UsageError
 from flowrec.messages import Applied, CameraLosses, Currents, Frame
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rig_settings import CAMERAS
-from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
+from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.units import nanoseconds
 
 _ABSENT_S = 0.1  # between ticks without an image
