@@ -15,11 +15,10 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.config import ResolvedConfig
 from flowrec.control.field_log import FieldLog
 from flowrec.control.field_rotation import FieldCommand
 from flowrec.errors import RigError, UsageError
@@ -28,6 +27,9 @@ from flowrec.rig_settings import AMPLIFIERS
 from flowrec.rigs.lab.amplifiers.amplifier import Amplifier, AmplifierInfo
 from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
+
+if TYPE_CHECKING:
+    from flowrec.config import ResolvedConfig  # with every stage: this module starts without them
 
 BEAT_S = 0.02  # between beats, at most, while the loop waits for a frame
 _REST = FieldCommand()

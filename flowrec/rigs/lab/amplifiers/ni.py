@@ -9,12 +9,11 @@ import time
 from collections import deque
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
 import numpy as np
 
-from flowrec.config import ResolvedConfig
 from flowrec.control.field_log import FieldLog
 from flowrec.control.field_rotation import FieldCommand
 from flowrec.errors import RigError
@@ -22,6 +21,9 @@ from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.rigs.lab.amplifiers.ni_orders import Played, Settings
 from flowrec.system.processes import child_command, child_environment
 from flowrec.units import NS_PER_S
+
+if TYPE_CHECKING:
+    from flowrec.config import ResolvedConfig  # with every stage: this module starts without them
 
 _START_S = 60.0  # the package of NI takes seconds to load on a busy computer, and so does a device
 _ZERO_S = 0.5

@@ -15,14 +15,13 @@ import select
 import threading
 import time
 from collections import deque
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import serial
 from serial.tools import list_ports
 
 from flowrec.clocks import DeviceClock
 from flowrec.clocks.device_clock import Fit
-from flowrec.config import ResolvedConfig
 from flowrec.control.coils import Coils
 from flowrec.control.field_log import FieldLog
 from flowrec.control.field_rotation import FieldCommand
@@ -41,6 +40,9 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
 )
 from flowrec.system.processes import realtime_priority
 from flowrec.units import NS_PER_S, seconds
+
+if TYPE_CHECKING:
+    from flowrec.config import ResolvedConfig  # with every stage: this module starts without them
 
 _BOOT_S = 4.0  # many boards start anew when their port is opened
 _ASK_S = 0.25
