@@ -18,6 +18,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Annotated
 
@@ -26,10 +28,14 @@ import typer
 
 from flowrec.bench.harness import Results, run
 from flowrec.terminal import progress, table
+from tests.perf import guardian_trial
 from tests.twins.firmware import SAMPLE, compiled, firmware_twin, read_samples
 
 TIMER_S = 0.1
 _START_S, _AFTER_S = 90.0, 0.6
+# Recorders are forked from a process that has loaded all they need.
+_CONTEXT = get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["tests.perf.guardian_trial", "flowrec.rigs.lab.amplifiers.serial_line"])
 _ROOT = Path(__file__).parents[2]
 _SLEEPER = """
 import sys, time
@@ -91,69 +97,69 @@ def trial(on: Device, fault: str, silence_s: float = TIMER_S) -> Ended | None:
     `guardian`: kill of the guardian alone; `signals`: SIGINT, SIGTERM and SIGHUP to the guardian, then the kill.
     """
     own = fault if fault in ("hang", "spin") else ""
-    words = [sys.executable, "-m", "tests.perf.guardian_trial", on.kind, on.address, str(silence_s), own]
     begin = on.file.stat().st_size // SAMPLE.itemsize * SAMPLE.itemsize
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=_ROOT, env=_env()) as recorder:
-        try:
-            helpers = _wait_on(recorder)
-            if helpers is None:
-                return None
-            said = ""
-            if own:
-                fault_ns = int(_line(recorder, "fault").split()[1])
-            else:
-                time.sleep(random.uniform(0.05, 0.3))
-                fault_ns = _harm(fault, recorder, helpers)
-            time.sleep(_AFTER_S)
-            off_ns = on.off_ns(fault_ns, begin)
-            if fault == "stop":
-                recorder.send_signal(signal.SIGCONT)
-                said = _line(recorder, "failed")
-            elif fault == "guardian":
-                said = _line(recorder, "failed")
-            again_ns = on.off_ns(fault_ns, begin)
-            return Ended(None if off_ns is None else 1e-9 * (off_ns - fault_ns), said, off_ns == again_ns)
-        finally:
-            recorder.kill()
+    said, says = _CONTEXT.Pipe(duplex=False)
+    recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, own))
+    recorder.start()
+    says.close()
+    assert recorder.pid is not None
+    try:
+        helpers = _wait_on(said)
+        if helpers is None:
+            return None
+        if own:
+            fault_ns = int(_line(said, "fault").split()[1])
+        else:
+            time.sleep(random.uniform(0.05, 0.3))
+            fault_ns = _harm(fault, recorder.pid, helpers)
+        time.sleep(_AFTER_S)
+        off_ns = on.off_ns(fault_ns, begin)
+        last = ""
+        if fault == "stop":
+            os.kill(recorder.pid, signal.SIGCONT)
+        if fault in ("stop", "guardian"):
+            last = _line(said, "failed")
+        again_ns = on.off_ns(fault_ns, begin)
+        return Ended(None if off_ns is None else 1e-9 * (off_ns - fault_ns), last, off_ns == again_ns)
+    finally:
+        recorder.kill()
+        recorder.join()
+        said.close()
 
 
-def _harm(fault: str, recorder: subprocess.Popen[str], helpers: dict[str, int]) -> int:
+def _harm(fault: str, recorder: int, helpers: dict[str, int]) -> int:
     if fault == "signals":
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             os.kill(helpers["guardian"], number)
-    victim = helpers["guardian"] if fault == "guardian" else recorder.pid
     fault_ns = time.monotonic_ns()
+    victim = helpers["guardian"] if fault == "guardian" else recorder
     os.kill(victim, signal.SIGSTOP if fault == "stop" else signal.SIGKILL)
     if fault == "kill both" and "process" in helpers:
         os.kill(helpers["process"], signal.SIGKILL)
     return fault_ns
 
 
-def _wait_on(recorder: subprocess.Popen[str]) -> dict[str, int] | None:
+def _wait_on(said: Connection) -> dict[str, int] | None:
     helpers: dict[str, int] = {}
-    while True:
-        line = _line(recorder)
-        if line == "on":
-            return helpers
+    while (line := _line(said)) != "on":
         name, _, number = line.partition(" ")
         if name not in ("guardian", "process"):
             print(line, file=sys.stderr)
             return None
         helpers[name] = int(number)
+    return helpers
 
 
-def _line(recorder: subprocess.Popen[str], word: str = "") -> str:
-    """The next line of the recorder that begins with a word; it is killed when none comes."""
-    assert recorder.stdout is not None
-    timer = threading.Timer(_START_S, recorder.kill)
-    timer.start()
+def _line(said: Connection, word: str = "") -> str:
+    """The next line of the recorder that begins with a word."""
     try:
-        for line in recorder.stdout:
+        while said.poll(_START_S):
+            line: str = said.recv()
             if line.startswith(word):
-                return line.strip()
+                return line
+    except EOFError:
         return "it has ended"
-    finally:
-        timer.cancel()
+    return "it says nothing"
 
 
 def _env() -> dict[str, str]:
@@ -162,17 +168,25 @@ def _env() -> dict[str, str]:
 
 @contextmanager
 def sleeper(timer_s: float = TIMER_S) -> Iterator[list[float]]:
-    """Context in which another process measures sleeps; the list holds their delays in s."""
-    worst: list[float] = []
-    with subprocess.Popen([sys.executable, "-c", _SLEEPER, str(timer_s)], stdout=subprocess.PIPE, text=True) as process:
+    """Context in which other processes, as many as a trip takes, measure sleeps; the list holds their delays in s."""
+    delays: list[float] = []
+    command = [sys.executable, "-c", _SLEEPER, str(timer_s)]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+
+    def collect(process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
-        lines = process.stdout
-        thread = threading.Thread(target=lambda: worst.extend(float(line) for line in lines), daemon=True)
+        with process.stdout:
+            delays.extend(float(line) for line in process.stdout)
+
+    threads = [threading.Thread(target=collect, args=(process,), daemon=True) for process in processes]
+    for thread in threads:
         thread.start()
-        try:
-            yield worst
-        finally:
+    try:
+        yield delays
+    finally:
+        for process, thread in zip(processes, threads, strict=True):
             process.kill()
+            process.wait()
             thread.join()
 
 

@@ -1,14 +1,15 @@
-"""A recorder with its coils on, until something is done to it: `guardian_trial KIND ADDRESS SILENCE_S [FAULT]`.
+"""A recorder with its coils on, until something is done to it.
 
-It prints `on` when the field is at its full amplitude, and `failed TEXT` when the coils are lost. FAULT `hang` makes it
-keep the interpreter's lock in C from then on, `spin` makes it compute without an end, both after printing the time.
+It says `on` when the field is at its full amplitude, and `failed TEXT` when the coils are lost. The fault `hang` makes
+it keep the interpreter's lock in C from then on, `spin` makes it compute without an end, both after saying the time.
 """
 
 from __future__ import annotations
 
 import ctypes
-import sys
 import time
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 
 import numpy as np
 
@@ -55,13 +56,12 @@ def currents(frequency_hz: float, heading_rad: float, amplitude_mt: float = 4.0)
     )
 
 
-def main(kind: str, address: str, silence_s: str, fault: str = "") -> None:
-    """See above."""
-    limits = Limits(COILS, ROBOT, OUTPUT, lambda text: print(text, flush=True))
-    with Drive(amplifier(kind, address, float(silence_s)), limits, float(silence_s), 1.0) as drive:
-        print("guardian", drive._guardian._process.pid, flush=True)
+def record(say: Callable[[str], None], kind: str, address: str, silence_s: float, fault: str) -> None:
+    """Drive the coils until it is killed."""
+    with Drive(amplifier(kind, address, silence_s), Limits(COILS, ROBOT, OUTPUT, say), silence_s, 1.0) as drive:
+        say(f"guardian {drive._guardian._process.pid}")
         if kind == "ni":
-            print("process", drive._amplifier._process.pid, flush=True)
+            say(f"process {drive._amplifier._process.pid}")
         number, said, before_ns = 0, False, None
         while True:
             drive.apply(currents(8.0 + 6.0 * np.sin(0.05 * number), 0.02 * number))
@@ -74,20 +74,21 @@ def main(kind: str, address: str, silence_s: str, fault: str = "") -> None:
             applied = drive.applied(now_ns, before_ns)
             before_ns = now_ns
             if not said and applied.amplitude_mt >= 3.999:
-                print("on", flush=True)
+                say("on")
                 said = True
                 faulty_s = time.monotonic() + 0.2
             if said and fault and time.monotonic() > faulty_s:
-                print("fault", time.monotonic_ns(), flush=True)
+                say(f"fault {time.monotonic_ns()}")
                 if fault == "hang":
                     ctypes.PyDLL(None).usleep(3_000_000)
                 while fault == "spin":
                     pass
 
 
-if __name__ == "__main__":
+def main(connection: Connection, kind: str, address: str, silence_s: float, fault: str) -> None:
+    """The process; it says on the connection what the module's docstring states."""
     try:
         with realtime_priority():  # as flowrec record has it
-            main(*sys.argv[1:])
+            record(connection.send, kind, address, silence_s, fault)
     except RigError as error:
-        print("failed", error, flush=True)
+        connection.send(f"failed {error}")
