@@ -201,7 +201,7 @@ def _coils(config: ResolvedConfig) -> Iterator[Finding]:
     if config.mission.observes:
         yield Finding("coils", OK, "not used by a mission that observes")
         return
-    from flowrec.rigs.lab.amplifiers.drive import probe
+    from flowrec.rigs.lab.drive import probe
 
     seen = probe(config)
     info = seen.info
