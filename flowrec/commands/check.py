@@ -222,7 +222,9 @@ class _FileCheck:
                 "by the queue before the loop": losses.backlog,
             }
             causes = ", ".join(f"{count} {cause}" for cause, count in lost.items() if count) or "none lost"
-            verdict.fact("losses", f"{losses.ids} images numbered, {losses.frames} handed on; {causes}")
+            by_s = seconds(losses.stamp_ns - found.first_ns)
+            counts = f"of {losses.ids} images that the camera has numbered by {by_s:.1f} s, {losses.frames} came"
+            verdict.fact("losses", f"{counts}; {causes}")
             if losses.triggers:
                 verdict.odd("drops", f"{losses.triggers} triggers that the camera has not answered")
             if losses.reconnections:

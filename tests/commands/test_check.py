@@ -135,13 +135,17 @@ def test_images_that_were_dropped_are_told_apart_from_those_that_are_missing(tmp
 
 
 def test_what_a_camera_has_lost_is_told_by_cause(tmp_path):
-    losses = [CameraLosses(0, 10, 10, 0, 0, 0, 0, 0, 0), CameraLosses(1, 90, 60, 3, 20, 0, 7, 2, 1)]
+    losses = [
+        CameraLosses(at_ns, *of)
+        for at_ns, of in ((10**9, (10, 10, 0, 0, 0, 0, 0, 0)), (2 * 10**9, (90, 60, 3, 20, 0, 7, 2, 1)))
+    ]
     with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
         for number, tick in enumerate(ticks_of(20)):
             writer.write(replace(tick, losses=losses[number >= 10]))
     verdict = check(tmp_path / "s.mcap")
     assert verdict.facts["losses"] == (
-        "90 images numbered, 60 handed on; 3 on the link, 20 incomplete, 7 by the queue before the loop"
+        "of 90 images that the camera has numbered by 1.0 s, 60 came; "
+        "3 on the link, 20 incomplete, 7 by the queue before the loop"
     )
     said = " ".join(text for _, text in found(verdict))
     assert "2 triggers that the camera has not answered" in said and "the camera was absent 1 times" in said
