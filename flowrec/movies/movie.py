@@ -35,6 +35,7 @@ MOVIE_READERS = Methods(
 )
 LARGEST_PX, SMALLEST_PX = 16_384, 8  # as of camera.width_px and height_px
 MOST_PIXELS = 150_000_000
+MOST_IMAGES = 20_000_000
 _ONLY = "only the first"
 _MEDIAN_BYTES = 400_000_000  # of the images that a median is taken of
 _BEGINNINGS = {
@@ -225,6 +226,22 @@ def checked_size(path: Path, width_px: int, height_px: int) -> tuple[int, int]:
             f"be read, and {MOST_PIXELS / 1e6:g} million in all; crop or bin them"
         )
     return width_px, height_px
+
+
+def checked_count(path: Path, count: int) -> int:
+    """The number of images that a header declares, before a list of that length is made; MovieError if it is absurd."""
+    if not 0 < count <= MOST_IMAGES:
+        raise MovieError(f"{path}: declares {count} images; from 1 to {MOST_IMAGES / 1e6:g} million can be read")
+    return count
+
+
+def refuse_missing(image: Image, path: Path, index: int) -> Image:
+    """The image, of a format that returns zeros where its data is missing; MovieError if it is nothing else."""
+    if not image.any():
+        raise MovieError(
+            f"{path}: image {index} holds nothing but 0: its data is missing, or the file was copied in part"
+        )
+    return image
 
 
 def depth_of(significant: int, asked: int | None) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,7 +16,16 @@ from numpy.typing import NDArray
 from flowrec.declarations import Image
 from flowrec.errors import MovieError
 from flowrec.movies.grey import grey_image
-from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_size, depth_of, whole_ns
+from flowrec.movies.movie import (
+    Movie,
+    MovieFacts,
+    ReadOptions,
+    checked_count,
+    checked_size,
+    depth_of,
+    refuse_missing,
+    whole_ns,
+)
 
 _S_PER_MS = 1e-3
 
@@ -49,7 +60,7 @@ class NikonMovie(Movie):
                 f"{self.path}: has more than one series of images ({named}); export one channel and one plane"
             )
         attributes = file.attributes
-        count = int(attributes.sequenceCount)
+        count = checked_count(self.path, math.prod(long.values()) if long else int(attributes.sequenceCount))
         times = _times_s(file, count)
         stated = attributes.bitsPerComponentSignificant
         lossy = (attributes.compressionType or "").lower() == "lossy"
@@ -74,21 +85,26 @@ class NikonMovie(Movie):
 
     def image(self, index: int) -> Image:
         try:
-            array: NDArray[Any] = np.asarray(self._file.read_frame(index))
+            # A copy: what the library returns is memory of the file, which is gone when the file is closed.
+            array: NDArray[Any] = np.array(self._file.read_frame(index))
         except Exception as error:  # of many kinds, by the version of the format
             raise MovieError(f"{self.path}: image {index} can not be read ({error})") from error
-        if array.ndim == 3:  # components, height, width
-            array = np.moveaxis(array, 0, 2) if array.shape[0] in (1, 3) else array
-        return grey_image(array, self.options.channel, self.facts.bits, self.path, index)
+        if array.ndim == 3 and array.shape[0] in (1, 3) and array.shape[2] not in (1, 3):  # components first
+            array = np.moveaxis(array, 0, 2)
+        image = grey_image(array, self.options.channel, self.facts.bits, self.path, index)
+        return refuse_missing(image, self.path, index)
 
 
 def _times_s(file: Any, count: int) -> NDArray[np.float64] | None:
     """Acquisition time of each image since the start of the acquisition; None if one is missing."""
     times = []
-    for index in range(count):
-        metadata = file.frame_metadata(index)
-        channels = getattr(metadata, "channels", None)
-        if not channels:
-            return None
-        times.append(channels[0].time.relativeTimeMs * _S_PER_MS)
+    with warnings.catch_warnings(action="ignore"):  # it warns of a file without times
+        for index in range(count):
+            try:
+                channels = getattr(file.frame_metadata(index), "channels", None)
+            except IndexError:
+                return None
+            if not channels:
+                return None
+            times.append(channels[0].time.relativeTimeMs * _S_PER_MS)
     return np.array(times)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
@@ -25,13 +26,8 @@ class OmeFacts:
 
 def ome_facts(xml: str, frames: int) -> OmeFacts:
     """Read the first image of an OME-XML text; what is damaged there counts as not stated."""
-    if len(xml) > _LIMIT_CHARACTERS:
-        return OmeFacts()
-    try:
-        root = ElementTree.fromstring(xml.encode())  # noqa: S314  expat bounds the expansion of entities
-    except ElementTree.ParseError:
-        return OmeFacts()
-    pixels = next((each for each in root.iter() if _name(each) == "Pixels"), None)
+    root = _root(xml)
+    pixels = None if root is None else next((each for each in root.iter() if _name(each) == "Pixels"), None)
     if pixels is None:
         return OmeFacts()
     given = pixels.attrib
@@ -44,6 +40,20 @@ def ome_facts(xml: str, frames: int) -> OmeFacts:
     )
 
 
+def declared_planes(xml: str) -> int:
+    """How many planes the images of an OME-XML text declare in all, whether they exist or not; at least 1."""
+    root = _root(xml)
+    if root is None:
+        return 1
+    total = 0
+    for pixels in root.iter():
+        if _name(pixels) == "Pixels":
+            sizes = [_number(pixels.get(f"Size{axis}")) or 1.0 for axis in "TZC"]
+            blocks = [_number(block.get("PlaneCount")) or 1.0 for block in pixels if _name(block) == "TiffData"]
+            total += int(min(max(math.prod(sizes), sum(blocks)), 1e15))
+    return max(total, 1)
+
+
 def seconds_per(unit: str | None) -> float | None:
     """Length of a unit of time in s, by its short or long name; None: unknown."""
     short = {"second": "s", "millisecond": "ms", "microsecond": "us", "nanosecond": "ns", "minute": "min", "hour": "h"}
@@ -54,6 +64,15 @@ def um_per(unit: str | None) -> float | None:
     """Length of a unit of length in um, by its short or long name; None: unknown."""
     short = {"micrometer": "um", "nanometer": "nm", "millimeter": "mm", "centimeter": "cm", "meter": "m"}
     return _UM_PER.get(short.get(unit or "", unit or ""))
+
+
+def _root(xml: str) -> ElementTree.Element | None:
+    if len(xml) > _LIMIT_CHARACTERS:
+        return None
+    try:
+        return ElementTree.fromstring(xml.encode())  # noqa: S314  expat bounds the expansion of entities
+    except ElementTree.ParseError:
+        return None
 
 
 def _times_s(pixels: ElementTree.Element, frames: int) -> NDArray[np.float64] | None:

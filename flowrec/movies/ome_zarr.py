@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from flowrec.declarations import Image
 from flowrec.errors import MovieError
 from flowrec.movies.grey import grey_image, refuse_other_type
-from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_size, depth_of, whole_ns
+from flowrec.movies.movie import (
+    Movie,
+    MovieFacts,
+    ReadOptions,
+    checked_count,
+    checked_size,
+    depth_of,
+    refuse_missing,
+    whole_ns,
+)
 from flowrec.movies.ome import OmeFacts, ome_facts, seconds_per, um_per
 
 _LARGEST_CHUNK_BYTES = 1 << 30
@@ -46,7 +55,7 @@ class ZarrMovie(Movie):
 
     def _facts(self, axes: list[str], scale: list[tuple[float, str | None]]) -> MovieFacts:
         array, along = self._array, self._along
-        count = array.shape[along] if along is not None else 1
+        count = checked_count(self.path, array.shape[along] if along is not None else 1)
         refuse_other_type(self.path, array.dtype)
         remarks = []
         bits = depth_of(self._ome.bits or 8 * array.dtype.itemsize, self.options.bits)
@@ -79,7 +88,8 @@ class ZarrMovie(Movie):
         )
 
     def image(self, index: int) -> Image:
-        return grey_image(self._plane(index), self.options.channel, self.facts.bits, self.path, index)
+        image = grey_image(self._plane(index), self.options.channel, self.facts.bits, self.path, index)
+        return refuse_missing(image, self.path, index)
 
     def _plane(self, index: int) -> NDArray[Any]:
         """One image, of the chunk that is held; that is read when it is another one."""

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from flowrec.declarations import Image
 from flowrec.errors import MovieError
 from flowrec.movies.grey import grey_image, refuse_other_type
-from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_size, depth_of, whole_ns
-from flowrec.movies.ome import OmeFacts, ome_facts, um_per
+from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_count, checked_size, depth_of, whole_ns
+from flowrec.movies.ome import OmeFacts, declared_planes, ome_facts, um_per
 
 _LOSSY = ("JPEG", "JPEG_LOSSY", "OJPEG", "WEBP", "JPEGXR", "JPEGXL", "JPEG2000", "JETRAW")
 _MINISWHITE, _PALETTE = 0, 3
@@ -31,6 +31,8 @@ class TiffMovie(Movie):
             try:
                 with _logged() as complaints:
                     self._file = refused.enter_context(tifffile.TiffFile(path))
+                    if self._file.is_ome:  # before tifffile makes a list of all that the text declares
+                        checked_count(path, declared_planes(self._file.ome_metadata or ""))
                     self._pages = self._pages_of(self._file)
                     self.facts = self._facts()
                 if complaints:
@@ -43,7 +45,8 @@ class TiffMovie(Movie):
             refused.pop_all()
 
     def _unreadable(self, error: Exception) -> MovieError:
-        return MovieError(f"{self.path}: is no TIFF that can be read ({error}); the file is damaged or cut short")
+        why = str(error) or type(error).__name__
+        return MovieError(f"{self.path}: is no TIFF that can be read ({why}); the file is damaged or cut short")
 
     def close(self) -> None:
         self._file.close()
@@ -125,12 +128,25 @@ class TiffMovie(Movie):
     def image(self, index: int) -> Image:
         page = self._pages[index]
         try:
-            array = np.asarray(page if isinstance(page, np.ndarray) else page.asarray())
+            array = np.asarray(page) if isinstance(page, np.ndarray) else _decoded(page)
         except Exception as error:  # of many kinds, by the codec
             raise MovieError(f"{self.path}: image {index} can not be decoded ({error})") from error
         if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[2] not in (3, 4):  # one plane per colour
             array = np.moveaxis(array, 0, 2)
         return grey_image(array, self.options.channel, self.facts.bits, self.path, index)
+
+
+def _decoded(page: Any) -> NDArray[Any]:
+    """The pixels of a page; tifffile has closed the other files of an OME series."""
+    file = page.parent.filehandle
+    was_closed = file.closed
+    if was_closed:
+        file.open()
+    try:
+        return np.asarray(page.asarray())
+    finally:
+        if was_closed:
+            file.close()
 
 
 @contextmanager

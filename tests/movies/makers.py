@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from fractions import Fraction
 from pathlib import Path
 
@@ -98,3 +99,69 @@ def folder(path: Path, images, name: str = "img_{}.png") -> Path:
         assert ok
         (path / name.format(number)).write_bytes(data.tobytes())
     return path
+
+
+def nd2(path: Path, images, times_s, bits: int = 12, um_per_px: float = 0.65) -> Path:
+    """A minimal ND2 file of version 3: chunks with attributes, planes, time loop, times and images, then their map."""
+    height, width = images[0].shape
+    step = images[0].dtype.itemsize
+    attributes = _level(
+        "SLxImageAttributes",
+        _uint("uiWidth", width), _uint("uiHeight", height), _uint("uiWidthBytes", width * step), _uint("uiComp", 1),
+        _uint("uiBpcInMemory", 8 * step), _uint("uiBpcSignificant", bits), _uint("uiSequenceCount", len(images)),
+    )  # fmt: skip
+    probe = _level("pFluorescentProbe", _bool("m_bIsUsed", False))  # without one the library fails
+    plane = _level("a0", _uint("uiCompCount", 1), _uint("uiSampleIndex", 0), probe)
+    planes = _level("sPicturePlanes", _uint("uiCount", 1), _level("sPlaneNew", plane))
+    metadata = _level("SLxPictureMetadata", _double("dCalibration", um_per_px), _bool("bCalibrated", True), planes)
+    loop = _level(
+        "uLoopPars", _uint("uiCount", len(images)), *(_double(key, 0.0) for key in ("dStart", "dPeriod", "dDuration"))
+    )
+    experiment = _level("SLxExperiment", _uint("eType", 1), loop)
+    chunks = {
+        "ImageAttributesLV!": attributes,
+        "ImageMetadataLV!": experiment,
+        "ImageMetadataSeqLV|0!": metadata,
+        "CustomData|AcqTimesCache!": (1e3 * np.asarray(times_s, np.float64)).tobytes(),
+    }
+    for number, image in enumerate(images):
+        chunks[f"ImageDataSeq|{number}!"] = struct.pack("<d", 1e3 * times_s[number]) + image.tobytes()
+    with path.open("wb") as file:
+        file.write(_chunk(b"ND2 FILE SIGNATURE CHUNK NAME01!", 32, b"Ver3.0".ljust(64, b"\0")))
+        places = b""
+        for name, data in chunks.items():
+            file.write(bytes(-file.tell() % 4096))
+            places += name.encode() + struct.pack("<QQ", file.tell(), len(data))
+            # The pixels begin 4096 bytes after the chunk: 16 of its head, its name, 8 of the time.
+            file.write(_chunk(name.encode(), 4072 if name.startswith("ImageDataSeq") else 64, data))
+        where = file.tell()
+        end = b"ND2 CHUNK MAP SIGNATURE 0000001!" + struct.pack("<Q", where)
+        file.write(_chunk(b"ND2 FILEMAP SIGNATURE NAME 0001!", 32, places + end))
+    return path
+
+
+def _chunk(name: bytes, length: int, data: bytes) -> bytes:
+    return struct.pack("<IIQ", 0x0ABECEDA, length, len(data)) + name.ljust(length, b"\0") + data
+
+
+def _item(kind: int, name: str, data: bytes) -> bytes:
+    return bytes([kind, len(name) + 1]) + (name + "\0").encode("utf-16-le") + data
+
+
+def _uint(name: str, value: int) -> bytes:
+    return _item(3, name, struct.pack("<I", value))
+
+
+def _double(name: str, value: float) -> bytes:
+    return _item(6, name, struct.pack("<d", value))
+
+
+def _bool(name: str, value: bool) -> bytes:
+    return _item(1, name, bytes([value]))
+
+
+def _level(name: str, *items: bytes) -> bytes:
+    head = len(_item(11, name, b"")) + 12
+    content = b"".join(items)
+    length = struct.pack("<IQ", len(items), head + len(content))
+    return _item(11, name, length) + content + bytes(8 * len(items))

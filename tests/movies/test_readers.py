@@ -48,6 +48,7 @@ LOSSLESS = {
     "12-bit ffv1": (12, lambda d, images: makers.video(d / "a12.mkv", "ffv1_12", images)),
     "raw avi": (8, lambda d, images: makers.video(d / "a.avi", "raw", images)),
     "luma of h264": (8, lambda d, images: makers.video(d / "a.mp4", "h264_lossless", images)),
+    "nd2": (12, lambda d, images: makers.nd2(d / "a.nd2", images, np.arange(COUNT) / 30)),
     "ome-zarr 0.5": (16, lambda d, images: makers.ome_zarr(d / "a.zarr", images, 0.05)),
     "ome-zarr 0.4": (8, lambda d, images: makers.ome_zarr(d / "b.zarr", images, 0.05, "0.4", "tyx", 5)),
 }
@@ -75,6 +76,7 @@ def test_times_are_those_of_the_file_where_it_has_them(tmp_path):
         makers.video(tmp_path / "v.mkv", "ffv1", images, times_ms=TIMES_MS),
         makers.video(tmp_path / "v.mp4", "h264", images, times_ms=TIMES_MS),
         makers.ome_tiff(tmp_path / "v.ome.tif", images, np.array(TIMES_MS) / 1e3),
+        makers.nd2(tmp_path / "v.nd2", images, np.array(TIMES_MS) / 1e3, 8),
     ]
     for path in made:
         facts, frames, _ = read(path)
@@ -230,6 +232,56 @@ def test_a_folder_is_read_in_natural_order_also_with_odd_names(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(MovieError, match="no image is in this folder"):
         open_movie(tmp_path / "empty")
+
+
+def test_what_a_header_declares_is_not_believed(tmp_path):
+    """A billion images cost no memory, and data that is missing is not taken for black images."""
+    images = pictures()
+    xml = tifffile.TiffFile(makers.ome_tiff(tmp_path / "a.ome.tif", images))
+    text = xml.ome_metadata.replace('SizeT="12"', 'SizeT="1000000000"').replace(
+        'PlaneCount="12"', 'PlaneCount="1000000000"'
+    )
+    xml.close()
+    tifffile.imwrite(tmp_path / "declared.tif", np.stack(images), description=text.encode(), metadata=None)
+    makers.ome_zarr(tmp_path / "declared.zarr", images, 0.1, axes="tyx", chunk=1)
+    meta = tmp_path / "declared.zarr" / "0" / "zarr.json"
+    meta.write_text(meta.read_text().replace(f"{COUNT},", f"{10**9},", 1))
+    makers.ome_zarr(tmp_path / "part.zarr", images, 0.1, axes="tyx", chunk=1)
+    (tmp_path / "part.zarr" / "0" / "c" / "5" / "0" / "0").unlink()
+    for name in ("declared.tif", "declared.zarr"):
+        with pytest.raises(MovieError, match="declares 1000000000 images"):
+            read(tmp_path / name)
+    with pytest.raises(MovieError, match=r"image 5 holds nothing but 0: .* --partial takes the 5"):
+        read(tmp_path / "part.zarr")
+    assert len(read(tmp_path / "part.zarr", partial=True)[1]) == 5
+
+
+def test_a_series_of_several_ome_files_is_one_movie(tmp_path):
+    images = pictures(12)
+    uuids = [f"urn:uuid:00000000-0000-0000-0000-00000000000{n}" for n in range(3)]
+    planes = "".join(
+        f'<TiffData FirstT="{t}" IFD="{t % 4}" PlaneCount="1">'
+        f'<UUID FileName="part{t // 4}.ome.tif">{uuids[t // 4]}</UUID></TiffData>'
+        f'<Plane TheC="0" TheZ="0" TheT="{t}" DeltaT="{0.05 * t}"/>'
+        for t in range(12)
+    )
+    for n in range(3):
+        xml = (
+            f'<?xml version="1.0"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="{uuids[n]}">'
+            '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYCZT" Type="uint8" SizeX="64" SizeY="48" '
+            f'SizeC="1" SizeZ="1" SizeT="12"><Channel ID="Channel:0:0" SamplesPerPixel="1"/>{planes}</Pixels></Image>'
+            "</OME>"
+        )
+        part = np.stack(images[4 * n : 4 * n + 4]).astype(np.uint8)
+        tifffile.imwrite(
+            tmp_path / f"part{n}.ome.tif", part, description=xml.encode(), metadata=None, photometric="minisblack"
+        )
+    facts, frames, _ = read(tmp_path / "part0.ome.tif")
+    assert facts.frames == len(frames) == 12 and "DeltaT" in facts.times
+    np.testing.assert_array_equal([frame.image for frame in frames], [image.astype(np.uint8) for image in images])
+    (tmp_path / "part2.ome.tif").unlink()
+    with pytest.raises(MovieError, match=r"breaks off|no TIFF that can be read"):
+        read(tmp_path / "part0.ome.tif")
 
 
 def test_what_can_not_be_kept_exactly_is_refused(tmp_path):
