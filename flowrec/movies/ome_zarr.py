@@ -69,7 +69,7 @@ class ZarrMovie(Movie):
         if self._ome.times_s is not None and self._ome.times_s.any():
             times, text = whole_ns(self._ome.times_s), "OME DeltaT of each image"
         elif along is not None and axes[along] == "t" and second is not None and factor > 0.0:
-            times = whole_ns(np.arange(count) * factor * second)
+            times = whole_ns(np.arange(count, dtype=np.float64) * factor * second)
             text = f"the scale of the time axis, every {1e3 * factor * second:.4g} ms; nominal"
         um = um_per(scale[-1][1])
         return MovieFacts(
