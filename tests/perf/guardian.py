@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -27,6 +27,7 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run
+from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.terminal import progress, table
 from tests.perf import guardian_trial
 from tests.twins.firmware import SAMPLE, compiled, firmware_twin, read_samples
@@ -127,6 +128,44 @@ def trial(on: Device, fault: str, silence_s: float = TIMER_S) -> Ended | None:
         said.close()
 
 
+@dataclass
+class Blocks:
+    """A long output of NI blocks."""
+
+    seconds: float  # until it ran dry, or the end
+    largest_step_v: float
+    bound_v: float  # largest step of a continuous field within the limits
+    ran_dry: str  # what the recorder said; '': it did not run dry
+    zero: bool  # whether the outputs ended at zero
+
+
+def blocks(on: Device, seconds: float, silence_s: float = TIMER_S) -> Blocks:
+    """Put out a field for so long, with another frequency and heading in each frame; what the outputs did meanwhile."""
+    begin = on.file.stat().st_size // SAMPLE.itemsize * SAMPLE.itemsize
+    said, says = _CONTEXT.Pipe(duplex=False)
+    recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, ""))
+    recorder.start()
+    says.close()
+    try:
+        if _wait_on(said) is None:
+            raise RuntimeError("the recorder did not start")
+        begin_ns = time.monotonic_ns()
+        ran_dry = said.recv() if said.poll(seconds) else ""
+        end_ns = time.monotonic_ns()
+    finally:
+        recorder.kill()
+        recorder.join()
+        said.close()
+    time.sleep(_AFTER_S)
+    times, outputs = read_samples(on.file, from_byte=begin)
+    off_ns = on.off_ns(begin_ns, begin)
+    kept = outputs[(times >= begin_ns) & (times < min(end_ns, off_ns or end_ns) - 10_000_000)]
+    limits = Limits(guardian_trial.COILS, guardian_trial.ROBOT, guardian_trial.OUTPUT)
+    bound = limits.slew_a_s / guardian_trial.COILS.amplifier.output_hz / min(guardian_trial.COILS.amplifier.a_per_v)
+    step = float(np.abs(np.diff(kept, axis=0)).max())
+    return Blocks(1e-9 * (end_ns - begin_ns), step, bound, ran_dry, off_ns is not None)
+
+
 def _harm(fault: str, recorder: int, helpers: dict[str, int]) -> int:
     if fault == "signals":
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -208,14 +247,18 @@ def measure(
     others: Annotated[int, typer.Option(help="trials of each other fault")] = 5,
     load: Annotated[int, typer.Option(help="processes that compute meanwhile")] = 0,
     kinds: Annotated[str, typer.Option(help="devices, separated by commas")] = "serial,serial+timer,ni",
+    blocks_s: Annotated[float, typer.Option(help="time of NI blocks with every core busy; 0: none")] = 60.0,
 ) -> Results:
-    """Times from the fault to zero, by device and fault."""
-    rows = []
+    """Times from the fault to zero, by device and fault; the output of NI blocks on a busy machine."""
+    rows, long = [], None
     with tempfile.TemporaryDirectory() as folder, busy(load):
         for kind in kinds.split(","):
             faults = {"kill": kills, "stop": stops, "hang": others, "spin": others, "signals": others}
             faults |= {"guardian": others} | ({"kill both": others} if kind == "ni" else {})
             with device(kind, Path(folder)) as on:
+                if kind == "ni" and blocks_s:
+                    with busy(os.cpu_count() or 1):
+                        long = asdict(blocks(on, blocks_s))
                 for fault, count in faults.items():
                     with sleeper() as worst, progress(f"{kind} {fault}", count) as done:
                         ends, refused = [], 0
@@ -238,11 +281,13 @@ def measure(
                         }
                     )
                     print(f"{kind} {fault}: {np.round(1e3 * np.array(sorted(off_s)), 1).tolist()}", file=sys.stderr)
-    return {"rows": rows, "load": os.getloadavg()[0]}
+    return {"rows": rows, "load": os.getloadavg()[0], "blocks": long}
 
 
 def show(results: Results) -> None:
-    """Print the table."""
+    """Print the tables."""
+    if results["blocks"] is not None:
+        print("NI blocks, every core busy:", results["blocks"])
     table(
         f"time from the fault to zero; the timer is {1e3 * TIMER_S:.0f} ms; load {results['load']:.1f}",
         (

@@ -38,7 +38,8 @@ ONLY_HARDWARE = (
     "no program covers a dead computer or cable: a serial amplifier then has its own timer, an NI device holds its "
     "last voltage; use amplifiers with an enable input and an emergency stop in their supply"
 )
-_START_S = 30.0  # NI's package takes seconds to load on a busy computer
+SERIAL_ZERO = b"\nZ\n"  # as in serial_protocol.py, which would load much more
+_START_S = 60.0  # NI's package takes seconds to load on a busy computer
 _ANSWER_S = 0.5  # a guardian that has not read a beat for so long does not guard
 _REPORT_S = 3.0
 _TRY_S = 2.0  # for the guardian's attempts
@@ -276,7 +277,7 @@ def _serial_zero(port: int) -> Callable[[], str]:
         with contextlib.suppress(termios.error):
             termios.tcflush(port, termios.TCOFLUSH)  # what a stopped recorder has left in the queue
         for _ in range(5):
-            os.write(port, b"\nZ\n")
+            os.write(port, SERIAL_ZERO)
             # A recorder that lives may read the answer first: then the repetitions have to do.
             if select.select([port], [], [], 0.02)[0]:
                 with contextlib.suppress(BlockingIOError):

@@ -51,7 +51,7 @@ def on(request: pytest.FixtureRequest) -> Device:
 @contextlib.contextmanager
 def driven(on: Device, seconds: float = 0.0) -> Iterator[tuple[Drive, int, int]]:
     """A drive after so many seconds of commands, and the times of its first and last command."""
-    with Drive(amplifier(on.kind, on.address), Limits(COILS, ROBOT, OUTPUT), 1.0, 5.0) as drive:
+    with Drive(amplifier(on.kind, on.address, 5.0), Limits(COILS, ROBOT, OUTPUT), 1.0, 5.0) as drive:
         begin_ns, number = time.monotonic_ns(), 0
         while time.monotonic_ns() < begin_ns + seconds * 1e9:
             drive.apply(currents(8.0 + 6.0 * math.sin(0.05 * number), 0.03 * number))

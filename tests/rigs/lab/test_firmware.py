@@ -13,6 +13,7 @@ import pytest
 from flowrec.control.coils import Coils
 from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
+    ZERO,
     Reply,
     configuration,
     field_line,
@@ -20,6 +21,7 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
     reply,
     telemetry,
 )
+from flowrec.rigs.lab.guardian import SERIAL_ZERO
 from tests.twins.firmware import FULL_A, compiled, read_samples
 
 COILS = Coils(
@@ -140,13 +142,14 @@ def test_it_goes_to_zero_100_ms_after_the_last_valid_line_and_stays_there(board:
     assert not board.currents()[-50:].any()
 
 
+@pytest.mark.parametrize("zero", [ZERO, SERIAL_ZERO])
 @pytest.mark.parametrize("half", ["", "F 7 1000", "F 7 10000 0 4000 20000 1000000*12", "x" * 500])
-def test_newline_and_z_take_it_to_zero_at_once_after_any_half_line(board: Board, half: str) -> None:
+def test_newline_and_z_take_it_to_zero_at_once_after_any_half_line(board: Board, half: str, zero: bytes) -> None:
     board.arm()
     board.field(ON)
     board.run(20_000)
     assert board.currents()[-1].any()
-    board.text(f"{half}\nZ\n")
+    board.text(half + zero.decode())
     assert "Z" in verbs(board.run(400))
     assert not board.currents()[-1].any()
     assert verbs(board.field(ON)) == ["E"]  # only A leads out of it
