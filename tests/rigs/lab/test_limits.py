@@ -20,7 +20,7 @@ from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.robot import Robot
 
-RATE_HZ = 5000.0
+RATE_HZ = 2500.0
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=500.0, step_out_hz=30.0)
 COUPLED = ((2.1, 0.2, 0.1), (-0.3, 1.9, 0.2), (0.1, 0.2, 1.5))
 VOLTAGE = Coils(
@@ -37,7 +37,14 @@ numbers = st.one_of(
     st.floats(allow_nan=True, allow_infinity=True),
     st.floats(0.0, 60.0),
 )
-commands = st.lists(st.tuples(numbers, numbers, numbers, numbers, st.integers(1, 400)), min_size=1, max_size=12)
+likely = st.sampled_from([27.0, 27.0, 26.0, 10.0, 1e300])
+amplitudes = st.one_of(st.sampled_from([4.0, 4.0, 3.0, 1e300]), numbers)
+LONGEST = 700  # samples of one command
+commands = st.lists(
+    st.tuples(st.one_of(likely, numbers), numbers, amplitudes, st.one_of(likely, numbers), st.integers(1, LONGEST)),
+    min_size=1,
+    max_size=8,
+)
 
 
 class JudgedHere(Limits):
@@ -56,7 +63,7 @@ def command(frequency: float, heading: float, amplitude: float, limit: float) ->
     [(VOLTAGE, OutputLimits()), (CURRENT, SLEWED), (SUDDEN, SLEWED), (SUDDEN, OutputLimits())],
     ids=["voltage", "current, slew", "sudden, slew", "sudden"],
 )
-@settings(max_examples=40, phases=[Phase.explicit, Phase.reuse, Phase.generate])
+@settings(max_examples=25, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(sequence=commands)
 def test_no_sequence_of_commands_gets_a_sample_beyond_a_limit(
     coils: Coils, output: OutputLimits, sequence: list[tuple[float, float, float, float, int]]
@@ -77,7 +84,7 @@ def test_no_sequence_of_commands_gets_a_sample_beyond_a_limit(
         assert (np.abs(np.diff(i, axis=0)) * RATE_HZ <= output.slew_a_s * (1 + 1e-6)).all()
     off = np.flatnonzero(~(i != 0.0).any(axis=1))
     longest_s = np.diff(off, append=len(i)).max() / RATE_HZ
-    assert longest_s <= output.longest_on_s + limits.off_s + 400 / RATE_HZ  # a command may last that long
+    assert longest_s <= output.longest_on_s + limits.off_s + LONGEST / RATE_HZ  # a command may last that long
 
 
 def test_samples_beyond_a_limit_or_that_are_no_numbers_are_refused_whoever_made_them() -> None:
@@ -144,6 +151,6 @@ def test_the_phase_is_continuous_from_block_to_block_whatever_the_commands() -> 
     samples = []
     for _ in range(200):
         admitted = limits.admit(command(rng.uniform(0, 27), rng.uniform(-4, 4), CURRENT.amplitude_mt, 27.0), 0)
-        samples.append(waveform.block(admitted, 250).currents_a[:-1])
+        samples.append(waveform.block(admitted, 125).currents_a[:-1])
     step = np.abs(np.diff(np.concatenate(samples), axis=0)).max()
     assert step * RATE_HZ <= limits.slew_a_s * (1 + 1e-9)
