@@ -42,17 +42,22 @@ COMMON = (
 PATIENT = ("lab.guardian_s=1.0", "safety.guard_timeout_s=3.0", "lab.camera_timeout_s=1.0")
 
 
+@pytest.fixture(scope="module")
+def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled(tmp_path_factory.mktemp("firmware"))
+
+
 def words(sets: tuple[str, ...]) -> list[str]:
     return [word for text in sets for word in ("--set", text)]
 
 
-def test_a_mission_with_emulated_devices_arrives_and_replays_exactly(tmp_path: Path) -> None:
+def test_a_mission_with_emulated_devices_arrives_and_replays_exactly(firmware: Path, tmp_path: Path) -> None:
     config = load_config(None, [*COMMON, "camera.rate_hz=60.0", "simulated.seed=5"])
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
     session = tmp_path / "s.mcap"
     with (
-        firmware_twin(compiled(tmp_path), tmp_path / "outputs") as twin,
+        firmware_twin(firmware, tmp_path / "outputs") as twin,
         live_images(assemble(resolved, chip), resolved, twin.samples, tmp_path) as (features, positions),
     ):
         sets = (*COMMON, *PATIENT, "camera.rate_hz=20.0", "recording.anonymous=true", "lab.camera=pylon")
@@ -88,16 +93,15 @@ def test_a_mission_with_emulated_devices_arrives_and_replays_exactly(tmp_path: P
     [
         ("0", (), "pylon: no camera found"),
         ("2", (), "pylon: 2 cameras found; set lab.device"),
-        ("1", ('lab.port="/dev/nothing"',), "/dev/nothing"),
         ("1", ("coils.max_current_a=50.0",), "coils.max_current_a = 50 A: .* makes at most 5 A"),
     ],
 )
 def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_file_and_no_field(
-    cameras: str, sets: tuple[str, ...], told: str, tmp_path: Path
+    cameras: str, sets: tuple[str, ...], told: str, firmware: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    with firmware_twin(compiled(tmp_path), tmp_path / "outputs") as twin:
+    with firmware_twin(firmware, tmp_path / "outputs") as twin:
         given = (*COMMON, "camera.rate_hz=20.0", "lab.camera=pylon", f'lab.port="{twin.port}"', *sets)
         command = [sys.executable, "-m", "flowrec", "record", "--rig", "lab", "--out", str(out / "s.mcap")]
         done = subprocess.run(
