@@ -44,7 +44,7 @@ PATIENT = ("lab.guardian_s=1.0", "safety.guard_timeout_s=3.0", "lab.camera_timeo
 
 @pytest.fixture(scope="module")
 def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled(tmp_path_factory.mktemp("firmware"))
+    return compiled(tmp_path_factory.mktemp("firmware"), timer_ms=1000)
 
 
 def words(sets: tuple[str, ...]) -> list[str]:
