@@ -92,7 +92,8 @@ class Tracker:
     # Brightness of the robot relative to the background; auto: found out on the first image that shows it. None: auto
     # in a new run; a session recorded before this setting existed is replayed as it was, dark and with exact walls.
     polarity: Polarity | None = None
-    click_px: tuple[_Pixel, _Pixel] | None = None  # a point (column, row) on the robot: its look is learned there
+    # a point (column, row) on the robot, whose look is learned there; robot.radius_um should reach its border
+    click_px: tuple[_Pixel, _Pixel] | None = None
     box_px: tuple[_Pixel, _Pixel, _Pixel, _Pixel] | None = None  # the same by a box around it: x0, y0, x1, y1
     click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
     # the walls of the mask may be off by this many robot radii; ignored where polarity is None

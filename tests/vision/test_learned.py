@@ -23,6 +23,7 @@ from flowrec.messages import Appearance, Frame, Track
 from flowrec.robot import Robot
 from flowrec.store.reader import SessionReader
 from flowrec.vision import Tracker
+from flowrec.vision.learned import Candidates, Motion, assigned
 from tests.conftest import SMALL
 from tests.vision.test_tracker import CHIP, ROBOT, WALLS, Scene
 
@@ -105,12 +106,12 @@ def test_a_click_between_two_objects_takes_the_one_of_the_polarity(polarity: str
 
 def test_sixteen_bits_are_tracked_like_the_same_eight() -> None:
     made = film("ring")
-    deep = replace(made, images=[image.astype(np.uint16) * 257 for image in made.images], bits=16)
+    deep = replace(made, images=[image.astype(np.uint16) * 250 for image in made.images], bits=16)
     click = (float(made.centres_px[0, 0]), float(made.centres_px[0, 1]))
     tracker = Tracker(polarity="auto", click_px=click)
     np.testing.assert_allclose(misses(follow(deep, tracker), deep), misses(follow(made, tracker), made), atol=1e-3)
     dark = film("dark disc, vignette")
-    deep = replace(dark, images=[image.astype(np.uint16) * 257 for image in dark.images], bits=16)
+    deep = replace(dark, images=[image.astype(np.uint16) * 250 for image in dark.images], bits=16)
     assert np.abs(misses(follow(deep, Tracker(polarity="dark")), deep)).max() < 0.3
 
 
@@ -273,3 +274,12 @@ def test_the_note_on_a_robot_that_is_not_found_names_polarity_and_click() -> Non
     assert Tracker().not_found_note(None) == ""  # sessions of before
     note = Tracker(polarity="auto").not_found_note(None)
     assert "tracker.polarity" in note and "tracker.click_px" in note
+
+
+def test_an_object_that_a_known_neighbour_explains_is_not_taken_for_a_robot_that_has_gone() -> None:
+    one = np.ones(1)
+    found = Candidates(np.array([[10.0, 0.2]]), np.array([[10.0, 0.2]]), 50.0 * one, np.zeros(1, int), one, np.zeros(2))
+    motion = Motion(np.array([6.0, 0.0]), 1.0)
+    last = Track(0, True, np.zeros(2), 1.0, 0, 2.5, np.zeros(4), None, np.zeros(2), 1.0, 50.0)
+    assert assigned(found, last, motion, 10.0) == 0
+    assert assigned(found, replace(last, neighbours_px=np.array([10.0, 0.0, 50.0])), motion, 10.0) is None
