@@ -53,11 +53,10 @@ def prioritise_process(priority: int) -> bool:
 
     For processes that wait nearly always, with libraries whose own threads do a part of the work.
     """
-    if sys.platform != "linux":
-        return False
-    try:
-        for thread in Path("/proc/self/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
-    except OSError:
-        return False
-    return True
+    granted = False
+    if sys.platform == "linux":
+        with suppress(OSError):
+            for thread in Path("/proc/self/task").iterdir():
+                os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+            granted = True
+    return granted
