@@ -46,3 +46,24 @@ def coils(
         typer.echo(json.dumps(verb.figures(fit)))
     else:
         verb.show(fit, out)
+
+
+@calibrate.command()
+def motion(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap), recorded or imported.")],
+    coils: Annotated[
+        Path | None,
+        typer.Option("--coils", metavar="LOG", help="Another log of the coils (CSV, Excel), on any clock."),
+    ] = None,
+    out: TomlOut = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit um per revolution, latency and heading offset to the motion of the robot, with standard errors."""
+    from flowrec.commands import calibrate_motion as verb
+
+    fit = verb.calibrate_motion(session, coils, out, overwrite)
+    if as_json:
+        typer.echo(json.dumps(verb.figures(fit)))
+    else:
+        verb.show(fit, session, out)

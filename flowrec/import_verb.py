@@ -29,6 +29,10 @@ def import_movie(
     ] = None,
     fps: Annotated[float | None, typer.Option(metavar="F", help="Images per second, where no times are known.")] = None,
     partial: Annotated[bool, typer.Option("--partial", help="Take a movie that breaks off up to there.")] = False,
+    align: Annotated[
+        bool,
+        typer.Option("--align/--no-align", help="Fit the clock of the log to the motion of the robot."),
+    ] = True,
     sets: Sets = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -55,6 +59,7 @@ def import_movie(
         overwrite=overwrite,
         control=AtTerminal(),
         inputs=[config] if config is not None else [],
+        align=align,
     )
     if as_json:
         files = [str(file) for file in recorded.files]

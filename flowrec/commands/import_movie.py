@@ -2,61 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from flowrec.commands.align import aligned
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.record import prepare, record
+from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import Config
-from flowrec.control.field_log import FieldLog
-from flowrec.messages import Appearance, Track
 from flowrec.rig_settings import MOVIE
-from flowrec.rigs.movie.source import MovieSource
-
-# A step between reading the settings and recording: it may look at the movie, and returns the settings to record with.
-Alignment = Callable[[Config], Config]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MovieTracks:
-    """Where the robot is in each image of a movie, before anything is recorded.
-
-    Attributes
-    ----------
-    stamps_ns : (n,) session stamps, by the settings movie.clock_rate and clock_offset_s.
-    positions_um : (n, 2) on the chip; meaningless where `seen` is False.
-    seen : (n,)
-    log : what the coils did on the same clock, without the robot's delay; None: there is no log.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    positions_um: NDArray[np.float64]
-    seen: NDArray[np.bool_]
-    log: FieldLog | None
-
-
-def tracks_of(asked: Config) -> MovieTracks:
-    """Track the robot through the movie of a configuration; FlowrecError as `import_movie`."""
-    config, chip, pipeline, *_ = prepare(asked)
-    track: Track | None = None
-    appearance: Appearance | None = None
-    tracks: list[Track] = []
-    with MovieSource(config.movie, config.coils) as source:
-        for frame in source.frames():
-            found = config.tracker.follow(track, appearance, frame, chip, pipeline.calibration, config.robot)
-            track, appearance = found
-            tracks.append(track)
-        return MovieTracks(
-            np.array([each.stamp_ns for each in tracks], np.int64),
-            np.array([each.position_um for each in tracks]).reshape(-1, 2),
-            np.array([each.seen for each in tracks], np.bool_),
-            source.log,
-        )
 
 
 def asked_import(
@@ -91,7 +46,7 @@ def import_movie(
     overwrite: bool = False,
     control: Unattended | None = None,
     inputs: Sequence[Path] = (),
-    align: Alignment | None = None,
+    align: bool = True,
 ) -> Recorded:
     """Make a session of a movie, as fast as it can be read. A failure leaves no file.
 
@@ -106,14 +61,18 @@ def import_movie(
     partial : a movie that breaks off is used up to there.
     control : as in `record`.
     inputs : files that were read besides these; the output may be none of them.
-    align : makes the settings to record with; None: they are recorded as they are given.
+    align : fit offset and rate of the log's clock to the motion of the robot, see commands/align.py; False: they are
+        those of the settings movie.clock_offset_s and clock_rate.
 
     Raises
     ------
     FlowrecError : in one line: what can not be read, what does not fit together, what is not told.
     """
     asked = asked_import(movie, config, coils=coils, times=times, fps=fps, partial=partial)
-    if align is not None:
-        asked = align(asked)
+    facts: Mapping[str, str] = {}
+    if align:
+        asked, facts = aligned(asked)
     path = None if out is None else Path(out)
-    return record(asked, path, overwrite=overwrite, control=control, inputs=inputs, keep_failed=False)
+    return record(
+        asked, path, overwrite=overwrite, control=control, inputs=inputs, keep_failed=False, given_facts=facts
+    )

@@ -184,6 +184,7 @@ def record(
     control: Unattended | None = None,
     inputs: Sequence[Path] = (),
     keep_failed: bool = True,
+    given_facts: Mapping[str, str] | None = None,
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -197,6 +198,7 @@ def record(
     control : who attends the run; None: nobody, it takes no signals and no keys and shows no progress.
     inputs : files that were read besides those that `config` names; no output may be one of them.
     keep_failed : False: a run that ends by an exception leaves no file, and one that it was to replace stays.
+    given_facts : more for the provenance in the head of the file.
 
     Raises
     ------
@@ -242,7 +244,7 @@ def record(
                 live=realtime,
                 in_pieces=True,
                 derived=made,
-                facts=source,
+                facts={**source, **(given_facts or {})},
                 keep_failed=keep_failed,
             )
         )

@@ -157,7 +157,7 @@ def test_a_robot_acts_on_the_log_its_delay_later(lab: Laboratory) -> None:
     rows = [HEADER, (0, 0, 0, 4), (1.0, 12, 90, 4), (1.5, 0, 90, 4)]
     log = lab.table("step.csv", rows)
     out = lab.folder / "step.mcap"
-    flowrec.import_movie(lab.folder / "film.avi", out, lab.config, coils=log)
+    flowrec.import_movie(lab.folder / "film.avi", out, lab.config, coils=log, align=False)
     ticks = [tick.applied for tick in flowrec.open(out).ticks(with_frames=False)]
     np.testing.assert_allclose(sum(applied.turns for applied in ticks), [0.0, 6.0], atol=1e-6)
     delay_s = lab.config.robot.delay_s
@@ -181,7 +181,7 @@ def test_clock_and_heading_of_the_log_are_set_by_four_settings(lab: Laboratory) 
     ):
         config = flowrec.config.with_sets(lab.config, sets)
         outs.append(lab.folder / f"{name}.mcap")
-        flowrec.import_movie(lab.folder / "pngs", outs[-1], config, coils=path, fps=fps)
+        flowrec.import_movie(lab.folder / "pngs", outs[-1], config, coils=path, fps=fps, align=False)
     right, other_turns = (
         np.array([tick.applied.turns for tick in flowrec.open(out).ticks(with_frames=False)]) for out in outs
     )
@@ -246,11 +246,11 @@ def test_bad_input_is_one_line_and_leaves_what_was_there(kind: str, lab: Laborat
     given = {"movie": "film.avi", "coils": lab.log} | make(lab)
     movie = lab.folder / str(given.pop("movie"))
     with pytest.raises(FlowrecError, match=why) as refused:
-        flowrec.import_movie(movie, tmp_path / "a.mcap", lab.config, **given)
+        flowrec.import_movie(movie, tmp_path / "a.mcap", lab.config, align=False, **given)
     assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
     (tmp_path / "a.mcap").write_bytes(b"what was there")
     with pytest.raises(FlowrecError, match=why):
-        flowrec.import_movie(movie, tmp_path / "a.mcap", lab.config, overwrite=True, **given)
+        flowrec.import_movie(movie, tmp_path / "a.mcap", lab.config, overwrite=True, align=False, **given)
     assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"]
     assert (tmp_path / "a.mcap").read_bytes() == b"what was there"
 
@@ -262,7 +262,7 @@ def test_a_movie_that_breaks_off_is_taken_as_far_as_it_goes_if_that_is_said(
     (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
     toml = tmp_path / "my.toml"
     toml.write_text(flowrec.config.to_toml(lab.config), encoding="utf-8")
-    words = ["import", tmp_path / "cut.avi", toml, "-o", tmp_path / "cut.mcap", "--coils", lab.log]
+    words = ["import", tmp_path / "cut.avi", toml, "-o", tmp_path / "cut.mcap", "--coils", lab.log, "--no-align"]
     assert run(words, monkeypatch) == 2
     refused = capsys.readouterr().err.strip().splitlines()
     assert len(refused) == 1 and "breaks off" in refused[0]

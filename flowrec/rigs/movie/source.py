@@ -39,6 +39,7 @@ class MovieSource:
     ----------
     facts : what the movie tells.
     times_text : where the times come from.
+    first_ns : time of the first image on the movie's clock.
     stamps_ns : (n,) expected stamps of the images; of a few movies the images themselves tell better.
     log : what the coils did, without any delay; None: there is no log.
     remarks : what was assumed, and what is unusual.
@@ -64,7 +65,7 @@ class MovieSource:
             first_ns, _ = self._times.of(
                 0, None if self.facts.times_ns is None else int(self.facts.times_ns[0]), self.path
             )
-            self._first_ns = first_ns
+            self.first_ns = first_ns
             self.stamps_ns = self._expected()
             self._log_remarks: list[str] = []
             self.log = self._read_log(coils)
@@ -120,7 +121,7 @@ class MovieSource:
             "source_codec": (facts.codec or "uncompressed") + (", lossy" if facts.lossy else ""),
             "source_images": f"{facts.width_px} x {facts.height_px} x {facts.bits} bit",
             "source_times": self.times_text,
-            "source_first_image_s": f"{seconds(self._first_ns):.9f}",
+            "source_first_image_s": f"{seconds(self.first_ns):.9f}",
         }
         if facts.um_per_px is not None:
             stated["source_um_per_px"] = f"{facts.um_per_px:.6g}"
@@ -147,14 +148,14 @@ class MovieSource:
         self.close()
 
     def _stamp_ns(self, time_ns: int) -> int:
-        since_ns, rate = time_ns - self._first_ns, self._settings.clock_rate
+        since_ns, rate = time_ns - self.first_ns, self._settings.clock_rate
         return since_ns if rate == 1.0 else round(since_ns * rate)
 
     def _expected(self) -> NDArray[np.int64]:
         times = self._times.times_ns
         if times is None:
             times = np.array([self._times.of(n, None, self.path)[0] for n in range(self.facts.frames)], np.int64)
-        since, rate = times - self._first_ns, self._settings.clock_rate
+        since, rate = times - self.first_ns, self._settings.clock_rate
         return since if rate == 1.0 else np.rint(since * rate).astype(np.int64)
 
     def _read_log(self, coils: Coils) -> FieldLog | None:
@@ -166,7 +167,7 @@ class MovieSource:
             return None
         name = Path(settings.coils)
         log = read_coil_log(name, settings.columns, coils, settings.heading_offset_deg, settings.heading_mirrored)
-        log = log.shifted(-self._first_ns - nanoseconds(settings.clock_offset_s))
+        log = log.shifted(-self.first_ns - nanoseconds(settings.clock_offset_s))
         begin_s, end_s, movie_s = (seconds(int(ns)) for ns in (log.times_ns[0], log.times_ns[-1], self.stamps_ns[-1]))
         if end_s < 0.0 or begin_s > movie_s:
             raise MovieError(

@@ -1,0 +1,143 @@
+"""The step of `flowrec import` that finds the clock of a log in the robot's own motion, before anything is recorded.
+
+The robot is tracked once through the movie, and its track is fitted to the log (estimation/motion_fit.py). What is
+found become settings: movie.clock_rate and movie.clock_offset_s, and movie.heading_mirrored and heading_offset_deg if
+the axes of the log are turned or mirrored. So the session holds them, and a replay does not depend on the fit.
+
+The um per revolution that are found stay a proposal. They are known to 2 to 5 %, because the flow changes where the
+robot moves; a user who has measured them knows them better.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.commands.calibrate_motion import (
+    ANYWHERE,
+    figures_of,
+    fit_log,
+    heading_settings,
+    remarks,
+    rows_of,
+)
+from flowrec.commands.record import prepare
+from flowrec.config import Config
+from flowrec.control.coil_log import read_coil_log
+from flowrec.control.field_log import FieldLog
+from flowrec.errors import UsageError
+from flowrec.estimation.motion_fit import MotionFit
+from flowrec.messages import Appearance, Track
+from flowrec.rigs.movie.source import MovieSource
+from flowrec.terminal import say, table, warn
+from flowrec.units import seconds
+
+_FAR = 0.3  # relative difference of um_per_rev from which it is doubtful whether the log is of this run
+_Z95 = 1.96
+_WITHOUT = "import it as it is with --no-align, and set movie.clock_offset_s and movie.clock_rate yourself"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovieTracks:
+    """Where the robot is in each image of a movie, before anything is recorded.
+
+    Attributes
+    ----------
+    stamps_ns : (n,) session stamps, by the settings movie.clock_rate and clock_offset_s.
+    positions_um : (n, 2) on the chip; meaningless where `seen` is False.
+    seen : (n,)
+    log : what the coils did on the same clock, without the robot's delay; None: there is no log.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    positions_um: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    log: FieldLog | None
+
+
+def tracks_of(asked: Config) -> MovieTracks:
+    """Track the robot through the movie of a configuration; FlowrecError as `import_movie`."""
+    config, chip, pipeline, *_ = prepare(asked)
+    track: Track | None = None
+    appearance: Appearance | None = None
+    tracks: list[Track] = []
+    with MovieSource(config.movie, config.coils) as source:
+        for frame in source.frames():
+            found = config.tracker.follow(track, appearance, frame, chip, pipeline.calibration, config.robot)
+            track, appearance = found
+            tracks.append(track)
+        return MovieTracks(
+            np.array([each.stamp_ns for each in tracks], np.int64),
+            np.array([each.position_um for each in tracks]).reshape(-1, 2),
+            np.array([each.seen for each in tracks], np.bool_),
+            source.log,
+        )
+
+
+def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
+    """The configuration with the clock of the log as the motion shows it, and the fit for the head of the session.
+
+    A configuration without a log comes back as it is.
+
+    Raises
+    ------
+    UsageError : the log does not explain the motion, in one line with what to do.
+    FlowrecError : as `import_movie`.
+    """
+    if not asked.movie.coils:
+        return asked, {}
+    rough = _overlapping(asked)
+    tracks = tracks_of(rough)
+    assert tracks.log is not None, "there is a log"
+    seen = tracks.seen
+    try:
+        fit = fit_log(tracks.stamps_ns[seen], tracks.positions_um[seen], tracks.log, ANYWHERE)
+    except UsageError as error:
+        raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {error}; {_WITHOUT}") from error
+    if fit.refusal:
+        raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {fit.refusal}; or {_WITHOUT}")
+    movie = rough.movie
+    # The rig applies the log robot.delay_s late; the offset that is found has that latency in it.
+    offset_s = movie.clock_offset_s + fit.offset_s + (asked.robot.delay_s or 0.0)
+    heading = heading_settings(fit, movie.heading_offset_deg, movie.heading_mirrored)
+    changed = replace(
+        movie,
+        clock_rate=movie.clock_rate * fit.rate,
+        clock_offset_s=round(offset_s, 6),
+        **{key.partition(".")[2]: value for key, value in heading.items()},  # type: ignore[arg-type]
+    )
+    _tell(asked, fit, changed.clock_offset_s)
+    return replace(asked, movie=changed), {"alignment": json.dumps(figures_of(fit))}
+
+
+def _overlapping(asked: Config) -> Config:
+    """The configuration with the log at the movie, wherever its clock begins: a log that is elsewhere is refused."""
+    with MovieSource(replace(asked.movie, coils=""), asked.coils) as source:
+        first_s = seconds(source.first_ns)
+    movie = asked.movie
+    log = read_coil_log(Path(movie.coils), movie.columns, asked.coils)
+    begin_s = seconds(int(log.times_ns[0]))
+    return replace(asked, movie=replace(movie, clock_offset_s=begin_s - first_s))
+
+
+def _tell(asked: Config, fit: MotionFit, offset_s: float) -> None:
+    table(f"{asked.movie.coils} against the motion of the robot", ("", "value and standard error"), rows_of(fit))
+    say(f"movie.clock_offset_s = {offset_s:.6g} and the rate are recorded; --no-align takes the log as it is")
+    stated = asked.robot.um_per_rev
+    if abs(fit.um_per_rev / stated - 1.0) > _FAR:
+        warn(
+            f"the robot moves {fit.um_per_rev:.3g} um per revolution, robot.um_per_rev = {stated:g}: set it; "
+            "or is this the log of another run?"
+        )
+    elif abs(fit.um_per_rev - stated) > _Z95 * fit.um_per_rev_std:
+        warn(
+            f"the robot moves {fit.um_per_rev:.4g} ± {fit.um_per_rev_std:.2g} um per revolution; robot.um_per_rev = "
+            f"{stated:g} is used; to use what was found: --set robot.um_per_rev={fit.um_per_rev:.4g}"
+        )
+    for sentence in remarks(fit):
+        warn(sentence)

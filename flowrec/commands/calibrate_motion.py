@@ -1,0 +1,328 @@
+"""`flowrec calibrate motion`: um per revolution, latency and axes of the heading, from the robot's own motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.control.coil_log import read_coil_log
+from flowrec.control.field_log import FieldLog
+from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.errors import UsageError
+from flowrec.estimation.motion_fit import MotionFit, fit_motion
+from flowrec.estimation.motion_search import Range
+from flowrec.flow import sample
+from flowrec.messages import Applied, Currents, FlowField, Track
+from flowrec.rig_settings import MOVIE
+from flowrec.session import Session, files_behind
+from flowrec.system.outputs import TOML, Output
+from flowrec.terminal import say, table
+from flowrec.units import NS_PER_S, seconds
+from flowrec.version import __version__
+
+# A log on another clock: any offset, and rates of 30 % to either side.
+ANYWHERE = Range(least_rate=0.7, largest_rate=1.0 / 0.7)
+_ONE_CLOCK = Range(-2.0, 2.0)  # from command to motion
+_Z95 = 1.96
+_SIGNIFICANT = 3.0
+_LEAST_RAD = math.radians(2.0)  # by which the axes of the heading differ at least before a setting is proposed
+_POOR_OFFSET_S = 0.01  # larger errors cost the refined flow about a percent
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """The fit of a session, and the settings that it proposes."""
+
+    fit: MotionFit
+    log: str  # what the motion was compared with
+    shared_clock: bool  # of the log and the session
+    sets: dict[str, float | bool]  # settings by key
+    advice: tuple[str, ...]
+
+
+def calibrate_motion(path: Path, coils: Path | None = None, out: Path | None = None, overwrite: bool = False) -> Motion:
+    """Compare the track of a session with what its coils did, and write the settings found to `out` if it is given.
+
+    Parameters
+    ----------
+    coils : another log, on any clock; None: the session's own.
+
+    Raises
+    ------
+    UsageError : the log does not explain the motion, or there is too little of it; in one line, with what to do.
+    OutputError, SessionError : see `Output.check` and `Session`.
+    """
+    session = Session(path)
+    output = Output(out, TOML, tuple(files_behind(path)), overwrite) if out is not None else None
+    if output is not None:
+        output.check()
+    tracks = [track for track in session.messages("track") if track.seen]
+    imported = session.config.rig == MOVIE
+    if coils is not None:
+        log = read_coil_log(coils, session.config.movie.columns, session.config.coils)
+        fit, name = fit_tracks(tracks, log, ANYWHERE, flow=_assumed(session)), coils.name
+    elif imported:
+        fit, name = _fit_applied(tracks, list(session.messages("applied")), _assumed(session)), "the session's log"
+    else:
+        log = commanded(list(session.messages("currents")))
+        fit = fit_tracks(tracks, log, _ONE_CLOCK, flow=_assumed(session), exact_log=True)
+        name = "the session's commands"
+    if fit.refusal:
+        raise UsageError(f"{path}: {fit.refusal}")
+    shared = coils is None and not imported
+    motion = Motion(fit, name, shared, *_proposed(fit, session, shared_clock=shared, own_log=coils is None))
+    if output is not None:
+        with output.new_file() as part:
+            part.write_text(fragment(motion, path), encoding="utf-8")
+    return motion
+
+
+def fit_tracks(
+    tracks: list[Track], log: FieldLog, within: Range, flow: FlowField | None = None, exact_log: bool = False
+) -> MotionFit:
+    """The fit of the tracks in which the robot is seen to a log; stamps and log in s. UsageError, see `fit_motion`."""
+    stamps_ns = np.array([track.stamp_ns for track in tracks], np.int64)
+    positions = np.array([track.position_um for track in tracks]).reshape(-1, 2)
+    return fit_log(stamps_ns, positions, log, within, flow, exact_log=exact_log)
+
+
+def fit_log(
+    stamps_ns: NDArray[np.int64],
+    positions_um: Floats,
+    log: FieldLog,
+    within: Range,
+    flow: FlowField | None = None,
+    *,
+    exact_log: bool = False,
+) -> MotionFit:
+    """The same of arrays (n,) and (n, 2).
+
+    The time of the log may be the time of day: a float of seconds holds it to 0.2 us.
+    """
+    if not len(log) or not (log.amplitude_mt > 0.0).any():
+        raise UsageError("the log holds no field, so there is nothing to compare the motion with")
+    begin_ns = int(log.times_ns[0])
+
+    def turns(time_s: Floats) -> Floats:
+        return log.turns_until((time_s - begin_s) * NS_PER_S + begin_ns)
+
+    begin_s = seconds(begin_ns)
+    span = (begin_s, seconds(int(log.times_ns[-1])))
+    times_s = stamps_ns / NS_PER_S
+    carried = _carried(times_s, positions_um, flow)
+    return fit_motion(times_s, positions_um, turns, span, within, exact_log=exact_log, carried_um=carried)
+
+
+def _fit_applied(tracks: list[Track], applied: list[Applied], flow: FlowField | None) -> MotionFit:
+    """The fit to what an imported session holds: the turns from frame to frame."""
+    stamps_s = np.array([each.stamp_ns for each in applied]) / NS_PER_S
+    total = np.cumsum([each.turns for each in applied], axis=0)
+    seen_s = np.array([track.stamp_ns for track in tracks]) / NS_PER_S
+    positions = np.array([track.position_um for track in tracks]).reshape(-1, 2)
+
+    def turns(time_s: Floats) -> Floats:
+        return np.column_stack([np.interp(time_s, stamps_s, total[:, axis]) for axis in (0, 1)])
+
+    span = (float(stamps_s[0]), float(stamps_s[-1]))
+    return fit_motion(
+        seen_s, positions, turns, span, _ONE_CLOCK, exact_log=False, carried_um=_carried(seen_s, positions, flow)
+    )
+
+
+def commanded(currents: list[Currents]) -> FieldLog:
+    """What the field does by the commands of a session, if there were no delay: the plane turns as it is ordered."""
+    log, state = FieldLog(), FieldState()
+    changes = [
+        now
+        for before, now in zip([None, *currents[:-1]], currents, strict=True)
+        if before is None or _differ(before, now)
+    ]
+    for command, after in zip(changes, [*changes[1:], currents[-1]], strict=True) if changes else ():
+        c = command
+        motion = field_motion(state, FieldCommand(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz))
+        duration_s = seconds(after.stamp_ns - c.stamp_ns)
+        log.extend(c.stamp_ns, motion.segments(duration_s), c.amplitude_mt)
+        if duration_s <= 0.0:
+            log.append(c.stamp_ns, c.frequency_hz, c.heading_rad, c.amplitude_mt)
+        state = motion.after(duration_s)
+    return log
+
+
+def _differ(one: Currents, other: Currents) -> bool:
+    return (one.frequency_hz, one.heading_rad, one.amplitude_mt, one.limit_hz) != (
+        other.frequency_hz,
+        other.heading_rad,
+        other.amplitude_mt,
+        other.limit_hz,
+    )
+
+
+def _assumed(session: Session) -> FlowField | None:
+    """The flow that was assumed: that of a refinement has seen the um per revolution of the settings."""
+    return session.fields.get("assumed")
+
+
+def _carried(times_s: Floats, positions_um: Floats, flow: FlowField | None) -> Floats | None:
+    """(n, 2) um that a flow carries the robot until each frame."""
+    if flow is None or not len(times_s):
+        return None
+    speed = np.array([sample(flow, point) for point in positions_um])
+    steps = 0.5 * np.diff(times_s)[:, None] * (speed[1:] + speed[:-1])
+    carried: Floats = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+    return carried if carried.any() else None
+
+
+def heading_settings(fit: MotionFit, offset_deg: float, mirrored: bool) -> dict[str, float | bool]:
+    """Changes of the settings movie.heading_* that a fit makes to present ones; {} if they are as good."""
+    changed: dict[str, float | bool] = {}
+    if fit.mirrored:
+        changed["movie.heading_mirrored"] = not mirrored
+        offset_deg = -offset_deg
+    turned_rad = fit.heading_offset_rad
+    turned = abs(turned_rad) > max(_SIGNIFICANT * fit.heading_offset_std_rad, _LEAST_RAD)
+    if turned or fit.mirrored:
+        total = offset_deg + (math.degrees(turned_rad) if turned else 0.0)
+        changed["movie.heading_offset_deg"] = round((total + 180.0) % 360.0 - 180.0, 2) + 0.0
+    return changed
+
+
+def _proposed(
+    fit: MotionFit, session: Session, *, shared_clock: bool, own_log: bool
+) -> tuple[dict[str, float | bool], tuple[str, ...]]:
+    """Settings, and sentences on what the fit says of the present ones."""
+    config, advice = session.config, []
+    sets: dict[str, float | bool] = {"robot.um_per_rev": float(f"{fit.um_per_rev:.4g}")}
+    stated = config.robot.um_per_rev
+    if abs(fit.um_per_rev - stated) > _Z95 * fit.um_per_rev_std:
+        advice.append(
+            f"{fit.um_per_rev:.4g} um per revolution differ from robot.um_per_rev = {stated:g} by "
+            f"{100.0 * (fit.um_per_rev / stated - 1.0):+.1f} %, more than the error allows"
+        )
+    else:
+        advice.append(f"robot.um_per_rev = {stated:g} agrees with the motion")
+    if shared_clock:
+        delay_s = -fit.offset_s
+        sets["robot.delay_s"] = round(max(delay_s, 0.0), 4)
+        if abs(delay_s - config.robot.delay_s) > _Z95 * fit.offset_std_s:
+            advice.append(f"robot.delay_s = {config.robot.delay_s:g} differs from the latency by more than its error")
+    else:
+        movie = config.movie
+        advice.append("log and movie have clocks of their own, so the offset holds the latency too")
+        if own_log and abs(fit.offset_s) > _Z95 * fit.offset_std_s:
+            sets["movie.clock_offset_s"] = round(movie.clock_offset_s + fit.offset_s, 4)
+            advice.append("the log is not aligned: import again with --align, or with this movie.clock_offset_s")
+        sets |= heading_settings(fit, movie.heading_offset_deg, movie.heading_mirrored) if own_log else {}
+    if fit.mirrored:
+        advice.append("the y axis of the log's headings is opposed to that of the chip (image: y down)")
+    if abs(fit.heading_offset_rad) > max(_SIGNIFICANT * fit.heading_offset_std_rad, _LEAST_RAD):
+        degrees = math.degrees(fit.heading_offset_rad)
+        where = "" if not shared_clock else "; see coils.mt_per_a (its axes) and camera.angle_deg"
+        advice.append(f"the robot travels {degrees:+.1f} degrees off the heading{where}")
+    return sets, (*advice, *remarks(fit))
+
+
+def remarks(fit: MotionFit) -> list[str]:
+    """What makes a fit less certain than it may look, in sentences."""
+    sentences = []
+    if fit.offset_std_s > _POOR_OFFSET_S:
+        sentences.append(
+            f"the offset is known to {1e3 * fit.offset_std_s:.0f} ms only; a longer movie with more changes of heading "
+            "or frequency determines it better"
+        )
+    if fit.left_out > 0.02 * (fit.frames + fit.left_out):
+        sentences.append(f"{fit.left_out} positions were left out because the robot can not have been there")
+    return sentences
+
+
+def fragment(motion: Motion, path: Path) -> str:
+    """The settings as TOML, with a comment on their source."""
+    lines = [f"# By flowrec {__version__} calibrate motion from {path.name} and {motion.log}.", *_comments(motion.fit)]
+    section = ""
+    for key, value in sorted(motion.sets.items()):
+        name, _, setting = key.partition(".")
+        if name != section:
+            lines.append(f"[{name}]")
+            section = name
+        lines.append(f"{setting} = {str(value).lower() if isinstance(value, bool) else value}")
+    return "\n".join(lines) + "\n"
+
+
+def _comments(fit: MotionFit) -> list[str]:
+    return [f"# {name}: {value}" for name, value in rows_of(fit)]
+
+
+def rows_of(fit: MotionFit, shared_clock: bool = False) -> list[tuple[str, str]]:
+    """The fit for people, each value with its standard error."""
+    offset = ("latency", -1e3) if shared_clock else ("time of log less time of movie", 1e3)
+    rows = [
+        ("um per revolution", f"{fit.um_per_rev:.2f} ± {fit.um_per_rev_std:.2f}"),
+        (offset[0], f"{offset[1] * fit.offset_s:.1f} ± {1e3 * fit.offset_std_s:.1f} ms"),
+        (
+            "heading offset",
+            f"{math.degrees(fit.heading_offset_rad):.1f} ± {math.degrees(fit.heading_offset_std_rad):.1f} degrees"
+            + (", mirrored" if fit.mirrored else ""),
+        ),
+        ("explained", f"R2 = {fit.r2:.2f}; at the best other place {fit.second_r2:.2f}"),
+        ("frames used", f"{fit.frames}" + (f", {fit.left_out} left out" if fit.left_out else "")),
+    ]
+    if fit.rate_std > 0.0:
+        used = "" if fit.rate != 1.0 else "; 1 is used"
+        rows.insert(2, ("s of the log per s of the movie", f"{fit.rate_estimate:.6f} ± {fit.rate_std:.6f}{used}"))
+    return rows
+
+
+def as_sets(motion: Motion) -> list[str]:
+    """The settings as values of --set."""
+    return [f"{key}={str(v).lower() if isinstance(v, bool) else v}" for key, v in motion.sets.items()]
+
+
+def figures(motion: Motion) -> dict[str, Any]:
+    """The fit as plain numbers; None where the movie does not determine one."""
+    return figures_of(motion.fit) | {
+        "log": motion.log,
+        "shared_clock": motion.shared_clock,
+        "advice": list(motion.advice),
+        "set": as_sets(motion),
+    }
+
+
+def figures_of(fit: MotionFit) -> dict[str, Any]:
+    """The fit as plain numbers."""
+    values: dict[str, Any] = {
+        "offset_s": fit.offset_s,
+        "offset_standard_error_s": fit.offset_std_s,
+        "rate": fit.rate,
+        "rate_estimate": fit.rate_estimate,
+        "rate_standard_error": fit.rate_std,
+        "um_per_rev": fit.um_per_rev,
+        "um_per_rev_standard_error": fit.um_per_rev_std,
+        "heading_offset_deg": math.degrees(fit.heading_offset_rad),
+        "heading_offset_standard_error_deg": math.degrees(fit.heading_offset_std_rad),
+        "heading_mirrored": fit.mirrored,
+        "r2": fit.r2,
+        "second_r2": fit.second_r2,
+        "p_value": fit.p_value,
+        "frames": fit.frames,
+        "frames_left_out": fit.left_out,
+        "refusal": fit.refusal,
+    }
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+
+
+def show(motion: Motion, path: Path, out: Path | None) -> None:
+    """Print the fit as a table, advice and settings."""
+    table(
+        f"{path.name} against {motion.log}", ("", "value and standard error"), rows_of(motion.fit, motion.shared_clock)
+    )
+    for sentence in motion.advice:
+        say(f"- {sentence}")
+    if out is not None:
+        say(f"{out} written")
+    say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(motion)))
