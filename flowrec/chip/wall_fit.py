@@ -1,0 +1,338 @@
+"""Sub-pixel registration of a chip's walls: the pose for which grey levels depend most on the distance to the walls.
+
+Near the walls the image is a function f of the signed distance d to the walls: a dark line, a step, both. f is unknown
+and the same everywhere but for light and contrast, which differ from one patch k of the chip to the next. The pose p,
+f (piecewise linear), a and b minimise
+
+    sum_x w(x) [I(x) - a_k - b_k f(d(x; p))]^2
+
+by Gauss-Newton; w are Tukey's weights, which leave out debris and the robot. So it does not matter whether walls are
+dark or bright, how wide they look, or whether all of them look wider than the mask says. In relief (oblique light,
+differential interference contrast) walls are bright on one side and dark on the other; then I is the local contrast.
+
+A patch is found if its own profile correlates with f. The offsets of the patches across the walls are the residual;
+the scatter of their normal equations gives the standard errors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.chip.clearance import clearance_um
+from flowrec.chip.registration import Calibration
+from flowrec.interpolation import cells_at
+from flowrec.chip.wall_search import Points, moved
+
+_LONGEST_PX = 1280  # side of the image that is fitted
+# Blur, most pixels, and the motion in px at which Gauss-Newton ends; one row after the other.
+_STAGES = ((4.0, 30_000, 0.05), (2.0, 30_000, 0.05), (1.0, 30_000, 0.02), (0.0, 100_000, 0.003))
+_STEPS = 8  # of Gauss-Newton, at most, in each stage
+_LIT_UNEVENLY = 0.85  # part of the walls found below which the local contrast is tried instead of the grey levels
+_KNOTS = 12  # of f on either side of the wall
+_ALL_KNOTS = 2 * _KNOTS + 1
+_TUKEY = 4.685
+_LIKE = 0.5  # correlation of a patch's profile with f from which on the patch counts as found
+_LEAST_PIXELS = 30  # of a patch
+_LEAST_ALL = 200  # pixels of a fit
+
+
+@dataclass(frozen=True, slots=True)
+class WallFit:
+    """A pose with all that is known of its quality.
+
+    Attributes
+    ----------
+    calibration : the pose.
+    explained : relative variance of the grey levels near the walls that f explains.
+    found : part of the walls in the image that look like the others, 0 to 1.
+    seen : part of the chip's walls that the image shows.
+    residual_um : root mean square distance of the patches from where the pose puts them.
+    std : (4,) standard errors: shift of the image's centre along x and y in um, angle in degrees, relative scale.
+    """
+
+    calibration: Calibration
+    explained: float
+    found: float
+    seen: float
+    residual_um: float
+    std: NDArray[np.float64]
+
+
+class WallMap:
+    """Smooth signed distance to the walls of a mask, in um, also a little beyond its border.
+
+    Attributes
+    ----------
+    clearance_um : (h, w).
+    size_um : width and height of the mask.
+    points_um : (n, 2) pixel centres beside the walls.
+    """
+
+    def __init__(self, mask: NDArray[np.bool_], um_per_px: float) -> None:
+        pad = 4
+        distance = clearance_um(np.pad(mask, pad, mode="edge"), um_per_px)
+        smooth = cv2.GaussianBlur(distance, (0, 0), 1.0)[pad:-pad, pad:-pad]
+        self.clearance_um = np.ascontiguousarray(smooth, np.float32)
+        self._um = um_per_px
+        down, right = np.gradient(self.clearance_um, um_per_px)
+        height, width = mask.shape
+        self.size_um = (width * um_per_px, height * um_per_px)
+        rows, columns = np.nonzero(np.abs(self.clearance_um) < um_per_px)
+        self.points_um = np.stack((columns, rows), -1) * um_per_px
+        self._all = np.stack((self.clearance_um, right, down), -1)
+
+    def at(self, points_um: Points) -> tuple[NDArray[np.float64], Points, NDArray[np.bool_]]:
+        """Distances (n,), their gradients (n, 2), and whether the points (n, 2) lie on the mask (n,)."""
+        cells = cells_at(points_um / self._um, self.clearance_um.shape)
+        found = cells.interpolate(self._all)
+        return found[:, 0], found[:, 1:], cells.inside
+
+
+class Fitter:
+    """Fits poses of one chip to one picture.
+
+    Parameters
+    ----------
+    picture : (h, w) grey levels.
+    walls : of the chip.
+    reach_um : distance from the walls up to which the picture is used.
+    um_per_px : of the picture, roughly.
+    """
+
+    def __init__(self, picture: NDArray[np.float32], walls: WallMap, reach_um: float, um_per_px: float) -> None:
+        self._walls, self._reach_um = walls, reach_um
+        self._size_px = (picture.shape[1], picture.shape[0])
+        self._step = max(1.0, max(picture.shape) / _LONGEST_PX)
+        small = np.asarray(picture, np.float32)
+        if self._step > 1.0:
+            height, width = (round(n / self._step) for n in picture.shape)
+            small = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
+        self._sigma_px = 2.0 * reach_um / (um_per_px * self._step)
+        self._levelled = _levelled(small, 2.0 * self._sigma_px)
+
+    def fit(self, start: Calibration) -> WallFit:
+        """The pose near a first one."""
+        done = self._fit(self._levelled, start)
+        if done.found < _LIT_UNEVENLY:
+            smooth = cv2.GaussianBlur(self._levelled, (0, 0), 1.0)
+            contrast = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+            other = self._fit(_levelled(contrast, 2.0 * self._sigma_px), start)
+            if other.found > done.found:
+                return other
+        return done
+
+    def _fit(self, picture: NDArray[np.float32], start: Calibration) -> WallFit:
+        now = start
+        for blur_px, most, enough_px in _STAGES:
+            image = cv2.GaussianBlur(picture, (0, 0), blur_px) if blur_px > 0.0 else picture
+            sample = self._sample(image, now, most)
+            model = None
+            for _ in range(_STEPS):
+                model = _Model(sample, self._walls, now, self._reach_um, model)
+                move = model.step()
+                now = moved(now, move, sample.middle_px, sample.reach_px)
+                if float(np.abs(move).max()) < enough_px:
+                    break
+        return self._judged(_Model(sample, self._walls, now, self._reach_um, model), now, sample)
+
+    def _sample(self, image: NDArray[np.float32], start: Calibration, most: int) -> _Sample:
+        """At most so many pixels of the image near the walls, for a pose that moves a little yet."""
+        height, width = image.shape
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
+        pixels = pixels[np.random.default_rng(0).permutation(len(pixels))]
+        if len(pixels) > 4 * most:
+            pixels = pixels[: max(4 * most, len(pixels) // 4)]
+        at_px = (pixels + 0.5) * self._step - 0.5
+        distance, _, inside = self._walls.at(start.to_um(at_px))
+        near = np.flatnonzero(inside & (np.abs(distance) < 1.2 * self._reach_um))[:most]
+        return _Sample(at_px[near], image[pixels[near, 1], pixels[near, 0]].astype(np.float64))
+
+    def _judged(self, model: _Model, now: Calibration, sample: _Sample) -> WallFit:
+        found, residual_um, covariance = model.patches()
+        # The shift of the image's centre rather than of the middle of the pixels.
+        right, down = (np.array(self._size_px) - 1) / 2 - sample.middle_px
+        per = 1.0 / sample.reach_px
+        to_centre = np.array(
+            [[1, 0, -down * per, right * per], [0, 1, right * per, down * per], [0, 0, per, 0], [0, 0, 0, per]]
+        )
+        std = np.sqrt(np.maximum(np.diag(to_centre @ covariance @ to_centre.T), 0.0))
+        std *= (now.um_per_px, now.um_per_px, math.degrees(1.0), 1.0)
+        at_px = now.to_px(self._walls.points_um)
+        seen = float(((at_px >= 0) & (at_px <= np.array(self._size_px) - 1)).all(-1).mean())
+        return WallFit(now, model.explained, found, seen, residual_um, std)
+
+
+def _levelled(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """An image without its slow variation, of even contrast."""
+    high = image - cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT)
+    power = cv2.GaussianBlur(high * high, (0, 0), 2.0 * sigma_px, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(high / np.sqrt(power + 0.05 * max(float(power.mean()), 1e-12)), np.float32)
+
+
+class _Sample:
+    """Pixels (n, 2) and their grey levels (n,); the point about which poses turn, and the mean distance from it."""
+
+    def __init__(self, at_px: Points, levels: NDArray[np.float64]) -> None:
+        self.at_px, self.levels = at_px, levels
+        self.middle_px = at_px.mean(0) if len(at_px) else np.zeros(2)
+        self.reach_px = max(float(np.hypot(*(at_px - self.middle_px).T).mean()), 1.0) if len(at_px) else 1.0
+
+
+class _Model:
+    """f, a and b at one pose, the residuals, and the normal equations for a motion of the chip.
+
+    `before` : the model at a pose nearby, with which the search for f, a and b begins.
+    """
+
+    def __init__(
+        self, sample: _Sample, walls: WallMap, now: Calibration, reach_um: float, before: _Model | None = None
+    ) -> None:
+        points_um = now.to_um(sample.at_px)
+        distance, gradient, inside = walls.at(points_um)
+        used = inside & (np.abs(distance) < reach_um)
+        self._distance, self._reach_um = distance[used], reach_um
+        self._levels = sample.levels[used]
+        place = (self._distance / reach_um + 1.0) * _KNOTS
+        self._low = np.clip(place.astype(np.intp), 0, _ALL_KNOTS - 2)
+        self._part = place - self._low
+        columns, rows = np.floor(points_um[used] / (2.0 * reach_um) + 0.5).astype(np.intp).T
+        across, down = (int(length // (2.0 * reach_um)) + 2 for length in walls.size_um)
+        self._patch = np.clip(rows, 0, down - 1) * across + np.clip(columns, 0, across - 1)
+        self._patches = across * down
+        slope_px = now.um_per_px * gradient[used] @ now.axes.T  # of d, in um per px of the image
+        arm = (sample.at_px[used] - sample.middle_px) / sample.reach_px
+        turn = slope_px[:, 1] * arm[:, 0] - slope_px[:, 0] * arm[:, 1]
+        # (n, 4) derivatives of d by right, down, turn, growth
+        self._of_d = -np.column_stack((slope_px, turn, (slope_px * arm).sum(-1)))
+        same = before is not None and before._patches == self._patches
+        self._a = before._a if same and before is not None else np.zeros(self._patches)
+        self._b = before._b if same and before is not None else np.ones(self._patches)
+        self._weight = np.ones(len(self._levels))
+        for _ in range(3 if same else 5):
+            self._improve()
+
+    def _improve(self) -> None:
+        """f with a and b as they are, a and b with f, then the weights."""
+        a, b = self._a[self._patch], self._b[self._patch]
+        self._profile = self._solve(self._weight * b, self._levels - a, b)
+        f = self._at(self._profile)
+        self._a, self._b = self._light(f, self._levels)
+        self._b = np.clip(self._b, 0.2, 5.0)
+        self._a = _mean(self._patch, self._weight, self._levels - self._b[self._patch] * f, self._patches)
+        self._rest = self._levels - self._a[self._patch] - self._b[self._patch] * f
+        scale = 1.4826 * float(np.median(np.abs(self._rest))) + 1e-9 if len(self._rest) else 1.0
+        self._weight = np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2
+
+    def _solve(
+        self, weight: NDArray[np.float64], values: NDArray[np.float64], gain: NDArray[np.float64] | float = 1.0
+    ) -> NDArray[np.float64]:
+        """g at the knots that minimises sum weight / gain (values - gain g(d))^2, with a little smoothness."""
+        low, part = self._low, self._part
+        own = weight * gain
+        diagonal = np.bincount(low, own * (1 - part) ** 2, _ALL_KNOTS)
+        diagonal += np.bincount(low + 1, own * part**2, _ALL_KNOTS)
+        beside = np.bincount(low, own * part * (1 - part), _ALL_KNOTS)[:-1]
+        right = np.bincount(low, weight * (1 - part) * values, _ALL_KNOTS)
+        right += np.bincount(low + 1, weight * part * values, _ALL_KNOTS)
+        matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        bend = np.diff(np.eye(_ALL_KNOTS), 2, axis=0)
+        matrix += 1e-4 * max(float(diagonal.mean()), 1e-9) * (bend.T @ bend) + 1e-9 * np.eye(_ALL_KNOTS)
+        return np.asarray(np.linalg.solve(matrix, right))
+
+    def _at(self, profile: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (1 - self._part) * profile[self._low] + self._part * profile[self._low + 1]
+
+    def _light(
+        self, f: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """a and b (patches,) of the line a + b f through the values of each patch, drawn towards (mean, 1)."""
+        w, patch, count = self._weight, self._patch, self._patches
+        mean_f, mean_v = _mean(patch, w, f, count), _mean(patch, w, values, count)
+        df, dv = f - mean_f[patch], values - mean_v[patch]
+        square, cross = np.bincount(patch, w * df * df, count), np.bincount(patch, w * df * dv, count)
+        draw = 0.1 * float(square.sum()) / max(np.count_nonzero(square), 1) + 1e-12
+        b = (cross + draw) / (square + draw)
+        return mean_v - b * mean_f, b
+
+    @property
+    def explained(self) -> float:
+        """Relative weighted variance within the patches that f explains."""
+        if not len(self._levels):
+            return 0.0
+        off = self._levels - _mean(self._patch, self._weight, self._levels, self._patches)[self._patch]
+        whole = float(np.sum(self._weight * off**2))
+        return max(1.0 - float(np.sum(self._weight * self._rest**2)) / max(whole, 1e-12), 0.0)
+
+    def _jacobian(self) -> NDArray[np.float64]:
+        """(n, 4) derivatives of b f(d) by the motion, without what other f, a and b could explain."""
+        slope = np.gradient(self._profile) * _KNOTS / self._reach_um
+        gain = self._b[self._patch]
+        jacobian = (gain * self._at(slope))[:, None] * self._of_d
+        for column in range(4):
+            values = jacobian[:, column]
+            for _ in range(2):
+                values = values - gain * self._at(self._solve(self._weight * gain, values, gain))
+                values = values - _mean(self._patch, self._weight, values, self._patches)[self._patch]
+            jacobian[:, column] = values
+        return jacobian
+
+    def step(self) -> NDArray[np.float64]:
+        """The motion (4,) px that Gauss-Newton makes, at most two pixels of each kind."""
+        if len(self._levels) < _LEAST_ALL:
+            return np.zeros(4)
+        jacobian = self._jacobian()
+        normal = jacobian.T @ (self._weight[:, None] * jacobian)
+        right = jacobian.T @ (self._weight * self._rest)
+        normal += 1e-6 * np.trace(normal) * np.eye(4) + 1e-12 * np.eye(4)
+        return np.clip(np.linalg.solve(normal, right), -2.0, 2.0)
+
+    def patches(self) -> tuple[float, float, NDArray[np.float64]]:
+        """The part of the walls that is found, the residual in um, and the covariance (4, 4) of the motion in px^2."""
+        if len(self._levels) < _LEAST_ALL:
+            return 0.0, math.inf, np.full((4, 4), math.inf)
+        patch, count = self._patch, self._patches
+        # The mean profile of each patch on the knots, and its correlation with f.
+        nearest = np.clip(np.rint(self._low + self._part).astype(np.intp), 0, _ALL_KNOTS - 1)
+        key = patch * _ALL_KNOTS + nearest
+        shape = (count, _ALL_KNOTS)
+        number = np.bincount(key, minlength=count * _ALL_KNOTS).reshape(shape)
+        total = np.bincount(key, self._levels, count * _ALL_KNOTS).reshape(shape)
+        like = _correlation(total / np.maximum(number, 1), np.broadcast_to(self._profile, shape), number)
+        size = np.bincount(patch, minlength=count)
+        usable = (size >= _LEAST_PIXELS) & ((number > 0).sum(1) >= _KNOTS // 2)
+        length = np.bincount(patch, np.abs(self._distance) < 0.25 * self._reach_um, count)
+        found = usable & (like > _LIKE)
+        share = float(length[found].sum() / max(length[usable].sum(), 1e-9))
+        slope = np.gradient(self._profile) * _KNOTS / self._reach_um
+        of_d = self._b[patch] * self._at(slope)
+        across = np.bincount(patch, of_d * self._weight * of_d, count)
+        off_um = np.bincount(patch, of_d * self._weight * self._rest, count) / np.maximum(across, 1e-12)
+        weights = length * found
+        residual = math.sqrt(float(np.sum(weights * off_um**2) / max(weights.sum(), 1e-9)))
+        jacobian = self._jacobian()
+        normal = jacobian.T @ (self._weight[:, None] * jacobian)
+        parts = np.stack([np.bincount(patch, self._weight * self._rest * jacobian[:, k], count) for k in range(4)], -1)
+        values, vectors = np.linalg.eigh(normal)
+        inverse = vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
+        return share, residual, inverse @ (parts.T @ parts) @ inverse
+
+
+def _mean(
+    patch: NDArray[np.intp], weight: NDArray[np.float64], values: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Weighted mean (count,) of the values of each patch."""
+    return np.asarray(np.bincount(patch, weight * values, count) / (np.bincount(patch, weight, count) + 1e-9))
+
+
+def _correlation(a: NDArray[np.float64], b: NDArray[np.float64], weight: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Weighted correlation of the rows of a and b."""
+    total = np.maximum(weight.sum(1, keepdims=True), 1)
+    a = a - (weight * a).sum(1, keepdims=True) / total
+    b = b - (weight * b).sum(1, keepdims=True) / total
+    both = np.sqrt((weight * a * a).sum(1) * (weight * b * b).sum(1))
+    return np.asarray((weight * a * b).sum(1) / np.maximum(both, 1e-12))
