@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from flowrec.bench.verbs import AsJson, Overwrite
+from flowrec.bench.verbs import AsJson, Overwrite, Sets
 
 TomlOut = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
@@ -67,3 +67,33 @@ def motion(
         typer.echo(json.dumps(verb.figures(fit)))
     else:
         verb.show(fit, session, out)
+
+
+@calibrate.command()
+def image(
+    picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
+    config: Annotated[
+        Path | None, typer.Argument(help="Configuration (TOML) with the chip and, roughly, camera.um_per_px.")
+    ] = None,
+    out: TomlOut = None,
+    mirror: Annotated[
+        bool | None,
+        typer.Option("--mirror/--no-mirror", help="Whether the image is mirrored; by default both are tried."),
+    ] = None,
+    pick: Annotated[
+        int | None, typer.Option(metavar="N", help="Which of several equally good poses is meant, from 1.")
+    ] = None,
+    sets: Sets = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find the chip in a picture: um per pixel, angle, mirror and origin (section camera); an overlay shows it."""
+    from flowrec.commands import calibrate_image as verb
+    from flowrec.config import load_config
+
+    inputs = [config] if config is not None else []
+    done = verb.calibrate_image(picture, load_config(config, sets or []), out, mirror, pick, overwrite, inputs)
+    if as_json:
+        typer.echo(json.dumps(verb.figures(done)))
+        raise typer.Exit(0 if done.chosen is not None else 1)
+    verb.show(done, out)

@@ -123,6 +123,8 @@ class ResolvedConfig(Config):
     mission: PlacedMission
 
 
+REGISTRATION = "camera.registration"
+_IMAGE_SIZE = ("width_px", "height_px")
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
 
@@ -152,7 +154,8 @@ def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mappi
     ------
     UsageError : one line that names the flag or the file, the key, its range and the nearest valid value.
     """
-    tree = _read_config(path) if path is not None else {}
+    tree, sets = _read_config(path) if path is not None else {}, list(sets)
+    _take_registration(tree, sets)
     origin = Origin(str(path) if path is not None else "--set", _apply_sets(tree, sets) | dict(flags or {}))
     config = _config_from(Config, tree, origin)
     check_config(config, origin)
@@ -187,7 +190,10 @@ def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] 
 
     A recorded configuration may hold settings outside of their ranges; only the changed settings are checked.
     """
-    tree = _without_none(asdict(config))
+    tree, sets = _without_none(asdict(config)), list(sets)
+    if any(_key(text) == REGISTRATION for text in sets):
+        tree["camera"] = {k: v for k, v in tree["camera"].items() if k not in _IMAGE_SIZE}  # that of the file
+        _take_registration(tree, sets)
     origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
     changed = _config_from(type(config), tree, origin)
     check_config(changed, origin, frozenset(faults(config)))
@@ -233,6 +239,31 @@ def _apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> dict[str, str]:
         _put(tree, key.strip().split("."), _value(value.strip()))
         flags[key.strip()] = "--set"
     return flags
+
+
+def _key(text: str) -> str:
+    return text.partition("=")[0].strip()
+
+
+def _take_registration(tree: dict[str, Any], sets: Iterable[str]) -> None:
+    """Put the settings of a registration file, which the tree or one of `sets` names, before those of the tree."""
+    camera = tree.get("camera", {})
+    named = [_value(text.partition("=")[2].strip()) for text in sets if _key(text) == REGISTRATION]
+    path = named[-1] if named else camera.get("registration") if isinstance(camera, dict) else None
+    if not isinstance(path, str) or not path or not isinstance(camera, dict):
+        return
+    stated = read_toml(Path(path)).get("camera")
+    if not isinstance(stated, dict) or not {"um_per_px", "angle_deg", "width_px", "height_px"} <= stated.keys():
+        raise UsageError(f"{path}: is no registration; flowrec calibrate image PICTURE -o {path} makes one")
+    for key in _IMAGE_SIZE:
+        given = [_value(text.partition("=")[2].strip()) for text in sets if _key(text) == f"camera.{key}"]
+        value = given[-1] if given else camera.get(key, stated[key])
+        if value != stated[key]:
+            raise UsageError(
+                f"{path}: is of images {stated['width_px']} x {stated['height_px']}, and camera.{key} = {value}; take "
+                "a picture with the size and region of the run, and register it"
+            )
+    tree["camera"] = camera | stated
 
 
 def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:

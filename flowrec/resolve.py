@@ -26,7 +26,7 @@ from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera, Simulat
 from flowrec.robot import USUAL_DELAY_S, Robot
 
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
-_MAY_BE_NONE = ("camera.centre_um",)  # None is a value
+_MAY_BE_NONE = ("camera.centre_um", "camera.residual_um")  # None is a value
 _ONLY_FOR_DRIVING = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s")
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)

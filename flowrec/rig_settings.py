@@ -50,10 +50,17 @@ class CameraSettings:
     bits: Annotated[int, OneOf(8, 10, 12, 14, 16)] = 8  # depth of a pixel; grey levels are below 2^bits
     rate_hz: _Rate | None = None  # None: chosen to fit the robot's speed
     um_per_px: _Scale | None = None  # None: the whole chip fills the image
-    # Registration: how the chip lies in the image. flowrec calibrate image measures it together with um_per_px.
+    # Registration: how the chip lies in the image, and um_per_px. flowrec calibrate image measures them and writes a
+    # file; its settings go before those of this section.
+    registration: str = ""  # that file
     angle_deg: Angle = 0.0  # direction of the chip's x axis in the image: 0 right, 90 down
     mirror: bool = False  # the image shows the chip as in a mirror
     centre_um: PointUm | None = None  # chip point at the centre of the image; None: the centre of the chip
+    # Stated by the file of a registration: when it was measured, in which picture, and how far the walls in the
+    # picture are from where it puts them (root mean square).
+    registered_on: str = ""
+    registered_from: str = ""
+    residual_um: Annotated[float, Range(0.0, 1e6)] | None = None
     exposure_s: Annotated[float, Range(0.0, 10.0)] = 0.004
     # The following settings, OF_SIMULATED_CAMERA, are those of the simulated rig only.
     blur_px: Annotated[float, Range(0.0, 100.0)] = 0.8  # optical blur, one sigma

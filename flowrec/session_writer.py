@@ -23,6 +23,7 @@ from flowrec.store.writer import SessionWriter
 from flowrec.system.outputs import Output
 
 _QUEUE_S = 2.0
+_LARGEST_PICTURE_BYTES = 50_000_000
 _LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
 
 
@@ -147,4 +148,16 @@ def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:
         facts["seed"] = str(config.simulated.seed)
     if config.refine.weights_sha256:
         facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
-    return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]))
+    pictures = _pictures(config)
+    return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]), pictures=pictures)
+
+
+def _pictures(config: ResolvedConfig) -> dict[str, bytes]:
+    """The picture of the registration, if the file that is named has one beside it."""
+    named = Path(config.camera.registration)
+    if not named.name:
+        return {}
+    overlay = named.with_suffix(".png")
+    if not overlay.is_file() or overlay.stat().st_size > _LARGEST_PICTURE_BYTES:
+        return {}
+    return {"registration.png": overlay.read_bytes()}

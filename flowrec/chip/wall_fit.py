@@ -25,14 +25,15 @@ from numpy.typing import NDArray
 
 from flowrec.chip.clearance import clearance_um
 from flowrec.chip.registration import Calibration
+from flowrec.chip.wall_search import Points, blurred, gradient, moved
 from flowrec.interpolation import cells_at
-from flowrec.chip.wall_search import Points, moved
 
 _LONGEST_PX = 1280  # side of the image that is fitted
 # Blur, most pixels, and the motion in px at which Gauss-Newton ends; one row after the other.
 _STAGES = ((4.0, 30_000, 0.05), (2.0, 30_000, 0.05), (1.0, 30_000, 0.02), (0.0, 100_000, 0.003))
 _STEPS = 8  # of Gauss-Newton, at most, in each stage
-_LIT_UNEVENLY = 0.85  # part of the walls found below which the local contrast is tried instead of the grey levels
+# Part of the walls found between which the local contrast is tried instead of the grey levels.
+_HOPELESS, _LIT_UNEVENLY = 0.4, 0.85
 _KNOTS = 12  # of f on either side of the wall
 _ALL_KNOTS = 2 * _KNOTS + 1
 _TUKEY = 4.685
@@ -107,20 +108,21 @@ class Fitter:
     def __init__(self, picture: NDArray[np.float32], walls: WallMap, reach_um: float, um_per_px: float) -> None:
         self._walls, self._reach_um = walls, reach_um
         self._size_px = (picture.shape[1], picture.shape[0])
-        self._step = max(1.0, max(picture.shape) / _LONGEST_PX)
+        step = max(1.0, max(picture.shape) / _LONGEST_PX)
         small = np.asarray(picture, np.float32)
-        if self._step > 1.0:
-            height, width = (round(n / self._step) for n in picture.shape)
-            small = cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA)
-        self._sigma_px = 2.0 * reach_um / (um_per_px * self._step)
+        if step > 1.0:
+            height, width = (round(n / step) for n in picture.shape)
+            small = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+        # Pixels of the picture to one of those that are fitted, along x and y.
+        self._step = np.array(self._size_px) / small.shape[::-1]
+        self._sigma_px = 2.0 * reach_um / (um_per_px * step)
         self._levelled = _levelled(small, 2.0 * self._sigma_px)
 
     def fit(self, start: Calibration) -> WallFit:
         """The pose near a first one."""
         done = self._fit(self._levelled, start)
-        if done.found < _LIT_UNEVENLY:
-            smooth = cv2.GaussianBlur(self._levelled, (0, 0), 1.0)
-            contrast = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+        if _HOPELESS < done.found < _LIT_UNEVENLY:
+            contrast = np.hypot(*gradient(blurred(self._levelled, 1.0)))
             other = self._fit(_levelled(contrast, 2.0 * self._sigma_px), start)
             if other.found > done.found:
                 return other
@@ -129,7 +131,7 @@ class Fitter:
     def _fit(self, picture: NDArray[np.float32], start: Calibration) -> WallFit:
         now = start
         for blur_px, most, enough_px in _STAGES:
-            image = cv2.GaussianBlur(picture, (0, 0), blur_px) if blur_px > 0.0 else picture
+            image = blurred(picture, blur_px) if blur_px > 0.0 else picture
             sample = self._sample(image, now, most)
             model = None
             for _ in range(_STEPS):
@@ -186,7 +188,11 @@ class _Sample:
 class _Model:
     """f, a and b at one pose, the residuals, and the normal equations for a motion of the chip.
 
-    `before` : the model at a pose nearby, with which the search for f, a and b begins.
+    `before` is the model at a pose nearby, with which the search for f, a and b begins.
+
+    Attributes
+    ----------
+    offset, gain : (patches,) a and b.
     """
 
     def __init__(
@@ -203,43 +209,42 @@ class _Model:
         columns, rows = np.floor(points_um[used] / (2.0 * reach_um) + 0.5).astype(np.intp).T
         across, down = (int(length // (2.0 * reach_um)) + 2 for length in walls.size_um)
         self._patch = np.clip(rows, 0, down - 1) * across + np.clip(columns, 0, across - 1)
-        self._patches = across * down
+        self._count = across * down
         slope_px = now.um_per_px * gradient[used] @ now.axes.T  # of d, in um per px of the image
         arm = (sample.at_px[used] - sample.middle_px) / sample.reach_px
         turn = slope_px[:, 1] * arm[:, 0] - slope_px[:, 0] * arm[:, 1]
         # (n, 4) derivatives of d by right, down, turn, growth
         self._of_d = -np.column_stack((slope_px, turn, (slope_px * arm).sum(-1)))
-        same = before is not None and before._patches == self._patches
-        self._a = before._a if same and before is not None else np.zeros(self._patches)
-        self._b = before._b if same and before is not None else np.ones(self._patches)
+        self.offset: NDArray[np.float64] = before.offset if before is not None else np.zeros(self._count)
+        self.gain: NDArray[np.float64] = before.gain if before is not None else np.ones(self._count)
         self._weight = np.ones(len(self._levels))
-        for _ in range(3 if same else 5):
+        for _ in range(5 if before is None else 3):
             self._improve()
 
     def _improve(self) -> None:
-        """f with a and b as they are, a and b with f, then the weights."""
-        a, b = self._a[self._patch], self._b[self._patch]
+        """Solve for f with a and b as they are, for a and b with f, then for the weights."""
+        a, b = self.offset[self._patch], self.gain[self._patch]
         self._profile = self._solve(self._weight * b, self._levels - a, b)
         f = self._at(self._profile)
-        self._a, self._b = self._light(f, self._levels)
-        self._b = np.clip(self._b, 0.2, 5.0)
-        self._a = _mean(self._patch, self._weight, self._levels - self._b[self._patch] * f, self._patches)
-        self._rest = self._levels - self._a[self._patch] - self._b[self._patch] * f
+        self.offset, self.gain = self._light(f, self._levels)
+        self.gain = np.clip(self.gain, 0.2, 5.0)
+        self.offset = _mean(self._patch, self._weight, self._levels - self.gain[self._patch] * f, self._count)
+        self._rest = self._levels - self.offset[self._patch] - self.gain[self._patch] * f
         scale = 1.4826 * float(np.median(np.abs(self._rest))) + 1e-9 if len(self._rest) else 1.0
         self._weight = np.maximum(1.0 - (self._rest / (_TUKEY * scale)) ** 2, 0.0) ** 2
 
     def _solve(
         self, weight: NDArray[np.float64], values: NDArray[np.float64], gain: NDArray[np.float64] | float = 1.0
     ) -> NDArray[np.float64]:
-        """g at the knots that minimises sum weight / gain (values - gain g(d))^2, with a little smoothness."""
+        """The g at the knots that minimises sum weight / gain (values - gain g(d))^2, with a little smoothness."""
         low, part = self._low, self._part
         own = weight * gain
-        diagonal = np.bincount(low, own * (1 - part) ** 2, _ALL_KNOTS)
-        diagonal += np.bincount(low + 1, own * part**2, _ALL_KNOTS)
+        upper = np.bincount(low, own * (1 - part) ** 2, _ALL_KNOTS)
+        diagonal = np.asarray(upper + np.bincount(low + 1, own * part**2, _ALL_KNOTS), np.float64)
         beside = np.bincount(low, own * part * (1 - part), _ALL_KNOTS)[:-1]
         right = np.bincount(low, weight * (1 - part) * values, _ALL_KNOTS)
-        right += np.bincount(low + 1, weight * part * values, _ALL_KNOTS)
-        matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        right = right + np.bincount(low + 1, weight * part * values, _ALL_KNOTS)
+        matrix: NDArray[np.float64] = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
         bend = np.diff(np.eye(_ALL_KNOTS), 2, axis=0)
         matrix += 1e-4 * max(float(diagonal.mean()), 1e-9) * (bend.T @ bend) + 1e-9 * np.eye(_ALL_KNOTS)
         return np.asarray(np.linalg.solve(matrix, right))
@@ -250,12 +255,12 @@ class _Model:
     def _light(
         self, f: NDArray[np.float64], values: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """a and b (patches,) of the line a + b f through the values of each patch, drawn towards (mean, 1)."""
-        w, patch, count = self._weight, self._patch, self._patches
+        """Offset a and gain b (patches,) of the line a + b f through each patch, drawn towards (mean, 1)."""
+        w, patch, count = self._weight, self._patch, self._count
         mean_f, mean_v = _mean(patch, w, f, count), _mean(patch, w, values, count)
         df, dv = f - mean_f[patch], values - mean_v[patch]
         square, cross = np.bincount(patch, w * df * df, count), np.bincount(patch, w * df * dv, count)
-        draw = 0.1 * float(square.sum()) / max(np.count_nonzero(square), 1) + 1e-12
+        draw = 0.1 * float(square.sum()) / max(int(np.count_nonzero(square)), 1) + 1e-12
         b = (cross + draw) / (square + draw)
         return mean_v - b * mean_f, b
 
@@ -264,20 +269,20 @@ class _Model:
         """Relative weighted variance within the patches that f explains."""
         if not len(self._levels):
             return 0.0
-        off = self._levels - _mean(self._patch, self._weight, self._levels, self._patches)[self._patch]
+        off = self._levels - _mean(self._patch, self._weight, self._levels, self._count)[self._patch]
         whole = float(np.sum(self._weight * off**2))
         return max(1.0 - float(np.sum(self._weight * self._rest**2)) / max(whole, 1e-12), 0.0)
 
     def _jacobian(self) -> NDArray[np.float64]:
         """(n, 4) derivatives of b f(d) by the motion, without what other f, a and b could explain."""
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
-        gain = self._b[self._patch]
-        jacobian = (gain * self._at(slope))[:, None] * self._of_d
+        gain = self.gain[self._patch]
+        jacobian: NDArray[np.float64] = (gain * self._at(slope))[:, None] * self._of_d
         for column in range(4):
             values = jacobian[:, column]
             for _ in range(2):
                 values = values - gain * self._at(self._solve(self._weight * gain, values, gain))
-                values = values - _mean(self._patch, self._weight, values, self._patches)[self._patch]
+                values = values - _mean(self._patch, self._weight, values, self._count)[self._patch]
             jacobian[:, column] = values
         return jacobian
 
@@ -295,7 +300,7 @@ class _Model:
         """The part of the walls that is found, the residual in um, and the covariance (4, 4) of the motion in px^2."""
         if len(self._levels) < _LEAST_ALL:
             return 0.0, math.inf, np.full((4, 4), math.inf)
-        patch, count = self._patch, self._patches
+        patch, count = self._patch, self._count
         # The mean profile of each patch on the knots, and its correlation with f.
         nearest = np.clip(np.rint(self._low + self._part).astype(np.intp), 0, _ALL_KNOTS - 1)
         key = patch * _ALL_KNOTS + nearest
@@ -309,7 +314,7 @@ class _Model:
         found = usable & (like > _LIKE)
         share = float(length[found].sum() / max(length[usable].sum(), 1e-9))
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
-        of_d = self._b[patch] * self._at(slope)
+        of_d = self.gain[patch] * self._at(slope)
         across = np.bincount(patch, of_d * self._weight * of_d, count)
         off_um = np.bincount(patch, of_d * self._weight * self._rest, count) / np.maximum(across, 1e-12)
         weights = length * found

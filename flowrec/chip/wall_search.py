@@ -19,13 +19,15 @@ import scipy  # its fft and optimize load at first use, not at start-up
 from numpy.typing import NDArray
 
 from flowrec.chip.registration import Calibration
+from flowrec.interpolation import cells_at
 
 Complex = NDArray[np.complex64]
 Points = NDArray[np.float64]
-_FINE_PX, _COARSE_PX = 480, 96  # longer side of the image in which gradients are taken, and of the one that is searched
-_ANGLE_PX, _SCALE_PX = 1.6, 1.2  # how far half a step moves the chip's farthest wall, in coarse pixels
+_FINE_PX, _COARSE_PX = 480, 80  # longer side of the image in which gradients are taken, and of the one that is searched
+_ANGLE_PX, _SCALE_PX = 1.8, 1.4  # how far half a step moves the chip's farthest wall, in coarse pixels
 _LEAST_SEEN = 0.2  # of the walls that must lie in the image
 _PEAKS = 3  # places that are kept of each angle and scale
+_LEAST_SCORE = 0.5  # of a candidate, relative to the best one
 _APART_PX = 6.0  # distance between two candidates, in coarse pixels
 
 
@@ -37,34 +39,47 @@ class Pose:
     score: float
 
 
+def blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    """An image (h, w) after a Gaussian blur; beyond the border its edge goes on."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def gradient(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Sobel's derivatives (h, w) to the right and down."""
+    right, down = (
+        np.asarray(cv2.Sobel(image, cv2.CV_32F, *axis, ksize=3, borderType=cv2.BORDER_REPLICATE), np.float32)
+        for axis in ((1, 0), (0, 1))
+    )
+    return right, down
+
+
 def orientations(image: NDArray[np.float32], width_px: float) -> Complex:
     """(h, w) z of an image, at most about 1 in size, averaged over lines of this width."""
-    smooth = cv2.GaussianBlur(image, (0, 0), 1.0, borderType=cv2.BORDER_REPLICATE)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, borderType=cv2.BORDER_REPLICATE)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, borderType=cv2.BORDER_REPLICATE)
-    size = np.hypot(gx, gy)
+    gx, gy = gradient(blurred(image, 1.0))
+    size = np.asarray(np.hypot(gx, gy), np.float32)
     inverse = 1.0 / np.maximum(size, 1e-12)
     real, imaginary, around = (
-        cv2.GaussianBlur(part, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+        blurred(part, sigma)
         for part, sigma in (
-            ((gx * gx - gy * gy) * inverse, width_px),
-            (2.0 * gx * gy * inverse, width_px),
+            (np.asarray((gx * gx - gy * gy) * inverse, np.float32), width_px),
+            (np.asarray(2.0 * gx * gy * inverse, np.float32), width_px),
             (size, 3.0 * width_px),
         )
     )
-    around += 0.5 * max(float(size.mean()), 1e-12)
+    around = around + np.float32(0.5 * max(float(size.mean()), 1e-12))
     return np.asarray((real + 1j * imaginary) / around, np.complex64)
 
 
 def wall_points(clearance_px: NDArray[np.float32]) -> tuple[Points, Points]:
     """Points (n, 2) on the walls in px of the mask, as (column, row), and the unit normals (n, 2) there."""
-    down, right = np.gradient(clearance_px.astype(np.float64))
-    size = np.hypot(right, down)
-    near = (np.abs(clearance_px) <= 0.75) & (size > 0.3)
+    down, right = (np.asarray(slope, np.float64) for slope in np.gradient(clearance_px.astype(np.float64)))
+    size: Points = np.asarray(np.hypot(right, down), np.float64)
+    near: NDArray[np.bool_] = np.asarray((np.abs(clearance_px) <= 0.75) & (size > 0.3))
     near[[0, -1]] = near[:, [0, -1]] = False
     rows, columns = np.nonzero(near)
-    normals = np.stack((right[near], down[near]), -1) / size[near][:, None]
-    return np.stack((columns, rows), -1) - clearance_px[near][:, None] * normals, normals
+    normals = np.stack((right[near], down[near]), -1) / size[near].reshape(-1, 1)
+    points: Points = np.stack((columns, rows), -1) - clearance_px[near].reshape(-1, 1) * normals
+    return points, normals
 
 
 class Search:
@@ -102,6 +117,8 @@ class Search:
         found = sorted(self._coarse_poses(um_per_px, mirrors), key=lambda pose: -pose.score)
         kept: list[Pose] = []
         for pose in found:
+            if pose.score < _LEAST_SCORE * found[0].score:
+                break
             if all(self._distance_px(pose, other) > _APART_PX for other in kept):
                 kept.append(pose)
                 if len(kept) == count:
@@ -116,7 +133,7 @@ class Search:
     def _distance_px(self, one: Pose, other: Pose) -> float:
         """Root mean square distance of the walls of two poses, in coarse pixels."""
         off = one.calibration.to_px(self._points_um[::10]) - other.calibration.to_px(self._points_um[::10])
-        return float(np.sqrt(np.mean(np.sum(off * off, -1)))) / (self._fine * self._coarse)
+        return math.sqrt(float(np.mean(np.sum(off * off, -1)))) / float(self._fine * self._coarse)
 
     def _coarse_poses(self, um_per_px: tuple[float, float], mirrors: tuple[bool, ...]) -> Iterator[Pose]:
         low, high = um_per_px
@@ -141,7 +158,8 @@ class Search:
         padded = np.pad(self._mask, pad, mode="edge").astype(np.float32)
         height, width = (max(8, round(n * scale)) for n in padded.shape)
         how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
-        fine = orientations(cv2.resize(padded, (width, height), interpolation=how), 1.0)
+        drawn = np.asarray(cv2.resize(padded, (width, height), interpolation=how), np.float32)
+        fine = orientations(drawn, 1.0)
         cut = round(pad * scale)
         fine = fine[cut : height - cut, cut : width - cut]
         return np.asarray(_reduced(fine.real, self._coarse) + 1j * _reduced(fine.imag, self._coarse), np.complex64)
@@ -233,10 +251,9 @@ class Search:
             return 0.0
         normals = self._normals[inside] @ calibration.axes.T
         across = (normals[:, 0] + 1j * normals[:, 1]) ** 2
-        here = at[inside].astype(np.float32)[None]
-        real = cv2.remap(z.real, here, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
-        imaginary = cv2.remap(z.imag, here, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
-        return float((across.real * real + across.imag * imaginary).mean() * math.sqrt(inside.mean()))
+        cells = cells_at(at[inside], z.shape)
+        agreement = across.real * cells.interpolate(z.real) + across.imag * cells.interpolate(z.imag)
+        return float(agreement.mean()) * math.sqrt(float(inside.mean()))
 
 
 def moved(calibration: Calibration, move: Points, middle_px: Points, reach_px: float) -> Calibration:
@@ -250,8 +267,9 @@ def moved(calibration: Calibration, move: Points, middle_px: Points, reach_px: f
     right, down, turn, growth = move.tolist()
     fixed_um = calibration.to_um(middle_px)
     scale_um = calibration.um_per_px * math.exp(-growth / reach_px)
-    turned = Calibration(scale_um, (0.0, 0.0), calibration.angle_deg + math.degrees(turn / reach_px), calibration.mirror)
-    x, y = (fixed_um - turned.to_um(middle_px + (right, down))).tolist()
+    angle_deg = calibration.angle_deg + math.degrees(turn / reach_px)
+    turned = Calibration(scale_um, (0.0, 0.0), angle_deg, calibration.mirror)
+    x, y = (fixed_um - turned.to_um(middle_px + np.array((right, down)))).tolist()
     return replace(turned, origin_um=(x, y))
 
 

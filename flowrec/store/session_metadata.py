@@ -35,6 +35,7 @@ CONFIG_FILE = "config.toml"
 CHIP_IMAGE_FILE = "chip.png"
 CHIP_FILE = "chip.toml"
 _WEIGHTS = "weights/"
+_PICTURES = "pictures/"
 
 _METADATA_LIMIT_BYTES = 16 << 20
 _ATTACHMENTS_LIMIT_BYTES = 256 << 20
@@ -76,6 +77,7 @@ class SessionHeader:
     provenance : version, commit, packages, host, seed, operator, ...: all text.
     parent : name and hash of the session that this one replays; empty for a live run.
     weights : network weights by file name.
+    pictures : PNG files by name that show what the run relies on, such as the registration of the chip.
     part : which file of a run this is; None where the run is in one file.
     start_unix_ns : Unix time of stamp 0 of the session clock. In the file, log times, publish times and the timestamps
         of foxglove's messages are Unix times: stamps plus this. 0 in files of the first release: there they are stamps.
@@ -90,6 +92,7 @@ class SessionHeader:
     weights: Mapping[str, bytes] = field(default_factory=dict)
     part: Part | None = None
     start_unix_ns: int = 0
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
     def is_same_run(self, other: SessionHeader) -> bool:
         """Whether two headers differ in their part at most."""
@@ -112,6 +115,7 @@ def header_records(header: SessionHeader) -> Iterator[Metadata | Attachment]:
         (CHIP_IMAGE_FILE, "image/png", header.chip_png),
         (CHIP_FILE, "application/toml", header.chip_toml.encode()),
         *((_WEIGHTS + name, "application/octet-stream", data) for name, data in sorted(header.weights.items())),
+        *((_PICTURES + name, "image/png", data) for name, data in sorted(header.pictures.items())),
     ]
     for name, media_type, data in attachments:
         yield Attachment(header.start_unix_ns, header.start_unix_ns, name, media_type, data)
@@ -119,7 +123,7 @@ def header_records(header: SessionHeader) -> Iterator[Metadata | Attachment]:
 
 def is_header_file(name: str) -> bool:
     """Whether an attachment is part of a session's header."""
-    return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith(_WEIGHTS)
+    return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith((_WEIGHTS, _PICTURES))
 
 
 class SessionMetadata:
@@ -223,6 +227,9 @@ class SessionMetadata:
                 },
                 part=self.part,
                 start_unix_ns=self.source.start_unix_ns,
+                pictures={
+                    name.removeprefix(_PICTURES): data for name, data in files.items() if name.startswith(_PICTURES)
+                },
             )
         except KeyError as error:
             raise self.source.damaged(0, f"the record {error} is missing") from error

@@ -104,7 +104,8 @@ def picture(
         scene += np.float32(rng.uniform(-0.35, 0.2)) * spot
     if look.robot:
         spot = np.zeros((height, width), np.float32)
-        cv2.circle(spot, tuple(int(v) for v in rng.uniform((0.3 * width,) * 2, (0.6 * width,) * 2)), round(8 * width / 640), 1.0, -1, cv2.LINE_AA)
+        x, y = rng.uniform(0.3, 0.6, 2) * width
+        cv2.circle(spot, (int(x), int(y)), round(width / 80), 1.0, -1, cv2.LINE_AA)
         scene = scene * (1.0 - 0.8 * spot)
     scene = cv2.GaussianBlur(scene, (0, 0), look.blur_px)
     x, y = np.meshgrid(np.linspace(-1, 1, width, dtype=np.float32), np.linspace(-1, 1, height, dtype=np.float32))

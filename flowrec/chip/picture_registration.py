@@ -1,0 +1,120 @@
+"""How a chip lies in one picture of it: search, sub-pixel fit, and a verdict.
+
+Nothing is chosen silently: poses that explain the picture equally well are all returned (a chip may be symmetric), and
+a picture that does not show the chip, or not enough of it, is refused.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.chip.chip import Chip
+from flowrec.chip.clearance import median_width_um
+from flowrec.chip.registration import Calibration
+from flowrec.chip.wall_fit import Fitter, WallFit, WallMap
+from flowrec.chip.wall_search import Search
+from flowrec.errors import ChipError
+
+_CANDIDATES = 12
+_LEAST_SCORE = 0.55  # of a candidate, relative to the best one
+_FIRST, _HOPELESS = 3, 0.5  # if of so many candidates none finds this part of the walls, the others are not tried
+_REACH_WIDTHS, _REACH_PX = 0.6, 6.0  # from the walls: in median channel widths, but at least so many camera pixels
+_LEAST_FOUND = 0.75  # part of the walls
+_EQUAL_FOUND, _EQUAL_EXPLAINED = 0.1, 0.85  # less found by this, and explained at least by this factor: equally good
+_SAME_PX = 2.0  # two poses that differ by less are one
+_MOST_SHIFT_PX, _MOST_ANGLE_DEG, _MOST_SCALE = 1.0, 0.3, 0.01  # standard errors above which a picture is refused
+
+
+def register(
+    picture: NDArray[np.uint8 | np.uint16],
+    chip: Chip,
+    um_per_px: tuple[float, float],
+    mirrors: tuple[bool, ...] = (False, True),
+) -> tuple[WallFit, ...]:
+    """The poses of a chip that explain a picture (h, w) equally well, best first; usually one.
+
+    `um_per_px` is the range that is searched, `mirrors` says whether mirror images are.
+
+    Raises
+    ------
+    ChipError : one line: the picture does not show this chip, or does not determine how it lies.
+    """
+    grey = np.asarray(picture, np.float32)
+    if min(grey.shape) < 32:
+        raise ChipError(f"the picture has {grey.shape[1]} x {grey.shape[0]} pixels; take one of at least 32 x 32")
+    if float(grey.max() - grey.min()) < 4.0:
+        raise ChipError("the picture is blank; is the lamp on and the chip in view?")
+    rough_um = math.sqrt(um_per_px[0] * um_per_px[1])
+    walls = WallMap(chip.mask, chip.um_per_px)
+    poses = Search(grey, chip.mask, chip.um_per_px, walls.clearance_um).candidates(um_per_px, mirrors, _CANDIDATES)
+    reach_um = max(_REACH_WIDTHS * median_width_um(chip), _REACH_PX * rough_um)
+    fitter = Fitter(grey, walls, reach_um, rough_um)
+    fits: list[WallFit] = []
+    for pose in poses:
+        hopeless = len(fits) == _FIRST and max(fit.found for fit in fits) < _HOPELESS
+        if hopeless or pose.score < _LEAST_SCORE * poses[0].score:
+            break
+        fits.append(fitter.fit(pose.calibration))
+    fits.sort(key=lambda fit: -fit.found * fit.explained)
+    distinct: list[WallFit] = []
+    for fit in fits:
+        if all(_apart_px(fit.calibration, other.calibration, walls) > _SAME_PX for other in distinct):
+            distinct.append(fit)
+    if not distinct or distinct[0].found < _LEAST_FOUND:
+        found = 100.0 * distinct[0].found if distinct else 0.0
+        raise ChipError(
+            f"the picture does not show the chip {chip.name}: at best {found:.0f} % of its walls agree, "
+            f"{100 * _LEAST_FOUND:.0f} % are needed; is it this chip, in focus, and is um_per_px about right?"
+        )
+    best = distinct[0]
+    equal = [
+        fit
+        for fit in distinct
+        if fit.found >= best.found - _EQUAL_FOUND and fit.explained >= _EQUAL_EXPLAINED * best.explained
+    ]
+    _refuse_undetermined(best, chip)
+    return tuple(equal)
+
+
+def _apart_px(one: Calibration, other: Calibration, walls: WallMap) -> float:
+    """Root mean square distance of the walls of two poses in the image."""
+    off = one.to_px(walls.points_um) - other.to_px(walls.points_um)
+    return float(np.sqrt(np.mean(np.sum(off * off, -1))))
+
+
+def _refuse_undetermined(fit: WallFit, chip: Chip) -> None:
+    x, y, angle, scale = fit.std.tolist()
+    limit_um = _MOST_SHIFT_PX * fit.calibration.um_per_px
+    loose = [
+        text
+        for text, bad in (
+            (f"the shift along x ({x:.3g} um)", not x < limit_um),
+            (f"the shift along y ({y:.3g} um)", not y < limit_um),
+            (f"the angle ({angle:.2g} degrees)", not angle < _MOST_ANGLE_DEG),
+            (f"the scale ({100 * scale:.2g} %)", not scale < _MOST_SCALE),
+        )
+        if bad
+    ]
+    if loose:
+        raise ChipError(
+            f"the walls of {chip.name} in the picture do not determine {' and '.join(loose)}; show more of the chip, "
+            "with walls of several directions"
+        )
+
+
+def overlay(picture: NDArray[np.uint8 | np.uint16], chip: Chip, calibration: Calibration) -> NDArray[np.uint8]:
+    """The picture (h, w, 3), blue first, with the outline of the chip as it was found, in orange."""
+    grey = picture.astype(np.float32)
+    low, high = np.percentile(grey, (0.5, 99.5))
+    shown = np.clip(255.0 * (grey - low) / max(float(high - low), 1.0), 0, 255).astype(np.uint8)
+    drawn = np.asarray(cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR), np.uint8)
+    contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    wide = max(1, round(max(grey.shape) / 800))
+    for contour in contours:
+        at = calibration.to_px(contour[:, 0] * chip.um_per_px)
+        cv2.polylines(drawn, [np.rint(16 * at).astype(np.int32)], True, (0, 140, 255), wide, cv2.LINE_AA, 4)
+    return drawn

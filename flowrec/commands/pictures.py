@@ -1,0 +1,67 @@
+"""The picture that a calibration looks at: an image file, the median of a movie's images, or that of a session's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from flowrec.declarations import Image
+from flowrec.errors import UsageError
+from flowrec.movies import ReadOptions, open_movie
+from flowrec.rigs.movie.source import sha256_of
+from flowrec.session import open as open_session
+
+_IMAGES = 31  # of a session, for the median
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A picture and where it comes from.
+
+    Attributes
+    ----------
+    image : (h, w) grey levels.
+    bits : depth of a pixel.
+    source : name of the file, and what was made of it.
+    sha256 : of the file.
+    """
+
+    image: Image
+    bits: int
+    source: str
+    sha256: str
+
+
+def read_picture(path: Path, channel: str | None = None) -> Picture:
+    """The picture in a file: what does not move, if the file holds many images.
+
+    `channel` chooses red, green, blue or grey of colours.
+
+    Raises
+    ------
+    FlowrecError : one line: no such file, none that can be read, or colour without a choice.
+    """
+    if path.suffix == ".mcap":
+        image, bits, count = _of_session(path)
+    else:
+        with open_movie(path, options=ReadOptions(channel)) as movie:
+            image, bits, count = movie.median_image(), movie.facts.bits, movie.facts.frames
+    source = path.name if count == 1 else f"{path.name}, median of images"
+    return Picture(image, bits, source, sha256_of(path))
+
+
+def _of_session(path: Path) -> tuple[Image, int, int]:
+    session = open_session(path)
+    times = np.unique(np.linspace(0.0, session.duration_s, _IMAGES))
+    frames = {}
+    for time_s in times.tolist():
+        frame = session.at(time_s).frame
+        if frame is not None and frame.image.size:
+            frames[frame.index] = frame
+    if not frames:
+        raise UsageError(f"{path}: holds no images; take a session that was recorded with them")
+    stack = np.stack([frame.image for frame in frames.values()])
+    image: Image = np.median(stack, axis=0, overwrite_input=True).round().astype(stack.dtype)
+    return image, next(iter(frames.values())).bits, len(frames)

@@ -1,0 +1,288 @@
+"""`python -m tests.perf.registration`: errors of `flowrec calibrate image` over chips, transformations and looks.
+
+Every look of tests/chip/looks.py and the simulated microscope, as it is and inverted, meets every transformation; chips
+and textures change from case to case. Then pictures that do not show the chip: how many are refused. With `--rivals`
+the search is compared with the log-polar FFT and the fit with OpenCV's ECC, from the same pictures and first poses.
+
+FLOWREC_REFERENCE_DATA adds real vessels to the chips, and real images as textures (also `--textures DIR`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flowrec.chip import ChipSettings, load_chip
+from flowrec.chip.chip import Chip
+from flowrec.chip.picture_registration import register
+from flowrec.chip.registration import Calibration
+from flowrec.chip.wall_fit import WallMap
+from flowrec.chip.wall_search import Search
+from flowrec.errors import ChipError
+from flowrec.rig_settings import CameraSettings
+from flowrec.rigs.simulated.microscope import Microscope
+from tests.chip.looks import LOOKS, picture
+
+SIZE_PX, ABOUT_UM, CHIP_UM = (640, 512), 10.0, 20.0
+# Turn in degrees, mirror, shift in um, scale.
+TRANSFORMATIONS: dict[str, tuple[float, bool, float, float]] = {
+    "as assumed": (0.0, False, 0.0, 1.0),
+    "2 degrees": (2.0, False, 0.0, 1.0),
+    "90 degrees": (90.0, False, 0.0, 1.0),
+    "180 degrees": (180.0, False, 0.0, 1.0),
+    "mirrored": (0.0, True, 0.0, 1.0),
+    "shifted 300 um": (0.0, False, 300.0, 1.0),
+    "scale + 3 %": (0.0, False, 0.0, 1.03),
+    "scale - 3 %": (0.0, False, 0.0, 0.97),
+    "all": (37.0, True, 300.0, 1.03),
+    "half in view": (-63.0, False, 600.0, 0.6),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    look: str
+    transformation: str
+    chip: Chip
+    truth: Calibration
+    image: np.ndarray
+    seed: int
+
+    @property
+    def about_um(self) -> float:
+        """um per pixel as a person would state it before."""
+        return ABOUT_UM * (0.6 if self.transformation == "half in view" else 1.0)
+
+
+def chips() -> list[Chip]:
+    found = [load_chip(ChipSettings("vessels", seed=seed)) for seed in range(6)] + [load_chip(ChipSettings())]
+    data = os.environ.get("FLOWREC_REFERENCE_DATA")
+    if data:
+        for number in (0, 4, 7):
+            found.append(replace(load_chip(ChipSettings(path=f"{data}/vessels/case_{number:02}.npz")), um_per_px=50.0))
+        for name in ("hrf_10_dr", "hrf_12_h"):
+            mask = cv2.imread(f"{data}/masks/{name}.png", cv2.IMREAD_GRAYSCALE)
+            small = cv2.resize(mask, (584, 389), interpolation=cv2.INTER_AREA) > 100
+            found.append(replace(found[0], name=name, mask=small, um_per_px=11.0))
+    return found
+
+
+def textures(folder: Path | None) -> list[np.ndarray]:
+    data = os.environ.get("FLOWREC_REFERENCE_DATA")
+    files = sorted(folder.glob("*.png")) if folder else []
+    files += [Path(data) / "movies" / name / "000.png" for name in ("bulk_water", "brightfield")] if data else []
+    images = [cv2.imread(str(file), cv2.IMREAD_GRAYSCALE) for file in files]
+    return [image for image in images if image is not None]
+
+
+def cases(seed: int, laid: list[np.ndarray]) -> Iterator[Case]:
+    rng, available, number = np.random.default_rng(seed), chips(), seed
+    for look in (*LOOKS, "microscope", "microscope, inverted"):
+        for name, (turn, mirror, shift_um, scale) in TRANSFORMATIONS.items():
+            chip = available[number % len(available)]
+            if chip.name == "bifurcation" and mirror:  # which is its own mirror image
+                chip = available[(number + 1) % len(available)]
+            fill = max(chip.size_um[0] / SIZE_PX[0], chip.size_um[1] / SIZE_PX[1]) / ABOUT_UM  # of this chip
+            centre = np.array(chip.size_um) / 2 - chip.um_per_px / 2
+            way = rng.uniform(0, 2 * np.pi)
+            centre = centre + shift_um * fill * np.array((np.cos(way), np.sin(way)))
+            truth = Calibration.centred(ABOUT_UM * fill * scale, centre, SIZE_PX, turn, mirror)
+            texture = laid[number % len(laid)] if laid and number % 3 else None
+            if look in LOOKS:
+                contrast = 0.25 * max(abs(v) for v in (LOOKS[look].line, LOOKS[look].channel, LOOKS[look].shade))
+                image = picture(chip.mask, chip.um_per_px, truth, SIZE_PX, LOOKS[look], rng, texture, contrast)
+            else:
+                camera = CameraSettings(*SIZE_PX)
+                seen = Microscope(chip.mask, chip.um_per_px, truth, camera, number)
+                robot = np.array(truth.to_um((300.0, 200.0)))
+                image = seen.image(robot, 5 * truth.um_per_px, np.zeros(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+                image = 255 - image if "inverted" in look else image
+            yield Case(look, name, replace(chip, um_per_px=chip.um_per_px / fill), rescaled(truth, fill), image, number)
+            number += 1
+
+
+def rescaled(truth: Calibration, fill: float) -> Calibration:
+    """So that every chip fills an image of 10 um a pixel, and um mean the same in all cases."""
+    x, y = truth.origin_um
+    return Calibration(truth.um_per_px / fill, (x / fill, y / fill), truth.angle_deg, truth.mirror)
+
+
+def errors(found: Calibration, truth: Calibration) -> dict[str, float]:
+    """Angle in degrees, shift of the image's centre and worst corner in um, scale in percent."""
+    width, height = SIZE_PX
+    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)])
+    middle = (np.array(SIZE_PX) - 1) / 2
+    turned = abs((found.angle_deg - truth.angle_deg + 180.0) % 360.0 - 180.0)
+    return {
+        "angle_deg": turned if found.mirror == truth.mirror else 180.0,
+        "centre_um": float(np.hypot(*(found.to_um(middle) - truth.to_um(middle)))),
+        "corner_um": float(np.hypot(*(found.to_um(corners) - truth.to_um(corners)).T).max()),
+        "scale_percent": 100.0 * abs(found.um_per_px / truth.um_per_px - 1.0),
+    }
+
+
+def measure(case: Case) -> dict[str, object]:
+    began = time.process_time()
+    row: dict[str, object] = {"look": case.look, "transformation": case.transformation, "chip": case.chip.name}
+    try:
+        fits = register(case.image, case.chip, (case.about_um / 1.12, case.about_um * 1.12))
+    except ChipError as error:
+        return row | {"refused": str(error), "cpu_s": time.process_time() - began}
+    row["cpu_s"] = time.process_time() - began
+    nearest = min(fits, key=lambda fit: errors(fit.calibration, case.truth)["corner_um"])
+    row |= {"ways": len(fits), "found": nearest.found, "explained": nearest.explained, "std": nearest.std.tolist()}
+    return row | errors(nearest.calibration, case.truth) | {"residual_um": nearest.residual_um}
+
+
+def refusals(seed: int, laid: list[np.ndarray]) -> Iterator[dict[str, object]]:
+    """Pictures without the chip: another chip, textures alone, noise."""
+    rng, available = np.random.default_rng(seed), chips()
+    for number in range(3 * len(available)):
+        chip = available[number % len(available)]
+        scale = max(chip.size_um[0] / SIZE_PX[0], chip.size_um[1] / SIZE_PX[1])
+        kind = ("another chip", "texture", "noise")[number // len(available)]
+        if kind == "another chip":
+            other = available[(number + 1 + seed % (len(available) - 1)) % len(available)]
+            about = max(other.size_um[0] / SIZE_PX[0], other.size_um[1] / SIZE_PX[1])
+            centre = np.array(other.size_um) / 2
+            view = Calibration.centred(about, centre, SIZE_PX, float(rng.uniform(0, 360)))
+            image = picture(other.mask, other.um_per_px, view, SIZE_PX, LOOKS["dark lines"], rng)
+        elif kind == "texture" and laid:
+            image = cv2.resize(laid[number % len(laid)], SIZE_PX)
+        else:
+            smooth = cv2.GaussianBlur(rng.standard_normal(SIZE_PX[::-1]), (0, 0), float(rng.uniform(0.5, 12)))
+            image = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+        row: dict[str, object] = {"kind": kind, "chip": chip.name}
+        try:
+            fit = register(image, chip, (scale / 1.12, scale * 1.12))[0]
+            yield row | {"accepted": True, "found": fit.found, "explained": fit.explained, "std": fit.std.tolist()}
+        except ChipError as error:
+            yield row | {"accepted": False, "why": str(error)}
+
+
+def log_polar(case: Case) -> Calibration:
+    """The rival of the search: angle and scale by phase correlation of log-polar spectra, then the shift."""
+    side = 512
+    step = max(SIZE_PX) / side
+    um = case.about_um * step
+    grey = cv2.resize(case.image.astype(np.float32), None, fx=1 / step, fy=1 / step, interpolation=cv2.INTER_AREA)
+    mask = case.chip.mask.astype(np.float32)
+    scale = case.chip.um_per_px / um
+    drawn = cv2.resize(mask, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+    def edges(image: np.ndarray) -> np.ndarray:
+        smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
+        size = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+        size = np.minimum(size / max(float(np.percentile(size, 99)), 1e-6), 1.0)
+        canvas = np.zeros((side, side), np.float32)
+        h, w = min(size.shape[0], side), min(size.shape[1], side)
+        top, left = (side - h) // 2, (side - w) // 2
+        canvas[top : top + h, left : left + w] = (size - size.mean())[:h, :w]
+        return canvas
+
+    def spectrum(canvas: np.ndarray) -> np.ndarray:
+        size = np.log1p(np.abs(np.fft.fftshift(np.fft.fft2(canvas * window))))
+        return cv2.warpPolar(size.astype(np.float32), (side, side), (side / 2,) * 2, side / 2, cv2.WARP_POLAR_LOG)
+
+    window = cv2.createHanningWindow((side, side), cv2.CV_32F)
+    target = edges(grey)
+    best, best_response = None, -1.0
+    for mirror in (False, True):
+        flat = edges(drawn[::-1] if mirror else drawn)
+        (dx, dy), _ = cv2.phaseCorrelate(spectrum(flat), spectrum(target), window)
+        ratio = np.exp(-dx * np.log(side / 2) / side)
+        for turn in (360.0 * dy / side, 360.0 * dy / side + 180.0):
+            matrix = cv2.getRotationMatrix2D(((side - 1) / 2,) * 2, -turn, ratio)
+            turned = cv2.warpAffine(flat, matrix, (side, side))
+            (sx, sy), response = cv2.phaseCorrelate(turned, target)
+            if response > best_response:
+                middle_um = np.array(case.chip.size_um) / 2 - case.chip.um_per_px / 2
+                at_px = step * (np.array(((grey.shape[1] - 1) / 2 + sx, (grey.shape[0] - 1) / 2 + sy)) + 0.5) - 0.5
+                first = Calibration(case.about_um / ratio, (0.0, 0.0), turn, mirror)
+                x, y = (middle_um - first.to_um(at_px)).tolist()
+                best, best_response = replace(first, origin_um=(x, y)), response
+    assert best is not None
+    return best
+
+
+def ecc(case: Case, start: Calibration) -> Calibration | None:
+    """The rival of the fit: OpenCV's ECC of edge images, affine; None if it does not converge."""
+    walls = WallMap(case.chip.mask, case.chip.um_per_px)
+    shape = case.chip.mask.shape
+    fine = 2
+    line = np.exp(-((walls.clearance_um / (0.5 * max(start.um_per_px, case.chip.um_per_px))) ** 2)).astype(np.float32)
+    line = cv2.resize(line, (fine * shape[1], fine * shape[0]), interpolation=cv2.INTER_CUBIC)
+    smooth = cv2.GaussianBlur(case.image.astype(np.float32), (0, 0), 1.0)
+    edge = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    fine_um = case.chip.um_per_px / fine
+    to_px = np.linalg.inv(np.vstack((start.matrix, (0, 0, 1))))
+    shift = 0.5 * fine_um * (1 - fine) * np.ones(2)  # of the centre of the first fine pixel
+    matrix = np.column_stack((to_px[:2, :2] * fine_um, to_px[:2, :2] @ shift + to_px[:2, 2])).astype(np.float32)
+    try:
+        _, found = cv2.findTransformECC(
+            line, edge, matrix, cv2.MOTION_AFFINE, (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-6), None, 5
+        )
+    except cv2.error:
+        return None
+    linear = found[:, :2] / fine_um
+    scale = np.sqrt(abs(np.linalg.det(linear)))
+    angle = np.degrees(np.arctan2(linear[1, 0], linear[0, 0]))
+    first = Calibration(float(1 / scale), (0.0, 0.0), float(angle), bool(np.linalg.det(linear) < 0))
+    at = found[:, :2] @ ((np.array((shape[1], shape[0])) * fine - 1) / 2) + found[:, 2]
+    middle_um = np.array(case.chip.size_um) / 2 - case.chip.um_per_px / 2
+    x, y = (middle_um - first.to_um(at)).tolist()
+    return replace(first, origin_um=(x, y))
+
+
+def rivals(case: Case) -> dict[str, object]:
+    walls = WallMap(case.chip.mask, case.chip.um_per_px)
+    t0 = time.process_time()
+    first = Search(case.image.astype(np.float32), case.chip.mask, case.chip.um_per_px, walls.clearance_um).candidates(
+        (case.about_um / 1.12, case.about_um * 1.12), (False, True), 4
+    )
+    t1 = time.process_time()
+    rival = log_polar(case)
+    t2 = time.process_time()
+    start = min((pose.calibration for pose in first), key=lambda c: errors(c, case.truth)["corner_um"])
+    refined = ecc(case, start)
+    t3 = time.process_time()
+    return {
+        "look": case.look,
+        "transformation": case.transformation,
+        "search_um": errors(start, case.truth)["corner_um"],
+        "search_s": t1 - t0,
+        "log_polar_um": errors(rival, case.truth)["corner_um"],
+        "log_polar_s": t2 - t1,
+        "ecc_um": errors(refined, case.truth)["corner_um"] if refined is not None else None,
+        "ecc_s": t3 - t2,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--every", type=int, default=1, help="only every N-th case")
+    parser.add_argument("--textures", type=Path, help="folder of PNG images")
+    parser.add_argument("--rivals", action="store_true")
+    parser.add_argument("--refusals", action="store_true", help="only pictures without the chip")
+    asked = parser.parse_args()
+    laid = textures(asked.textures)
+    if asked.refusals:
+        for row in refusals(asked.seed, laid):
+            print(json.dumps(row), flush=True)
+        return
+    for number, case in enumerate(cases(asked.seed, laid)):
+        if number % asked.every == 0:
+            print(json.dumps((rivals if asked.rivals else measure)(case)), flush=True)
+
+
+if __name__ == "__main__":
+    main()
