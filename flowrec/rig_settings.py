@@ -37,7 +37,8 @@ _Scale = Annotated[float, Range(1e-3, 1e3)]
 Angle = Annotated[float, Range(-360.0, 360.0)]
 _Coordinate = Annotated[float, Range(-1e7, 1e7)]
 # See Columns.
-Column = str | float | tuple[str, float] | tuple[str, float, float]
+_Number = Annotated[float, Range(-1e12, 1e12)]
+Column = str | _Number | tuple[str, _Number] | tuple[str, _Number, _Number]
 PointUm = tuple[_Coordinate, _Coordinate]
 
 

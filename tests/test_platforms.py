@@ -24,19 +24,19 @@ def flowrec_without(modules: str, *words: object) -> subprocess.CompletedProcess
 
 
 @pytest.mark.parametrize(
-    ("words", "output"),
+    ("words", "output", "status"),
     [
-        (["--version"], "flowrec "),
-        (["info", GOLDEN], "reached"),
-        (["check", GOLDEN], "golden.mcap: GOOD"),
-        (["ls", GOLDEN.parent], "golden.mcap"),
-        (["compare", GOLDEN, GOLDEN], "identical"),
-        (["replay", GOLDEN, "--verify"], "107 ticks: "),
+        (["--version"], "flowrec ", 0),
+        (["info", GOLDEN], "reached", 0),
+        (["check", GOLDEN], "golden.mcap: GOOD", 0),
+        (["ls", GOLDEN.parent], "golden.mcap", 0),
+        (["compare", GOLDEN, GOLDEN], "identical", 0),
+        (["replay", GOLDEN, "--verify"], "by other numerics", 3),
     ],
 )
-def test_a_verb_that_reads_needs_no_posix_module(words: list[object], output: str) -> None:
+def test_a_verb_that_reads_needs_no_posix_module(words: list[object], output: str, status: int) -> None:
     done = flowrec_without("fcntl,termios,tty,resource", *words)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == status, done.stderr
     assert output in done.stdout
 
 

@@ -79,8 +79,10 @@ def test_every_number_among_the_settings_has_a_range_that_is_kept(key: str) -> N
     valid = range_of(hint)
     assert valid is not None, f"{key}: declare Annotated[..., Range(low, high)]"
     assert all(valid.low <= number <= valid.high for number in numbers(default))
-    if key in ("mission.start", "mission.goal"):
+    if key in ("mission.start", "mission.goal", "camera.centre_um", "simulated.centre_um", "tracker.click_px"):
         default = (0.0, 0.0)
+    if key == "tracker.box_px":
+        default = (0.0, 0.0, 0.0, 0.0)
     whole = isinstance(valid.low, int)
     below = valid.low - 1 if whole else math.nextafter(valid.low, -math.inf)
     above = valid.high + 1 if whole else math.nextafter(valid.high, math.inf)

@@ -88,8 +88,9 @@ def live_images(
     pipeline: Pipeline, config: ResolvedConfig, samples: Samples, folder: Path
 ) -> Iterator[tuple[Path, list[np.ndarray]]]:
     """The world while it runs; yields pylon's feature file for its images, and the robot's true positions so far."""
-    images = folder / "images"
+    images, drafts = folder / "images", folder / "drafts"  # the emulator reads every file of its folder
     images.mkdir()
+    drafts.mkdir()
     world = TwinWorld.of(pipeline, config)
     world.samples, world.mt_per_a = samples, np.array(config.coils.mt_per_a)
     positions: list[np.ndarray] = []
@@ -98,7 +99,7 @@ def live_images(
     def show(image: np.ndarray) -> None:
         data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         for number in range(_FILES):
-            draft = images / f"draft{number}"
+            draft = drafts / f"{number}.png"
             draft.write_bytes(data)
             draft.replace(images / f"{number}.png")
 

@@ -115,14 +115,14 @@ def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
             robot += batch.column("frame").to_pylist()
         if chunk.entity_path == "/camera/image":
             if chunk.is_static:
-                scale += batch.column("Transform3D:scale").to_pylist()
+                scale += batch.column("Transform3D:mat3x3").to_pylist()
             else:
                 images += batch.column("EncodedImage:blob").to_pylist()
     assert robot == list(range(60))
     assert 1 <= len(images) < 60  # only the last image of what is handed over together
     preview = cv2.imdecode(np.array(images[-1][0], np.uint8), cv2.IMREAD_GRAYSCALE)
     assert preview.shape == (427, 534)
-    assert scale[-1] == [[3.0, 3.0, 1.0]]
+    assert scale[-1] == [list(np.diag([3.0, 3.0, 1.0]).ravel())]
 
 
 def test_without_a_viewer_the_run_goes_on_and_says_so(

@@ -49,7 +49,7 @@ class NiDevice:
             self.info = self._described(latency_s)
         except (DaqNotFoundError, DaqNotSupportedError) as error:
             raise RigError(
-                "NI-DAQmx is not installed on this computer; install it from ni.com, or set lab.ni_server"
+                "NI-DAQmx is not installed on this computer; install National Instruments' driver, or set lab.ni_server"
             ) from error
         except DaqError as error:
             raise RigError(f"lab.channels = {channels!r}: {reason(error)}") from error
