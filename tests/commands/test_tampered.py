@@ -48,9 +48,7 @@ def every_topic() -> list[Tick]:
     drops = Drops(now, "/camera/frame", 1, 0, 1)
     losses = CameraLosses(now, 12, 2, 1, 2, 3, 4, 5, 6)
     look = Appearance(now, "dark", 1.0, 0.5, 4.0, np.zeros(2), np.ones((1, 5, 5)))
-    return [
-        replace(tick, health=health, clocks=clocks, drops=drops, losses=losses, appearance=look) for tick in ticks
-    ]
+    return [replace(tick, health=health, clocks=clocks, drops=drops, losses=losses, appearance=look) for tick in ticks]
 
 
 @pytest.fixture(scope="module")

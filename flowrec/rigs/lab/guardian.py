@@ -71,6 +71,8 @@ class Guardian:
         ------
         RigError : it does not start; nothing may be energised.
         """
+        if os.name == "nt":
+            raise RigError("the guardian process needs Linux or macOS; nothing is energised")
         read_beats, self._beats = os.pipe()  # not inheritable: no other child keeps the pipe open
         self._status, write_status = os.pipe()
         command = [f"{self.silence_s:g}", str(read_beats), str(write_status), *self._action]

@@ -8,7 +8,6 @@ import subprocess
 import time
 from collections import deque
 from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Self
 
 import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
@@ -50,7 +49,7 @@ class NiAmplifier:
         self.underruns = 0
         self._settings = settings
         self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Connection | None = None
+        self._connection: Any = None  # the end of a multiprocessing.Pipe
         self._zero_pipe = self._done_pipe = -1
         self._permitted = False
         self._fault = ""
@@ -61,6 +60,8 @@ class NiAmplifier:
 
     def open(self) -> AmplifierInfo:
         self._fault = ""
+        if os.name == "nt":
+            raise RigError("lab.amplifier = 'ni' needs Linux or macOS; run flowrec there and set lab.ni_server")
         here, there = os.pipe(), os.pipe()
         ours, theirs = Pipe()
         descriptors = (theirs.fileno(), here[0], there[1])

@@ -182,6 +182,9 @@ class Server:
         self._connection.send(("fault", text))
 
 
+assert sys.platform != "win32"  # there is no SIGHUP; NiAmplifier refuses to start this process
+
+
 def main(arguments: Sequence[str]) -> None:
     """The process; see above."""
     gc.disable()  # a collection takes as long as a write
