@@ -4,8 +4,9 @@ The robot is tracked once through the movie, and its track is fitted to the log 
 found become settings: movie.clock_rate and movie.clock_offset_s, and movie.heading_mirrored and heading_offset_deg if
 the axes of the log are turned or mirrored. So the session holds them, and a replay does not depend on the fit.
 
-The um per revolution that are found stay a proposal. They are known to 2 to 5 %, because the flow changes where the
-robot moves; a user who has measured them knows them better.
+The um per revolution that are found are used where they differ from the stated ones by more than three of their
+standard errors, because 10 % cost as much in the refined flow as no refinement at all. The flow that is assumed is part
+of the fit, with a scale of its own: without it the error is twice as large.
 """
 
 from __future__ import annotations
@@ -32,13 +33,14 @@ from flowrec.control.coil_log import read_coil_log
 from flowrec.control.field_log import FieldLog
 from flowrec.errors import UsageError
 from flowrec.estimation.motion_fit import MotionFit
-from flowrec.messages import Appearance, Track
+from flowrec.messages import Appearance, FlowField, Track
 from flowrec.rigs.movie.source import MovieSource
 from flowrec.terminal import say, table, warn
 from flowrec.units import seconds
 
 _FAR = 0.3  # relative difference of um_per_rev from which it is doubtful whether the log is of this run
 _Z95 = 1.96
+_SIGNIFICANT = 3.0  # standard errors
 _WITHOUT = "import it as it is with --no-align, and set movie.clock_offset_s and movie.clock_rate yourself"
 
 
@@ -52,12 +54,14 @@ class MovieTracks:
     positions_um : (n, 2) on the chip; meaningless where `seen` is False.
     seen : (n,)
     log : what the coils did on the same clock, without the robot's delay; None: there is no log.
+    assumed : the flow by the chip and its boundary values.
     """
 
     stamps_ns: NDArray[np.int64]
     positions_um: NDArray[np.float64]
     seen: NDArray[np.bool_]
     log: FieldLog | None
+    assumed: FlowField
 
 
 def tracks_of(asked: Config) -> MovieTracks:
@@ -76,6 +80,7 @@ def tracks_of(asked: Config) -> MovieTracks:
             np.array([each.position_um for each in tracks]).reshape(-1, 2),
             np.array([each.seen for each in tracks], np.bool_),
             source.log,
+            config.flow.solve(chip),
         )
 
 
@@ -96,7 +101,7 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     assert tracks.log is not None, "there is a log"
     seen = tracks.seen
     try:
-        fit = fit_log(tracks.stamps_ns[seen], tracks.positions_um[seen], tracks.log, ANYWHERE)
+        fit = fit_log(tracks.stamps_ns[seen], tracks.positions_um[seen], tracks.log, ANYWHERE, tracks.assumed)
     except UsageError as error:
         raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {error}; {_WITHOUT}") from error
     if fit.refusal:
@@ -111,8 +116,16 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
         clock_offset_s=round(offset_s, 6),
         **{key.partition(".")[2]: value for key, value in heading.items()},  # type: ignore[arg-type]
     )
+    stated = asked.robot.um_per_rev
+    robot = replace(asked.robot, um_per_rev=float(f"{fit.um_per_rev:.4g}")) if _refuted(stated, fit) else asked.robot
     _tell(asked, fit, changed.clock_offset_s)
-    return replace(asked, movie=changed), {"alignment": json.dumps(figures_of(fit))}
+    facts = figures_of(fit) | {"um_per_rev_stated": stated, "um_per_rev_used": robot.um_per_rev}
+    return replace(asked, movie=changed, robot=robot), {"alignment": json.dumps(facts)}
+
+
+def _refuted(um_per_rev: float, fit: MotionFit) -> bool:
+    """Whether the motion shows that it is another value."""
+    return abs(fit.um_per_rev - um_per_rev) > _SIGNIFICANT * fit.um_per_rev_std
 
 
 def _overlapping(asked: Config) -> Config:
@@ -129,15 +142,17 @@ def _tell(asked: Config, fit: MotionFit, offset_s: float) -> None:
     table(f"{asked.movie.coils} against the motion of the robot", ("", "value and standard error"), rows_of(fit))
     say(f"movie.clock_offset_s = {offset_s:.6g} and the rate are recorded; --no-align takes the log as it is")
     stated = asked.robot.um_per_rev
-    if abs(fit.um_per_rev / stated - 1.0) > _FAR:
+    found = f"the robot moves {fit.um_per_rev:.4g} ± {fit.um_per_rev_std:.2g} um per revolution"
+    if _refuted(stated, fit):
+        doubt = "; or is this the log of another run?" if abs(fit.um_per_rev / stated - 1.0) > _FAR else ""
         warn(
-            f"the robot moves {fit.um_per_rev:.3g} um per revolution, robot.um_per_rev = {stated:g}: set it; "
-            "or is this the log of another run?"
+            f"{found}: this is used, not robot.um_per_rev = {stated:g}; to keep that, import with --no-align and the "
+            f"settings movie.* of this session{doubt}"
         )
     elif abs(fit.um_per_rev - stated) > _Z95 * fit.um_per_rev_std:
         warn(
-            f"the robot moves {fit.um_per_rev:.4g} ± {fit.um_per_rev_std:.2g} um per revolution; robot.um_per_rev = "
-            f"{stated:g} is used; to use what was found: --set robot.um_per_rev={fit.um_per_rev:.4g}"
+            f"{found}; robot.um_per_rev = {stated:g} is used; to use what was found: --set "
+            f"robot.um_per_rev={fit.um_per_rev:.4g}"
         )
     for sentence in remarks(fit):
         warn(sentence)

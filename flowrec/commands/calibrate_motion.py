@@ -269,7 +269,10 @@ def rows_of(fit: MotionFit, shared_clock: bool = False) -> list[tuple[str, str]]
             f"{math.degrees(fit.heading_offset_rad):.1f} ± {math.degrees(fit.heading_offset_std_rad):.1f} degrees"
             + (", mirrored" if fit.mirrored else ""),
         ),
-        ("explained", f"R2 = {fit.r2:.2f}; at the best other place {fit.second_r2:.2f}"),
+        (
+            "changes of motion explained",
+            f"{100.0 * fit.explained:.0f} %; at the best other place {100.0 * fit.second_explained:.0f} %",
+        ),
         ("frames used", f"{fit.frames}" + (f", {fit.left_out} left out" if fit.left_out else "")),
     ]
     if fit.rate_std > 0.0:
@@ -306,8 +309,8 @@ def figures_of(fit: MotionFit) -> dict[str, Any]:
         "heading_offset_deg": math.degrees(fit.heading_offset_rad),
         "heading_offset_standard_error_deg": math.degrees(fit.heading_offset_std_rad),
         "heading_mirrored": fit.mirrored,
-        "r2": fit.r2,
-        "second_r2": fit.second_r2,
+        "explained": fit.explained,
+        "second_explained": fit.second_explained,
         "p_value": fit.p_value,
         "frames": fit.frames,
         "frames_left_out": fit.left_out,

@@ -1,0 +1,79 @@
+"""A movie and a log on another clock are imported on one clock, and the session itself tells the same of the robot."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+import flowrec
+from flowrec.commands.calibrate_motion import calibrate_motion
+from flowrec.config import load_config
+from flowrec.errors import UsageError
+from tests.movies import makers
+
+MOVIE = Path(__file__).parents[2] / "sessions" / "movie"
+CLOCK_OFFSET_S = 12.4  # of its log, see lab.toml
+HIDDEN = [*range(60, 75), *range(130, 145), *range(200, 215)]  # images without the robot
+SETTINGS = ["camera.um_per_px=13.0", "robot.radius_um=50.0", "robot.delay_s=0.04", "robot.um_per_rev=30.0"]
+
+
+def late_log(path: Path, by_s: float, heading: float = 1.0) -> Path:
+    """The log of the movie with its times late, and its headings times a factor."""
+    header, *rows = csv.reader((MOVIE / "coils.csv").read_text(encoding="utf-8").splitlines())
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(
+            [header, *((f"{float(t) + by_s:.4f}", f, heading * float(phi), b) for t, f, phi, b in rows)]
+        )
+    return path
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The robot is hidden in some images, the log is 100 ms late, and robot.um_per_rev is stated 20 % too large."""
+    folder = tmp_path_factory.mktemp("align")
+    with av.open(str(MOVIE / "robot.mp4")) as source:
+        stream = source.streams.video[0]
+        rate_hz = float(stream.average_rate or 0.0)
+        images = [frame.to_ndarray(format="gray8") for frame in source.decode(stream)]
+    empty = np.median(images[::10], axis=0).astype(np.uint8)
+    makers.folder(folder / "images", [empty if n in HIDDEN else image for n, image in enumerate(images)])
+    config = load_config(MOVIE / "lab.toml", SETTINGS)
+    log, out = late_log(folder / "late.csv", 0.1), folder / "a.mcap"
+    flowrec.import_movie(folder / "images", out, config, coils=log, fps=rate_hz)
+    return out
+
+
+def test_a_log_that_is_100_ms_late_is_found_though_the_robot_is_not_always_seen(imported: Path) -> None:
+    session = flowrec.open(imported)
+    found = json.loads(session.provenance["alignment"])
+    assert session.config.movie.clock_offset_s == pytest.approx(CLOCK_OFFSET_S + 0.1, abs=4e-3)
+    assert session.config.movie.clock_rate == 1.0
+    seen = sum(track.seen for track in session.messages("track"))
+    assert seen <= len(list(session.messages("track"))) - len(HIDDEN)
+    assert found["frames"] + found["frames_left_out"] == seen
+
+
+def test_um_per_revolution_that_the_motion_refutes_are_replaced_and_both_are_recorded(imported: Path) -> None:
+    session = flowrec.open(imported)
+    found = json.loads(session.provenance["alignment"])
+    assert session.config.robot.um_per_rev == pytest.approx(25.0, rel=0.05)
+    assert (found["um_per_rev_stated"], found["um_per_rev_used"]) == (30.0, session.config.robot.um_per_rev)
+
+
+def test_calibrate_motion_finds_an_imported_session_aligned(imported: Path) -> None:
+    motion = calibrate_motion(imported)
+    seen = sum(track.seen for track in flowrec.open(imported).messages("track"))
+    assert motion.fit.frames + motion.fit.left_out == seen
+    assert motion.fit.offset_s == pytest.approx(0.0, abs=4e-3)
+    assert "movie.clock_offset_s" not in motion.sets and not motion.shared_clock
+    assert motion.sets["robot.um_per_rev"] == pytest.approx(25.0, rel=0.05)
+
+
+def test_calibrate_motion_refuses_headings_that_are_not_those_of_the_run(imported: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="the log explains"):
+        calibrate_motion(imported, late_log(tmp_path / "other.csv", 0.0, heading=3.0))
