@@ -140,6 +140,16 @@ def test_axes_of_the_headings_are_found(mirrored: bool) -> None:
     assert found.heading_offset_rad == pytest.approx(turn, abs=3.0 * found.heading_offset_std_rad)
 
 
+def test_one_wrong_position_in_thirty_does_not_hide_the_log() -> None:
+    log, rng = commands(8, 12.0), np.random.default_rng(8)
+    stamps, positions = track(log, 8, 12.0)
+    wrong, away = np.arange(10, len(stamps) - 10, 30), rng.uniform(-math.pi, math.pi, len(stamps))
+    positions[wrong] += 150.0 * np.column_stack([np.cos(away), np.sin(away)])[wrong]
+    found = fit(stamps, positions, log)
+    assert found.accepted and found.left_out >= len(wrong) - 1
+    assert found.offset_s == pytest.approx(-0.04, abs=3e-3)
+
+
 def test_frames_without_the_robot_and_positions_of_another_particle_do_not_move_the_offset() -> None:
     log = commands(8, 20.0)
     stamps, positions = track(log, 8, 20.0)
