@@ -285,8 +285,9 @@ def _spikes(time_s: Floats, positions_um: Floats) -> NDArray[np.intp]:
     inner = ((time_s[2:-2] - time_s[1:-3]) / (time_s[3:-1] - time_s[1:-3]))[:, None]
     outer = ((time_s[2:-2] - time_s[:-4]) / (time_s[4:] - time_s[:-4]))[:, None]
     near, far = before + inner * (after - before), positions_um[:-4] + outer * (positions_um[4:] - positions_um[:-4])
-    away, bend = np.hypot(*(here - near).T), np.hypot(*(far - near).T)
-    return np.flatnonzero((away > _SPIKE * np.median(away)) & (away > _KINK * bend)) + 2
+    away, bend, moved = (np.hypot(*each.T) for each in (here - near, far - near, after - before))
+    # A jump to something else, which lasts, moves the neighbours too.
+    return np.flatnonzero((away > _SPIKE * np.median(away)) & (away > _KINK * bend) & (away > moved)) + 2
 
 
 def _mean_hz(data: TrackData, fit: Regression) -> float:
