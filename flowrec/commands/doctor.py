@@ -17,13 +17,14 @@ import numpy as np
 
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
+from flowrec.commands.calibrate_image import registration_state
 from flowrec.commands.record import refuse_adrift
 from flowrec.config import Config, ResolvedConfig
 from flowrec.control import Coils
 from flowrec.errors import FlowrecError, RigError
 from flowrec.messages import CameraLosses
 from flowrec.resolve import resolve
-from flowrec.rig_settings import AMPLIFIERS, LAB, CameraSettings
+from flowrec.rig_settings import AMPLIFIERS, LAB
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
 from flowrec.session_writer import frames_of, image_bytes_s
 from flowrec.view.viewer import executable, has_display
@@ -277,9 +278,8 @@ def _calibrations(config: Config, file: Path | None) -> Iterator[Finding]:
     driven = not config.mission.observes
     if driven and config.coils.mt_per_a == Coils().mt_per_a:
         yield Finding("coils", WARNING, "coils.mt_per_a is the default; measure it: flowrec calibrate coils TABLE.csv")
-    if config.camera.centre_um == CameraSettings().centre_um:
-        text = "the chip is taken to be in the middle of the image; measure it: flowrec calibrate image"
-        yield Finding("registration", WARNING, text)
+    fresh, text = registration_state(config.camera)
+    yield Finding("registration", OK if fresh else WARNING, text)
     if file is None:
         return
     days = (time.time() - file.stat().st_mtime) / 86_400.0
