@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Callable
@@ -23,6 +24,11 @@ settings.load_profile("flowrec")
 
 HANG_S = 120.0  # a wait as long as this one hangs; no test asserts how quick something is
 SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1"]
+
+# For tests of what happens in real time: other tests beside them would be the cause of their failures.
+needs_quiet = pytest.mark.skipif(
+    "PYTEST_XDIST_WORKER" in os.environ, reason="needs a quiet machine: pytest -n 0 tests/rigs/lab"
+)
 
 
 @pytest.fixture(scope="session")

@@ -20,10 +20,12 @@ from flowrec.rig_settings import OutputLimits
 from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.lab.drive import Drive
 from flowrec.rigs.lab.guardian import Guardian
-from tests.conftest import until
+from tests.conftest import needs_quiet, until
 from tests.perf.guardian import Device, device, sleeper, trial
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, currents
 from tests.twins.firmware import FULL_A, read_samples
+
+pytestmark = needs_quiet
 
 SLACK_S = 0.25  # of a busy machine, besides the delay of a sleep that is measured meanwhile
 
@@ -66,21 +68,19 @@ def test_the_turns_that_are_logged_are_those_of_the_field_that_was_put_out(on: D
     with driven(on, 2.0) as (drive, begin_ns, _):
         drive.apply(currents(8.0, 1.0))
         now_ns = time.monotonic_ns() - 300_000_000
-        found = drive.put_out(time.monotonic_ns()).turns(begin_ns, now_ns)
+        full_ns = begin_ns + 600_000_000  # after the ramp and the latency: the bias compensation is complete
+        found = drive.put_out(time.monotonic_ns()).turns(full_ns, now_ns)
     times, outputs = read_samples(on.file, FULL_A if on.kind == "serial" else 1.0, begin)
-    kept = (times >= begin_ns) & (times <= now_ns)
+    kept = (times >= full_ns) & (times <= now_ns)
     bias = field_limits(COILS).bias_a
     field = (outputs[kept] + bias) @ np.array(COILS.mt_per_a).T
-    size = np.linalg.norm(field, axis=1)
-    field = field[size > 3.9]  # at the full amplitude: the bias compensation is complete
+    assert np.linalg.norm(field, axis=1).min() > 3.9
     # The horizontal heading h of a roller: z turns towards h, so z x h is the axis, and b x db its direction.
     b = field / np.linalg.norm(field, axis=1)[:, None]
     axis = np.cross(b[:-1], b[1:]).sum(axis=0) / (2 * math.pi)
     wanted = np.array([axis[1], -axis[0]])
     assert np.hypot(*wanted) > 5.0
-    ramp = 0.25 * 8.0  # turns on the ramp, which the judge leaves out
-    assert np.hypot(*(found - wanted)) < ramp
-    assert abs(math.remainder(math.atan2(found[1], found[0]) - math.atan2(wanted[1], wanted[0]), math.tau)) < 0.15
+    assert np.hypot(*(found - wanted)) < 0.5
 
 
 def test_a_recorder_that_is_killed_stopped_or_stuck_has_no_field_within_the_timer(on: Device) -> None:

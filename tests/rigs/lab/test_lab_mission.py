@@ -21,10 +21,12 @@ from flowrec.config import load_config
 from flowrec.pipeline import assemble
 from flowrec.resolve import resolve
 from flowrec.session import Session
+from tests.conftest import needs_quiet
 from tests.twins.firmware import compiled, firmware_twin
 from tests.twins.world import live_images
 
 pytest.importorskip("pypylon")
+pytestmark = needs_quiet
 
 COMMON = (
     "camera.width_px=320",
