@@ -335,24 +335,10 @@ def registered(
 
 
 @compiled
-def _gain(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> tuple[float, float]:
-    """Weighted least-squares gain and offset: patch = gain view + offset."""
-    sw, si, st, stt, sit = 1e-12, 0.0, 0.0, 0.0, 0.0
-    for v in range(patch.shape[0]):
-        for u in range(patch.shape[1]):
-            w, a, b = window[v, u], patch[v, u], view[v, u]
-            sw += w
-            si += w * a
-            st += w * b
-            stt += w * b * b
-            sit += w * a * b
-    gain = (sit - si * st / sw) / max(stt - st * st / sw, 1e-12)
-    return gain, (si - gain * st) / sw
-
-
-@compiled
-def correlation(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> float:
-    """Weighted correlation of two views."""
+def _moments(
+    patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]
+) -> tuple[float, float, float, float, float, float]:
+    """Weighted sums of 1, patch, view, patch^2, view^2 and patch view."""
     sw, si, st, sii, stt, sit = 1e-12, 0.0, 0.0, 0.0, 0.0, 0.0
     for v in range(patch.shape[0]):
         for u in range(patch.shape[1]):
@@ -363,5 +349,20 @@ def correlation(patch: NDArray[np.float32], view: NDArray[np.float32], window: N
             sii += w * a * a
             stt += w * b * b
             sit += w * a * b
+    return sw, si, st, sii, stt, sit
+
+
+@compiled
+def _gain(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> tuple[float, float]:
+    """Weighted least-squares gain and offset: patch = gain view + offset."""
+    sw, si, st, _, stt, sit = _moments(patch, view, window)
+    gain = (sit - si * st / sw) / max(stt - st * st / sw, 1e-12)
+    return gain, (si - gain * st) / sw
+
+
+@compiled
+def correlation(patch: NDArray[np.float32], view: NDArray[np.float32], window: NDArray[np.float32]) -> float:
+    """Weighted correlation of two views."""
+    sw, si, st, sii, stt, sit = _moments(patch, view, window)
     spread = (sii - si * si / sw) * (stt - st * st / sw)
     return (sit - si * st / sw) / math.sqrt(max(spread, 1e-18))

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from flowrec.errors import RigError
-from flowrec.rigs.lab.cameras.camera import SOFTWARE, Wanted, bits_of, difference
+from flowrec.rigs.lab.cameras.camera import SOFTWARE, CameraInfo, Wanted, bits_of, difference
 
 _US = 1e-6
 Value = int | float | bool | str
@@ -50,22 +50,8 @@ class Features(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True)
-class Settled:
-    """What a device has, after it was set; the names are those of camera.CameraInfo."""
-
-    width_px: int
-    height_px: int
-    bits: int
-    pixel_format: str
-    rate_hz: float
-    exposure_s: float
-    gain: float | None
-    notes: tuple[str, ...]
-
-
-def configure(device: Features, wanted: Wanted) -> Settled:
-    """Set a device that does not acquire.
+def configure(device: Features, wanted: Wanted) -> CameraInfo:
+    """Set a device that does not acquire; what it has then. The driver adds what the settings do not tell.
 
     Raises
     ------
@@ -79,7 +65,18 @@ def configure(device: Features, wanted: Wanted) -> Settled:
     exposure_s = _exposure(device, wanted.exposure_s, notes)
     gain = _gain(device, wanted.gain, notes)
     rate_hz = _rate(device, wanted, notes)
-    return Settled(width_px, height_px, bits_of(pixel_format), pixel_format, rate_hz, exposure_s, gain, tuple(notes))
+    return CameraInfo(
+        model="",
+        serial="",
+        width_px=width_px,
+        height_px=height_px,
+        bits=bits_of(pixel_format),
+        rate_hz=rate_hz,
+        exposure_s=exposure_s,
+        gain=gain,
+        pixel_format=pixel_format,
+        notes=tuple(notes),
+    )
 
 
 def _pixel_format(device: Features, asked: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from typing import Any
 
 import viva_genicam as vg
@@ -62,19 +63,12 @@ class GenicamCamera:
             self._stream = stream.__enter__()
             self._stack.callback(_quietly, stream.__exit__, None, None, None)
             extended = nodes.value("GevGVSPExtendedIDMode") == "On"
-            return CameraInfo(
+            return replace(
+                settled,
                 model=f"{nodes.value('DeviceVendorName') or ''} {nodes.value('DeviceModelName') or name}".strip(),
                 serial=str(nodes.value("DeviceSerialNumber") or nodes.value("DeviceID") or ""),
-                width_px=settled.width_px,
-                height_px=settled.height_px,
-                bits=settled.bits,
-                rate_hz=settled.rate_hz,
-                exposure_s=settled.exposure_s,
-                gain=settled.gain,
-                pixel_format=settled.pixel_format,
                 id_bits=16 if camera.transport == _GIGE and not extended else 64,
                 ticks_per_s=_ticks_per_s(camera, nodes),
-                notes=settled.notes,
             )
         except vg.GenicamError as error:
             raise RigError(f"camera {name}: {error}; see to its cable, then try again") from error

@@ -68,30 +68,6 @@ class Captured:
     losses: CameraLosses
 
 
-@dataclass(frozen=True, slots=True)
-class _Counts:
-    """Blocks lost before a frame, by cause, as far as the thread knows them."""
-
-    link: int = 0
-    incomplete: int = 0
-    driver: int = 0
-    triggers: int = 0
-    reconnections: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    """A frame in the queue."""
-
-    image: Image
-    bits: int
-    index: int
-    stamp_ns: int
-    arrival_ns: int
-    clock: Fit | None
-    counts: _Counts
-
-
 class Grabber:
     """Takes the frames of a camera; a context manager.
 
@@ -126,7 +102,7 @@ class Grabber:
         self._wanted = wanted
         self._length = length
         self._epoch_ns = epoch_ns
-        self._queue: deque[_Waiting] = deque()
+        self._queue: deque[Captured] = deque()
         self._filled = threading.Condition()
         self._opened = threading.Event()
         self._over = threading.Event()
@@ -137,7 +113,7 @@ class Grabber:
         # Of the thread only.
         self._ids = BlockIds()
         self._stamper = _Stamper()
-        self._counts = _Counts()
+        self._counts = CameraLosses(0, 0, 0, 0, 0, 0, 0, 0, 0)  # what the thread knows; frames and backlog stay 0
         self._span: tuple[tuple[int, int], tuple[int, int]] = (0, 0), (0, 0)  # index and stamp, first and last
         self._attributed = 0  # blocks of the driver's own count that are in the counts already
         self._thread = threading.Thread(target=self._work, name="camera", daemon=True)
@@ -214,26 +190,12 @@ class Grabber:
                 return None
             frame = self._queue.popleft()
             self.frames += 1
-            exact = self._exact = self._message(frame)
+            # All that the queue has dropped lies before the frame, which was behind it.
+            exact = self._exact = replace(frame.losses, frames=self.frames, backlog=self.backlog)
         last = self._reported
         if last is None or exact.stamp_ns >= last.stamp_ns + nanoseconds(_REPORT_S) or _lost(last) != _lost(exact):
             self._reported = last = exact
-        return Captured(frame.image, frame.bits, frame.index, frame.stamp_ns, frame.arrival_ns, frame.clock, last)
-
-    def _message(self, frame: _Waiting) -> CameraLosses:
-        """The losses up to a frame. All that the queue has dropped lies before the frame, which was behind it."""
-        counts = frame.counts
-        return CameraLosses(
-            frame.stamp_ns,
-            frame.index + 1,
-            self.frames,
-            counts.link,
-            counts.incomplete,
-            counts.driver,
-            self.backlog,
-            counts.triggers,
-            counts.reconnections,
-        )
+        return replace(frame, losses=last)
 
     # ---- the thread
 
@@ -330,7 +292,8 @@ class Grabber:
         at = self._ids.index, stamp_ns
         self._span = (self._span[0] if self._span[1] != (0, 0) else at), at
         arrival_ns = grabbed.arrival_ns - self._epoch_ns
-        frame = _Waiting(grabbed.image, grabbed.bits, self._ids.index, stamp_ns, arrival_ns, fit, counts)
+        losses = replace(counts, stamp_ns=stamp_ns, ids=self._ids.index + 1)
+        frame = Captured(grabbed.image, grabbed.bits, self._ids.index, stamp_ns, arrival_ns, fit, losses)
         with self._filled:
             if len(self._queue) == self._length:
                 self._queue.popleft()

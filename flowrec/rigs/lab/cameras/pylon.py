@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -75,19 +76,12 @@ class PylonCamera:
         self.device.StartGrabbing(pylon.GrabStrategy_OneByOne)
         gige = about.GetDeviceClass() == _GIGE
         extended = features.value("GevGVSPExtendedIDMode") == "On"
-        return CameraInfo(
+        return replace(
+            settled,
             model=f"{about.GetVendorName()} {about.GetModelName()}",
             serial=about.GetSerialNumber(),
-            width_px=settled.width_px,
-            height_px=settled.height_px,
-            bits=settled.bits,
-            rate_hz=settled.rate_hz,
-            exposure_s=settled.exposure_s,
-            gain=settled.gain,
-            pixel_format=settled.pixel_format,
             id_bits=16 if gige and not extended else 64,
             ticks_per_s=0.0 if self._emulated else float(features.value("GevTimestampTickFrequency") or _NS),
-            notes=settled.notes,
         )
 
     def grab(self, timeout_s: float) -> Grabbed | None:
