@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -98,6 +99,18 @@ def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_
     assert "nowhere.avi" in failures["camera"] and "/dev/nothing" in failures["coils"]
     assert {"settings", "mission", "disk", "viewer"} <= {one["what"] for one in found["findings"]}
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("days", "residual_um", "level"), [(None, 1.0, WARNING), (1, 1.0, OK), (1, 90.0, WARNING), (3650, 1.0, WARNING)]
+)
+def test_a_registration_is_judged_by_its_age_and_its_residual(
+    days: int | None, residual_um: float, level: str, tmp_path: Path
+) -> None:
+    sets = [*MEASURED, "mission.phases=observe", f"camera.residual_um={residual_um}"]
+    if days is not None:
+        sets.append(f'camera.registered_on="{(datetime.now(UTC) - timedelta(days=days)).isoformat()}"')
+    assert levels(load_config(None, sets), tmp_path)["registration"] == level
 
 
 def test_settings_that_are_not_measured_are_a_failure_that_names_them() -> None:
