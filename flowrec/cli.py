@@ -74,7 +74,9 @@ def record(
     rig: Annotated[str | None, typer.Option(help="Rig to use: simulated, movie, lab.")] = None,
     goal: Annotated[str | None, typer.Option(metavar="X,Y", help="Goal in um, or inlet, outlet, outlet:1.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Session file; by default named by date and sample.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Session file; by default named by date and sample.")
+    ] = None,
     sets: Sets = None,
     view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",
     realtime: Annotated[bool, typer.Option("--realtime", help="Run the simulated rig in real time.")] = False,
@@ -122,8 +124,8 @@ def record(
 
     if dry_run:
         resolved = prepare(chosen).config
-        failed = chosen.rig == "lab" and look_at_lab(chosen, config, out)
         typer.echo(to_toml(resolved))
+        failed = chosen.rig == "lab" and look_at_lab(chosen, config, out)  # last: 300 lines of settings would hide it
         raise typer.Exit(int(failed))
     inputs = [config] if config is not None else []
     realtime = realtime or chosen.rig == MOVIE  # `import` takes a movie as fast as it can be read
@@ -161,7 +163,7 @@ def replay(
     refly: Annotated[
         bool, typer.Option("--refly", help="Fly both plans in a simulator with the refined flow.")
     ] = False,
-    out: Annotated[Path | None, typer.Option(help="Session file of the replay.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Session file of the replay.")] = None,
     frames: Annotated[bool, typer.Option("--frames", help="Copy the camera images into the replay's file.")] = False,
     view: Annotated[Literal["rrd", "none"], typer.Option(help="Write an .rrd of both, side by side.")] = "none",
     overwrite: Overwrite = False,

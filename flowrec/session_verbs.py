@@ -27,7 +27,9 @@ METHODS = {
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
 RrdOut = Annotated[
     Path | None,
-    typer.Option(help="File to write; by default beside the session, where it replaces an .rrd of that session."),
+    typer.Option(
+        "--out", "-o", help="File to write; by default beside the session, where it replaces an .rrd of that session."
+    ),
 ]
 
 
@@ -83,7 +85,11 @@ def export(
     file_format: Annotated[str, typer.Option("--format", metavar="FORMAT", help="Format of the file.")] = "rrd",
     out: Annotated[
         Path | None,
-        typer.Option(help="File to write; by default beside the session, where it replaces an export of that session."),
+        typer.Option(
+            "--out",
+            "-o",
+            help="File to write; by default beside the session, where it replaces an export of that session.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -177,7 +183,7 @@ def recover(
         typer.Argument(metavar="FILE", help="Unfinished (.mcap.partial), cut-off or damaged file, or a run."),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Session file to make; X.mcap or X_recovered.mcap by default.")
+        Path | None, typer.Option("--out", "-o", help="Session file to make; X.mcap or X_recovered.mcap by default.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:

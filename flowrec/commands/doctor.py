@@ -1,6 +1,6 @@
 """`flowrec doctor`: is the lab ready for a run? Looks at every device without energising anything.
 
-`flowrec record --dry-run` does the same before it prints the configuration of a run.
+`flowrec record --dry-run` does the same after it has printed the configuration of a run.
 """
 
 from __future__ import annotations
