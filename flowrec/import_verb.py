@@ -63,7 +63,8 @@ def import_movie(
     )
     if as_json:
         files = [str(file) for file in recorded.files]
-        typer.echo(json.dumps({"path": str(recorded.path), **recorded.facts, "files": files}))
+        aligned = json.loads(recorded.source.get("alignment", "null"))
+        typer.echo(json.dumps({"path": str(recorded.path), **recorded.facts, "files": files, "alignment": aligned}))
     else:
         print_summary(recorded)
     raise typer.Exit(recorded.exit_status)

@@ -70,12 +70,13 @@ def time_left(estimate_s: float | None, stands_s: float) -> str:
     return f"{estimate_s:.0f} s left"
 
 
-def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table on stdout."""
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], to: TextIO | None = None) -> None:
+    """Print a table on stdout, or on `to`."""
+    to = to or sys.stdout
     shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
     for number, column in enumerate(columns):
         shown.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     for row in rows:
         shown.add_row(*(escape(printable(cell)) for cell in row))
     # In a log rich takes 80 columns; 110 hold each row of the widest table on one line.
-    Console(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else 110).print(shown)
+    Console(file=to, highlight=False, width=None if to.isatty() else 110).print(shown)

@@ -12,6 +12,7 @@ of the fit, with a scale of its own: without it the error is twice as large.
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -66,7 +67,7 @@ class MovieTracks:
 
 def tracks_of(asked: Config) -> MovieTracks:
     """Track the robot through the movie of a configuration; FlowrecError as `import_movie`."""
-    config, chip, pipeline, *_ = prepare(asked)
+    config, chip, pipeline, *_ = prepare(asked, aloud=False)  # the import says it, of the settings that are used
     track: Track | None = None
     appearance: Appearance | None = None
     tracks: list[Track] = []
@@ -139,8 +140,11 @@ def _overlapping(asked: Config) -> Config:
 
 
 def _tell(asked: Config, fit: MotionFit, offset_s: float) -> None:
-    table(f"{asked.movie.coils} against the motion of the robot", ("", "value and standard error"), rows_of(fit))
-    say(f"movie.clock_offset_s = {offset_s:.6g} and the rate are recorded; --no-align takes the log as it is")
+    # The offset from the beginning of the log, which is fitted, is no setting.
+    offset = ("movie.clock_offset_s", f"{offset_s:.4f} ± {fit.offset_std_s:.4f} s")
+    rows = rows_of(fit, offset)
+    table(f"{asked.movie.coils} against the motion of the robot", ("", "value and standard error"), rows, sys.stderr)
+    say("movie.clock_offset_s and the rate are recorded; --no-align takes the log as it is")
     stated = asked.robot.um_per_rev
     found = f"the robot moves {fit.um_per_rev:.4g} ± {fit.um_per_rev_std:.2g} um per revolution"
     if _refuted(stated, fit):

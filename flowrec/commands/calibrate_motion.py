@@ -258,12 +258,12 @@ def _comments(fit: MotionFit) -> list[str]:
     return [f"# {name}: {value}" for name, value in rows_of(fit)]
 
 
-def rows_of(fit: MotionFit, shared_clock: bool = False) -> list[tuple[str, str]]:
-    """The fit for people, each value with its standard error."""
-    offset = ("latency", -1e3) if shared_clock else ("time of log less time of movie", 1e3)
+def rows_of(fit: MotionFit, offset: tuple[str, str] | None = None, shared_clock: bool = False) -> list[tuple[str, str]]:
+    """The fit for people, each value with its standard error; `offset`: another row for the offset."""
+    name, factor = ("latency", -1e3) if shared_clock else ("time of log less time of movie", 1e3)
     rows = [
         ("um per revolution", f"{fit.um_per_rev:.2f} ± {fit.um_per_rev_std:.2f}"),
-        (offset[0], f"{offset[1] * fit.offset_s:.1f} ± {1e3 * fit.offset_std_s:.1f} ms"),
+        offset or (name, f"{factor * fit.offset_s:.1f} ± {1e3 * fit.offset_std_s:.1f} ms"),
         (
             "heading offset",
             f"{math.degrees(fit.heading_offset_rad):.1f} ± {math.degrees(fit.heading_offset_std_rad):.1f} degrees"
@@ -321,9 +321,8 @@ def figures_of(fit: MotionFit) -> dict[str, Any]:
 
 def show(motion: Motion, path: Path, out: Path | None) -> None:
     """Print the fit as a table, advice and settings."""
-    table(
-        f"{path.name} against {motion.log}", ("", "value and standard error"), rows_of(motion.fit, motion.shared_clock)
-    )
+    rows = rows_of(motion.fit, shared_clock=motion.shared_clock)
+    table(f"{path.name} against {motion.log}", ("", "value and standard error"), rows)
     for sentence in motion.advice:
         say(f"- {sentence}")
     if out is not None:

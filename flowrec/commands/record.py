@@ -72,8 +72,8 @@ class Prepared(NamedTuple):
     facts: Mapping[str, str]
 
 
-def prepare(asked: Config) -> Prepared:
-    """Resolve a configuration and check that the mission is feasible; warn where it is likely to fail.
+def prepare(asked: Config, aloud: bool = True) -> Prepared:
+    """Resolve a configuration and check that the mission is feasible; warn, if `aloud`, where it is likely to fail.
 
     Raises
     ------
@@ -86,41 +86,46 @@ def prepare(asked: Config) -> Prepared:
             f"sampler.method = {asked.sampler.method!r} needs the whole recording: use it in flowrec replay --refine; "
             f"a run takes {able}"
         )
+    tell, caution = (say, warn) if aloud else (_unsaid, _unsaid)
     given, facts = asked, dict[str, str]()
     if asked.rig == MOVIE:
         asked, found, remarks = fitted_to_movie(given)
         facts |= found
-        say(f"{given.movie.path}: {facts['source_images']}, {facts['source_codec']}, times: {facts['source_times']}")
+        tell(f"{given.movie.path}: {facts['source_images']}, {facts['source_codec']}, times: {facts['source_times']}")
         for remark in remarks:
-            warn(remark)
+            caution(remark)
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
     made = derived(given, config)
     if made:
         what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
         unused = ("survey.", "plan.") if config.mission.observes else ()
-        say(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items() if not key.startswith(unused))}")
+        tell(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items() if not key.startswith(unused))}")
     refuse_adrift(config, chip)
     full_mt = config.coils.full_mt(config.robot)
     if full_mt < config.coils.amplitude_mt:
-        warn(
+        caution(
             f"coils and amplifiers make {full_mt:.2g} of {config.coils.amplitude_mt:g} mT: the robot follows it up to "
             f"{config.robot.max_speed_um_s:.0f} um/s; see coils.max_current_a and coils.amplifier"
         )
     for opening in chip.openings:
         if opening.kind == "inlet" and opening.value > config.robot.max_speed_um_s:
-            warn(
+            caution(
                 f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
                 f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
             )
     blind_um = config.robot.delay_s * config.robot.max_speed_um_s
     if blind_um > 0.5 * median_width_um(chip):
-        warn(
+        caution(
             f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at "
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return Prepared(config, chip, assemble(config, chip), made, facts)
+
+
+def _unsaid(_text: str) -> None:
+    """In place of `say`."""
 
 
 def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
@@ -207,7 +212,8 @@ def record(
     inputs = (*inputs, *_files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
-    resolved, chip, pipeline, made, source = prepare(config)
+    resolved, chip, pipeline, made, found = prepare(config)
+    source = {**found, **(given_facts or {})}
     realtime = realtime or resolved.rig == LAB
     timeout_s = _guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
     path = _place(resolved, out, overwrite)
@@ -244,7 +250,7 @@ def record(
                 live=realtime,
                 in_pieces=True,
                 derived=made,
-                facts={**source, **(given_facts or {})},
+                facts=source,
                 keep_failed=keep_failed,
             )
         )
@@ -286,7 +292,8 @@ def record(
                 paced=realtime,
             )
         facts = figures_of(chip, report, statistics.true_field)
-        if not resolved.control.needs:  # a control law that descends the time to go has no reference
+        # Without navigation, and for a control law that descends the time to go, there is no reference.
+        if not (resolved.mission.observes or resolved.control.needs):
             facts["tracking_error_um"] = finite(statistics.tracking_error_um)
         if control.note:
             facts["note_not_finished"] = control.note
@@ -302,7 +309,7 @@ def record(
             live.close(VIEW_TIMEOUT_S)
     facts["frames_dropped"] = writer.dropped_frames  # the writer has added it to the outcome of the file
     files = tuple(writer.files)
-    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason))
+    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason), source)
     if view == "rrd" and run_control.reason:
         say(f"the run was stopped: no .rrd was made; flowrec export {path} makes it")
     elif view == "rrd":

@@ -39,6 +39,7 @@ class Recorded:
     derived : settings that were derived because they were not given, by key.
     lost : why the run was ended early by the disk monitor; '' if it was not.
     stopped : a person or a signal ended it.
+    source : of a movie: facts about it, and the alignment of its log as JSON; as in the head of the session.
     """
 
     path: Path
@@ -48,6 +49,7 @@ class Recorded:
     derived: Mapping[str, float] = field(default_factory=dict)
     lost: str = ""
     stopped: bool = False
+    source: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def sessions(self) -> tuple[Path, ...]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import av
@@ -44,7 +46,11 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     makers.folder(folder / "images", [empty if n in HIDDEN else image for n, image in enumerate(images)])
     config = load_config(MOVIE / "lab.toml", SETTINGS)
     log, out = late_log(folder / "late.csv", 0.1), folder / "a.mcap"
-    flowrec.import_movie(folder / "images", out, config, coils=log, fps=rate_hz)
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        done = flowrec.import_movie(folder / "images", out, config, coils=log, fps=rate_hz)
+    assert printed.getvalue() == "", "stdout is for --json"
+    assert json.loads(done.source["alignment"])["frames"] > 200
     return out
 
 
