@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 Edit = Callable[[Channel, Message, Any], bool]  # edits the decoded message; True where it did
-EditHead = Callable[[Attachment | Metadata], None]
+EditHead = Callable[[Attachment | Metadata | Schema | Channel], None]
 
 
 def parser_of(schema: Schema) -> Any:
@@ -54,6 +54,8 @@ def rewrite(
             edit_head(record)
             if keep_digest or record.name != "flowrec.digest":
                 writer.add_metadata(record.name, record.metadata)
+        for declared in (*summary.schemas.values(), *summary.channels.values()):
+            edit_head(declared)
         schemas = {n: writer.register_schema(s.name, s.encoding, s.data) for n, s in summary.schemas.items()}
         parsers = {n: parser_of(s) for n, s in summary.schemas.items()}
         channels = {

@@ -7,6 +7,9 @@ The digest of a topic is the sum, modulo 2^256, of the SHA-256 of each message: 
 it does not depend on the order, the chunks or the compression: a file that another MCAP tool has rewritten with the
 same messages keeps it. Of a payload of 64 KiB or more the length and the CRC-32 go into the SHA-256, which takes a
 quarter of the time; one edit in 4e9 is not detected.
+
+With it stands the SHA-256 of what the topic's channel declares: its schema, and its metadata, as depth and region of
+the images, without which a message means something else. Files of older versions have none.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from mcap.records import Attachment, Metadata
+from mcap.records import Attachment, Channel, Metadata, Schema
 
 from flowrec.errors import SessionError, printable
 from flowrec.store.mcap_format import Record
@@ -54,9 +57,17 @@ def head_digest(record: Metadata | Attachment) -> int:
     return int.from_bytes(hashed.digest(), "little")
 
 
-def digest_record(head: int, topics: Iterable[tuple[str, int, int]]) -> Metadata:
-    """The record of a file's digest: sum of its head, and name, number of messages and sum of each topic."""
-    of_topics = {topic: _topic_text(count, total) for topic, count, total in topics if count}
+def channel_digest(channel: Channel, schema: Schema | None) -> str:
+    """The digest of what a channel declares."""
+    declared = [channel.message_encoding, sorted(channel.metadata.items())]
+    if schema is not None:
+        declared += [schema.name, schema.encoding, schema.data.hex()]
+    return hashlib.sha256(json.dumps(declared).encode()).hexdigest()
+
+
+def digest_record(head: int, topics: Iterable[tuple[str, int, int, str]]) -> Metadata:
+    """The record of a file's digest: sum of its head; name, number of messages, sum and channel of each topic."""
+    of_topics = {topic: f"{_topic_text(count, total)} {declared}" for topic, count, total, declared in topics if count}
     return Metadata(DIGEST, {_HEAD: _text(head), **of_topics})
 
 
@@ -98,20 +109,28 @@ class FileDigest:
             return ["the digest that was recorded is missing"] if self.start_unix_ns and file.outcome else None
         counts: Counter[str] = Counter()
         sums: Counter[str] = Counter()
+        declared: dict[str, set[str]] = {}
         ours: set[str] = set()
         for number, channel in file.channels.items():
             counts[channel.topic] += self.counts[number]
             sums[channel.topic] += self.sums[number]
+            if self.counts[number]:  # other programs leave out channels without a message
+                of_channel = channel_digest(channel, file.schemas.get(channel.schema_id))
+                declared.setdefault(channel.topic, set()).add(of_channel)
             if "role" in channel.metadata:  # flowrec has declared it
                 ours.add(channel.topic)
         faults = []
         if not _head_matches(file, recorded.get(_HEAD)):
             faults.append("configuration, chip, origin or outcome are not those that were recorded")
         for topic in sorted((recorded.keys() | {topic for topic in ours if counts[topic]}) - {_HEAD}):
-            expected, found = recorded.get(topic, "0"), _topic_text(counts[topic], sums[topic])
-            if found == expected:
+            expected, found = recorded.get(topic, "0").split(" "), _topic_text(counts[topic], sums[topic]).split(" ")
+            if declared.get(topic, set()) - set(expected[2:]) and expected[2:]:
+                faults.append(
+                    printable(f"schema or metadata of {topic} are not those that were recorded"[:_TEXT_LIMIT])
+                )
+            if found == expected[:2]:
                 continue
-            count, expected_count = found.split(" ")[0], expected.split(" ")[0]
+            count, expected_count = found[0], expected[0]
             numbers = f", {count} where {expected_count} were recorded" if expected_count != count else ""
             faults.append(printable(f"the messages of {topic} are not those that were recorded{numbers}"[:_TEXT_LIMIT]))
         more = len(faults) - _FAULTS_LIMIT

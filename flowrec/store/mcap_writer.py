@@ -35,7 +35,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from flowrec.store.digest import digest_record, head_digest
+from flowrec.store.digest import channel_digest, digest_record, head_digest
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, Summary
 from flowrec.system.locks import open_new
 
@@ -90,9 +90,10 @@ class McapWriter:
 
     def add_digest(self) -> None:
         """Write the digest of all that was added; it is the last metadata record."""
+        channels, schemas = self._summary.channels, self._summary.schemas
         topics = [
-            (channel.topic, self._counts[channel.id], self._digests[channel.id])
-            for channel in self._summary.channels.values()
+            (each.topic, self._counts[n], self._digests[n], channel_digest(each, schemas.get(each.schema_id)))
+            for n, each in channels.items()
         ]
         self.add(digest_record(self._head_digest, topics))
 

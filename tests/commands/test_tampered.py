@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.records import Attachment, Metadata
+from mcap.records import Attachment, Channel, Metadata, Schema
 from typer.testing import CliRunner
 
 from flowrec.chip import load_chip
@@ -128,10 +128,10 @@ def test_the_time_and_the_number_of_a_message_are_under_the_digest(attribute: st
     "name", ["flowrec.provenance", "flowrec.parent", "flowrec.outcome", "config.toml", "chip.toml", "chip.png"]
 )
 def test_every_record_of_the_head_is_under_the_digest(name: str, small: Path, tmp_path: Path) -> None:
-    def edit_head(record: Attachment | Metadata) -> None:
-        if record.name == name and isinstance(record, Metadata):
+    def edit_head(record: Attachment | Metadata | Schema | Channel) -> None:
+        if isinstance(record, Metadata) and record.name == name:
             record.metadata["operator"] = "somebody else"
-        elif record.name == name:
+        elif isinstance(record, Attachment) and record.name == name:
             record.data += b"\n"
 
     rewrite(small, tmp_path / "edited.mcap", None, edit_head)
@@ -139,6 +139,23 @@ def test_every_record_of_the_head_is_under_the_digest(name: str, small: Path, tm
     assert digest_findings(tmp_path / "edited.mcap") == [
         "configuration, chip, origin or outcome are not those that were recorded: edited or damaged after the recording"
     ]
+
+
+@pytest.mark.parametrize("what", ["depth of the images", "schema", "role"])
+def test_what_is_declared_of_a_topic_is_under_the_digest(what: str, small: Path, tmp_path: Path) -> None:
+    def edit_head(record: Attachment | Metadata | Schema | Channel) -> None:
+        if isinstance(record, Channel) and record.topic == "/camera/frame":
+            if what == "role":
+                del record.metadata["role"]
+            elif what != "schema":
+                record.metadata["bits"] = "8"  # as before, but nobody has declared it
+        elif isinstance(record, Schema) and what == "schema":
+            record.data = record.data.replace(b"frame_id", b"frame_it")
+
+    rewrite(small, tmp_path / "edited.mcap", None, edit_head)
+    assert any(
+        "schema or metadata of /camera/frame are not" in text for text in digest_findings(tmp_path / "edited.mcap")
+    )
 
 
 def test_a_message_that_was_taken_out_is_missed_by_number(small: Path, tmp_path: Path) -> None:
