@@ -2,7 +2,8 @@
 
 A real recorder process drives the compiled firmware behind a pseudo terminal, or by NI's client a twin of the gRPC
 server; the outputs are read from the twins' files. A row per device and fault: the distribution of the time from the
-fault to zero, beside the largest delay of a sleep as long as the guardian's timer, measured meanwhile by a process.
+fault to zero, beside the largest delay of a sleep as long as the guardian's timer, measured meanwhile by processes.
+With `--record` the recorder is `flowrec record --rig lab` on a mission, with an emulated camera: guardian_record.py.
 """
 
 from __future__ import annotations
@@ -29,15 +30,16 @@ import typer
 from flowrec.bench.harness import Results, run
 from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.terminal import progress, table
-from tests.perf import guardian_trial
-from tests.twins.firmware import SAMPLE, compiled, firmware_twin, read_samples
+from tests.perf import guardian_record, guardian_trial
+from tests.twins.coils import Device, device
+from tests.twins.lab import still_scene
 
 TIMER_S = 0.1
 _START_S, _AFTER_S = 90.0, 0.6
+_RECOVERED = 10  # of so many unfinished files one is recovered
 # Recorders are forked from a process that has loaded all they need.
 _CONTEXT = get_context("forkserver")
 _CONTEXT.set_forkserver_preload(["tests.perf.guardian_trial", "flowrec.rigs.lab.amplifiers.serial_line"])
-_ROOT = Path(__file__).parents[2]
 _SLEEPER = """
 import sys, time
 while True:
@@ -45,41 +47,6 @@ while True:
     time.sleep(float(sys.argv[1]))
     print(time.monotonic() - begin - float(sys.argv[1]), flush=True)
 """
-
-
-@dataclass(frozen=True)
-class Device:
-    """A twin with coils on it."""
-
-    kind: str  # serial or ni
-    address: str
-    file: Path
-
-    def off_ns(self, since_ns: int, from_byte: int = 0) -> int | None:
-        """From when on all outputs were zero, for good; None: they are not."""
-        times, outputs = read_samples(self.file, from_byte=from_byte)
-        on = np.flatnonzero((outputs != 0.0).any(axis=1))
-        if on.size == 0 or on[-1] + 1 == len(times):
-            return None if on.size else since_ns
-        return max(int(times[on[-1] + 1]), since_ns)
-
-
-@contextmanager
-def device(kind: str, folder: Path) -> Iterator[Device]:
-    """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`."""
-    file = folder / f"{kind}.samples"
-    if kind != "ni":
-        with firmware_twin(compiled(folder, 100 if kind.endswith("timer") else 0), file) as twin:
-            yield Device("serial", twin.port, file)
-        return
-    command = [sys.executable, "-m", "tests.twins.ni", file]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(command, **pipes, text=True, cwd=_ROOT, env=_env()) as server:
-        try:
-            assert server.stdout is not None
-            yield Device("ni", f"127.0.0.1:{server.stdout.readline().strip()}", file)
-        finally:
-            server.kill()
 
 
 @dataclass
@@ -98,7 +65,7 @@ def trial(on: Device, fault: str, silence_s: float = TIMER_S) -> Ended | None:
     `guardian`: kill of the guardian alone; `signals`: SIGINT, SIGTERM and SIGHUP to the guardian, then the kill.
     """
     own = fault if fault in ("hang", "spin") else ""
-    begin = on.file.stat().st_size // SAMPLE.itemsize * SAMPLE.itemsize
+    begin = on.end()
     said, says = _CONTEXT.Pipe(duplex=False)
     recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, own))
     recorder.start()
@@ -141,7 +108,7 @@ class Blocks:
 
 def blocks(on: Device, seconds: float, silence_s: float = TIMER_S) -> Blocks:
     """Put out a field for so long, with another frequency and heading in each frame; what the outputs did meanwhile."""
-    begin = on.file.stat().st_size // SAMPLE.itemsize * SAMPLE.itemsize
+    begin = on.end()
     said, says = _CONTEXT.Pipe(duplex=False)
     recorder = _CONTEXT.Process(target=guardian_trial.main, args=(says, on.kind, on.address, silence_s, ""))
     recorder.start()
@@ -157,7 +124,7 @@ def blocks(on: Device, seconds: float, silence_s: float = TIMER_S) -> Blocks:
         recorder.join()
         said.close()
     time.sleep(_AFTER_S)
-    times, outputs = read_samples(on.file, from_byte=begin)
+    times, outputs = on.outputs(begin)
     off_ns = on.off_ns(begin_ns, begin)
     kept = outputs[(times >= begin_ns) & (times < min(end_ns, off_ns or end_ns) - 10_000_000)]
     limits = Limits(guardian_trial.COILS, guardian_trial.ROBOT, guardian_trial.OUTPUT)
@@ -199,10 +166,6 @@ def _line(said: Connection, word: str = "") -> str:
     except EOFError:
         return "it has ended"
     return "it says nothing"
-
-
-def _env() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 @contextmanager
@@ -248,40 +211,61 @@ def measure(
     load: Annotated[int, typer.Option(help="processes that compute meanwhile")] = 0,
     kinds: Annotated[str, typer.Option(help="devices, separated by commas")] = "serial,serial+timer,ni",
     blocks_s: Annotated[float, typer.Option(help="time of NI blocks with every core busy; 0: none")] = 60.0,
+    record: Annotated[bool, typer.Option(help="the recorder is a mission of `flowrec record --rig lab`")] = False,
 ) -> Results:
     """Times from the fault to zero, by device and fault; the output of NI blocks on a busy machine."""
     rows, long = [], None
-    with tempfile.TemporaryDirectory() as folder, busy(load):
+    with tempfile.TemporaryDirectory() as name, busy(load):
+        folder = Path(name)
+        camera = still_scene(folder) if record else ()
         for kind in kinds.split(","):
-            faults = {"kill": kills, "stop": stops, "hang": others, "spin": others, "signals": others}
-            faults |= {"guardian": others} | ({"kill both": others} if kind == "ni" else {})
-            with device(kind, Path(folder)) as on:
-                if kind == "ni" and blocks_s:
+            if record:
+                faults = {"kill": kills, "stop": stops, "held": others}
+            else:
+                faults = {"kill": kills, "stop": stops, "hang": others, "spin": others, "signals": others}
+                faults |= {"guardian": others} | ({"kill both": others} if kind == "ni" else {})
+            with device(kind, folder) as on:
+                if kind == "ni" and blocks_s and not record:
                     with busy(os.cpu_count() or 1):
                         long = asdict(blocks(on, blocks_s))
                 for fault, count in faults.items():
-                    with sleeper() as worst, progress(f"{kind} {fault}", count) as done:
-                        ends, refused = [], 0
-                        for number in range(count):
-                            while (ended := trial(on, fault)) is None:
-                                refused += 1  # it lost its coils, and they were at zero, before its field was up
-                            ends.append(ended)
-                            done(number + 1)
-                    jitter_s = max(worst, default=0.0)
-                    off_s = [one.off_s if one.off_s is not None and one.stayed_off else np.inf for one in ends]
-                    rows.append(
-                        {
-                            "device": kind,
-                            "fault": fault,
-                            "off_s": sorted(off_s),
-                            "sleep_s": jitter_s,
-                            "late": sum(one > TIMER_S + jitter_s for one in off_s),
-                            "not_started": refused,
-                            "said": ends[-1].said if ends else "",
-                        }
-                    )
-                    print(f"{kind} {fault}: {np.round(1e3 * np.array(sorted(off_s)), 1).tolist()}", file=sys.stderr)
+                    rows.append(_row(on, kind, fault, count, folder, camera))
     return {"rows": rows, "load": os.getloadavg()[0], "blocks": long}
+
+
+def _row(on: Device, kind: str, fault: str, count: int, folder: Path, camera: tuple[str, ...]) -> Results:
+    """All trials of a fault on a device; with settings of a camera, those of a real recorder."""
+    ends: list[Ended | guardian_record.Left] = []
+    refused = 0
+    with sleeper() as worst, progress(f"{kind} {fault}", count) as done:
+        while len(ends) < count:
+            name, recovers = f"{kind}-{fault}-{len(ends)}", len(ends) % _RECOVERED == 0
+            if camera:
+                ended = guardian_record.trial(on, fault, folder, camera, name, recovers=recovers)
+            else:
+                ended = trial(on, fault)
+            if ended is None:
+                refused += 1  # it lost its coils, and they were at zero, before its field was up
+                continue
+            ends.append(ended)
+            done(len(ends))
+    jitter_s = max(worst, default=0.0)
+    off_s = sorted(one.off_s if one.off_s is not None and one.stayed_off else np.inf for one in ends)
+    row = {
+        "device": kind,
+        "fault": fault,
+        "off_s": off_s,
+        "sleep_s": jitter_s,
+        "late": sum(one > TIMER_S + jitter_s for one in off_s),
+        "not_started": refused,
+        "said": ends[-1].said if ends else "",
+        "load": os.getloadavg()[0],
+    }
+    if camera:
+        recovered_s = [one.recovered_s for one in ends if one.recovered_s is not None]
+        row |= {"files": sorted({one.file for one in ends}), "recovered": len(recovered_s)}
+    print(f"{row | {'off_s': np.round(1e3 * np.array(off_s), 1).tolist()}}", file=sys.stderr)
+    return row
 
 
 def show(results: Results) -> None:
@@ -296,21 +280,25 @@ def show(results: Results) -> None:
             "trials",
             "least, ms",
             "median",
-            "95 %",
+            "90 %",
             "most",
             "delay of a sleep",
             "late or on",
             "not started",
+            "load",
+            "left (recovered)",
         ),
         [
             (
                 row["device"],
                 row["fault"],
                 str(len(row["off_s"])),
-                *(f"{1e3 * np.percentile(row['off_s'], q):.1f}" for q in (0, 50, 95, 100)),
+                *(f"{1e3 * np.percentile(row['off_s'], q):.1f}" for q in (0, 50, 90, 100)),
                 f"{1e3 * row['sleep_s']:.1f}",
                 str(row["late"]),
                 str(row["not_started"]),
+                f"{row['load']:.1f}",
+                f"{', '.join(row['files'])} ({row['recovered']})" if "files" in row else "-",
             )
             for row in results["rows"]
             if row["off_s"]

@@ -22,11 +22,11 @@ from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.robot import Robot
 from flowrec.system.processes import realtime_priority
+from tests.twins.coils import CHANNELS
 
 COILS = Coils(bias_mt=(0.05, 0.0, -0.04))
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=500.0, step_out_hz=30.0)
 OUTPUT = OutputLimits()
-CHANNELS = "cDAQ1Mod1/ao0:2"
 _FRAME_S = 1.0 / 60.0
 
 

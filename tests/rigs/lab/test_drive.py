@@ -21,9 +21,9 @@ from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.lab.drive import Drive
 from flowrec.rigs.lab.guardian import Guardian
 from tests.conftest import needs_quiet, until
-from tests.perf.guardian import Device, device, sleeper, trial
+from tests.perf.guardian import sleeper, trial
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, currents
-from tests.twins.firmware import FULL_A, read_samples
+from tests.twins.coils import Device, device
 
 pytestmark = needs_quiet
 
@@ -64,13 +64,13 @@ def driven(on: Device, seconds: float = 0.0) -> Iterator[tuple[Drive, int, int]]
 
 def test_the_turns_that_are_logged_are_those_of_the_field_that_was_put_out(on: Device) -> None:
     """The judge integrates the rotation of the field from the outputs alone."""
-    begin = on.file.stat().st_size // 32 * 32
+    begin = on.end()
     with driven(on, 2.0) as (drive, begin_ns, _):
         drive.apply(currents(8.0, 1.0))
         now_ns = time.monotonic_ns() - 300_000_000
         full_ns = begin_ns + 600_000_000  # after the ramp and the latency: the bias compensation is complete
         found = drive.put_out(time.monotonic_ns()).turns(full_ns, now_ns)
-    times, outputs = read_samples(on.file, FULL_A if on.kind == "serial" else 1.0, begin)
+    times, outputs = on.outputs(begin)
     kept = (times >= full_ns) & (times <= now_ns)
     bias = field_limits(COILS).bias_a
     field = (outputs[kept] + bias) @ np.array(COILS.mt_per_a).T
@@ -101,7 +101,7 @@ def test_a_recorder_whose_guardian_is_killed_takes_the_field_away_itself(serial:
 
 
 def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
-    begin = serial.file.stat().st_size // 32 * 32
+    begin = serial.end()
     limits = Limits(COILS, ROBOT, OUTPUT)
     with Drive(amplifier("serial", serial.address), limits, 0.1, 0.3) as drive:
         drive.apply(currents(5.0, 0.0))
@@ -115,7 +115,7 @@ def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
 
 
 def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
-    begin = on.file.stat().st_size // 32 * 32
+    begin = on.end()
     with driven(on, 0.4) as (drive, begin_ns, _):
         drive.zero()
         off_ns = on.off_ns(begin_ns, begin)
@@ -130,7 +130,7 @@ def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
 
 
 def test_an_ni_output_that_runs_dry_is_counted_and_ends_in_zero(ni: Device) -> None:
-    begin = ni.file.stat().st_size // 32 * 32
+    begin = ni.end()
     with driven(ni, 0.4) as (drive, begin_ns, _):
         process = drive._amplifier._process  # type: ignore[attr-defined]
         process.send_signal(signal.SIGSTOP)
@@ -153,7 +153,7 @@ def test_a_guardian_that_can_not_act_does_not_start() -> None:
 def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
     serial: Device, ni: Device, tmp_path: Path
 ) -> None:
-    begins = {one: one.file.stat().st_size // 32 * 32 for one in (serial, ni)}
+    begins = {one: one.end() for one in (serial, ni)}
     master, slave = os.openpty()
     strong = replace(COILS, max_current_a=7.0)
     cases = [
@@ -169,6 +169,6 @@ def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
     with driven(serial), pytest.raises(RigError, match="another program uses this port"), driven(serial):
         pass
     for one, begin in begins.items():
-        assert not read_samples(one.file, from_byte=begin)[1].any()
+        assert not one.energised(begin)
     os.close(master)
     os.close(slave)
