@@ -8,7 +8,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -59,12 +61,22 @@ class Device:
         return max(int(times[on[-1] + 1]), since_ns)
 
 
+@cache
+def _programs() -> TemporaryDirectory[str]:
+    """Compiled firmware of this process."""
+    return TemporaryDirectory()
+
+
 @contextmanager
 def device(kind: str, folder: Path, timer_ms: int = 100) -> Iterator[Device]:
-    """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`."""
+    """`serial`: the firmware's own timer is off, so that the guardian is alone; `serial+timer`; `ni`.
+
+    `folder` gets the file of the outputs.
+    """
     file = folder / f"{kind}.samples"
     if kind != "ni":
-        with firmware_twin(compiled(folder, timer_ms if kind.endswith("timer") else 0), file) as twin:
+        program = compiled(Path(_programs().name), timer_ms if kind.endswith("timer") else 0)
+        with firmware_twin(program, file) as twin:
             yield Device("serial", twin.port, file)
         return
     command = [sys.executable, "-m", "tests.twins.ni", file]

@@ -12,12 +12,16 @@ import signal
 import socket
 import struct
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.twins.coils import environment
+
+_ROOT = Path(__file__).parents[2]
 PROGRAM = "arv-fake-gv-camera-0.8"
 # Registers of the fake of Aravis, as its GenICam description states them.
 WIDTH, HEIGHT, OFFSET_X, OFFSET_Y, PIXEL_FORMAT = 0x100, 0x104, 0x130, 0x134, 0x128
@@ -50,10 +54,16 @@ class Aravis:
     Parameters
     ----------
     lost_packets : of a thousand.
+    shown : the file of what it shows, see gige_images.py; None: a pattern. With one, no packets are lost.
     """
 
-    def __init__(self, lost_packets: int = 0, serial: str = "T1", address: str = "127.0.0.1") -> None:
+    def __init__(
+        self, lost_packets: int = 0, serial: str = "T1", address: str = "127.0.0.1", shown: Path | None = None
+    ) -> None:
         self._command = [PROGRAM, "-i", address, "-s", serial, "-r", str(lost_packets)]
+        if shown is not None:
+            self._command = [sys.executable, "-m", "tests.twins.gige_images", str(shown), serial]
+        self._speaks = shown is not None
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Aravis:
@@ -66,8 +76,13 @@ class Aravis:
     def plug_in(self) -> None:
         """Start it; it answers after some hundredths of a second."""
         silent = subprocess.DEVNULL
-        self._process = subprocess.Popen(self._command, stdout=silent, stderr=silent)
-        time.sleep(0.1)
+        told = subprocess.PIPE if self._speaks else silent
+        self._process = subprocess.Popen(self._command, stdout=told, stderr=silent, cwd=_ROOT, env=environment())
+        if self._process.stdout is not None:
+            with self._process.stdout:
+                self._process.stdout.readline()
+        else:
+            time.sleep(0.1)
         assert self._process.poll() is None, f"{PROGRAM} has ended; is port 3956 in use?"
 
     def unplug(self) -> None:

@@ -1,123 +1,185 @@
-"""A whole mission of `record --rig lab`: an emulated camera and the serial firmware, a simulated world between them.
+"""Whole missions of `record --rig lab` on twins of camera and coils, with a simulated world between them.
 
-The recorder is a process of its own, as in a lab. The world is moved by the currents of the firmware's outputs alone.
+The recorder is a process of its own, as in a lab. The world is moved by the outputs of the amplifier's twin alone.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import subprocess
+import select
 import sys
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flowrec.chip import load_chip
+from flowrec.cli import main
 from flowrec.commands.check import check
 from flowrec.commands.replay import replay
 from flowrec.config import load_config
+from flowrec.flow.sampling import relative_rmse
 from flowrec.pipeline import assemble
 from flowrec.resolve import resolve
 from flowrec.session import Session
 from tests.conftest import needs_quiet
-from tests.twins.firmware import compiled, firmware_twin
-from tests.twins.world import live_images
+from tests.perf.camera_killed import trial
+from tests.twins.coils import Device, device
+from tests.twins.emulator import emulated
+from tests.twins.gige import installed
+from tests.twins.lab import COMMON, PATIENT, RATE, recorder, words
+from tests.twins.world import EmulatedView, live_world
 
-pytest.importorskip("pypylon")
 pytestmark = needs_quiet
-
-COMMON = (
-    "camera.width_px=320",
-    "camera.height_px=256",
-    "camera.um_per_px=20.0",
-    "robot.radius_um=80.0",
-    "robot.max_speed_um_s=300.0",
-    "robot.step_out_hz=15.0",
-    "robot.delay_s=0.06",
-    "chip.inlet_speed_um_s=40.0",  # slow: a computer that tests beside it delays frames by 0.1 s and more
-    "mission.phases=plan,navigate",
-    "mission.goal=[1100.0, 2700.0]",
-)
-# A computer that compiles, tests and renders beside the recorder stops it for longer than a lab's may.
-PATIENT = ("lab.guardian_s=1.0", "safety.guard_timeout_s=3.0", "lab.camera_timeout_s=1.0")
+GOAL_UM = (2480.0, 3343.0)
 
 
-@pytest.fixture(scope="module")
-def firmware(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled(tmp_path_factory.mktemp("firmware"), timer_ms=1000)
-
-
-def words(sets: tuple[str, ...]) -> list[str]:
-    return [word for text in sets for word in ("--set", text)]
-
-
-def test_a_mission_with_emulated_devices_arrives_and_replays_exactly(firmware: Path, tmp_path: Path) -> None:
-    config = load_config(None, [*COMMON, "camera.rate_hz=40.0", "simulated.seed=5"])
-    chip = load_chip(config.chip)
-    resolved = resolve(config, chip)
-    session = tmp_path / "s.mcap"
-    with (
-        firmware_twin(firmware, tmp_path / "outputs") as twin,
-        live_images(assemble(resolved, chip), resolved, twin.samples, tmp_path) as (features, positions),
-    ):
-        sets = (*COMMON, *PATIENT, "camera.rate_hz=20.0", "recording.anonymous=true", "lab.camera=pylon")
-        devices = (f'lab.device_config="{features}"', f'lab.port="{twin.port}"')
-        command = [sys.executable, "-m", "flowrec", "record", "--rig", "lab", "--out", str(session)]
-        done = subprocess.run(
-            [*command, *words((*sets, *devices))],
-            env=os.environ | {"PYLON_CAMEMU": "1"},
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
-        )
-        times_ns, currents = twin.samples()
-    assert done.returncode == 0, done.stderr[-2000:]
-    away_um = np.hypot(*(np.array(positions) - (1100.0, 2700.0)).T)
-    assert away_um.min() < 120.0, "the robot of the world was at the goal"
-    assert np.abs(currents).max() > 1.0 and not currents[-1].any()
-    with Session(session) as recorded:
+def test_a_mission_whose_camera_is_killed_on_the_way_has_no_field_meanwhile_and_arrives(tmp_path: Path) -> None:
+    """By the GigE Vision protocol and the serial firmware."""
+    pytest.importorskip("viva_genicam")
+    if not installed:
+        pytest.skip("needs aravis-tools")
+    killed = trial(tmp_path)
+    assert killed.status == 0, killed.said
+    assert killed.off_s < 3.0 and killed.back_s < 10.0, "a bound for this test; tests.perf.cameras measures"
+    assert "the field is off until there is an image again" in killed.said and "the camera is back" in killed.said
+    assert killed.closest_um < 150.0, "the robot of the world was at the goal"
+    with Session(killed.session) as recorded:
         assert recorded.outcome["outcome"] == "reached"
         ticks = list(recorded.ticks())
-    turns = np.sum([tick.applied.turns for tick in ticks], axis=0)
-    rolled_um = 25.0 * float(np.hypot(*turns))
-    assert rolled_um > 100.0, "the coils did the work"
-    assert any(tick.losses is not None for tick in ticks)
-    assert len(times_ns) > 1000
+    losses = [tick.losses for tick in ticks if tick.losses is not None][-1]
+    assert losses.reconnections == 1
+    assert losses.ids == losses.frames + losses.link + losses.incomplete + losses.driver + losses.backlog
+    assert any(tick.applied is not None and tick.applied.without_image for tick in ticks)
+    assert replay(killed.session, verify=True).same
+    assert check(killed.session).exit_status in (0, 3)
+
+
+def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path: Path) -> None:
+    """By pylon's emulator and the twin of NI's server."""
+    pytest.importorskip("pypylon")
+    pytest.importorskip("nidaqmx")
+    mission = ("mission.phases=survey,refine,plan,navigate", f"mission.goal={list(GOAL_UM)}", "robot.delay_s=0.19")
+    config = load_config(None, [*COMMON, *mission, "camera.rate_hz=40.0", "simulated.seed=5"])
+    chip = load_chip(config.chip)
+    resolved = resolve(config, chip)
+    session, errors = tmp_path / "s.mcap", tmp_path / "stderr"
+    view = EmulatedView(tmp_path, resolved)
+    with (
+        device("ni", tmp_path) as coils,
+        live_world(assemble(resolved, chip), resolved, coils, view) as (world, truths),
+    ):
+        sets = (*COMMON, *PATIENT, *mission, RATE, "recording.anonymous=true", "refine.method=assimilate")
+        with recorder(session, *sets, *view.sets, *coils.sets, errors=errors) as process:
+            assert process.wait(240.0) == 0, errors.read_text()[-2000:]
+        _, volts = coils.outputs()
+        truth = world.true_field
+    away_um = np.hypot(*(np.array([one.position_um for one in truths]) - GOAL_UM).T)
+    assert away_um.min() < 150.0, "the robot of the world was at the goal"
+    assert np.abs(volts).max() > 1.0 and not volts[-1].any()
+    with Session(session) as recorded:
+        assert recorded.outcome["outcome"] == "reached"
+        fields = recorded.fields
+        turns = np.sum([tick.applied.turns for tick in recorded.ticks() if tick.applied is not None], axis=0)
+    assert 25.0 * float(np.hypot(*turns)) > 300.0, "the coils did the work"
+    errors_v = {name: float(relative_rmse(field, truth, chip.mask).v) for name, field in fields.items()}
+    assert errors_v["assumed"] > 0.1 and errors_v["refined"] < 0.7 * errors_v["assumed"], errors_v
     assert replay(session, verify=True).same
     assert check(session).exit_status in (0, 3)
 
 
+@contextmanager
+def nothing_else(_on: Device) -> Iterator[tuple[str, ...]]:
+    """Nobody but the recorder is at the devices."""
+    yield ()
+
+
+@contextmanager
+def other_words(_on: Device) -> Iterator[tuple[str, ...]]:
+    """A port at which another device answers every line."""
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    over = threading.Event()
+
+    def answer() -> None:
+        while not over.is_set():
+            if select.select([ours], [], [], 0.05)[0] and os.read(ours, 4096):
+                os.write(ours, b"Grbl 1.1f ['$' for help]\r\nerror:2\r\n")
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    yield (f'lab.port="{os.ttyname(theirs)}"',)
+    over.set()
+    thread.join()
+    os.close(ours)
+    os.close(theirs)
+
+
+@contextmanager
+def port_in_use(on: Device) -> Iterator[tuple[str, ...]]:
+    """Another program has opened the port."""
+    import serial
+
+    with serial.Serial(on.address, exclusive=True):
+        yield ()
+
+
+@contextmanager
+def outputs_in_use(on: Device) -> Iterator[tuple[str, ...]]:
+    """Another program puts out zeros at one of the outputs; they stay its own."""
+    nidaqmx = pytest.importorskip("nidaqmx")
+    from flowrec.rigs.lab.amplifiers.ni_device import grpc_options
+
+    with nidaqmx.Task(grpc_options=grpc_options(on.address)) as other:
+        other.ao_channels.add_ao_voltage_chan("cDAQ1Mod1/ao1")
+        other.timing.cfg_samp_clk_timing(1000.0, sample_mode=nidaqmx.constants.AcquisitionType.CONTINUOUS)
+        other.write(np.zeros(1000))
+        other.start()
+        yield ()
+        assert not other.is_task_done()
+
+
 @pytest.mark.parametrize(
-    ("cameras", "sets", "told"),
+    ("kind", "cameras", "meanwhile", "sets", "told"),
     [
-        ("0", (), "pylon: no camera found"),
-        ("2", (), "pylon: 2 cameras found; set lab.device"),
-        ("1", ("coils.max_current_a=50.0",), "coils.max_current_a = 50 A: .* makes at most 5 A"),
+        ("serial", 0, nothing_else, (), "pylon: no camera found"),
+        ("serial", 2, nothing_else, (), "pylon: 2 cameras found; set lab.device"),
+        ("serial", 1, nothing_else, ("coils.max_current_a=50.0",), "coils.max_current_a = 50 A: .* makes at most 5 A"),
+        ("serial", 1, other_words, (), "another device than flowrec-coils answers"),
+        ("serial", 1, port_in_use, (), "another program uses this port"),
+        ("ni", 1, outputs_in_use, (), "another program uses the outputs"),
+        ("ni", 1, nothing_else, ('lab.channels="cDAQ1Mod1/ao7:9"',), "the device has no such output"),
     ],
 )
 def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_file_and_no_field(
-    cameras: str, sets: tuple[str, ...], told: str, firmware: Path, tmp_path: Path
+    kind: str,
+    cameras: int,
+    meanwhile: Callable[[Device], AbstractContextManager[tuple[str, ...]]],
+    sets: tuple[str, ...],
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """The verb itself, in this process."""
+    pytest.importorskip("pypylon")
     out = tmp_path / "out"
     out.mkdir()
-    with firmware_twin(firmware, tmp_path / "outputs") as twin:
-        given = (*COMMON, "camera.rate_hz=20.0", "lab.camera=pylon", f'lab.port="{twin.port}"', *sets)
-        command = [sys.executable, "-m", "flowrec", "record", "--rig", "lab", "--out", str(out / "s.mcap")]
-        done = subprocess.run(
-            [*command, *words(given)],
-            env=os.environ | {"PYLON_CAMEMU": cameras},
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=False,
-        )
-        _, currents = twin.samples()
-    assert done.returncode in (1, 2)
-    lines = [line for line in done.stderr.splitlines() if line.startswith("flowrec: ")]
-    assert len(lines) == 1 and "Traceback" not in done.stderr
+    with emulated(cameras), device(kind, tmp_path) as on, meanwhile(on) as more:
+        begin = on.end()
+        given = words((*COMMON, RATE, "lab.camera=pylon", *on.sets, *more, *sets))
+        monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--rig", "lab", "--out", str(out / "s.mcap"), *given])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert not on.energised(begin)
+    assert ended.value.code in (1, 2)
+    stderr = capsys.readouterr().err
+    lines = [line for line in stderr.splitlines() if line.startswith("flowrec: ")]
+    assert len(lines) == 1 and "Traceback" not in stderr
     assert re.search(told, lines[0]), lines[0]
     assert not list(out.iterdir())
-    assert not currents.any()

@@ -54,9 +54,23 @@ class NiDevice:
         except DaqError as error:
             raise RigError(f"lab.channels = {channels!r}: {reason(error)}") from error
 
+    def take(self) -> None:
+        """Take the outputs to zero before the first use. Nothing is taken away from another program that uses them.
+
+        Raises
+        ------
+        RigError : another program does; one line.
+        """
+        try:
+            write_zeros(self._channels, self._options)
+        except DaqError as error:
+            if int(error.error_code) in _RESERVED:
+                raise RigError(f"lab.channels = {self._channels!r}: {reason(error)}") from error
+            reset(self._channels, self._options)
+
     def start(self, block_s: float) -> float:
         """Prepare the output of blocks; returns the sample rate, which the device may have rounded."""
-        task = self._task = self._new_task()
+        task = self._task = self._new_task(self._amplifier.max_voltage_v)
         rate_hz = self._amplifier.output_hz
         count = round(block_s * rate_hz)
         task.timing.cfg_samp_clk_timing(rate_hz, sample_mode=AcquisitionType.CONTINUOUS, samps_per_chan=4 * count)
@@ -104,25 +118,31 @@ class NiDevice:
             reset(self._channels, self._options)
 
     def _described(self, latency_s: float) -> AmplifierInfo:
-        with self._new_task() as task:
+        device = Device(devices(self._channels)[0], grpc_options=self._options)
+        edges = device.ao_voltage_rngs  # lowest and highest of each range
+        offered_v = max((min(-low, high) for low, high in zip(edges[::2], edges[1::2], strict=True)), default=0.0)
+        # Within what the device offers: what is asked for beyond it is refused later, with the name of the setting.
+        with self._new_task(min(self._amplifier.max_voltage_v, offered_v)) as task:
             names = task.ao_channels.channel_names
         if len(names) != _COILS:
             raise RigError(f"lab.channels = {self._channels!r}: {len(names)} outputs, where three coils need {_COILS}")
-        device = Device(devices(self._channels)[0], grpc_options=self._options)
+        if len(set(names)) != _COILS:
+            raise RigError(
+                f"lab.channels = {self._channels!r}: an output is named twice; each coil needs one of its own"
+            )
         return AmplifierInfo(
             model=device.product_type,
             serial=f"{device.serial_num:X}",
             max_current_a=np.inf,
-            max_voltage_v=float(min(abs(edge) for edge in device.ao_voltage_rngs[:2])),
+            max_voltage_v=float(offered_v),
             max_output_hz=float(device.ao_max_rate),
             latency_s=latency_s,
             timer_s=0.0,
         )
 
-    def _new_task(self) -> nidaqmx.Task:
+    def _new_task(self, most_v: float) -> nidaqmx.Task:
         task = nidaqmx.Task(grpc_options=self._options)
         try:
-            most_v = self._amplifier.max_voltage_v
             task.ao_channels.add_ao_voltage_chan(self._channels, min_val=-most_v, max_val=most_v)
         except BaseException:
             task.close()

@@ -141,8 +141,9 @@ class Server:
 
     def _open(self, settings: Settings) -> None:
         self._settings = settings
-        self._device = NiDevice(settings.channels, settings.server, settings.coils.amplifier, LATENCY_S)
-        self._device.zero()
+        device = NiDevice(settings.channels, settings.server, settings.coils.amplifier, LATENCY_S)
+        device.take()
+        self._device = device  # from now on its outputs are taken to zero at the end, whoever uses them
         prioritise_process(2)  # now that the driver has started its threads
         self._connection.send(("info", self._device.info))
 

@@ -191,7 +191,9 @@ class SerialAmplifier:
                 ) from error
             if isinstance(error, OSError) and error.errno == errno.EACCES:
                 raise RigError(f"{self._name}: no right to use this port; sudo adduser $USER dialout") from error
-            raise RigError(f"lab.port = {self._name!r}: {_first_line(error)}; ports here: {there}") from error
+            gone = isinstance(error, OSError) and error.errno == errno.ENOENT
+            why = "there is no such port" if gone else f"it can not be used as a serial port ({_first_line(error)})"
+            raise RigError(f"lab.port = {self._name!r}: {why}; ports here: {there}") from error
 
     def _identified(self) -> AmplifierInfo:
         end_s = time.monotonic() + _BOOT_S
@@ -209,7 +211,9 @@ class SerialAmplifier:
             model, version, most_ua, timer_ms, update_hz = answer.words
             found = int(version), int(most_ua), int(timer_ms), int(update_hz)
         except ValueError as error:
-            raise RigError(f"{self._name}: the amplifier describes itself by {_words(answer)!r}") from error
+            raise RigError(
+                f"{self._name}: another device than flowrec-coils answers (by {_words(answer)!r}); is lab.port right?"
+            ) from error
         if found[0] != VERSION:
             raise RigError(f"{self._name}: protocol {found[0]}, where {VERSION} is needed; put the new firmware on it")
         return AmplifierInfo(

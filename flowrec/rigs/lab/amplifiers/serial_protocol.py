@@ -54,10 +54,10 @@ def line(verb: str, number: int, *numbers: int) -> bytes:
 def reply(received: bytes) -> Reply | None:
     """What a received line says; None: it is damaged, or of no flowrec-coils firmware."""
     body, star, crc = received.strip().rpartition(b"*")
-    if not star or crc != b"%04X" % _crc(body):
+    if not star or not body.strip() or crc != b"%04X" % _crc(body):
         return None
     verb, *words = body.decode("ascii", "replace").split()
-    number = int(words[0]) if words and words[0].lstrip("-").isdigit() else -1
+    number = int(words[0]) if words and words[0].isdigit() else -1
     return Reply(verb, number, tuple(words[1:]))
 
 
