@@ -32,8 +32,10 @@ from flowrec.rigs.lab.cameras.genicam import GenicamCamera
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.rigs.lab.cameras.mmcore import MmcoreCamera
 from flowrec.rigs.lab.cameras.pylon import PylonCamera
+from flowrec.session import Session
 from flowrec.terminal import table
 from flowrec.units import NS_PER_S
+from tests.perf.camera_killed import trial
 from tests.rigs.lab.cameras.watching import adds_up
 from tests.twins.emulator import emulated, showing
 from tests.twins.gige import Aravis, port
@@ -219,13 +221,27 @@ def unplugged(trials: int, *, kill: bool) -> Results:
     return {"trials": trials, "recognised_s": [min(seen), max(seen)], "resumed_s": [min(back), max(back)]}
 
 
+def killed_in_a_mission() -> Results:
+    """A mission of `flowrec record --rig lab` whose camera is killed while the coils are on: see camera_killed.py."""
+    with tempfile.TemporaryDirectory() as folder:
+        killed = trial(Path(folder))
+        with Session(killed.session) as session:
+            outcome = session.outcome["outcome"]
+        row = {"off_s": killed.off_s, "back_s": killed.back_s, "status": killed.status, "outcome": outcome}
+        sys.stderr.write(f"{row}\n")
+        return row
+
+
 def measure(
     seconds: Annotated[float, typer.Option(min=2.0, help="Length of the two long rows.")] = 60.0,
     trials: Annotated[int, typer.Option(min=1, help="How often the camera is killed, and how often frozen.")] = 10,
+    recorded: Annotated[int, typer.Option(help="Only missions of flowrec record, so many, with a killed camera.")] = 0,
 ) -> Results:
     """Run all rows."""
     short_s = seconds / 4.0
     load = os.getloadavg()[0]
+    if recorded:
+        return {"recorded": [killed_in_a_mission() for _ in range(recorded)], "load": [load, os.getloadavg()[0]]}
     campaigns: dict[str, Callable[[], Results]] = {
         "Aravis": lambda: aravis(seconds),
         "Aravis, 5 % of packets lost": lambda: aravis(seconds, 50),
@@ -254,6 +270,13 @@ def measure(
 def show(results: Results) -> None:
     """Print the tables."""
     load = "load {:.1f} to {:.1f} on {} cores".format(*results["load"], os.cpu_count())
+    if "recorded" in results:
+        table(
+            f"A camera killed in a mission with its coils on ({load})",
+            ["field off s after it", "field on s after the camera's start", "outcome"],
+            [[f"{row['off_s']:.2f}", f"{row['back_s']:.2f}", row["outcome"]] for row in results["recorded"]],
+        )
+        return
     table(
         f"What became of the blocks ({load})",
         ["", "ids", "frames", "link, incomplete, driver, queue", "adds up", "library", "Hz", "arrival ms", "slope"],
