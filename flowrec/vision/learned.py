@@ -4,6 +4,7 @@ Candidates are maxima of the foreground's energy (foreground.py), so an object i
 compared with the learned views: the first look, a slow mean of the recent looks, and up to six earlier looks that
 differ. All candidates are assigned at once, to the robot and to the neighbours of the frame before, at the least sum of
 costs (global nearest neighbour, Bar-Shalom and Li 1995): the best match alone would jump to an identical neighbour.
+Where two meet in one image, the neighbour is remembered at its place until they part.
 
 The position is the centroid of the foreground, which knows no drift. Of a round object a registration with the views is
 more precise; its views are centred by their own centroid, so that does not drift either.
@@ -35,6 +36,7 @@ from flowrec.vision.walls import Box
 
 SIGNS = {"dark": -1, "bright": 1, "mixed": 0}
 BLUR_PX = 1.0  # an image is larger than the object by about this much
+LEAST_RADIUS_PX = 3.2  # of an image: less holds too few pixels
 VIEWS = 8  # at most
 _STEP_RADIUS_PX = 6.0  # least radius in the reduced image
 _CENTROID_RADII = 1.15  # window of the centroid
@@ -46,6 +48,9 @@ _NEIGHBOUR_MISSED_COST = 6.0
 _ENERGY_SPREAD = 0.7  # of ln(energy / expected energy)
 _ISOLATED_RADII = 2.2  # no neighbour is nearer
 _KNOWN_LOOK = 0.8  # correlation from which on a look is one of the views
+_EXPECTED_FRAMES = 3  # for which a velocity goes on
+_FADE = 0.9  # of the energy of a neighbour that is in one image with the robot, in a frame
+_SUM_LOW = 0.65  # least energy of such an image relative to the sum
 _GAIN, _RECENT_GAIN = 0.3, 0.2  # of the velocity; of the recent view, energy and spread
 
 
@@ -93,6 +98,11 @@ class Scale:
     def window(self) -> NDArray[np.float32]:
         """Weights (n, n) of a view's pixels: 1 within the radius, 0 from 1.5 radii on."""
         return _window(self.radius)
+
+
+def scale_of(radius_px: float) -> Scale:
+    """Scale of an object whose own radius is given."""
+    return Scale(max(radius_px + BLUR_PX, LEAST_RADIUS_PX))
 
 
 @lru_cache(maxsize=16)
@@ -197,16 +207,21 @@ class Motion:
 def expected_motion(previous: Track, place_px: NDArray[np.float64], radius_px: float, frame_s: float) -> Motion:
     """The motion since a track: its velocity goes on for three frames at most, then the robot may be anywhere near."""
     frames = 1 + previous.lost_frames
-    moved = previous.velocity_px_s * frame_s * frames if previous.lost_frames < 3 else 0.0
+    moved = previous.velocity_px_s * frame_s * frames if previous.lost_frames < _EXPECTED_FRAMES else 0.0
     return Motion(place_px + moved, max(previous.spread_px, 0.15 * radius_px + 0.3) * frames)
 
 
-def assigned(found: Candidates, previous: Track, motion: Motion, range_px: float) -> int | None:
-    """The candidate that is the robot when all objects of the frame before are assigned at once; None: no one is."""
+def assigned(
+    found: Candidates, previous: Track, motion: Motion, range_px: float
+) -> tuple[int | None, NDArray[np.float64]]:
+    """The candidate that is the robot when all objects of the frame before are assigned at once; None: no one is.
+
+    Besides the neighbours (k, 3) that are no candidate.
+    """
     count = len(found.energy)
-    if not count:
-        return None
     neighbours = previous.neighbours_px.reshape(-1, 3)
+    if not count:
+        return None, neighbours
     costs = np.full((1 + len(neighbours), count + 1 + len(neighbours)), _IMPOSSIBLE)
     distance2 = ((found.px - motion.expected_px) ** 2).sum(axis=1)
     costs[0, :count] = _SIMILARITY_COST * (1.0 - found.similarity) + _moved(found, motion, distance2, previous.energy)
@@ -218,8 +233,57 @@ def assigned(found: Candidates, previous: Track, motion: Motion, range_px: float
         costs[row, count + row] = _NEIGHBOUR_MISSED_COST
     from scipy.optimize import linear_sum_assignment  # not at start-up
 
-    chosen = int(linear_sum_assignment(costs)[1][0])
-    return chosen if chosen < count else None
+    chosen = linear_sum_assignment(costs)[1]
+    missed = neighbours[chosen[1:] >= count]
+    return (int(chosen[0]) if chosen[0] < count else None), missed
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """The robot and neighbours (k, 3) in one image."""
+
+    which: int
+    place_px: NDArray[np.float64]  # (2,) of the robot
+    neighbours: NDArray[np.float64]
+
+
+def merged(
+    found: Candidates, which: int | None, previous: Track, motion: Motion, missed: NDArray[np.float64], radius_px: float
+) -> Merged | None:
+    """The image that is the robot and missed neighbours (k, 3) together: it is near both and has the sum of energies.
+
+    `which` is the candidate that is the robot; None: the one nearest to where it is expected, which then may be taken
+    for a neighbour. Its centroid is that of all, and they lie to each other as before:
+        centroid = sum(E_i p_i) / sum(E_i), p_robot - p_i = expected - p_i before.
+    """
+    if which is None:
+        if not len(found.energy) or previous.lost_frames >= _EXPECTED_FRAMES:
+            return None
+        which = int(np.hypot(*(found.px - motion.expected_px).T).argmin())
+        missed = previous.neighbours_px.reshape(-1, 3)
+    elif found.similarity[which] >= _KNOWN_LOOK:
+        return None
+    centroid = found.px[which]
+    near = hidden(missed, centroid, radius_px)
+    total = previous.energy + float(near[:, 2].sum())
+    if not len(near) or math.dist(centroid, motion.expected_px) > radius_px:
+        return None
+    # The second term: beside a much stronger neighbour the sum does not tell whether the robot is there.
+    if not _SUM_LOW < float(found.energy[which]) / total < 1.0 / _SUM_LOW or previous.energy < (1 - _SUM_LOW) * total:
+        return None
+    offsets = motion.expected_px - near[:, :2]
+    place_px = centroid + (near[:, 2:] * offsets).sum(axis=0) / total
+    return Merged(which, place_px, np.column_stack([place_px - offsets, near[:, 2]]))
+
+
+def hidden(missed: NDArray[np.float64], place_px: NDArray[np.float64], radius_px: float) -> NDArray[np.float64]:
+    """Those of the missed neighbours (k, 3) that are at the robot's place: they may come out of its image again.
+
+    They fade, since one that has gone out of focus does not come out.
+    """
+    near = missed[np.hypot(*(missed[:, :2] - place_px).T) < radius_px]
+    kept = near[near[:, 2] > _LEAST_ENERGY]
+    return np.column_stack([kept[:, :2], _FADE * kept[:, 2]])
 
 
 def _moved(found: Candidates, motion: Motion, distance2: NDArray[np.float64], energy: float) -> NDArray[np.float64]:
@@ -232,7 +296,7 @@ def similar(found: Candidates, which: int, previous: Track, motion: Motion, radi
     """Whether a candidate of unknown look is the robot by its place and energy: it has turned."""
     ratio = float(found.energy[which]) / max(previous.energy, 1e-6)
     near = math.dist(found.px[which], motion.expected_px) < 1.5 * radius_px
-    return previous.lost_frames < 3 and near and 0.25 < ratio < 4.0
+    return previous.lost_frames < _EXPECTED_FRAMES and near and 0.25 < ratio < 4.0
 
 
 def alone(found: Candidates, energy: float, least_score: float) -> int | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flowrec.declarations import Image
 from flowrec.messages import Appearance
 from flowrec.vision.foreground import energy_map, patch_at, peaks, silhouette_centroid
-from flowrec.vision.learned import BLUR_PX, SIGNS, Region, Scale, region_of
+from flowrec.vision.learned import SIGNS, Region, Scale, region_of, scale_of
 
 _QUANTUM = 0.29  # standard deviation of rounding to whole grey levels
 _SMOOTHED = 0.375  # noise of a foreground's block relative to that of a block's mean
@@ -49,7 +49,7 @@ def learn(
     to do if nothing differs from the background there; `views` is empty then.
     """
     height, width = image.shape
-    scale = Scale(radius_px + BLUR_PX)
+    scale = scale_of(radius_px)
     whole = region_of(image, distance_px, (0, 0, width, height), scale, solid_px)
     pixel = pixel_noise(image)
     usual = 1.4826 * float(np.median(np.abs(whole.c)))
@@ -86,7 +86,7 @@ def brightest_spot(
     `clear_px` is looked at, because walls have bright fringes. `outstanding`: no other object, bright or dark, has half
     its energy; else it may be light between dark objects.
     """
-    scale = Scale(radius_px + BLUR_PX)
+    scale = scale_of(radius_px)
     height, width = image.shape
     whole = region_of(image, distance_px, (0, 0, width, height), scale, clear_px)
     usual = 1.4826 * float(np.median(np.abs(whole.c)))

@@ -26,16 +26,18 @@ from flowrec.robot import Robot
 from flowrec.units import seconds
 from flowrec.vision.disc_search import LARGEST, Disc, Limits, Search, best_disc, best_disc_normalised, disc_pad_px
 from flowrec.vision.learned import (
-    BLUR_PX,
     Scale,
     alone,
     assigned,
     candidates,
     expected_motion,
+    hidden,
     is_isolated,
     located,
+    merged,
     neighbours_of,
     region_of,
+    scale_of,
     similar,
     updated_views,
     with_motion,
@@ -147,7 +149,7 @@ class Tracker:
         """The pixels of an image of `shape` that can influence a track, whatever the image shows."""
         pad_px = disc_pad_px(robot.radius_um / calibration.um_per_px)
         if self.polarity is not None:
-            pad_px = max(pad_px, Scale(self._radius_px(calibration, robot) + BLUR_PX).pad_px)
+            pad_px = max(pad_px, scale_of(self._radius_px(calibration, robot)).pad_px)
         return Footprint(pad_px, walls_in_view(chip, calibration, shape).box)
 
     def _radius_px(self, calibration: Calibration, robot: Robot) -> float:
@@ -223,7 +225,7 @@ class Tracker:
         displacement = self.reach_speed * scene.robot.speed_limit_um_s * dt / calibration.um_per_px
         farthest_px = max(self.search_radii * scale.radius_px + displacement, self.search_px) * frames
         near_px = max(self.search_px, 4.0 * scale.radius_px, 6.0 * motion.spread_px)
-        which = None
+        which, joined, missed = None, None, np.zeros((0, 3))
         for range_px in (math.inf,) if everywhere else (near_px, max(farthest_px, 1.5 * near_px)):
             box = walls.box if everywhere else _clipped(expected, range_px, walls.box)
             region = region_of(frame.image, walls.distance_px, _padded(box, scale.margin_px), scale, solid_px)
@@ -232,7 +234,7 @@ class Tracker:
             if everywhere:
                 which = alone(found, previous.energy, self.acquire_score)
             else:
-                which = assigned(found, previous, motion, range_px)
+                which, missed = assigned(found, previous, motion, range_px)
             if which is not None and not everywhere:
                 known = found.similarity[which] >= (self.acquire_score if previous.lost_frames else self.least_score)
                 far = math.dist(found.px[which], expected) > near_px
@@ -241,14 +243,21 @@ class Tracker:
                     far and alone(found, previous.energy, self.acquire_score) != which
                 ):
                     which = None
-            if which is not None:
+            joined = merged(found, which, previous, motion, missed, scale.radius_px)
+            if which is not None or joined is not None:
                 break
         roi = np.array(box, np.float64)
+        if joined is not None:
+            neighbours = np.concatenate([neighbours_of(found, joined.which), joined.neighbours.ravel()])
+            position_um = calibration.to_um(joined.place_px)
+            track = replace(previous, stamp_ns=frame.stamp_ns, seen=True, position_um=position_um, lost_frames=0)
+            return replace(track, roi_px=roi, neighbours_px=neighbours), appearance
         if which is None:
             return replace(unseen(previous, frame.stamp_ns), roi_px=roi), appearance
         blocks, score = located(region, found, which, appearance)
         to_px = region.to_px(blocks)
-        neighbours = neighbours_of(found, which)
+        covered = hidden(missed, to_px, scale.radius_px)
+        neighbours = np.concatenate([neighbours_of(found, which), covered.ravel()])
         views = updated_views(
             region,
             blocks,
@@ -267,7 +276,8 @@ class Tracker:
             roi_px=roi,
             neighbours_px=neighbours,
         )
-        track = with_motion(track, previous, motion, place_px, to_px, float(found.energy[which]), dt)
+        if not len(covered):
+            track = with_motion(track, previous, motion, place_px, to_px, float(found.energy[which]), dt)
         return track, appearance if views is None else replace(appearance, stamp_ns=frame.stamp_ns, views=views)
 
     def _solid_px(self, radius_px: float) -> float:
