@@ -6,15 +6,19 @@ import contextlib
 import math
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flowrec.control.coils import field_limits
+from flowrec.control.field_rotation import FieldCommand
 from flowrec.errors import FlowrecError, RigError
 from flowrec.rig_settings import OutputLimits
 from flowrec.rigs.lab.amplifiers.limits import Limits
@@ -23,7 +27,7 @@ from flowrec.rigs.lab.guardian import Guardian
 from tests.conftest import needs_quiet, until
 from tests.perf.guardian import sleeper, trial
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, currents
-from tests.twins.coils import Device, device
+from tests.twins.coils import CHANNELS, Device, device
 
 pytestmark = needs_quiet
 
@@ -140,6 +144,49 @@ def test_an_ni_output_that_runs_dry_is_counted_and_ends_in_zero(ni: Device) -> N
         with pytest.raises(RigError, match="ran dry"):
             drive.beat()
     assert ni.off_ns(begin_ns, begin) is not None
+
+
+@contextlib.contextmanager
+def obeying(on: Device, monkeypatch: pytest.MonkeyPatch, silence_s: float) -> Iterator[Connection]:
+    """The process of the NI output as a thread, with a field on; yields the recorder's end of its connection."""
+    from flowrec.rigs.lab.amplifiers import ni_process
+
+    monkeypatch.setattr(ni_process, "prioritise_process", lambda _priority: None)
+    ours, theirs = Pipe()
+    zero, done = os.pipe(), os.pipe()
+    thread = threading.Thread(target=ni_process.Server(theirs, zero[0], done[1]).serve)
+    thread.start()
+    begin = on.end()
+    try:
+        ours.send(("open", ni_process.Settings(CHANNELS, on.address, COILS, ROBOT, OUTPUT, silence_s)))
+        assert ours.recv()[0] == "info"
+        ours.send(("arm",))
+        assert ours.recv()[0] == "armed"
+        ours.send(("command", FieldCommand(5.0, 0.0, 4.0, 20.0, 20.0)))
+        until(lambda: on.energised(begin))
+        yield ours
+    finally:
+        ours.close()
+        thread.join(5.0)
+        theirs.close()
+        for end in (*zero, *done):
+            os.close(end)
+
+
+def test_an_ni_output_whose_recorder_falls_silent_or_ends_goes_to_zero_without_a_guardian(
+    ni: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = ni.end()
+    with obeying(ni, monkeypatch, silence_s=0.6) as recorder:
+        reports = []
+        while not reports or reports[-1][0] == "block":
+            assert recorder.poll(10.0)
+            reports.append(recorder.recv())
+        assert reports[-1] == ("fault", "no order of the loop for 600 ms")
+        assert ni.off_ns(0, begin) is not None
+    with obeying(ni, monkeypatch, silence_s=60.0):
+        pass
+    assert ni.off_ns(0, begin) is not None, "the connection has ended"
 
 
 def test_a_guardian_that_can_not_act_does_not_start() -> None:

@@ -154,6 +154,18 @@ def test_while_a_camera_is_absent_the_field_is_off_and_ticks_without_an_image_go
     assert "the field is off until" in off and "back after" in back
 
 
+def test_the_guardian_hears_the_loop_while_it_waits_for_the_first_frame() -> None:
+    """A guardian that has ended by then ends the run before there is a field."""
+    rig, coils = rig_of(config_of(), gone=(60.0, 61.0), duration_s=0.2)
+    camera = rig._make_grabber()._make()  # type: ignore[attr-defined]
+    grab, begun_s = camera.grab, time.monotonic()
+    camera.grab = lambda timeout_s: grab(timeout_s) if time.monotonic() > begun_s + 0.5 else time.sleep(0.02)  # type: ignore[method-assign]
+    driven_once = driven(rig)
+    next(driven_once)
+    assert len(coils.beats) >= 5 and not any(call.startswith("apply 4") for call in list(coils.calls)[:-1])
+    driven_once.close()
+
+
 def test_a_camera_that_stays_away_ends_the_run_with_the_coils_at_zero() -> None:
     rig, coils = rig_of(config_of("lab.give_up_s=0.5"), gone=(0.3, 60.0), duration_s=None)
     with pytest.raises(RigError, match=r"no image for 0\.5 s \(lab\.give_up_s\): unplugged"):
