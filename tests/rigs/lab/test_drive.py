@@ -118,6 +118,21 @@ def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
     assert serial.off_ns(0, begin) is not None
 
 
+def test_a_board_that_has_gone_to_zero_by_itself_ends_the_run(tmp_path: Path) -> None:
+    with (
+        device("serial+timer", tmp_path) as on,
+        Drive(amplifier("serial", on.address), Limits(COILS, ROBOT, OUTPUT), 5.0, 5.0) as drive,
+    ):
+        drive.apply(currents(5.0, 0.0))
+        until(on.energised)
+        time.sleep(0.3)
+        with pytest.raises(RigError, match=r"has gone to zero by itself \(no line reached it in time\)"):
+            for _ in range(100):
+                drive.apply(currents(5.0, 0.0))
+                time.sleep(0.01)
+        assert on.off_ns(0) is not None
+
+
 def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
     begin = on.end()
     with driven(on, 0.4) as (drive, begin_ns, _):
@@ -127,6 +142,11 @@ def test_zero_lets_no_later_command_bring_the_field_back(on: Device) -> None:
             drive.apply(currents(5.0, 0.0))
             drive.beat()
             time.sleep(0.01)
+        if on.kind == "serial":  # not by the amplifier's memory alone
+            drive._amplifier._permitted = True  # type: ignore[attr-defined]
+            for _ in range(10):
+                drive.apply(currents(5.0, 0.0))
+                time.sleep(0.01)
         drive.zero()
         log = drive.put_out(time.monotonic_ns())
         assert log.at(time.monotonic_ns()).amplitude_mt == 0.0 and log.at(begin_ns + 390_000_000).amplitude_mt > 3.0

@@ -145,6 +145,7 @@ def test_while_a_camera_is_absent_the_field_is_off_and_ticks_without_an_image_go
     assert all(calls == ["apply 4"] for _, calls in seen[:first] + seen[last:])
     assert not any(inputs.applied.without_image for inputs, _ in seen[last:])
     assert {inputs.applied.absent_until_ns for inputs, _ in seen[last:]} == {stamps[last - 1]}
+    assert coils.calls.count("rest") > sum(blind), "at once, before the tick that tells it"
     assert coils.beats_before_rest >= 4, "the guardian hears the loop while it waits with a field on"
     assert max(np.diff(coils.beats)) < 1.0
     turns = sum(inputs.applied.turns[0] for inputs, _ in seen)
