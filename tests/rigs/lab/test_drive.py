@@ -98,10 +98,21 @@ def test_a_recorder_that_is_killed_stopped_or_stuck_has_no_field_within_the_time
         assert "guardian has switched the coils off: no beat" in one.said or fault != "stop"
 
 
-def test_a_recorder_whose_guardian_is_killed_takes_the_field_away_itself(serial: Device) -> None:
-    ended = trial(serial, "guardian")
-    assert ended is not None and ended.off_s is not None and ended.stayed_off
-    assert "guardian process has ended" in ended.said
+def commanded(drive: Drive) -> None:
+    """A second of commands."""
+    for _ in range(100):
+        drive.apply(currents(5.0, 0.0))
+        time.sleep(0.01)
+
+
+def test_a_recorder_whose_guardian_is_killed_takes_the_field_away_itself(on: Device) -> None:
+    begin = on.end()
+    with driven(on, 0.4) as (drive, begin_ns, _):
+        assert drive._guardian is not None and drive._guardian._process is not None
+        drive._guardian._process.kill()
+        with pytest.raises(RigError, match="guardian process has ended"):
+            commanded(drive)
+        assert on.energised(begin) and on.off_ns(begin_ns, begin) is not None, "at once, not at the end of the run"
 
 
 def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
@@ -127,9 +138,7 @@ def test_a_board_that_has_gone_to_zero_by_itself_ends_the_run(tmp_path: Path) ->
         until(on.energised)
         time.sleep(0.3)
         with pytest.raises(RigError, match=r"has gone to zero by itself \(no line reached it in time\)"):
-            for _ in range(100):
-                drive.apply(currents(5.0, 0.0))
-                time.sleep(0.01)
+            commanded(drive)
         assert on.off_ns(0) is not None
 
 
