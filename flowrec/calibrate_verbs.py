@@ -97,3 +97,49 @@ def image(
         typer.echo(json.dumps(verb.figures(done)))
         raise typer.Exit(0 if done.chosen is not None else 1)
     verb.show(done, out)
+
+
+@calibrate.command()
+def chip(
+    picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="TOML", help="Write the chip; mask and overlay (PNG) go beside it."),
+    ] = None,
+    um_per_px: Annotated[
+        float | None, typer.Option("--um-per-px", metavar="UM", help="Micrometres per pixel of the picture.")
+    ] = None,
+    inlet: Annotated[
+        list[str] | None,
+        typer.Option("--inlet", metavar="SIDE:N", help="An opening that is an inlet, as in left:0; may be repeated."),
+    ] = None,
+    inlet_speed: Annotated[
+        float | None, typer.Option("--inlet-speed", metavar="UM_S", help="Mean speed at the inlets, in um/s.")
+    ] = None,
+    walls: Annotated[
+        str,
+        typer.Option(metavar="auto|dark|bright|step|relief", help="How walls show: as lines, or as a step."),
+    ] = "auto",
+    seed_point: Annotated[
+        list[str] | None,
+        typer.Option("--seed-point", metavar="X,Y", help="A point in the channel, in pixels; may be repeated."),
+    ] = None,
+    channel: Annotated[
+        str, typer.Option(metavar="red|green|blue|grey", help="What is used of a picture in colour.")
+    ] = "grey",
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make a chip of a picture: mask, openings and an overlay; the mask can be corrected in any paint program.
+
+    Example: flowrec calibrate chip movie.avi --um-per-px 5 --inlet left:0 --inlet-speed 200 -o chip.toml
+    """
+    from flowrec.commands import calibrate_chip as verb
+
+    done = verb.calibrate_chip(
+        picture, out, um_per_px, walls, seed_point or (), inlet or (), inlet_speed, channel, overwrite
+    )
+    if as_json:
+        typer.echo(json.dumps(verb.figures(done)))
+    else:
+        verb.show(done, out)
