@@ -1,7 +1,7 @@
 """A log of the coils from a table: what the rotating field did, whichever way the laboratory wrote it down.
 
 A row holds from its time until the time of the next row, the last one for as long as there are images. A log tells the
-time and, of these, the first that it has columns for:
+time (time_s, or in another unit, or dates: `Table.times_s`) and, of these, the first that it has columns for:
 
 - frequency_hz, heading_deg, amplitude_mt: the rotating field. The heading is that in which the robot should travel.
 - b_x_mt, b_y_mt, b_z_mt: the field, sampled so often that it turns by less than a third of a revolution between rows.
@@ -25,10 +25,11 @@ from flowrec.control.coils import Coils
 from flowrec.control.field_log import FieldLog
 from flowrec.errors import MovieError
 from flowrec.rig_settings import Column, Columns
-from flowrec.system.table_file import Table, read_table
+from flowrec.system.table_file import DATES, TIME_UNITS, Table, read_table
 from flowrec.units import NS_PER_S
 
 _ROTATING = ("frequency_hz", "heading_deg", "amplitude_mt")
+_OTHER_TIMES = (*list(TIME_UNITS)[1:], DATES)
 _CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
 _FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
 _KINDS = (_ROTATING, _FIELDS, _CURRENTS)
@@ -57,7 +58,7 @@ def read_coil_log(
     if not table.rows:
         raise MovieError(f"{path}: has no rows below its header")
     kind = _kind_of(table, columns)
-    times_s = _values(table, columns, "time_s")
+    times_s = _times_s(table, columns)
     back = np.flatnonzero(np.diff(times_s) < 0.0)
     if len(back):
         line = table.lines[int(back[0]) + 1]
@@ -107,7 +108,20 @@ def _kind_of(table: Table, columns: Columns) -> tuple[str, str, str]:
 
 def _has(table: Table, columns: Columns, name: str) -> bool:
     column: Column | None = getattr(columns, name)
-    return isinstance(column, (int, float)) or table.index(_name(column) or name) is not None
+    if isinstance(column, (int, float)):
+        return True
+    names = [_name(column)] if column is not None else [name, *(_OTHER_TIMES if name == "time_s" else ())]
+    return any(table.index(each) is not None for each in names)
+
+
+def _times_s(table: Table, columns: Columns) -> Vector:
+    """Numbers or dates of the column that is named, or else of the first with times."""
+    column = columns.time_s
+    if column is not None and not isinstance(column, str):
+        return _values(table, columns, "time_s")
+    found = table.times_s(column)
+    assert found is not None, "there is a column of times"
+    return found[1]
 
 
 def _name(column: Column | None) -> str:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from flowrec.errors import MovieError
 from flowrec.movies.movie import MovieFacts, whole_ns
-from flowrec.system.table_file import Table, read_table
+from flowrec.system.table_file import DATES, TIME_UNITS, Table, read_table
 from flowrec.units import NS_PER_S
 
-_UNITS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
 _MOST_IMAGES = 1 << 40
 
 
@@ -54,8 +53,8 @@ def frame_times(path: Path, facts: MovieFacts, table: str = "", rate_hz: float |
 
     Parameters
     ----------
-    table : CSV or Excel file with a column time_s (or time_ms, time_us, time_ns) and a row for each image in order; '':
-        none. A column frame holds the camera's own numbers, so that a gap is a loss.
+    table : CSV or Excel file with a column time_s (other units, dates: see `Table.times_s`) and a row
+        for each image in order; '': none. A column frame holds the camera's own numbers, so that a gap is a loss.
     rate_hz : images per second, instead.
 
     Raises
@@ -91,14 +90,15 @@ def frame_times(path: Path, facts: MovieFacts, table: str = "", rate_hz: float |
 
 
 def _from_table(table: Table) -> FrameTimes:
-    name = next((name for name in _UNITS if table.index(name) is not None), None)
-    if name is None:
+    found = table.times_s()
+    if found is None:
+        units = ", ".join(list(TIME_UNITS)[1:])
         raise MovieError(
-            f"{table.where}: no column time_s (or {', '.join(list(_UNITS)[1:])}); the header is frame,time_s"
+            f"{table.where}: no column time_s (or {units}; or {DATES}, with dates); the header is frame,time_s"
         )
     if not table.rows:
         raise MovieError(f"{table.where}: has no rows below its header")
-    times_ns = whole_ns(table.numbers(name) * _UNITS[name])
+    name, times_ns = found[0], whole_ns(found[1])
     numbers = None
     if table.index("frame") is not None:
         given = table.numbers("frame")

@@ -1,5 +1,7 @@
 """Tables as people save them: separators, byte orders, Excel; and what is no number is named with its line."""
 
+from datetime import UTC, datetime
+
 import openpyxl
 import pytest
 
@@ -34,9 +36,57 @@ def test_the_same_table_is_read_however_it_was_saved(name, tmp_path):
     assert [table.numbers("T").tolist(), table.numbers("heading °").tolist()] == [[0.5, 1.25], [-90.0, 30.0]]
 
 
+def test_a_column_is_found_in_other_spellings_and_one_of_the_very_name_goes_first(tmp_path):
+    (tmp_path / "log.csv").write_bytes("Zeit für µ;Time [ms];Heading (°);f (Hz);F_Hz\n1;2,5;3;4;5\n".encode("cp1252"))
+    table = read_table(tmp_path / "log.csv")
+    assert [table.numbers(name)[0] for name in ("heading_deg", "F_Hz", "f (Hz)")] == [3.0, 5.0, 4.0]
+    name, times_s = table.times_s()
+    assert (name, times_s.tolist()) == ("time_ms", [0.0025])
+    with pytest.raises(UsageError, match="two columns are named f_hz"):
+        table.numbers("f_hz")
+
+
+DATED = [datetime(2026, 5, 3, 14, 0, 0, 500_000), datetime(2026, 5, 3, 14, 0, 1)]
+
+
+@pytest.mark.parametrize("kind", ["iso", "with a zone", "time of day", "excel"])
+def test_dates_are_times_and_a_number_is_never_taken_for_one(kind, tmp_path):
+    written = {
+        "iso": [each.isoformat() for each in DATED],
+        "with a zone": [f"{each.isoformat(' ')}+02:00" for each in DATED],
+        "time of day": [each.time().isoformat() for each in DATED],
+        "excel": DATED,
+    }[kind]
+    if kind == "excel":
+        book = openpyxl.Workbook()
+        for cell in ["Time", *written]:
+            book.active.append([cell, 1])
+        book.save(tmp_path / "log.csv")
+    else:
+        (tmp_path / "log.csv").write_text("\n".join(["Time", *written]))
+    _, times_s = read_table(tmp_path / "log.csv").times_s()
+    first_s = 14 * 3600 + 0.5 if kind == "time of day" else DATED[0].replace(tzinfo=UTC).timestamp()
+    first_s -= 7200.0 if kind == "with a zone" else 0.0
+    assert times_s.tolist() == pytest.approx([first_s, first_s + 0.5], rel=0.0, abs=1e-6)
+    (tmp_path / "log.csv").write_text("time\n140000\n140001\n")
+    with pytest.raises(UsageError, match=r"'140000' is no date; .* name the unit, as time_s"):
+        read_table(tmp_path / "log.csv").times_s()
+
+
+def test_a_first_sheet_without_a_table_is_named(tmp_path):
+    book = openpyxl.Workbook()
+    book.active.append(["notes"])
+    for row in [HEADER, *ROWS]:
+        book.create_sheet("log").append(row)
+    book.save(tmp_path / "log.xlsx")
+    with pytest.raises(UsageError, match="first sheet, 'Sheet', holds no table"):
+        read_table(tmp_path / "log.xlsx")
+
+
 @pytest.mark.parametrize(
     ("text", "why"),
     [
+        ("0,1\n1,1\n", "line 1: numbers where the names of the columns are expected"),
         ("t,f\n0,1\n1,nan\n2,nan\n", r"line 3: f is nan \(and 1 more rows\); leave these rows out"),
         ("t,f\n0,1\n\n1,\n", "line 4: f is empty"),
         ("t,f\n0,1\n12:03:05,1\n", r"line 3: t = '12:03:05' is no number"),
