@@ -60,7 +60,9 @@ _AMBIGUOUS = 12.0  # the same of the best place against the second best
 _SIGNIFICANT = 3.0  # standard errors
 _SPIKE = 8.0  # times the median deviation from the line between the neighbours; a wrong position deviates more
 _KINK = 3.0  # times the deviation of the neighbours from theirs; a change of velocity deviates as they do
-_JUMP = 6.0  # times the speed that 95 % of the frames do not exceed: another thing is followed
+# Another thing is followed from a frame on if the way to it exceeds that of 95 % of the frames so many times,
+_JUMP = 6.0
+_LONE_JUMP = 2.0  # or so many times, where the ways before and after it do not.
 # Systematic errors, in quadrature with the statistical ones; measured on simulated missions.
 _OFFSET_S = 3e-4
 _COMMAND_REVOLUTIONS = 0.03  # by which a change of the command takes effect late
@@ -271,9 +273,24 @@ def _stretches(time_s: Floats, positions_um: Floats) -> Flags:
     flags: Flags = np.full(len(time_s), USED, np.int8)
     flags[_spikes(time_s, positions_um)] = SKIPPED
     kept = np.flatnonzero(flags == USED)
-    speed = np.hypot(*np.diff(positions_um[kept], axis=0).T) / np.diff(time_s[kept])
-    flags[kept[1:][speed > _JUMP * np.quantile(speed, 0.95)]] = RESTART
+    velocity = np.diff(positions_um[kept], axis=0) / np.diff(time_s[kept])[:, None]
+    speed = np.hypot(*velocity.T)
+    fast, away = float(np.quantile(speed, 0.95)), _off_neighbours(velocity)
+    jumps = (speed > _JUMP * fast) | (away > max(_LONE_JUMP * fast, _SPIKE * float(np.median(away))))
+    flags[kept[1:][jumps]] = RESTART
     return flags
+
+
+def _off_neighbours(velocity: Floats) -> Floats:
+    """Distance (n,) of each velocity (n, 2) from the line between those before and after it; 0 at the ends.
+
+    A change of the command takes the velocity from one end of this line to the other, a jump takes it off.
+    """
+    before, here, after = velocity[:-2], velocity[1:-1], velocity[2:]
+    along = after - before
+    part = ((here - before) * along).sum(1) / np.maximum((along**2).sum(1), 1e-300)
+    nearest = before + np.clip(part, 0.0, 1.0)[:, None] * along
+    return np.pad(np.hypot(*(here - nearest).T), 1)
 
 
 def _spikes(time_s: Floats, positions_um: Floats) -> NDArray[np.intp]:

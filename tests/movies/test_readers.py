@@ -130,6 +130,20 @@ def test_a_movie_that_breaks_off_is_refused_and_its_whole_images_can_be_asked_fo
             read(cut(path, 0.6))
 
 
+def test_a_damaged_slice_of_ffv1_is_refused_and_the_images_before_it_are_whole(tmp_path):
+    """Its decoder puts the image before in the place of the damaged one."""
+    images = pictures()
+    path = makers.video(tmp_path / "film.mkv", "ffv1", images)
+    data = bytearray(path.read_bytes())
+    data[len(data) * 2 // 3] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(MovieError, match=r"image \d+ can not be decoded .*damaged.*; --partial takes the \d+ images"):
+        read(path)
+    _, frames, remarks = read(path, partial=True)
+    assert 4 <= len(frames) < COUNT and "only the first" in remarks[0]
+    np.testing.assert_array_equal([frame.image for frame in frames], images[: len(frames)])
+
+
 def test_colour_is_refused_unless_it_is_said_what_to_take_of_it(tmp_path):
     colours = np.random.default_rng(1).integers(0, 255, (3, HEIGHT, WIDTH, 3)).astype(np.uint8)
     tifffile.imwrite(tmp_path / "c.tif", colours, photometric="rgb")
