@@ -14,6 +14,7 @@ A fit is refused if the log of another run could have given it: see `refusal`.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -63,6 +64,8 @@ _KINK = 3.0  # times the deviation of the neighbours from theirs; a change of ve
 # Another thing is followed from a frame on if the way to it exceeds that of 95 % of the frames so many times,
 _JUMP = 6.0
 _LONE_JUMP = 2.0  # or so many times, where the ways before and after it do not.
+_LARGEST_EXCURSIONS = 0.25  # fraction of the frames that may be passed over as spent on other things
+_LOG_VARIANCE = 0.03109  # of log(1 + x / FREEDOM) of normal noise, see `_explained`
 # Systematic errors, in quadrature with the statistical ones; measured on simulated missions.
 _OFFSET_S = 3e-4
 _COMMAND_REVOLUTIONS = 0.03  # by which a change of the command takes effect late
@@ -252,7 +255,9 @@ def _explained(data: TrackData, fit: Regression, everything: Flags, noise: Noise
     unexplained = float(np.log1p(rest / (FREEDOM * quiet)).sum())
     # The mean of log(1 + x / FREEDOM) for x of mean 1 and exponential distribution: normal noise of two axes.
     of_noise = len(rest) * math.exp(FREEDOM) * float(exp1(FREEDOM))
-    return (motion - unexplained) / (motion - min(of_noise, unexplained)) if motion > of_noise else 0.0
+    # Motion hardly above the noise is explained by anything: so much of it may be noise.
+    doubtful = 2.0 * math.sqrt(_LOG_VARIANCE * len(rest))
+    return (motion - unexplained) / (motion - min(of_noise, unexplained) + doubtful) if motion > of_noise else 0.0
 
 
 def _liveliest(white: Floats) -> slice:
@@ -269,7 +274,7 @@ def _liveliest(white: Floats) -> slice:
 
 
 def _stretches(time_s: Floats, positions_um: Floats) -> Flags:
-    """Flags (n,) that skip single wrong positions, and begin a stretch where the position jumps too far for a robot."""
+    """Flags (n,) that skip single wrong positions and excursions to other things, and begin a stretch at each jump."""
     flags: Flags = np.full(len(time_s), USED, np.int8)
     flags[_spikes(time_s, positions_um)] = SKIPPED
     kept = np.flatnonzero(flags == USED)
@@ -278,7 +283,24 @@ def _stretches(time_s: Floats, positions_um: Floats) -> Flags:
     fast, away = float(np.quantile(speed, 0.95)), _off_neighbours(velocity)
     jumps = (speed > _JUMP * fast) | (away > max(_LONE_JUMP * fast, _SPIKE * float(np.median(away))))
     flags[kept[1:][jumps]] = RESTART
+    _skip_excursions(flags, kept, np.flatnonzero(jumps) + 1)
     return flags
+
+
+def _skip_excursions(flags: Flags, kept: NDArray[np.intp], starts: NDArray[np.intp]) -> None:
+    """Skip what lies between two jumps if it is short: the track went to something else and came back.
+
+    Parameters
+    ----------
+    kept : frames in use.
+    starts : places in `kept` of those that the track jumped to.
+    """
+    left = int(_LARGEST_EXCURSIONS * len(kept))
+    for first, last in sorted(itertools.pairwise(starts), key=lambda ends: int(ends[1] - ends[0])):
+        if last - first > left:
+            return
+        flags[kept[first:last]] = SKIPPED
+        left -= int(last - first)
 
 
 def _off_neighbours(velocity: Floats) -> Floats:

@@ -239,7 +239,8 @@ def refuse_missing(image: Image, path: Path, index: int) -> Image:
     """The image, of a format that returns zeros where its data is missing; MovieError if it is nothing else."""
     if not image.any():
         raise MovieError(
-            f"{path}: image {index} holds nothing but 0: its data is missing, or the file was copied in part"
+            f"{path}: image {index} holds nothing but 0: its data is missing, or it is black; export the movie again "
+            "without it"
         )
     return image
 

@@ -150,7 +150,7 @@ def test_one_wrong_position_in_thirty_does_not_hide_the_log() -> None:
     assert found.offset_s == pytest.approx(-0.04, abs=3e-3)
 
 
-def test_frames_without_the_robot_and_positions_of_another_particle_do_not_move_the_offset() -> None:
+def test_frames_without_the_robot_and_positions_of_another_particle_neither_hide_the_log_nor_move_the_offset() -> None:
     log = commands(8, 20.0)
     stamps, positions = track(log, 8, 20.0)
     rng = np.random.default_rng(8)
@@ -161,8 +161,21 @@ def test_frames_without_the_robot_and_positions_of_another_particle_do_not_move_
     kept = rng.random(len(stamps)) > 0.2
     kept[400:430] = False
     found = fit(stamps[kept], wrong[kept], log)
+    assert found.accepted
+    every = fit(stamps, wrong, log)
+    assert every.accepted and 60 <= every.left_out <= 66  # those on the other particle, and the single ones
     assert found.offset_s == pytest.approx(-0.04, abs=3e-3)
     assert found.um_per_rev == pytest.approx(K, abs=3.0 * found.um_per_rev_std)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_of_noise_alone_a_log_explains_little(seed: int) -> None:
+    """A fraction of next to nothing says nothing, however large it is."""
+    rng, log = np.random.default_rng(seed), commands(seed + 70, 24.0)
+    stamps = np.arange(0.0, 8.0, 1.0 / 30.0)
+    drifting = np.cumsum(rng.normal(0.0, 1.0, (len(stamps), 2)), axis=0)
+    found = fit(stamps, drifting + rng.normal(0.0, 3.0, drifting.shape), log, Range())
+    assert found.explained < 0.4 and not found.accepted
 
 
 @pytest.mark.parametrize("other", ["another run", "backwards"])

@@ -73,6 +73,7 @@ class Found(NamedTuple):
     rate: float
     score: float
     accepted: bool | None  # None: by a threshold of the score
+    why: str = ""  # it is refused
 
 
 def mission(folder: Path, family: str, seed: int) -> Mission:
@@ -128,9 +129,9 @@ def ours(given: Mission, log: FieldLog) -> Found:
     """The fit of `flowrec import --align`."""
     try:
         fit = fit_log(given.stamps_ns, given.positions_um, log, ANYWHERE, given.flow)
-    except UsageError:
-        return Found(0.0, 1.0, 0.0, accepted=False)
-    return Found(fit.offset_s, fit.rate, fit.explained, fit.accepted)
+    except UsageError as error:
+        return Found(0.0, 1.0, 0.0, accepted=False, why=str(error))
+    return Found(fit.offset_s, fit.rate, fit.explained, fit.accepted, fit.refusal)
 
 
 def _correlated(pick: Callable[[Floats, Floats], tuple[Floats, Floats]], given: Mission, log: FieldLog) -> Found:
@@ -238,6 +239,7 @@ def measured(missions: list[Mission], foreign: int, names: tuple[str, ...]) -> l
                             "fold": number // 2 % 2, "mission": f"{one.family} {one.seed}", "log": source.seed,
                             "case": kind, "own": kind.startswith("own"), "method": name, "score": found.score,
                             "accepted": found.accepted, "error_s": error_s, "rate_error": found.rate / rate - 1.0,
+                            "why": found.why,
                         }
                     )  # fmt: skip
             done(number + 1)
