@@ -1,8 +1,8 @@
 """`python -m tests.perf.movies DIR`: simulated runs as movies of other people's encoders, imported, verified, compared.
 
 Each run is exported as a laboratory would have it: a movie and a table of what the coils were commanded. The session
-that `import` makes of them knows nothing of the truth; its refined flow is compared with the simulator's true flow. How good
-that can be depends on where the run went and how well the robot rolls: so all observations of the run itself are
+that `import` makes of them knows nothing of the truth; its refined flow is compared with the simulator's true flow. How
+good that can be depends on where the run went and how well the robot rolls: so all observations of the run itself are
 refined too, as are the true velocities where they were taken.
 """
 
