@@ -19,7 +19,7 @@ from pathlib import Path
 
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
-from flowrec.store.recovery import recover
+from flowrec.store.recovery import NothingSavedError, recover
 from tests.twins.coils import Device
 from tests.twins.lab import COMMON, RATE, recorder
 
@@ -36,7 +36,8 @@ class Left:
     ----------
     off_s : from the fault to zero; None: never.
     stayed_off : whether the field was still off when the recorder had gone on or ended.
-    file : what it left: 'partial' for an unfinished file, else the outcome that the session states.
+    file : what it left: 'partial' for an unfinished file, 'nothing saved' where nothing of it can be recovered, else the
+        outcome that the session states.
     recovered_s : length of the session that `flowrec recover` makes of the unfinished file; None: it was not tried.
     said : the last line of the recorder.
     """
@@ -64,7 +65,7 @@ def trial(on: Device, fault: str, folder: Path, camera: tuple[str, ...], name: s
                 print(errors.read_text()[-1000:], file=sys.stderr)
                 return None
             time.sleep(0.02)
-        time.sleep(random.uniform(0.05, 0.5))
+        time.sleep(random.uniform(0.05, 1.0))
         fault_ns = _harm(process, fault)
         time.sleep(_AFTER_S)
         off_ns = on.off_ns(fault_ns, begin)
@@ -109,7 +110,11 @@ def _left(out: Path, *, ended: bool, recovers: bool) -> tuple[str, float | None]
         pass
     recovered_s = None
     if recovers:
-        found = recover(partial)
+        try:
+            found = recover(partial)
+        except NothingSavedError:  # killed before the first messages were on the disk
+            _remove(partial)
+            return "nothing saved", None
         assert found.ticks > 0 and not partial.exists()
         with Session(out) as session:
             assert session.outcome["outcome"] not in ("reached", "time over"), f"{out}: looks like a good run"
