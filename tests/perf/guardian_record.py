@@ -36,8 +36,8 @@ class Left:
     ----------
     off_s : from the fault to zero; None: never.
     stayed_off : whether the field was still off when the recorder had gone on or ended.
-    file : what it left: 'partial' for an unfinished file, 'nothing saved' where nothing of it can be recovered, else the
-        outcome that the session states.
+    file : what it left: 'partial' for an unfinished file, 'nothing saved' where nothing of it can be recovered; else
+        the outcome that the session states.
     recovered_s : length of the session that `flowrec recover` makes of the unfinished file; None: it was not tried.
     said : the last line of the recorder.
     """
