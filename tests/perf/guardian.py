@@ -239,7 +239,7 @@ def _row(on: Device, kind: str, fault: str, count: int, folder: Path, camera: tu
     refused = 0
     with sleeper() as worst, progress(f"{kind} {fault}", count) as done:
         while len(ends) < count:
-            name, recovers = f"{kind}-{fault}-{len(ends)}", len(ends) % _RECOVERED == 0
+            name, recovers = f"{kind}-{fault}-{len(ends)}-{refused}", len(ends) % _RECOVERED == 0
             if camera:
                 ended = guardian_record.trial(on, fault, folder, camera, name, recovers=recovers)
             else:

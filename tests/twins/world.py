@@ -29,7 +29,7 @@ from tests.twins.firmware import SAMPLE
 
 _FILES = 3  # of the folder; the emulator reads one after the other, and keeps a file in memory where there is only one
 _LATE_NS = 5_000_000  # after a moment its samples are in the file
-_PIECE_NS = 4_000_000  # during which the robot rolls straight
+_PIECE_NS = 25_000_000  # during which the robot rolls straight; shorter ones show the delays of a twin as fast turns
 _KEPT_NS = 1_000_000_000
 _FEATURES = """# {{05D8C294-F295-4dfb-9D01-096BD04049F4}}
 # GenApi persistence file (version 3.1.0)

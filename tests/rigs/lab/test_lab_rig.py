@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -210,8 +211,25 @@ def test_a_lab_that_is_not_ready_is_one_line_and_leaves_no_file(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_package_that_is_not_installed_is_named_with_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pypylon", None)
-    monkeypatch.delitem(__import__("sys").modules, "flowrec.rigs.lab.cameras.pylon", raising=False)
-    with pytest.raises(UsageError, match=r"method pylon needs pypylon, .* pip install 'flowrec\[pylon\]'"):
-        record(load_config(None, [*MEASURED, "lab.camera=pylon"]), Path("never.mcap"))
+@pytest.mark.parametrize(
+    ("sets", "package", "module", "told"),
+    [
+        (
+            ("lab.camera=pylon",),
+            "pypylon",
+            "cameras.pylon",
+            r"needs pypylon, .* pip install 'flowrec\[pylon\]'",
+        ),
+        (("lab.camera=genicam",), "viva_genicam", "cameras.genicam", r"pip install 'flowrec\[genicam\]'"),
+        (("lab.camera=opencv", "lab.amplifier=serial"), "serial", "amplifiers.serial_line", r"'flowrec\[serial\]'"),
+        (("lab.camera=opencv", "lab.amplifier=ni"), "nidaqmx", "amplifiers.ni", r"'flowrec\[ni\]'"),
+    ],
+)
+def test_a_package_that_is_not_installed_is_named_with_the_command(
+    sets: tuple[str, ...], package: str, module: str, told: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"flowrec.rigs.lab.{module}", raising=False)
+    with pytest.raises(UsageError, match=told):
+        record(load_config(None, [*MEASURED, *sets]), tmp_path / "never.mcap")
+    assert not list(tmp_path.iterdir())
