@@ -65,7 +65,8 @@ def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path
     pytest.importorskip("pypylon")
     pytest.importorskip("nidaqmx")
     mission = ("mission.phases=survey,refine,plan,navigate", f"mission.goal={list(GOAL_UM)}", "robot.delay_s=0.19")
-    config = load_config(None, [*COMMON, *mission, "camera.rate_hz=40.0", "simulated.seed=5"])
+    # The inlet of this world is 32 % slower or faster than assumed: a busy computer costs the survey some percent.
+    config = load_config(None, [*COMMON, *mission, "camera.rate_hz=40.0", "simulated.seed=7"])
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
     session, errors = tmp_path / "s.mcap", tmp_path / "stderr"
