@@ -128,7 +128,10 @@ def check_chip(chip: Chip, where: str) -> None:
     if not chip.mask.any():
         raise ChipError(f'{where}: no fluid in the mask; is it the other way round? (fluid = "dark" in its TOML)')
     if chip.mask.all():
-        raise ChipError(f'{where}: no wall in the mask; is it the other way round? (fluid = "dark" in its TOML)')
+        raise ChipError(
+            f'{where}: no wall in the mask; is it the other way round? (fluid = "dark" in its TOML) A field without '
+            "walls, such as a dish, needs two far ones: make the first and the last row of pixels black"
+        )
     for key in ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "depth_um"):
         value = getattr(chip, key)
         if value is not None and not (math.isfinite(value) and value > 0):

@@ -126,7 +126,7 @@ def test_dark_fluid_is_read_and_pockets_without_opening_are_filled(tmp_path):
     ("mask", "toml", "words"),
     [
         (mask_of(), "um_per_px = 5", "no fluid in the mask"),
-        (~mask_of(), "um_per_px = 5", "no wall in the mask"),
+        (~mask_of(), "um_per_px = 5", "the first and the last row of pixels black"),
         (mask_of(40, 60, np.s_[10:20, 10:20]), "um_per_px = 5", "no opening"),
         (mask_of(40, 60, np.s_[10:20, :30]), "um_per_px = 5", "no outlet"),
         (mask_of(4, 60, np.s_[1:3, :]), "um_per_px = 5", "at least 8 x 8"),
