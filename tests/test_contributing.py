@@ -10,11 +10,13 @@ import sys
 from pathlib import Path
 
 import pytest
+from numba.core.caching import _CacheLocator
 
 from flowrec.control.controller import CONTROLLERS
 from flowrec.estimation.observer import OBSERVERS
 from flowrec.planning.planner import PLANNERS
 from flowrec.refine.refiner import REFINERS
+from flowrec.system.numba_setup import _cache_folder, kernel_files
 
 ROOT = Path(__file__).parents[1]
 GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -30,7 +32,10 @@ def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path
     copy = tmp_path / "copy"
     for folder in ("flowrec", "sessions"):
         shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    caches = tmp_path / "caches"
+    share_kernels(copy, caches)
     outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(tmp_path), "PYTHONPATH": str(copy)}
+    outside = outside | {"XDG_CACHE_HOME": str(caches), "NUMBA_CACHE_DIR": ""}
     for name, text in RECIPES.items():
         (change,), (commands,) = blocks(text, "diff"), blocks(text, "sh")
         run(["git", "apply", "--recount", "-"], f"{name}: the change does not apply", copy, outside, change)
@@ -38,6 +43,18 @@ def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path
             program, *arguments = command.split()
             assert program == "flowrec"
             run([sys.executable, "-m", "flowrec", *arguments], f"{name}: {command}", copy, outside)
+
+
+def share_kernels(copy: Path, caches: Path) -> None:
+    """Give the copy the kernels that are compiled already, half a minute of work; numba files them by their folder."""
+    used = Path(_cache_folder())
+    for folder in {path.parent for path in kernel_files()}:
+        names = [
+            _CacheLocator.get_suitable_cache_subpath(str(each / "kernels.py"))
+            for each in (folder, copy / folder.relative_to(ROOT))
+        ]
+        if (used / names[0]).is_dir():
+            shutil.copytree(used / names[0], caches / "flowrec" / used.name / names[1])
 
 
 def run(command: list[str], what: str, folder: Path, environment: dict[str, str], given: str = "") -> None:
