@@ -6,7 +6,7 @@ import zstandard
 from mcap.reader import make_reader
 
 from flowrec.store.channels import message_codec
-from tests.perf import store_equal
+from tests.perf import store_equal, store_kills
 from tests.perf.store_kills import kills
 from tests.perf.store_loop import soak
 from tests.perf.store_writers import LOADS, WRITERS
@@ -24,7 +24,8 @@ def test_every_writer_writes_every_message(load, tmp_path):
         assert 5 in counts.values(), name
 
 
-def test_a_soak_and_a_kill_say_what_they_saw(tmp_path):
+def test_a_soak_and_a_kill_say_what_they_saw(tmp_path, monkeypatch):
+    monkeypatch.setattr(store_kills, "_LONGEST_S", 0.8)
     seen = soak(0.01, tmp_path)
     assert seen["dropped"] == 0 and seen["file_mb"] > 1.0 and seen["memory_mb"]
     cost = kills(1, tmp_path)
