@@ -199,7 +199,9 @@ class Lab:
     # The following four settings belong to the amplifier of that name.
     port: str = ""  # serial: '/dev/ttyACM0'
     baud: Annotated[int, Range(9600, 12_000_000)] = 115_200  # serial; a board with USB of its own ignores it
-    channels: str = ""  # ni: outputs of the coils x, y, z: 'cDAQ1Mod1/ao0:2'
+    # ni: outputs of the coils x, y, z: 'cDAQ1Mod1/ao0:2'. The guardian resets their device when it starts and when it
+    # acts, which aborts every other task on it.
+    channels: str = ""
     ni_server: str = ""  # ni: host:port of an NI gRPC Device Server; '': the driver of this computer
     output: OutputLimits = field(default_factory=OutputLimits)
     # time without a step of the loop, while a field is on, after which the guardian process takes the field away

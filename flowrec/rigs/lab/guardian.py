@@ -2,7 +2,8 @@
 
 It is started before anything is energised. The loop sends it a byte at every step of its work (`Guardian.beat`); no
 thread does, because a thread may outlive a loop that hangs. The guardian takes the output to zero
-- at the end of its pipe: the recorder is gone, whatever ended it;
+- at the end of its pipe: the recorder is gone, whatever ended it. The kernel closes the pipe of a killed process after
+  its memory, which takes 0.1 s and more on a busy computer: then the silence below comes first;
 - after `silence_s` without a byte while a field is on: the recorder is stopped, stuck, or keeps the interpreter's lock;
 - when it is asked to, because the amplifier does not confirm a zero.
 It runs in a session of its own and ignores the signals that end a terminal's processes. If it dies first, the next beat
