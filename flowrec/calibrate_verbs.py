@@ -127,6 +127,10 @@ def chip(
     channel: Annotated[
         str, typer.Option(metavar="red|green|blue|grey", help="What is used of a picture in colour.")
     ] = "grey",
+    wall_shift: Annotated[
+        float,
+        typer.Option(metavar="UM", help="Move walls outwards by so much (negative: inwards), if widths are known."),
+    ] = 0.0,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -137,7 +141,7 @@ def chip(
     from flowrec.commands import calibrate_chip as verb
 
     done = verb.calibrate_chip(
-        picture, out, um_per_px, walls, seed_point or (), inlet or (), inlet_speed, channel, overwrite
+        picture, out, um_per_px, walls, seed_point or (), inlet or (), inlet_speed, channel, wall_shift, overwrite
     )
     if as_json:
         typer.echo(json.dumps(verb.figures(done)))

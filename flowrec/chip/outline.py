@@ -10,7 +10,7 @@ is the wall: the middle of the line, or half the height of the step.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -49,7 +49,7 @@ class Outline:
     curves : closed polygons (n, 2), x, y in pixels; they go on beyond the picture's border.
     size_px : width and height of the picture.
     walls : what a wall looks like.
-    width_px : median width of the channel.
+    width_px : width of the channel that is exceeded along three quarters of its length.
     support : part of the walls at which the picture has the profile of the others, 0 to 1.
     gap_px : longest piece of the walls without that profile.
     explained : part of the picture's edges that are such walls, less what chance would give; at most 1.
@@ -83,6 +83,12 @@ class Outline:
         share = cv2.resize(canvas, shape[::-1], interpolation=cv2.INTER_AREA)
         return np.asarray(share >= 128)
 
+    def shifted(self, outwards_px: float) -> Outline:
+        """The same with all walls farther from the fluid; inwards if negative."""
+        level = _level(self.mask())
+        curves = (curve - outwards_px * _inward(curve, level) for curve in self.curves)
+        return replace(self, curves=tuple(curves), width_px=self.width_px + 2.0 * outwards_px)
+
 
 def outline_of(image: Floats, mask: NDArray[np.bool_], walls: Walls) -> Outline | None:
     """The outline near that of a mask (h, w), fitted to a picture (h, w); None if the mask has none."""
@@ -98,9 +104,7 @@ def outline_of(image: Floats, mask: NDArray[np.bool_], walls: Walls) -> Outline 
     off = np.zeros(0)
     for most_px in _SEARCH_PX:
         points = np.concatenate(curves)
-        normals = np.concatenate([_normals(curve) for curve in curves])
-        turn = np.sign(_at(level, points + normals) - _at(level, points - normals))
-        normals = normals * np.where(turn == 0, 1.0, turn)[:, None]
+        normals = np.concatenate([_inward(curve, level) for curve in curves])
         seen = np.all((points >= 0) & (points <= (width - 1, height - 1)), axis=1)
         if np.count_nonzero(seen) < 20:
             return None
@@ -216,11 +220,14 @@ def _smooth(contour: Points, level: Floats) -> Points | None:
     return np.column_stack([np.interp(at, length, closed[:, k]) for k in (0, 1)])
 
 
-def _normals(curve: Points) -> Points:
+def _inward(curve: Points, level: Floats) -> Points:
+    """Unit normals (n, 2) of a curve, from solid to fluid."""
     tangent = np.roll(curve, -1, axis=0) - np.roll(curve, 1, axis=0)
     tangent = scipy.ndimage.gaussian_filter1d(tangent, 2.0, axis=0, mode="wrap")
     across = np.stack((-tangent[:, 1], tangent[:, 0]), -1)
-    return np.asarray(across / np.maximum(np.hypot(*across.T), 1e-9)[:, None])
+    across /= np.maximum(np.hypot(*across.T), 1e-9)[:, None]
+    turn = _at(level, curve + across) < _at(level, curve - across)
+    return np.where(turn[:, None], -across, across)
 
 
 def _at(padded: Floats, points: Points) -> NDArray[np.float64]:

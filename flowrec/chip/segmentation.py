@@ -37,7 +37,7 @@ _LEAST_AGREED = 0.9  # of lines, before an outline is fitted
 _SUPPORT, _EXPLAINED, _AGREED, _THROUGH = 0.88, 0.4, 0.96, 0.8
 _EXPLAINED_BY_STEP = 0.6  # of steps, which any object has
 _CLEAR: dict[Shown, float] = {"dark": 0.25, "bright": 0.25, "relief": 0.5, "step": 0.5}
-_LINES_FIRST, _RELIEF_LAST = 0.85, 0.9  # what others must reach of the quality of step and of relief to go before them
+_LINES_FIRST, _RELIEF_LAST = 0.85, 0.9  # what others must reach of the evidence for step and for relief
 _RIVAL, _SAME = 0.9, 0.9  # quality of another hypothesis, relative to the best; IoU from which on both are one
 _GAP, _GAP_COST = 0.25, 0.4  # from which on other hypotheses must have the same islands and openings; of the quality
 _ALONG = 0.8  # of a channel that lies along lines: then it is their walls
@@ -203,9 +203,9 @@ def _chosen(found: list[Segmentation]) -> Segmentation:
 
     lines, relief, step = best_of("dark", "bright"), best_of("relief"), best_of("step")
     chosen = lines
-    if relief is not None and (chosen is None or chosen.quality < _RELIEF_LAST * relief.quality):
+    if relief is not None and (chosen is None or chosen.evidence < _RELIEF_LAST * relief.evidence):
         chosen = relief
-    if step is not None and (chosen is None or chosen.quality < _LINES_FIRST * step.quality):
+    if step is not None and (chosen is None or chosen.evidence < _LINES_FIRST * step.evidence):
         # Is what is darker or brighter nothing but the walls of a channel that other hypotheses see?
         doubts = [each for each in found if each.shown != "step" and _walls_of(each, step)]
         if not doubts:
@@ -298,7 +298,7 @@ def hypotheses(light: Floats, shown: Shown, seeds: Sequence[tuple[int, int]]) ->
             outline = outline_of(light if kind != "relief" else image, mask, walls)
             if outline is not None:
                 found = Segmentation(outline, kind, agreed)
-                enough |= found.quality >= _RELIEF_LAST and not _faults(found)
+                enough |= found.evidence >= _RELIEF_LAST and not _faults(found)
                 yield found
     if shown in ("auto", "step"):
         parts, contrast = _levels(light)

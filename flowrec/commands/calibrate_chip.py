@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -56,6 +56,7 @@ class PictureChip:
     openings: tuple[Opening, ...]
     inlets_known: bool
     speed_um_s: float | None
+    wall_shift_um: float
 
 
 def calibrate_chip(
@@ -67,6 +68,7 @@ def calibrate_chip(
     inlets: Sequence[str] = (),
     inlet_speed_um_s: float | None = None,
     channel: str = "grey",
+    wall_shift_um: float = 0.0,
     overwrite: bool = False,
 ) -> PictureChip:
     """Find the channel in a picture; write `out` (TOML), the mask of the same stem (PNG) and an overlay.
@@ -80,6 +82,7 @@ def calibrate_chip(
     inlets : names of openings, as in chip.inlets; none: they are left open.
     inlet_speed_um_s : mean; None: it is left open.
     channel : red, green, blue or grey of colours.
+    wall_shift_um : all walls are moved outwards by so much; a known width shows by how much.
 
     Raises
     ------
@@ -90,6 +93,8 @@ def calibrate_chip(
     for name, value in (("--um-per-px", um_per_px), ("--inlet-speed", inlet_speed_um_s)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise UsageError(f"{name} {value:g}: it must be more than zero")
+    if wall_shift_um and (um_per_px is None or not math.isfinite(wall_shift_um)):
+        raise UsageError(f"--wall-shift {wall_shift_um:g}: it is in um, so give --um-per-px, too")
     seeds = [_point(text) for text in seed_points]
     outputs = _outputs(out, path, overwrite)
     picture = read_picture(path, channel)
@@ -97,6 +102,12 @@ def calibrate_chip(
         found = segment(picture.image, cast(Shown, walls), seeds)
     except ChipError as error:
         raise ChipError(f"{path}: {error}") from error
+    if wall_shift_um and um_per_px is not None:
+        shift_px = wall_shift_um / um_per_px
+        if not abs(shift_px) < 0.4 * found.outline.width_px:
+            width_um = found.outline.width_px * um_per_px
+            raise UsageError(f"--wall-shift {wall_shift_um:g}: too much for channels of {width_um:.3g} um")
+        found = replace(found, outline=found.outline.shifted(shift_px))
     mask, pixel = chip_mask(found, 1.0)
     openings = guess_inlets(find_openings(mask))
     if len(openings) < 2:
@@ -107,7 +118,7 @@ def calibrate_chip(
     openings = name_inlets(openings, inlets, str(path)) if inlets else openings
     if inlet_speed_um_s is not None:
         openings = set_inlet_speed(openings, inlet_speed_um_s)
-    done = PictureChip(picture, found, mask, pixel, um_per_px, openings, bool(inlets), inlet_speed_um_s)
+    done = PictureChip(picture, found, mask, pixel, um_per_px, openings, bool(inlets), inlet_speed_um_s, wall_shift_um)
     check_chip(_chip(done, path.stem), str(path))
     if out is not None:
         settings, png, drawing = outputs
@@ -187,6 +198,8 @@ def verdict(done: PictureChip) -> str:
     )
     if found.shown != "step":
         text += f"; lines are {o.line_px * unit:.2g} {name} wide, and the wall is taken to be in their middle"
+    if done.wall_shift_um:
+        text += f"; walls were moved outwards by {done.wall_shift_um:g} um"
     return text
 
 
@@ -197,6 +210,10 @@ def remarks(done: PictureChip) -> list[str]:
         lines.append(
             f"Beside each {done.found.shown} line is another one of the other brightness, {found.between_px:.2g} px "
             "away; if that is the wall, choose it with --walls"
+        )
+    if done.found.shown != "step" and not done.wall_shift_um:
+        lines.append(
+            "If you know the width of an opening and the table has another: --wall-shift UM moves walls outwards"
         )
     if done.um_per_px is None:
         lines.append("um_per_px is not known: fill it in, or give --um-per-px")

@@ -72,6 +72,16 @@ def test_what_a_picture_does_not_tell_is_asked_for_and_a_corrected_mask_loads(im
     assert np.array_equal(load_chip(ChipSettings(path=str(out))).mask, island >= 128)
 
 
+def test_a_known_width_moves_the_walls(image):
+    plain = calibrate_chip(image, None, UM_PER_PX, walls="dark")
+    narrower = calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-UM_PER_PX)
+    assert [o.width_px - 2 for o in plain.openings] == [o.width_px for o in narrower.openings]
+    lost = np.count_nonzero(plain.mask & ~narrower.mask)
+    assert not (narrower.mask & ~plain.mask).any() and 0.05 < lost / np.count_nonzero(plain.mask) < 0.15
+    with pytest.raises(UsageError, match="too much for channels"):
+        calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-150.0)
+
+
 def test_a_refused_picture_leaves_no_file(image, tmp_path):
     blank = tmp_path / "blank.png"
     cv2.imwrite(str(blank), np.full((128, 128), 90, np.uint8))
