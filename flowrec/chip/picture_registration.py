@@ -26,7 +26,7 @@ _REACH_WIDTHS, _REACH_PX = 0.6, 6.0  # from the walls: in median channel widths,
 _LEAST_FOUND = 0.75  # part of the walls
 _EQUAL_FOUND, _EQUAL_EXPLAINED = 0.1, 0.85  # less found by this, and explained at least by this factor: equally good
 _SAME_PX = 2.0  # two poses that differ by less are one
-_MOST_SHIFT_PX, _MOST_ANGLE_DEG, _MOST_SCALE = 1.0, 0.3, 0.01  # standard errors above which a picture is refused
+_MOST_SHIFT_PX, _MOST_ANGLE_DEG, _MOST_SCALE = 0.5, 0.1, 0.003  # standard errors above which a picture is refused
 
 
 def register(
@@ -87,22 +87,20 @@ def _apart_px(one: Calibration, other: Calibration, walls: WallMap) -> float:
 
 
 def _refuse_undetermined(fit: WallFit, chip: Chip) -> None:
-    x, y, angle, scale = fit.std.tolist()
-    limit_um = _MOST_SHIFT_PX * fit.calibration.um_per_px
-    loose = [
-        text
-        for text, bad in (
-            (f"the shift along x ({x:.3g} um)", not x < limit_um),
-            (f"the shift along y ({y:.3g} um)", not y < limit_um),
-            (f"the angle ({angle:.2g} degrees)", not angle < _MOST_ANGLE_DEG),
-            (f"the scale ({100 * scale:.2g} %)", not scale < _MOST_SCALE),
-        )
-        if bad
-    ]
-    if loose:
+    limits = np.array((*2 * (_MOST_SHIFT_PX * fit.calibration.um_per_px,), _MOST_ANGLE_DEG, _MOST_SCALE))
+    names = ("the shift along x ({:.3g} um)", "the shift along y ({:.3g} um)", "the angle ({:.2g} degrees)")
+    shown = [name.format(value) for name, value in zip(names, fit.std.tolist(), strict=False)]
+    shown.append(f"the scale ({100 * fit.std[3]:.2g} %)")
+    loose = [text for text, good in zip(shown, (fit.std < limits).tolist(), strict=True) if not good]
+    if loose and (fit.apart < limits).all():
         raise ChipError(
             f"the walls of {chip.name} in the picture do not determine {' and '.join(loose)}; show more of the chip, "
             "with walls of several directions"
+        )
+    if loose:
+        raise ChipError(
+            f"grey levels and local contrast of the picture put {chip.name} in different places: they disagree on "
+            f"{' and '.join(loose)}; is it this chip, in focus, and is the light even from all sides?"
         )
 
 

@@ -7,17 +7,26 @@ f (piecewise linear), a and b minimise
     sum_x w(x) [I(x) - a_k - b_k f(d(x; p))]^2
 
 by Gauss-Newton; w are Tukey's weights, which leave out debris and the robot. So it does not matter whether walls are
-dark or bright, how wide they look, or whether all of them look wider than the mask says. In relief (oblique light,
-differential interference contrast) walls are bright on one side and dark on the other; then I is the local contrast.
+dark or bright, how wide they look, or whether all of them look wider than the mask says.
 
-A patch is found if its own profile correlates with f. The offsets of the patches across the walls are the residual;
-the scatter of their normal equations gives the standard errors.
+f is free, so it can also explain a wrong pose. In relief (oblique light, differential interference contrast) walls are
+bright on one side of the channel and dark on the other; with the chip shifted by half the width of these lines, f is
+dark outside of the channel, bright inside, and every wall shows half of that. Two things tell:
+
+- The wall of a patch counts as found if its own profile correlates with the f of walls that face the other way.
+- The picture is read twice, as grey levels and as local contrast |grad I|, which is a function of d where I is one, and
+  where I is in relief. Both fits begin at the same pose and end at the same one if it is right; where it is not, their
+  errors have nothing in common. The difference is part of the standard error.
+
+The offsets of the patches across the walls are the residual; the scatter of their normal equations gives the standard
+error of one reading.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -30,10 +39,17 @@ from flowrec.interpolation import cells_at
 
 _LONGEST_PX = 1280  # side of the image that is fitted
 # Blur, most pixels, and the motion in px at which Gauss-Newton ends; one row after the other.
-_STAGES = ((4.0, 30_000, 0.05), (2.0, 30_000, 0.05), (1.0, 30_000, 0.02), (0.0, 100_000, 0.003))
+_STAGES = (
+    (8.0, 15_000, 0.1),
+    (4.0, 30_000, 0.05),
+    (2.0, 30_000, 0.05),
+    (1.0, 30_000, 0.02),
+    (0.0, 100_000, 0.003),
+)
 _STEPS = 8  # of Gauss-Newton, at most, in each stage
-# Part of the walls found between which the local contrast is tried instead of the grey levels.
-_HOPELESS, _LIT_UNEVENLY = 0.4, 0.85
+_CONTRAST_BLUR_PX = 1.5  # at least, where local contrast is taken: noise has contrast too
+_HOPELESS = 0.4  # part of the walls found by grey levels below which local contrast is not asked
+_RELIEF_FOUND, _RELIEF_MORE = 0.9, 0.1  # part of the walls found by local contrast, and by how much less by grey levels
 _KNOTS = 12  # of f on either side of the wall
 _ALL_KNOTS = 2 * _KNOTS + 1
 _TUKEY = 4.685
@@ -52,8 +68,9 @@ class WallFit:
     explained : relative variance of the grey levels near the walls that f explains.
     found : part of the walls in the image that look like the others, 0 to 1.
     seen : part of the chip's walls that the image shows.
-    residual_um : root mean square distance of the patches from where the pose puts them.
+    residual_um : root mean square distance of the walls of the patches from where the pose puts them.
     std : (4,) standard errors: shift of the image's centre along x and y in um, angle in degrees, relative scale.
+    apart : (4,) the part of them that is the difference of the two readings; 0 where only one of them counts.
     """
 
     calibration: Calibration
@@ -62,6 +79,7 @@ class WallFit:
     seen: float
     residual_um: float
     std: NDArray[np.float64]
+    apart: NDArray[np.float64]
 
 
 class WallMap:
@@ -93,6 +111,16 @@ class WallMap:
         found = cells.interpolate(self._all)
         return found[:, 0], found[:, 1:], cells.inside
 
+    def drawn(self, to_um: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """Distances (h, w) at the pixels of an image, roughly; infinite beside the mask.
+
+        `to_um` (2, 3) takes (column, row, 1) of a pixel to the chip.
+        """
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        size, to_px = (shape[1], shape[0]), to_um / self._um
+        drawn = cv2.warpAffine(self.clearance_um, to_px, size, flags=flags, borderValue=math.inf)
+        return np.asarray(drawn, np.float32)
+
 
 class Fitter:
     """Fits poses of one chip to one picture.
@@ -117,21 +145,39 @@ class Fitter:
         self._step = np.array(self._size_px) / small.shape[::-1]
         self._sigma_px = 2.0 * reach_um / (um_per_px * step)
         self._levelled = _levelled(small, 2.0 * self._sigma_px)
+        self._contrasts: dict[float, NDArray[np.float32]] = {}
 
     def fit(self, start: Calibration) -> WallFit:
-        """The pose near a first one."""
-        done = self._fit(self._levelled, start)
-        if _HOPELESS < done.found < _LIT_UNEVENLY:
-            contrast = np.hypot(*gradient(blurred(self._levelled, 1.0)))
-            other = self._fit(_levelled(contrast, 2.0 * self._sigma_px), start)
-            if other.found > done.found:
-                return other
-        return done
+        """The pose near a first one, by both readings."""
+        grey = self._fit(self._grey, start)
+        if grey.found < _HOPELESS:
+            return grey
+        contrast = self._fit(self._contrast, start)
+        if contrast.found >= _RELIEF_FOUND and grey.found < contrast.found - _RELIEF_MORE:
+            return contrast
+        apart = np.abs(self._difference(grey.calibration, contrast.calibration))
+        return replace(grey, std=np.hypot(grey.std, apart), apart=apart)
 
-    def _fit(self, picture: NDArray[np.float32], start: Calibration) -> WallFit:
+    def _difference(self, one: Calibration, other: Calibration) -> NDArray[np.float64]:
+        """(4,) difference of two poses, in the units of `WallFit.std`."""
+        middle = (np.array(self._size_px) - 1) / 2
+        turned = (one.angle_deg - other.angle_deg + 180.0) % 360.0 - 180.0
+        return np.array((*(one.to_um(middle) - other.to_um(middle)), turned, math.log(one.um_per_px / other.um_per_px)))
+
+    def _grey(self, blur_px: float) -> NDArray[np.float32]:
+        return blurred(self._levelled, blur_px) if blur_px > 0.0 else self._levelled
+
+    def _contrast(self, blur_px: float) -> NDArray[np.float32]:
+        sigma_px = max(blur_px, _CONTRAST_BLUR_PX)
+        if sigma_px not in self._contrasts:
+            size = np.hypot(*gradient(blurred(self._levelled, sigma_px)))
+            self._contrasts[sigma_px] = _levelled(np.asarray(size, np.float32), 2.0 * self._sigma_px)
+        return self._contrasts[sigma_px]
+
+    def _fit(self, reading: Callable[[float], NDArray[np.float32]], start: Calibration) -> WallFit:
         now = start
         for blur_px, most, enough_px in _STAGES:
-            image = blurred(picture, blur_px) if blur_px > 0.0 else picture
+            image = reading(blur_px)
             sample = self._sample(image, now, most)
             model = None
             for _ in range(_STEPS):
@@ -144,15 +190,14 @@ class Fitter:
 
     def _sample(self, image: NDArray[np.float32], start: Calibration, most: int) -> _Sample:
         """At most so many pixels of the image near the walls, for a pose that moves a little yet."""
-        height, width = image.shape
-        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
-        pixels = pixels[np.random.default_rng(0).permutation(len(pixels))]
-        if len(pixels) > 4 * most:
-            pixels = pixels[: max(4 * most, len(pixels) // 4)]
-        at_px = (pixels + 0.5) * self._step - 0.5
-        distance, _, inside = self._walls.at(start.to_um(at_px))
-        near = np.flatnonzero(inside & (np.abs(distance) < 1.2 * self._reach_um))[:most]
-        return _Sample(at_px[near], image[pixels[near, 1], pixels[near, 0]].astype(np.float64))
+        to_um = start.matrix @ np.vstack(
+            (np.column_stack((np.diag(self._step), 0.5 * self._step - 0.5)), (0.0, 0.0, 1.0))
+        )
+        near = np.flatnonzero(np.abs(self._walls.drawn(to_um, image.shape)) < 1.2 * self._reach_um)
+        near = np.random.default_rng(0).permutation(near)[:most]
+        rows, columns = np.divmod(near, image.shape[1])
+        at_px = (np.stack((columns, rows), -1) + 0.5) * self._step - 0.5
+        return _Sample(at_px, image[rows, columns].astype(np.float64))
 
     def _judged(self, model: _Model, now: Calibration, sample: _Sample) -> WallFit:
         found, residual_um, covariance = model.patches()
@@ -162,11 +207,13 @@ class Fitter:
         to_centre = np.array(
             [[1, 0, -down * per, right * per], [0, 1, right * per, down * per], [0, 0, per, 0], [0, 0, 0, per]]
         )
-        std = np.sqrt(np.maximum(np.diag(to_centre @ covariance @ to_centre.T), 0.0))
+        std = np.full(4, math.inf)
+        if np.isfinite(covariance).all():
+            std = np.sqrt(np.maximum(np.diag(to_centre @ covariance @ to_centre.T), 0.0))
         std *= (now.um_per_px, now.um_per_px, math.degrees(1.0), 1.0)
         at_px = now.to_px(self._walls.points_um)
         seen = float(((at_px >= 0) & (at_px <= np.array(self._size_px) - 1)).all(-1).mean())
-        return WallFit(now, model.explained, found, seen, residual_um, std)
+        return WallFit(now, model.explained, found, seen, residual_um, std, np.zeros(4))
 
 
 def _levelled(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
@@ -211,6 +258,7 @@ class _Model:
         self._patch = np.clip(rows, 0, down - 1) * across + np.clip(columns, 0, across - 1)
         self._count = across * down
         slope_px = now.um_per_px * gradient[used] @ now.axes.T  # of d, in um per px of the image
+        self._across = slope_px
         arm = (sample.at_px[used] - sample.middle_px) / sample.reach_px
         turn = slope_px[:, 1] * arm[:, 0] - slope_px[:, 0] * arm[:, 1]
         # (n, 4) derivatives of d by right, down, turn, growth
@@ -296,27 +344,34 @@ class _Model:
         normal += 1e-6 * np.trace(normal) * np.eye(4) + 1e-12 * np.eye(4)
         return np.clip(np.linalg.solve(normal, right), -2.0, 2.0)
 
+    def _other_profiles(self) -> NDArray[np.float64]:
+        """(4, knots) f of the walls whose channel lies to the left, above, to the right and below."""
+        gain, levels = self.gain[self._patch], self._levels - self.offset[self._patch]
+        ways = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+        return np.stack([self._solve(gain * (self._across @ way < 0.0), levels, gain) for way in ways])
+
     def patches(self) -> tuple[float, float, NDArray[np.float64]]:
         """The part of the walls that is found, the residual in um, and the covariance (4, 4) of the motion in px^2."""
         if len(self._levels) < _LEAST_ALL:
             return 0.0, math.inf, np.full((4, 4), math.inf)
         patch, count = self._patch, self._count
-        # The mean profile of each patch on the knots, and its correlation with f.
+        # The walls of a patch that face one of four ways, and how their mean profile correlates with f of the others.
+        way = np.rint(np.arctan2(self._across[:, 1], self._across[:, 0]) / (0.5 * math.pi)).astype(np.intp) % 4
+        wall, walls = 4 * patch + way, 4 * count
         nearest = np.clip(np.rint(self._low + self._part).astype(np.intp), 0, _ALL_KNOTS - 1)
-        key = patch * _ALL_KNOTS + nearest
-        shape = (count, _ALL_KNOTS)
-        number = np.bincount(key, minlength=count * _ALL_KNOTS).reshape(shape)
-        total = np.bincount(key, self._levels, count * _ALL_KNOTS).reshape(shape)
-        like = _correlation(total / np.maximum(number, 1), np.broadcast_to(self._profile, shape), number)
-        size = np.bincount(patch, minlength=count)
-        usable = (size >= _LEAST_PIXELS) & ((number > 0).sum(1) >= _KNOTS // 2)
-        length = np.bincount(patch, np.abs(self._distance) < 0.25 * self._reach_um, count)
+        key = wall * _ALL_KNOTS + nearest
+        shape = (walls, _ALL_KNOTS)
+        number = np.bincount(key, minlength=walls * _ALL_KNOTS).reshape(shape)
+        total = np.bincount(key, self._levels, walls * _ALL_KNOTS).reshape(shape)
+        like = _correlation(total / np.maximum(number, 1), np.tile(self._other_profiles(), (count, 1)), number)
+        usable = (np.bincount(wall, minlength=walls) >= _LEAST_PIXELS) & ((number > 0).sum(1) >= _KNOTS // 2)
+        length = np.bincount(wall, np.abs(self._distance) < 0.25 * self._reach_um, walls)
         found = usable & (like > _LIKE)
         share = float(length[found].sum() / max(length[usable].sum(), 1e-9))
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
         of_d = self.gain[patch] * self._at(slope)
-        across = np.bincount(patch, of_d * self._weight * of_d, count)
-        off_um = np.bincount(patch, of_d * self._weight * self._rest, count) / np.maximum(across, 1e-12)
+        square = np.bincount(wall, of_d * self._weight * of_d, walls)
+        off_um = np.bincount(wall, of_d * self._weight * self._rest, walls) / np.maximum(square, 1e-12)
         weights = length * found
         residual = math.sqrt(float(np.sum(weights * off_um**2) / max(weights.sum(), 1e-9)))
         jacobian = self._jacobian()

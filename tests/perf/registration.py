@@ -142,30 +142,56 @@ def measure(case: Case) -> dict[str, object]:
     return row | errors(nearest.calibration, case.truth) | {"residual_um": nearest.residual_um}
 
 
-def refusals(seed: int, laid: list[np.ndarray]) -> Iterator[dict[str, object]]:
-    """Pictures without the chip: another chip, textures alone, noise."""
-    rng, available = np.random.default_rng(seed), chips()
-    for number in range(3 * len(available)):
-        chip = available[number % len(available)]
-        scale = max(chip.size_um[0] / SIZE_PX[0], chip.size_um[1] / SIZE_PX[1])
-        kind = ("another chip", "texture", "noise")[number // len(available)]
-        if kind == "another chip":
-            other = available[(number + 1 + seed % (len(available) - 1)) % len(available)]
-            about = max(other.size_um[0] / SIZE_PX[0], other.size_um[1] / SIZE_PX[1])
-            centre = np.array(other.size_um) / 2
-            view = Calibration.centred(about, centre, SIZE_PX, float(rng.uniform(0, 360)))
-            image = picture(other.mask, other.um_per_px, view, SIZE_PX, LOOKS["dark lines"], rng)
-        elif kind == "texture" and laid:
-            image = cv2.resize(laid[number % len(laid)], SIZE_PX)
-        else:
-            smooth = cv2.GaussianBlur(rng.standard_normal(SIZE_PX[::-1]), (0, 0), float(rng.uniform(0.5, 12)))
-            image = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-        row: dict[str, object] = {"kind": kind, "chip": chip.name}
-        try:
-            fit = register(image, chip, (scale / 1.12, scale * 1.12))[0]
-            yield row | {"accepted": True, "found": fit.found, "explained": fit.explained, "std": fit.std.tolist()}
-        except ChipError as error:
-            yield row | {"accepted": False, "why": str(error)}
+@dataclass(frozen=True)
+class Stranger:
+    """A picture that does not show the chip as it is asked for."""
+
+    kind: str
+    chip: Chip
+    image: np.ndarray
+    about_um: float
+    mirrors: tuple[bool, ...] = (False, True)
+
+
+def strangers(seed: int, laid: list[np.ndarray]) -> Iterator[Stranger]:
+    """Another chip, the mirror image where none is expected, another scale, textures alone, noise."""
+    rng, available, looks = np.random.default_rng(seed), chips(), list(LOOKS.values())
+    kinds = ("another chip", "another chip near by", "mirror image", "another scale", "texture", "noise")
+    for number in range(len(kinds) * len(available)):
+        chip, kind = available[number % len(available)], kinds[number // len(available)]
+        about_um = max(chip.size_um[0] / SIZE_PX[0], chip.size_um[1] / SIZE_PX[1])
+        if chip.name == "bifurcation" and kind == "mirror image":  # which is its own mirror image
+            continue
+        if kind in ("texture", "noise"):
+            if kind == "texture" and laid:
+                image = cv2.resize(laid[number % len(laid)], SIZE_PX)
+            else:
+                smooth = cv2.GaussianBlur(rng.standard_normal(SIZE_PX[::-1]), (0, 0), float(rng.uniform(0.5, 12)))
+                image = cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+            yield Stranger(kind, chip, image, about_um)
+            continue
+        shown = chip
+        if kind.startswith("another chip"):
+            shown = available[(number + 1 + int(rng.integers(len(available) - 1))) % len(available)]
+        fill = max(shown.size_um[0] / SIZE_PX[0], shown.size_um[1] / SIZE_PX[1])
+        scale = {"another chip near by": 0.6, "another scale": float(rng.choice((0.7, 1.4)))}.get(kind, 1.0)
+        centre = np.array(shown.size_um) / 2 + rng.uniform(-0.1, 0.1, 2) * shown.size_um
+        turn, mirror = float(rng.uniform(0, 360)), kind == "mirror image"
+        view = Calibration.centred(fill * scale, centre, SIZE_PX, turn, mirror)
+        image = picture(shown.mask, shown.um_per_px, view, SIZE_PX, looks[number % len(looks)], rng)
+        mirrors = (False,) if mirror else (False, True)
+        yield Stranger(kind, chip, image, about_um * (scale if "near" in kind else 1.0), mirrors)
+
+
+def refused(case: Stranger) -> dict[str, object]:
+    began = time.process_time()
+    row: dict[str, object] = {"kind": case.kind, "chip": case.chip.name}
+    try:
+        fit = register(case.image, case.chip, (case.about_um / 1.12, case.about_um * 1.12), case.mirrors)[0]
+        row |= {"accepted": True, "found": fit.found, "explained": fit.explained, "std": fit.std.tolist()}
+    except ChipError as error:
+        row |= {"accepted": False, "why": str(error)}
+    return row | {"cpu_s": time.process_time() - began}
 
 
 def log_polar(case: Case) -> Calibration:
@@ -276,8 +302,9 @@ def main() -> None:
     asked = parser.parse_args()
     laid = textures(asked.textures)
     if asked.refusals:
-        for row in refusals(asked.seed, laid):
-            print(json.dumps(row), flush=True)
+        for number, stranger in enumerate(strangers(asked.seed, laid)):
+            if number % asked.every == 0:
+                print(json.dumps(refused(stranger)), flush=True)
         return
     for number, case in enumerate(cases(asked.seed, laid)):
         if number % asked.every == 0:
