@@ -37,15 +37,11 @@ from flowrec.chip.registration import Calibration
 from flowrec.chip.wall_search import Points, blurred, gradient, moved
 from flowrec.interpolation import cells_at
 
+Stages = tuple[tuple[float, int, float], ...]
 _LONGEST_PX = 1280  # side of the image that is fitted
 # Blur, most pixels, and the motion in px at which Gauss-Newton ends; one row after the other.
-_STAGES = (
-    (8.0, 15_000, 0.1),
-    (4.0, 30_000, 0.05),
-    (2.0, 30_000, 0.05),
-    (1.0, 30_000, 0.02),
-    (0.0, 100_000, 0.003),
-)
+_STAGES = ((4.0, 30_000, 0.05), (2.0, 30_000, 0.05), (1.0, 30_000, 0.02), (0.0, 100_000, 0.003))
+_COARSE = (8.0, 30_000, 0.05)  # before these, where they do not lead to the same pose
 _STEPS = 8  # of Gauss-Newton, at most, in each stage
 _CONTRAST_BLUR_PX = 1.5  # at least, where local contrast is taken: noise has contrast too
 _HOPELESS = 0.4  # part of the walls found by grey levels below which local contrast is not asked
@@ -153,16 +149,22 @@ class Fitter:
         if grey.found < _HOPELESS:
             return grey
         contrast = self._fit(self._contrast, start)
+        apart = self._apart(grey, contrast)
+        if contrast.found < _RELIEF_FOUND and (apart > grey.std + contrast.std).any():
+            # Local contrast has more local minima than grey levels.
+            other = self._fit(self._contrast, start, (_COARSE, *_STAGES))
+            contrast = max(contrast, other, key=lambda fit: fit.found)
+            apart = self._apart(grey, contrast)
         if contrast.found >= _RELIEF_FOUND and grey.found < contrast.found - _RELIEF_MORE:
             return contrast
-        apart = np.abs(self._difference(grey.calibration, contrast.calibration))
         return replace(grey, std=np.hypot(grey.std, apart), apart=apart)
 
-    def _difference(self, one: Calibration, other: Calibration) -> NDArray[np.float64]:
+    def _apart(self, one: WallFit, other: WallFit) -> NDArray[np.float64]:
         """(4,) difference of two poses, in the units of `WallFit.std`."""
+        a, b = one.calibration, other.calibration
         middle = (np.array(self._size_px) - 1) / 2
-        turned = (one.angle_deg - other.angle_deg + 180.0) % 360.0 - 180.0
-        return np.array((*(one.to_um(middle) - other.to_um(middle)), turned, math.log(one.um_per_px / other.um_per_px)))
+        turned = (a.angle_deg - b.angle_deg + 180.0) % 360.0 - 180.0
+        return np.abs((*(a.to_um(middle) - b.to_um(middle)), turned, math.log(a.um_per_px / b.um_per_px)))
 
     def _grey(self, blur_px: float) -> NDArray[np.float32]:
         return blurred(self._levelled, blur_px) if blur_px > 0.0 else self._levelled
@@ -174,9 +176,11 @@ class Fitter:
             self._contrasts[sigma_px] = _levelled(np.asarray(size, np.float32), 2.0 * self._sigma_px)
         return self._contrasts[sigma_px]
 
-    def _fit(self, reading: Callable[[float], NDArray[np.float32]], start: Calibration) -> WallFit:
+    def _fit(
+        self, reading: Callable[[float], NDArray[np.float32]], start: Calibration, stages: Stages = _STAGES
+    ) -> WallFit:
         now = start
-        for blur_px, most, enough_px in _STAGES:
+        for blur_px, most, enough_px in stages:
             image = reading(blur_px)
             sample = self._sample(image, now, most)
             model = None

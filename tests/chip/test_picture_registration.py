@@ -1,5 +1,7 @@
 """One picture tells how the chip lies in it; pictures by another renderer than the simulated microscope."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -39,6 +41,15 @@ def test_the_pose_is_found_whatever_the_walls_look_like(look, angle_deg, mirror,
     assert np.hypot(*off_um) < 3.0
     assert fit.found > 0.9
     assert np.all(np.abs(off_um) < 6.0 * fit.std[:2] + 1.0)  # standard errors do not promise too much
+
+
+def test_a_pose_that_one_reading_of_the_picture_finds_and_the_other_does_not_is_refused():
+    """Broad lines, bright on one side of the channels: grey levels alone agree best 117 um beside the truth."""
+    truth = Calibration.centred(13.4, np.array(VESSELS.size_um) / 2 + (290.0, -210.0), SIZE_PX, 37.0)
+    broad = replace(LOOKS["relief"], line_um=60.0)
+    image = picture(VESSELS.mask, VESSELS.um_per_px, truth, SIZE_PX, broad, np.random.default_rng(4))
+    with pytest.raises(ChipError, match="in different places|does not show"):
+        register(image, VESSELS, ABOUT, (False,))
 
 
 def test_a_symmetric_chip_has_two_poses_and_none_is_chosen():
