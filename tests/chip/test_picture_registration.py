@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from flowrec.chip import ChipSettings, load_chip
-from flowrec.chip.picture_registration import register
+from flowrec.chip import ChipSettings, load_chip, wall_fit
+from flowrec.chip.clearance import median_width_um
+from flowrec.chip.picture_registration import overlay, register
 from flowrec.chip.registration import Calibration
+from flowrec.chip.wall_fit import Fitter, WallMap
 from flowrec.errors import ChipError
 from tests.chip.looks import LOOKS, picture
 
@@ -43,13 +46,46 @@ def test_the_pose_is_found_whatever_the_walls_look_like(look, angle_deg, mirror,
     assert np.all(np.abs(off_um) < 6.0 * fit.std[:2] + 1.0)  # standard errors do not promise too much
 
 
-def test_a_pose_that_one_reading_of_the_picture_finds_and_the_other_does_not_is_refused():
+def fitted(image, start, chip=VESSELS):
+    reach_um = max(0.6 * median_width_um(chip), 6.0 * 13.4)
+    return Fitter(image.astype(np.float32), WallMap(chip.mask, chip.um_per_px), reach_um, 13.4).fit(start)
+
+
+def test_walls_that_grey_levels_and_local_contrast_put_in_different_places_are_refused():
     """Broad lines, bright on one side of the channels: grey levels alone agree best 117 um beside the truth."""
-    truth = Calibration.centred(13.4, np.array(VESSELS.size_um) / 2 + (290.0, -210.0), SIZE_PX, 37.0)
+    truth, _ = seen("relief", 37.0, shift_um=(300.0, -200.0))
     broad = replace(LOOKS["relief"], line_um=60.0)
     image = picture(VESSELS.mask, VESSELS.um_per_px, truth, SIZE_PX, broad, np.random.default_rng(4))
-    with pytest.raises(ChipError, match="in different places|does not show"):
+    fit = fitted(image, truth)
+    assert fit.found > 0.7  # part of the walls alone does not tell
+    assert np.hypot(*fit.apart[:2]) > 50.0
+    assert (fit.std >= fit.apart).all()
+    with pytest.raises(ChipError, match="put vessels-3 in different places"):
         register(image, VESSELS, ABOUT, (False,))
+
+
+def test_the_residual_is_how_far_the_walls_are_from_the_mask():
+    truth, image = seen("dark lines", 0.0)
+    assert 0.0 < fitted(image, truth).residual_um < 2.0
+    wider = replace(VESSELS, mask=cv2.resize(VESSELS.mask.astype(np.uint8), None, fx=1.02, fy=1.0) > 0)
+    assert 4.0 < fitted(image, truth, wider).residual_um < 40.0
+
+
+def test_where_the_walls_are_found_does_not_depend_on_the_size_at_which_the_picture_is_fitted(monkeypatch):
+    truth, image = seen("dark lines", 20.0)
+    monkeypatch.setattr(wall_fit, "_LONGEST_PX", 200)
+    off_um = fitted(image, truth).calibration.to_um((239.5, 191.5)) - truth.to_um((239.5, 191.5))
+    assert np.hypot(*off_um) < 2.0
+
+
+def test_the_overlay_is_drawn_on_the_walls():
+    calibration = Calibration(13.4, (-400.0, 5200.0), 37.0, True)
+    drawn = overlay(np.full(SIZE_PX[::-1], 90, np.uint8), VESSELS, calibration).astype(int)
+    rows, columns = np.nonzero(drawn[..., 2] - drawn[..., 0] > 120)
+    distance, _, inside = WallMap(VESSELS.mask, VESSELS.um_per_px).at(calibration.to_um(np.stack((columns, rows), -1)))
+    assert len(rows) > 500
+    assert inside.mean() > 0.95
+    assert np.percentile(np.abs(distance[inside]), 95) < 30.0
 
 
 def test_a_symmetric_chip_has_two_poses_and_none_is_chosen():
