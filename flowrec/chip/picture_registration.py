@@ -7,6 +7,7 @@ a picture that does not show the chip, or not enough of it, is refused.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -59,11 +60,13 @@ def register(
         if hopeless or pose.score < _LEAST_SCORE * poses[0].score:
             break
         fits.append(fitter.fit(pose.calibration))
-    fits.sort(key=lambda fit: -fit.found * fit.explained)
+    # Of fits that end at one pose, one in which both readings do goes before one in which a reading went astray.
+    fits.sort(key=lambda fit: bool(_loose(fit).any()))
     distinct: list[WallFit] = []
     for fit in fits:
         if all(_apart_px(fit.calibration, other.calibration, walls) > _SAME_PX for other in distinct):
             distinct.append(fit)
+    distinct.sort(key=lambda fit: -fit.found * fit.explained)
     if not distinct or distinct[0].found < _LEAST_FOUND:
         found = 100.0 * distinct[0].found if distinct else 0.0
         raise ChipError(
@@ -80,28 +83,47 @@ def register(
     return tuple(equal)
 
 
+def moved_px(picture: NDArray[np.uint8 | np.uint16], chip: Chip, assumed: Calibration) -> float | None:
+    """How far the walls in a picture (h, w) are from where a calibration puts them: root mean square, in pixels.
+
+    None if the picture does not tell, because it does not show the walls nearby or not enough of them.
+    """
+    walls = WallMap(chip.mask, chip.um_per_px)
+    reach_um = max(_REACH_WIDTHS * median_width_um(chip), _REACH_PX * assumed.um_per_px)
+    fit = Fitter(np.asarray(picture, np.float32), walls, reach_um, assumed.um_per_px).fit(assumed)
+    if fit.found < _LEAST_FOUND or _loose(fit).any():
+        return None
+    return _apart_px(fit.calibration, assumed, walls)
+
+
 def _apart_px(one: Calibration, other: Calibration, walls: WallMap) -> float:
     """Root mean square distance of the walls of two poses in the image."""
     off = one.to_px(walls.points_um) - other.to_px(walls.points_um)
     return float(np.sqrt(np.mean(np.sum(off * off, -1))))
 
 
+def _loose(fit: WallFit) -> NDArray[np.bool_]:
+    """(4,) which of shift along x and y, angle and scale the picture does not determine."""
+    shift_um = _MOST_SHIFT_PX * fit.calibration.um_per_px
+    return ~(fit.std < (shift_um, shift_um, _MOST_ANGLE_DEG, _MOST_SCALE))
+
+
 def _refuse_undetermined(fit: WallFit, chip: Chip) -> None:
-    limits = np.array((*2 * (_MOST_SHIFT_PX * fit.calibration.um_per_px,), _MOST_ANGLE_DEG, _MOST_SCALE))
     names = ("the shift along x ({:.3g} um)", "the shift along y ({:.3g} um)", "the angle ({:.2g} degrees)")
     shown = [name.format(value) for name, value in zip(names, fit.std.tolist(), strict=False)]
     shown.append(f"the scale ({100 * fit.std[3]:.2g} %)")
-    loose = [text for text, good in zip(shown, (fit.std < limits).tolist(), strict=True) if not good]
-    if loose and (fit.apart < limits).all():
+    loose = [text for text, bad in zip(shown, _loose(fit).tolist(), strict=True) if bad]
+    if not loose:
+        return
+    if not _loose(replace(fit, std=fit.apart)).any():
         raise ChipError(
             f"the walls of {chip.name} in the picture do not determine {' and '.join(loose)}; show more of the chip, "
             "with walls of several directions"
         )
-    if loose:
-        raise ChipError(
-            f"grey levels and local contrast of the picture put {chip.name} in different places: they disagree on "
-            f"{' and '.join(loose)}; is it this chip, in focus, and is the light even from all sides?"
-        )
+    raise ChipError(
+        f"grey levels and local contrast of the picture put {chip.name} in different places: they disagree on "
+        f"{' and '.join(loose)}; is it this chip, in focus, and is the light even from all sides?"
+    )
 
 
 def overlay(picture: NDArray[np.uint8 | np.uint16], chip: Chip, calibration: Calibration) -> NDArray[np.uint8]:
