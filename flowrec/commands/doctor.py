@@ -17,10 +17,12 @@ import numpy as np
 
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
+from flowrec.chip.picture_registration import moved_px
 from flowrec.commands.calibrate_image import registration_state
 from flowrec.commands.record import refuse_adrift
-from flowrec.config import Config, ResolvedConfig
+from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.control import Coils
+from flowrec.declarations import Image
 from flowrec.errors import FlowrecError, RigError
 from flowrec.messages import CameraLosses
 from flowrec.resolve import resolve
@@ -35,6 +37,7 @@ _RATE_TOLERANCE = 0.05
 _CLOCK_TOLERANCE = 0.01
 _LOSS_WARNING, _LOSS_FAILURE = 0.001, 0.05  # fraction of the blocks
 _DARK = 0.1  # of the full scale
+_MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones
 _TRIAL_BYTES = 128 << 20
 _HEADROOM = 2.0  # of the disk's speed over the rate of a run
 _LEAST_MINUTES = 10.0
@@ -81,7 +84,7 @@ def diagnose(asked: Config, config_file: Path | None = None, folder: Path | None
         config, chip = settled[0]
         yield from _look("mission", lambda: _mission(config, chip))
         if asked.rig == LAB:
-            yield from _look("camera", lambda: _camera(config))
+            yield from _look("camera", lambda: _camera(config, chip))
             yield from _look("coils", lambda: _coils(config))
         else:
             text = f"rig = {asked.rig!r}: neither camera nor coils are looked at; give the configuration of the lab"
@@ -143,7 +146,7 @@ def _mission(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
     )
 
 
-def _camera(config: ResolvedConfig) -> Iterator[Finding]:
+def _camera(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
     from flowrec.rigs.lab.cameras.probe import probe
 
     camera = config.camera
@@ -183,6 +186,20 @@ def _camera(config: ResolvedConfig) -> Iterator[Finding]:
         yield Finding("image", WARNING, text)
     else:
         yield Finding("image", OK, f"brightest pixel {seen.brightest} of {full}")
+    if seen.image is not None and seen.image.shape == (camera.height_px, camera.width_px):
+        yield from _walls(config, chip, seen.image)
+
+
+def _walls(config: ResolvedConfig, chip: Chip, image: Image) -> Iterator[Finding]:
+    """Whether the chip still lies in the image as it is registered; nothing if the image does not show enough of it."""
+    moved = moved_px(image, chip, registration_of(config.camera, chip))
+    if moved is None:
+        return
+    text = f"the walls in the image are {moved:.2g} px from where the registration puts them"
+    if moved > _MOVED_PX:
+        yield Finding("walls", WARNING, f"{text}; flowrec calibrate image PICTURE -o registration.toml measures it")
+    else:
+        yield Finding("walls", OK, text)
 
 
 def _losses(losses: CameraLosses | None) -> Iterator[Finding]:

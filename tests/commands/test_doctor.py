@@ -7,9 +7,12 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from flowrec.chip import ChipSettings, load_chip
+from flowrec.chip.registration import Calibration
 from flowrec.cli import app
 from flowrec.commands import doctor
 from flowrec.commands.doctor import FAILURE, OK, WARNING, diagnose
@@ -17,6 +20,7 @@ from flowrec.config import Config, load_config
 from flowrec.messages import CameraLosses
 from flowrec.rigs.lab.cameras import probe as camera
 from flowrec.rigs.lab.cameras.camera import CameraInfo
+from tests.chip.looks import LOOKS, picture
 
 MEASURED = (
     "rig=lab",
@@ -74,6 +78,21 @@ def test_what_a_camera_shows_is_judged(
     monkeypatch.setattr(doctor, "_write_speed", lambda _folder: 1e9)
     config = load_config(None, [*MEASURED, "mission.phases=observe"])
     assert levels(config, tmp_path)[what] == level
+
+
+@pytest.mark.parametrize(("turned_deg", "level"), [(0.0, OK), (1.0, WARNING)])
+def test_a_chip_that_was_turned_since_its_registration_is_noticed(
+    turned_deg: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chip = load_chip(ChipSettings())
+    centre_um = (np.array(chip.size_um) - chip.um_per_px) / 2
+    truth = Calibration.centred(20.0, centre_um, (320, 256), turned_deg)
+    image = picture(chip.mask, chip.um_per_px, truth, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
+    info = replace(SEEN.info, width_px=320, height_px=256)
+    monkeypatch.setattr(camera, "probe", lambda *_: replace(SEEN, info=info, image=image))
+    monkeypatch.setattr(doctor, "_write_speed", lambda _folder: 1e9)
+    sets = ["camera.width_px=320", "camera.height_px=256", "mission.phases=observe"]
+    assert levels(load_config(None, [*MEASURED, *sets]), tmp_path)["walls"] == level
 
 
 @pytest.mark.parametrize(("speed", "level"), [(1e9, OK), (5e6, WARNING), (1e6, FAILURE)])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from flowrec.clocks.device_clock import envelope
+from flowrec.declarations import Image
 from flowrec.errors import RigError
 from flowrec.messages import CameraLosses
 from flowrec.rig_settings import CAMERAS, CameraSettings, Lab
@@ -30,6 +31,7 @@ class Probe:
     arrival_ms : longest interval between two arrivals.
     brightest : grey level of the brightest pixel of the last image; 2**bits - 1 means that it is overexposed.
     notes : settings that differ from what was asked, and what else a person should know, a line each.
+    image : (h, w) the last one; None: not one frame came.
     """
 
     info: CameraInfo
@@ -40,6 +42,7 @@ class Probe:
     arrival_ms: float
     brightest: int
     notes: tuple[str, ...]
+    image: Image | None = None
 
 
 def probe(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> Probe:
@@ -78,6 +81,7 @@ def probe(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> Probe:
         arrival_ms=max((b - a for a, b in itertools.pairwise(arrivals)), default=0) / 1e6,
         brightest=int(last.image.max()),
         notes=notes,
+        image=last.image,
     )
 
 
