@@ -43,6 +43,8 @@ def read_picture(path: Path, channel: str | None = None) -> Picture:
     ------
     FlowrecError : one line: no such file, none that can be read, or colour without a choice.
     """
+    if not path.exists():
+        raise UsageError(f"{path}: no such picture; it is an image file, a movie, or a session")
     if path.suffix == ".mcap":
         image, bits, count = _of_session(path)
     else:
