@@ -31,6 +31,11 @@ needs_quiet = pytest.mark.skipif(
 )
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One worker more than processors: many tests only wait for a process that they watch."""
+    return (os.cpu_count() or 1) + 1
+
+
 @pytest.fixture(scope="session")
 def mission(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """A whole mission on the bifurcation, seen by a small camera."""

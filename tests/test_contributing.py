@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from numba.core.caching import _CacheLocator
 
+import flowrec
 from flowrec.control.controller import CONTROLLERS
 from flowrec.estimation.observer import OBSERVERS
 from flowrec.planning.planner import PLANNERS
@@ -19,6 +20,7 @@ from flowrec.refine.refiner import REFINERS
 from flowrec.system.numba_setup import _cache_folder, kernel_files
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = Path(flowrec.__file__).parent  # where its kernels are compiled for
 GUIDE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
 RECIPES = dict(re.findall(r"^### (Add .+?)\n(.*?)(?=^##)", GUIDE, re.M | re.S))
 
@@ -30,8 +32,8 @@ def blocks(text: str, kind: str) -> list[str]:
 
 def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path: Path) -> None:
     copy = tmp_path / "copy"
-    for folder in ("flowrec", "sessions"):
-        shutil.copytree(ROOT / folder, copy / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in (PACKAGE, ROOT / "sessions"):
+        shutil.copytree(folder, copy / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
     caches = tmp_path / "caches"
     share_kernels(copy, caches)
     outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(tmp_path), "PYTHONPATH": str(copy)}
@@ -51,7 +53,7 @@ def share_kernels(copy: Path, caches: Path) -> None:
     for folder in {path.parent for path in kernel_files()}:
         names = [
             _CacheLocator.get_suitable_cache_subpath(str(each / "kernels.py"))
-            for each in (folder, copy / folder.relative_to(ROOT))
+            for each in (folder, copy / folder.relative_to(PACKAGE.parent))
         ]
         if (used / names[0]).is_dir():
             shutil.copytree(used / names[0], caches / "flowrec" / used.name / names[1])

@@ -139,6 +139,7 @@ def test_inductive_coils_driven_with_these_voltages_make_this_field():
 
 @settings(max_examples=60)
 @given(situations(least=0.02))
+@example((FieldState(0.0, 0.0, 3.44), FieldCommand(limit_hz=25.8, ramp_mt_s=20.0)))  # 3440 samples less a rounding
 def test_after_a_stop_or_when_no_one_orders_the_next_block_the_field_turns_down_to_nothing(situation):
     state, order = situation
     end = tail(COILS, state, order)

@@ -45,8 +45,8 @@ def tail(coils: Coils, state: FieldState, order: FieldCommand) -> Block:
     block is there in time, so that a process that has died leaves no field.
     """
     still = replace(order, amplitude_mt=0.0, ramp_mt_s=coils.ramp_mt_s)
-    # One more than the ramp has, for when rounding would leave a little of it.
-    count = math.floor(state.amplitude_mt / coils.ramp_mt_s * coils.amplifier.output_hz) + 1
+    # One more than the ramp has, for when rounding would leave a little of it; rounding does not take it away.
+    count = math.floor(state.amplitude_mt / coils.ramp_mt_s * coils.amplifier.output_hz * (1.0 + 1e-12)) + 1
     down = block(coils, state, still, count)
     nothing = np.zeros((1, 3))
     return Block(

@@ -70,13 +70,20 @@ class NiTwin(rpc.NiDAQmxServicer):
         self._reset_zeroes = reset_zeroes
         self._names = 0
         self._log(np.array([time.monotonic_ns()]), self.outputs[None])
-        threading.Thread(target=self._play, daemon=True).start()
+        self._ended = threading.Event()
+        self._player = threading.Thread(target=self._play, daemon=True)
+        self._player.start()
+
+    def close(self) -> None:
+        """End the device, after its server."""
+        self._ended.set()
+        self._player.join()
+        self._file.close()
 
     # ---- the device
 
     def _play(self) -> None:
-        while True:
-            time.sleep(_STEP_S)
+        while not self._ended.wait(_STEP_S):
             with self.lock:
                 self._advance()
 

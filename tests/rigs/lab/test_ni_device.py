@@ -26,6 +26,7 @@ def server(tmp_path: Path) -> Iterator[tuple[str, NiTwin]]:
     running, port, twin = serve(tmp_path / "samples")
     yield f"127.0.0.1:{port}", twin
     running.stop(None).wait()
+    twin.close()
 
 
 @pytest.mark.parametrize(
