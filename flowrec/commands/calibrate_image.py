@@ -13,10 +13,12 @@ import cv2
 
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
-from flowrec.chip.picture_registration import overlay, register
+from flowrec.chip.picture_registration import moved_px, overlay, register
+from flowrec.chip.registration import Calibration
 from flowrec.chip.wall_fit import WallFit
 from flowrec.commands.pictures import Picture, read_picture
 from flowrec.config import Config
+from flowrec.declarations import Image
 from flowrec.errors import ChipError, UsageError
 from flowrec.rig_settings import CameraSettings
 from flowrec.system.outputs import PICTURE, TOML, Output
@@ -27,6 +29,7 @@ _ABOUT = 1.12  # camera.um_per_px, where it is given, is right up to this factor
 _UNKNOWN = 2.0  # the same of the scale at which the chip fills the image
 _STALE_DAYS = 30.0
 _POOR_PX = 1.0  # residual
+_MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -196,6 +199,17 @@ def registration_state(camera: CameraSettings, now: datetime | None = None) -> t
     um_per_px = camera.um_per_px
     if camera.residual_um is not None and um_per_px is not None and camera.residual_um > _POOR_PX * um_per_px:
         return False, f"{text}, more than a pixel; does the mask fit the chip? {advice} again"
+    return True, text
+
+
+def walls_state(image: Image, chip: Chip, assumed: Calibration) -> tuple[bool, str] | None:
+    """Whether the walls in an image are where a registration puts them, and one line on it; None: it does not tell."""
+    moved = moved_px(image, chip, assumed)
+    if moved is None:
+        return None
+    text = f"the walls in the image are {moved:.2g} px from where the registration puts them"
+    if moved > _MOVED_PX:
+        return False, f"{text}; flowrec calibrate image PICTURE -o registration.toml measures it"
     return True, text
 
 

@@ -17,8 +17,7 @@ import numpy as np
 
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
-from flowrec.chip.picture_registration import moved_px
-from flowrec.commands.calibrate_image import registration_state
+from flowrec.commands.calibrate_image import registration_state, walls_state
 from flowrec.commands.record import refuse_adrift
 from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.control import Coils
@@ -37,7 +36,6 @@ _RATE_TOLERANCE = 0.05
 _CLOCK_TOLERANCE = 0.01
 _LOSS_WARNING, _LOSS_FAILURE = 0.001, 0.05  # fraction of the blocks
 _DARK = 0.1  # of the full scale
-_MOVED_PX = 1.0  # of the walls; a hundred times the error of a fit to good pictures, ten times that to poor ones
 _TRIAL_BYTES = 128 << 20
 _HEADROOM = 2.0  # of the disk's speed over the rate of a run
 _LEAST_MINUTES = 10.0
@@ -192,14 +190,10 @@ def _camera(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
 
 def _walls(config: ResolvedConfig, chip: Chip, image: Image) -> Iterator[Finding]:
     """Whether the chip still lies in the image as it is registered; nothing if the image does not show enough of it."""
-    moved = moved_px(image, chip, registration_of(config.camera, chip))
-    if moved is None:
-        return
-    text = f"the walls in the image are {moved:.2g} px from where the registration puts them"
-    if moved > _MOVED_PX:
-        yield Finding("walls", WARNING, f"{text}; flowrec calibrate image PICTURE -o registration.toml measures it")
-    else:
-        yield Finding("walls", OK, text)
+    found = walls_state(image, chip, registration_of(config.camera, chip))
+    if found is not None:
+        good, text = found
+        yield Finding("walls", OK if good else WARNING, text)
 
 
 def _losses(losses: CameraLosses | None) -> Iterator[Finding]:

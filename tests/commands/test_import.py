@@ -6,7 +6,7 @@ import csv
 import hashlib
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -279,6 +279,17 @@ def test_a_session_never_replaces_what_it_is_made_of(lab: Laboratory, tmp_path: 
     with pytest.raises(FlowrecError, match="is read by this command and stays as it is"):
         flowrec.import_movie(movie, movie, lab.config, overwrite=True)
     assert movie.exists()
+
+
+def test_walls_that_are_not_where_the_registration_says_are_told_before_the_import_and_in_the_file(
+    lab: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    makers.folder(tmp_path / "few", lab.images[:40:4])
+    for angle_deg, told in ((0.0, False), (2.0, True)):
+        config = replace(lab.config, camera=replace(lab.config.camera, angle_deg=angle_deg))
+        flowrec.import_movie(tmp_path / "few", tmp_path / f"{angle_deg}.mcap", config, fps=10.0)
+        assert ("from where the registration puts them" in capsys.readouterr().err) == told
+        assert ("source_walls" in flowrec.info(tmp_path / f"{angle_deg}.mcap")) == told
 
 
 def test_one_image_makes_a_session(lab: Laboratory, tmp_path: Path) -> None:
