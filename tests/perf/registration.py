@@ -3,6 +3,8 @@
 Every look of tests/chip/looks.py and the simulated microscope, as it is and inverted, meets every transformation; chips
 and textures change from case to case. Then pictures that do not show the chip: how many are refused. With `--rivals`
 the search is compared with the log-polar FFT and the fit with OpenCV's ECC, from the same pictures and first poses.
+Of 20 pictures the best pose of our search is within 50 um (5 px) in 18 and takes 1.2 s, log-polar in 8 and 0.05 s. ECC
+is then within 5 um in 7 and our fit, of the poses that are accepted, in all.
 
 FLOWREC_REFERENCE_DATA adds real vessels to the chips, and real images as textures (also `--textures DIR`).
 """
