@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.chip import load_chip
 from flowrec.commands.align import aligned
-from flowrec.commands.calibrate_image import walls_state
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
-from flowrec.config import Config, registration_of
-from flowrec.errors import MovieError
-from flowrec.movies import ReadOptions, open_movie
-from flowrec.resolve import resolve
+from flowrec.config import Config
 from flowrec.rig_settings import MOVIE
-from flowrec.rigs.movie.rig import fitted_to_movie
-from flowrec.terminal import warn
 
 
 def asked_import(
@@ -76,30 +69,10 @@ def import_movie(
     FlowrecError : in one line: what can not be read, what does not fit together, what is not told.
     """
     asked = asked_import(movie, config, coils=coils, times=times, fps=fps, partial=partial)
-    facts = dict(_walls(asked))
+    facts: Mapping[str, str] = {}
     if align:
-        asked, found = aligned(asked)
-        facts |= found
+        asked, facts = aligned(asked)
     path = None if out is None else Path(out)
     return record(
         asked, path, overwrite=overwrite, control=control, inputs=inputs, keep_failed=False, given_facts=facts
     )
-
-
-def _walls(asked: Config) -> dict[str, str]:
-    """A warning, also for the head of the session, if the walls in the movie are not where its registration says.
-
-    Nothing where the movie does not show enough of the walls, or can not be read everywhere: the import tells that.
-    """
-    fitted, *_ = fitted_to_movie(asked)
-    chip, movie = load_chip(fitted.chip), asked.movie
-    try:
-        with open_movie(movie.path, movie.reader, ReadOptions(movie.channel, movie.bits, movie.partial)) as opened:
-            image = opened.median_image()
-    except MovieError:
-        return {}
-    found = walls_state(image, chip, registration_of(resolve(fitted, chip).camera, chip))
-    if found is None or found[0]:
-        return {}
-    warn(found[1])
-    return {"source_walls": found[1]}

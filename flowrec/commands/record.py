@@ -19,9 +19,9 @@ from flowrec.clocks import ClockMonitor
 from flowrec.commands.auto_recovery import recover_leftovers
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded, RunStatistics, figures_of, files_text
-from flowrec.config import Config, ResolvedConfig
+from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.enums import Outcome, Phase
-from flowrec.errors import SessionError, UnreachableError, UsageError
+from flowrec.errors import MovieError, SessionError, UnreachableError, UsageError
 from flowrec.estimation.sampler import SAMPLERS
 from flowrec.messages import FlowField, Tick
 from flowrec.pipeline import Pipeline, assemble
@@ -29,6 +29,7 @@ from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
 from flowrec.rig_settings import LAB, MOVIE, RIGS
 from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
+from flowrec.rigs.movie.source import opened
 from flowrec.rigs.rig import Connecting, Rig
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.loop import Sink, run
@@ -96,6 +97,9 @@ def prepare(asked: Config, aloud: bool = True) -> Prepared:
             caution(remark)
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
+    if asked.rig == MOVIE and aloud and (moved := _walls_moved(config, chip)):
+        caution(moved)
+        facts["source_walls"] = moved
     made = derived(given, config)
     if made:
         what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
@@ -122,6 +126,19 @@ def prepare(asked: Config, aloud: bool = True) -> Prepared:
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
     return Prepared(config, chip, assemble(config, chip), made, facts)
+
+
+def _walls_moved(config: ResolvedConfig, chip: Chip) -> str:
+    """What to say if the walls in a movie are not where its registration puts them; '' if it can not be told."""
+    from flowrec.commands.calibrate_image import walls_state
+
+    try:
+        with opened(config.movie) as movie:
+            image = movie.median_image()
+    except MovieError:  # an image can not be read: the run tells that
+        return ""
+    good, text = walls_state(image, chip, registration_of(config.camera, chip)) or (True, "")
+    return "" if good else text
 
 
 def _unsaid(_text: str) -> None:

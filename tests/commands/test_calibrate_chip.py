@@ -72,6 +72,15 @@ def test_what_a_picture_does_not_tell_is_asked_for_and_a_corrected_mask_loads(im
     assert np.array_equal(load_chip(ChipSettings(path=str(out))).mask, island >= 128)
 
 
+def test_the_mask_of_a_large_picture_has_larger_pixels_and_says_so(image, tmp_path):
+    large, out = tmp_path / "large.png", tmp_path / "mine.toml"
+    cv2.imwrite(str(large), cv2.resize(cv2.imread(str(image)), None, fx=3.0, fy=3.0, interpolation=cv2.INTER_CUBIC))
+    calibrate_chip(large, out, um_per_px=UM_PER_PX / 3.0, inlets=["left:0"], inlet_speed_um_s=220.0)
+    chip = load_chip(ChipSettings(path=str(out)))
+    assert chip.mask.shape[1] < 3 * SIZE_PX[0]
+    assert chip.size_um == pytest.approx(UM_PER_PX * np.array(SIZE_PX), rel=1e-3)
+
+
 def test_a_known_width_moves_the_walls(image):
     plain = calibrate_chip(image, None, UM_PER_PX, walls="dark")
     narrower = calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-UM_PER_PX)

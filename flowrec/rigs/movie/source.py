@@ -15,6 +15,7 @@ from flowrec.control.coil_log import read_coil_log
 from flowrec.control.field_log import FieldLog
 from flowrec.errors import MovieError, UsageError
 from flowrec.messages import Frame
+from flowrec.movies import Movie as OpenMovie
 from flowrec.movies import MovieFacts, ReadOptions, open_movie
 from flowrec.movies.frame_times import frame_times
 from flowrec.rig_settings import Movie
@@ -22,6 +23,12 @@ from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _PAUSE = 1.5  # median intervals; some formats round times to ms, so the mean says more than the median
 _LEAST_OVERLAP = 0.98  # of the movie; with less a remark says so
+
+
+def opened(settings: Movie) -> OpenMovie:
+    """The movie of settings, open."""
+    options = ReadOptions(settings.channel, settings.bits, settings.partial)
+    return open_movie(Path(settings.path), settings.reader, options)
 
 
 class MovieSource:
@@ -56,8 +63,7 @@ class MovieSource:
             )
         self.path = Path(settings.path)
         self._settings = settings
-        options = ReadOptions(settings.channel, settings.bits, settings.partial)
-        self._movie = open_movie(self.path, settings.reader, options)
+        self._movie = opened(settings)
         try:
             self.facts: MovieFacts = self._movie.facts
             self._times = frame_times(self.path, self.facts, settings.times, settings.rate_hz)
