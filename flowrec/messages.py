@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.declarations import (
     Image,
@@ -146,6 +147,14 @@ class FlowField(Message):
     # Signed distance from the pixel centres to the wall in pixels, negative in solid; exact near the wall only, and
     # the wall lies where it is 0 between two centres. None: not stated.
     wall_px: Annotated[Raster, Shape("h", "w")] | None = None
+    # Expected relative RMSE of the velocity over the fluid pixels: from the posterior, or from the prior where no
+    # observation was used. None: not known.
+    error_share: float | None = None
+    # What the refinement found besides the boundary values and the fluid: "; " between the names, one value and one
+    # standard deviation per name. The names are listed in refine/causes.py.
+    parameter_names: str = ""
+    parameters: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
+    parameter_std: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,6 +228,8 @@ class Estimate(Message):
     # (2,) sliding mean of the innovations, in standard deviations; (0,): not known
     surprise: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
     um_per_rev: float | None = None  # of the robot; None: the nominal one is used
+    # (2,) the robot's own motion through the fluid, averaged over time as `flow_um_s` is; (0,): not known
+    rolled_um_s: Annotated[Vector, Shape("o")] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,12 +261,44 @@ class Health(Message):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations(Message):
-    """Local flow measured along the robot's way: the data of a refinement."""
+    """Local flow measured along the robot's way: the data of a refinement.
+
+    The measured flow is the robot's velocity over ground less its own motion as assumed, `rolled_um_s`. So a wrong um
+    per revolution, slip and hindered motion near walls appear as a part of the flow along `rolled_um_s`.
+    """
 
     stamp_ns: int
     position_um: Annotated[Matrix, Shape("n", 2)]
     flow_um_s: Annotated[Matrix, Shape("n", 2)]
     std_um_s: Annotated[Vector, Shape("n")]  # one standard deviation per component
+    # um_per_rev times revolutions per second along the heading, a mean over the time that the flow is a mean of; None:
+    # not stated
+    rolled_um_s: Annotated[Matrix, Shape("n", 2)] | None = None
+    time_s: Annotated[Vector, Shape("n")] | None = None  # middle of that time on the session clock; None: not stated
+
+    def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """Some of the observations, chosen by an index of arrays."""
+        return Observations(
+            self.stamp_ns,
+            self.position_um[which],
+            self.flow_um_s[which],
+            self.std_um_s[which],
+            None if self.rolled_um_s is None else self.rolled_um_s[which],
+            None if self.time_s is None else self.time_s[which],
+        )
+
+    def followed_by(self, more: Observations) -> Observations:
+        """These observations, then more; the stamp is that of the later ones. What one does not state, both do not."""
+        rolled = (self.rolled_um_s, more.rolled_um_s)
+        time = (self.time_s, more.time_s)
+        return Observations(
+            more.stamp_ns,
+            np.concatenate((self.position_um, more.position_um)),
+            np.concatenate((self.flow_um_s, more.flow_um_s)),
+            np.concatenate((self.std_um_s, more.std_um_s)),
+            None if rolled[0] is None or rolled[1] is None else np.concatenate((rolled[0], rolled[1])),
+            None if time[0] is None or time[1] is None else np.concatenate((time[0], time[1])),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

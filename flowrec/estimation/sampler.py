@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -58,12 +58,11 @@ class Trimmed:
             & np.isfinite(observations.flow_um_s).all(axis=1)
             & np.isfinite(observations.std_um_s)
         )
-        position, flow, std = (
-            array[finite] for array in (observations.position_um, observations.flow_um_s, observations.std_um_s)
-        )
+        kept = observations.only(finite)
+        position, flow, std = kept.position_um, kept.flow_um_s, kept.std_um_s
         count = len(std)
         if count <= self.degree + _EXTRA_POINTS:
-            return Observations(observations.stamp_ns, position, flow, std)
+            return kept
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(position, axis=0).T))])
         retained = np.stack([_central(flow[:, axis], self.discarded_share) for axis in (0, 1)], axis=1)
         smooth, scatter = flow.copy(), np.tile(std[:, None], 2)
@@ -78,7 +77,7 @@ class Trimmed:
                         distance[near][use] - distance[index], values[use], std[near][use], self.degree
                     )
                     scatter[index, axis] = max(std[index], rms)
-        return Observations(observations.stamp_ns, position, smooth, np.sqrt((scatter**2).mean(axis=1)))
+        return replace(kept, flow_um_s=smooth, std_um_s=np.sqrt((scatter**2).mean(axis=1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,15 +144,15 @@ class Sampler:
         own_um_s = math.hypot(*(velocity - estimate.flow_um_s))
         total = variance * (1.0 + 2.0 * filter_memory_s / elapsed_s) + (self.rolling_share * own_um_s) ** 2
         sigma = max(self.floor_um_s, math.sqrt(total))
-        if previous is None:
-            return Observations(estimate.stamp_ns, position[None], estimate.flow_um_s[None], np.array([sigma]))
-        newest = slice(-self.capacity + 1, None)
-        return Observations(
+        one = Observations(
             estimate.stamp_ns,
-            np.concatenate((previous.position_um[newest], position[None])),
-            np.concatenate((previous.flow_um_s[newest], estimate.flow_um_s[None])),
-            np.concatenate((previous.std_um_s[newest], [sigma])),
+            position[None],
+            estimate.flow_um_s[None],
+            np.array([sigma]),
+            estimate.rolled_um_s[None] if estimate.rolled_um_s.size else None,
+            np.array([seconds(estimate.stamp_ns) - filter_memory_s]),
         )
+        return one if previous is None else previous.only(slice(-self.capacity + 1, None)).followed_by(one)
 
 
 def _central(values: Floats, discarded: float) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from flowrec.estimation.kalman import Kalman, memory_s, state_of
 from flowrec.estimation.process_model import Floats
 from flowrec.messages import Applied, Estimate, Observations, Track
 from flowrec.robot import Robot
-from flowrec.units import seconds
+from flowrec.units import NS_PER_S, seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +28,7 @@ class Smoothed:
     flow_um_s: Floats  # (n, 2)
     covariance: Floats  # (n, 4, 4) of [x, y, vx, vy]: um2, um2/s, um2/s2
     memory_s: Floats  # (n,) K_x / K_v of the filter: time over which the errors of the flow are correlated
+    rolled_um_s: Floats  # (n, 2) the robot's own motion, averaged over that time on either side
 
 
 def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, robot: Robot) -> Smoothed:
@@ -54,7 +55,23 @@ def smooth(tracks: Sequence[Track], applied: Sequence[Applied], kalman: Kalman, 
             covariance = 0.5 * (covariance + covariance.T)
         states[index], covariances[index] = state[:4], covariance[:4, :4]
     stamps = tuple(track.stamp_ns for track in tracks)
-    return Smoothed(stamps, states[:, :2], states[:, 2:], covariances, memory)
+    rolled = _rolled_um_s(stamps, applied, memory, robot)
+    return Smoothed(stamps, states[:, :2], states[:, 2:], covariances, memory, rolled)
+
+
+def _rolled_um_s(stamps: Sequence[int], applied: Sequence[Applied], memory: Floats, robot: Robot) -> Floats:
+    """(n, 2) mean of the robot's own motion with the weight exp(-|t| / memory), which is that of the smoother."""
+    dt = np.diff(np.array(stamps, np.float64), prepend=np.nan) / NS_PER_S
+    turns = np.array([one.turns for one in applied]).reshape(-1, 2)
+    now = robot.um_per_rev * turns / np.where(dt > 0.0, dt, np.inf)[:, None]
+    ways = []
+    for order in (slice(None), slice(None, None, -1)):
+        mean, gaps = now[order].copy(), np.abs(np.diff(np.array(stamps, np.float64)[order])) / NS_PER_S
+        for index in range(1, len(mean)):
+            keep = math.exp(-gaps[index - 1] / max(memory[order][index], 1e-9))
+            mean[index] = keep * mean[index - 1] + (1.0 - keep) * mean[index]
+        ways.append(mean[order])
+    return np.asarray(0.5 * (ways[0] + ways[1]))
 
 
 def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settled_share: float = 0.1) -> Observations:
@@ -77,4 +94,12 @@ def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settle
                 continue
         chosen.append(index)
     stamp_ns = smoothed.stamps_ns[-1] if smoothed.stamps_ns else 0
-    return Observations(stamp_ns, smoothed.position_um[chosen], smoothed.flow_um_s[chosen], std[chosen])
+    time_s = np.array([seconds(smoothed.stamps_ns[index]) for index in chosen])
+    return Observations(
+        stamp_ns,
+        smoothed.position_um[chosen],
+        smoothed.flow_um_s[chosen],
+        std[chosen],
+        smoothed.rolled_um_s[chosen],
+        time_s,
+    )
