@@ -12,6 +12,7 @@ from typing import Annotated
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
+from flowrec.flow.uncertainty import FlowUncertainty
 from flowrec.messages import FlowField, Observations
 from flowrec.methods import Method, Methods
 from flowrec.refine.assimilate import Assimilate
@@ -20,6 +21,7 @@ from flowrec.refine.ni import Ni
 from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.pi_unet import PiUnet
 from flowrec.refine.pinn import Pinn
+from flowrec.refine.uncertainty import flow_uncertainty
 from flowrec.refine.unet import Unet
 
 REFINERS = Methods(
@@ -110,6 +112,16 @@ class Refiner:
             why = f"none of the observations is of use ({ignored})" if ignored else "no observations"
             return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
         return method.fit(problem)
+
+    def uncertainty(
+        self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver
+    ) -> FlowUncertainty | None:
+        """What is not known of the flow after some observations, by the assimilation, whatever the method.
+
+        None where nothing says how wrong the assumed flow may be.
+        """
+        operator = observation_operator(observations, chip.mask, chip.um_per_px, assumed.wall_px)
+        return flow_uncertainty(self.assimilate, operator, chip, solver)
 
     def _selected(self) -> Refinement:
         """The method with its settings: the first of the row's options, or its class where it has no settings."""

@@ -1,0 +1,57 @@
+"""What is not known of a flow: the modes of its error, their covariance, and what they do not explain.
+
+It is not a message: it follows from the recorded observations and is computed anew where it is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowUncertainty:
+    """The flow is mean + z columns with z ~ N(0, covariance), on the n fluid pixels of a mask in raster order.
+
+    The first p unknowns are those of the flow. The last r are constants of the robot: each adds to an *observed* flow
+    a multiple of the robot's own velocity through the fluid, and nothing to the flow itself.
+
+    Attributes
+    ----------
+    mean_um_s : (n, 2) the most probable flow.
+    columns_um_s : (p, n, 2) per unit of each unknown of the flow.
+    rolled : (r, n) ratio of what a unit of each constant of the robot adds to an observed flow to its own velocity;
+        1 everywhere for the relative error of um per revolution.
+    covariance : (p + r, p + r) of all unknowns.
+    error_um_s : (n,) standard deviation of a component that no unknown explains.
+    """
+
+    mean_um_s: Floats
+    columns_um_s: Floats
+    rolled: Floats
+    covariance: Floats
+    error_um_s: Floats
+
+    @property
+    def std_um_s(self) -> Floats:
+        """(n, 2) standard deviation of each component of the flow."""
+        count = len(self.columns_um_s)
+        modes = np.tensordot(self.covariance[:count, :count], self.columns_um_s, axes=1)
+        variance = (modes * self.columns_um_s).sum(axis=0)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0) + self.error_um_s[:, None] ** 2))
+
+    def with_covariance(self, covariance: Floats) -> FlowUncertainty:
+        """The same modes with another covariance (p + r, p + r)."""
+        return replace(self, covariance=covariance)
+
+    def effect(self, pixels: NDArray[np.intp], own_um_s: Floats) -> Floats:
+        """(p + r, m, 2) what a unit of each unknown adds to the flow observed in m fluid pixels.
+
+        `own_um_s` (m, 2) is the velocity of the robot through the fluid there.
+        """
+        rolled = self.rolled[:, pixels, None] * own_um_s
+        return np.concatenate([self.columns_um_s[:, pixels], rolled])
