@@ -64,6 +64,8 @@ class Chip:
     density_kg_m3: float
     depth_um: float | None = None  # None: two-dimensional; else depth-averaged friction -12 mu v / depth^2
     walls: Walls = "smooth"
+    # (h, w) friction of each pixel beside that of the depth, as 12 / depth^2: the force is -mu times this times v
+    friction_per_um2: NDArray[np.float64] | None = None
 
     @property
     def size_um(self) -> tuple[float, float]:

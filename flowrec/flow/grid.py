@@ -95,6 +95,18 @@ class Grid:
         count = self._blocks(self.fluid[..., None]).sum(axis=(1, 3))[..., 0]
         return np.asarray(total / np.maximum(count, 1) * self.mask)
 
+    def face_means(self, pixels: Floats) -> Floats:
+        """(faces,) means of the cells on both sides of each face, of values (h, w) of the pixels."""
+        cells = np.pad(np.repeat(np.repeat(pixels, self.k, axis=0), self.k, axis=1), 1, mode="edge")
+        means = np.empty(self.faces)
+        for faces, before, after in (
+            (self.u, cells[1:-1, :-1], cells[1:-1, 1:]),
+            (self.v, cells[:-1, 1:-1], cells[1:, 1:-1]),
+        ):
+            numbered = faces.number >= 0
+            means[faces.number[numbered]] = 0.5 * (before + after)[numbered]
+        return means
+
     def _blocks(self, cells: NDArray[np.generic]) -> Floats:
         """(h k, w k, c) as (h, k, w, k, c)."""
         h, w, channels = cells.shape

@@ -109,7 +109,13 @@ def chip_key(chip: Chip) -> Hashable:
         chip.density_kg_m3,
         chip.depth_um,
         chip.walls,
+        friction_key(chip),
     )
+
+
+def friction_key(chip: Chip) -> bytes:
+    """The friction of the chip's pixels, as part of a cache key."""
+    return b"" if chip.friction_per_um2 is None else chip.friction_per_um2.tobytes()
 
 
 def cell_count(chip: Chip, k: int) -> int:

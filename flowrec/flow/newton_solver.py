@@ -6,7 +6,7 @@ factorisation serves all of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +20,7 @@ from flowrec.flow import streamfunction as streams
 from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.grid import INLET, Grid
 from flowrec.flow.level_set import LevelSet
-from flowrec.flow.linear_solver import Factors, cached, cell_count, factorise
+from flowrec.flow.linear_solver import Factors, cached, cell_count, factorise, friction_key
 from flowrec.flow.momentum import Momentum
 from flowrec.flow.streamfunction import StreamBasis
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
@@ -66,6 +66,11 @@ class Scales:
 def depth_friction(chip: Chip, k: int) -> float:
     """The factor f = 12 h^2 / H^2 of a shallow chip, else 0."""
     return 0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / k / chip.depth_um) ** 2
+
+
+def local_friction(friction_per_um2: Floats, um_per_px: float, grid: Grid) -> Floats:
+    """(faces,) the same of pixels (h, w): the mean of the two cells beside each face."""
+    return grid.face_means(friction_per_um2) * (um_per_px / grid.k) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +203,19 @@ def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel, from the cache if they are there."""
     openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
     mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    key = ("system", *mask, openings, chip.walls, k, depth_friction(chip, k))
-    equations: System = cached(key, cell_count(chip, k), lambda: assembled(chip, k))
+    key = ("system", *mask, openings, chip.walls, k, depth_friction(chip, k), friction_key(chip))
+    equations: System = cached(key, cell_count(chip, k), lambda: _made(chip, k))
     return equations
+
+
+def _made(chip: Chip, k: int) -> System:
+    """The same without the cache. Friction of single pixels changes nothing but the resistance of a chip without it."""
+    if chip.friction_per_um2 is None:
+        return assembled(chip, k)
+    bare = system(replace(chip, friction_per_um2=None), k)
+    friction = local_friction(chip.friction_per_um2, chip.um_per_px, bare.grid)
+    resistance = sp.csr_array(bare.resistance + sp.diags_array(friction * bare.momentum.volume))
+    return replace(bare, resistance=resistance, stokes=factorise(bare.stream.curl.T @ resistance @ bare.stream.curl))
 
 
 def assembled(chip: Chip, k: int, walls: LevelSet | None = None) -> System:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from flowrec.chip.chip import Chip, Opening
+from flowrec.chip.synthetic import bifurcation
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow import newton_solver as systems
@@ -88,6 +89,24 @@ def test_the_modes_are_the_derivatives_of_the_solution(crossing):
     assert relative(np.tensordot(direction, expansion.modes, 1), velocity) < 5e-3
     more, less = (np.exp(sign * 0.02) * expansion.pressure(sign * 0.02 * direction, still) for sign in (1, -1))
     assert relative((more - less) / 0.04, pressure) < 5e-3
+
+
+@pytest.mark.parametrize("k", [1, 2])
+def test_the_same_friction_in_every_pixel_is_that_of_a_depth(k):
+    chip = bifurcation()
+    everywhere = replace(chip, friction_per_um2=np.full(chip.mask.shape, 12.0 / 150.0**2))
+    solver = FlowSolver(k=k)
+    by_depth, by_pixel = solver.solve(replace(chip, depth_um=150.0)), solver.solve(everywhere)
+    assert by_pixel.velocity_um_s == pytest.approx(by_depth.velocity_um_s, abs=1e-3)
+    assert solver.solve(chip).velocity_um_s != pytest.approx(by_depth.velocity_um_s, abs=1.0)  # nothing is left behind
+
+
+def test_friction_in_one_branch_sends_the_flow_through_the_other():
+    chip = bifurcation()
+    friction = np.zeros(chip.mask.shape)
+    friction[140:, 130:190] = 1.0  # in the lower branch: as good as solid
+    below = FlowSolver().solve(replace(chip, friction_per_um2=friction)).velocity_um_s[140:, 160, 0]
+    assert abs(below).max() < 5.0
 
 
 def test_depth_friction_gives_the_profile_of_a_shallow_channel(straight):
