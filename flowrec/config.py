@@ -29,8 +29,9 @@ from flowrec.methods import Methods
 from flowrec.planning import PLANNERS, Planner, SurveyPlanner
 from flowrec.ranges import Fault, Range, faults, hints, range_of
 from flowrec.refine import Refiner
-from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Lab, Movie, Safety, Simulated
+from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Lab, Movie, Safety
 from flowrec.robot import Robot, RobotSettings
+from flowrec.simulated_settings import FIRST_WORLD, WORLDS, Simulated
 from flowrec.system.toml_file import parse_toml, read_toml
 from flowrec.vision import Tracker
 
@@ -170,7 +171,11 @@ def config_from_toml(text: str, where: str) -> ResolvedConfig:
     """
     origin = Origin(where)
     try:
-        config = _config_from(ResolvedConfig, parse_toml(text), origin)
+        tree = parse_toml(text)
+        simulated = tree.setdefault("simulated", {})
+        if isinstance(simulated, dict):
+            simulated.setdefault("world", FIRST_WORLD)  # of sessions from before the setting
+        config = _config_from(ResolvedConfig, tree, origin)
     except (ValueError, RecursionError) as error:  # bad TOML, and absurd numbers and nesting
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error
     for fault in faults(config):
@@ -194,6 +199,9 @@ def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] 
     if any(_key(text) == REGISTRATION for text in sets):
         tree["camera"] = {k: v for k, v in tree["camera"].items() if k not in _IMAGE_SIZE}  # that of the file
         _take_registration(tree, sets)
+    if any(_key(text) == "simulated.world" for text in sets):  # what the other world's preset has stated goes with it
+        preset = WORLDS[config.simulated.world]
+        tree["simulated"] = {key: value for key, value in tree["simulated"].items() if value != preset.get(key)}
     origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
     changed = _config_from(type(config), tree, origin)
     check_config(changed, origin, frozenset(faults(config)))

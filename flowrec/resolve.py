@@ -22,8 +22,9 @@ from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
 from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
-from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera, Simulated
+from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
+from flowrec.simulated_settings import Simulated
 
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _MAY_BE_NONE = ("camera.centre_um", "camera.residual_um")  # None is a value
@@ -67,13 +68,14 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
         )
         _refuse_apart(chip, mission)
     tracker = replace(config.tracker, polarity=config.tracker.polarity or "auto")
-    sections = {"tracker": tracker, "plan": plan, "survey": survey}
+    simulated = config.simulated.with_preset() if config.rig == SIMULATED else config.simulated
+    sections = {"tracker": tracker, "plan": plan, "survey": survey, "simulated": simulated}
     return _narrowed(ResolvedConfig, config, robot=robot, camera=camera, mission=mission, **sections)
 
 
 def derived(asked: Config, resolved: ResolvedConfig) -> dict[str, float]:
-    """The numbers that resolving a configuration has filled in or changed, by key."""
-    was, now = _flat(asdict(asked), ""), _flat(asdict(resolved), "")
+    """The numbers that resolving a configuration has filled in or changed, by key; without those of a named world."""
+    was, now = _flat(asdict(asked), ""), _flat(asdict(replace(resolved, simulated=asked.simulated)), "")
     return {key: value for key, value in now.items() if isinstance(value, (int, float)) and value != was[key]}
 
 

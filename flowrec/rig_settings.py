@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from flowrec.methods import Method, Methods
 from flowrec.movies import MOVIE_READERS
-from flowrec.ranges import OneOf, Range, Seed, Share
+from flowrec.ranges import OneOf, Range, Share
 
 SIMULATED, MOVIE, LAB = "simulated", "movie", "lab"
 # `of(pipeline, config, duration_s, realtime)` of a row's class makes the rig, a rigs.rig.Rig.
@@ -82,40 +81,6 @@ class Camera(CameraSettings):
 
     rate_hz: _Rate
     um_per_px: _Scale
-
-
-@dataclass(frozen=True, slots=True)
-class Simulated:
-    """Differences between the simulated and the assumed world, and the robot's noise; drawn from the seed."""
-
-    seed: Seed = 0
-    # each true inlet speed is the assumed one times 1 +- (a third of this to all)
-    inlet_speed_error: Annotated[float, Range(0.0, 0.99)] = 0.25
-    # each true outlet pressure differs by up to this fraction of the chip's pressure drop
-    outlet_pressure_error: Annotated[float, Range(0.0, 10.0)] = 0.1
-    # the true viscosity is the assumed one times 1 +- this, uniformly
-    viscosity_error: Annotated[float, Range(0.0, 0.99)] = 0.1
-    # random walk of the robot after one second, per axis, one sigma
-    position_noise_um: Annotated[float, Range(0.0, 1e3)] = 1.0
-    # deviation of the rolling direction from the heading: one sigma, correlated over a second
-    heading_noise_rad: Annotated[float, Range(0.0, math.pi)] = 0.03
-    speed_noise: Share = 0.02  # relative deviation of the rolling speed, likewise
-    # from command to motion; None: that of the robot as it is assumed
-    delay_s: Annotated[float, Range(0.0, 10.0)] | None = None
-    # the robot's true step-out frequency divided by the assumed one
-    step_out_share: Annotated[float, Range(0.01, 10.0)] = 1.0
-    # the true flow is the steady one times 1 + this sin(2 pi pulsation_hz t)
-    pulsation_share: Annotated[float, Range(0.0, 0.99)] = 0.0
-    pulsation_hz: Annotated[float, Range(0.0, 1e3)] = 1.0
-    k: Annotated[int, OneOf(1, 2, 4)] = 1  # cells of the true flow per pixel side
-    # relative rate error of the camera's clock; None: drawn, up to 50 either way
-    clock_skew_ppm: Annotated[float, Range(-1e5, 1e5)] | None = None
-    arrival_jitter_s: Annotated[float, Range(0.0, 1.0)] = 3e-4  # mean delay of a frame on its way to the host
-    # The camera's true registration; None: as [camera] states it.
-    um_per_px: _Scale | None = None
-    angle_deg: Angle | None = None
-    mirror: bool | None = None
-    centre_um: PointUm | None = None
 
 
 @dataclass(frozen=True, slots=True)

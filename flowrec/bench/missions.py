@@ -33,7 +33,8 @@ from flowrec.messages import FlowField, Route, Tick
 from flowrec.pipeline import assemble
 from flowrec.planning import Planner
 from flowrec.resolve import resolve
-from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.rigs.simulated.world import true_chip
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
@@ -271,7 +272,7 @@ def fly(
 
 def true_field(chip: Chip, config: ResolvedConfig, world: World) -> FlowField:
     """The true flow: inlets off by exactly the flow error of the world, outlets and viscosity as drawn by the rig."""
-    solver = FlowSolver(k=config.simulated.k)
+    solver = FlowSolver(k=config.simulated.value("k"))
     drawn = true_chip(chip, config.simulated, solver)
     rng = np.random.default_rng([config.simulated.seed, 0xF10])
     signs = np.where(rng.random(len(chip.openings)) < 0.5, -1.0, 1.0)

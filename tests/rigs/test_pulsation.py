@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flowrec.messages import FlowField
-from flowrec.rig_settings import Simulated
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.robot import Robot
+from flowrec.simulated_settings import Simulated
 
 
 def drifter(share: float) -> Swimmer:

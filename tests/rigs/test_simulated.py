@@ -12,9 +12,11 @@ from flowrec.control import Coils
 from flowrec.errors import ChipError, RigError, UsageError
 from flowrec.flow import FlowSolver
 from flowrec.messages import Currents, FlowField
-from flowrec.rig_settings import Camera, Simulated
-from flowrec.rigs.simulated.rig import SimulatedRig, true_chip
+from flowrec.rig_settings import Camera
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.rigs.simulated.world import true_chip
 from flowrec.robot import Robot
+from flowrec.simulated_settings import Simulated
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
 EXACT = Simulated(position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)

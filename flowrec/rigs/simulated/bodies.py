@@ -1,15 +1,15 @@
 """What moves in the simulated flow: the robot, and particles that a tracker must not follow.
 
-The robot moves by xdot = u(f) (cos phi, sin phi) + v(x), the paper's kinematics, with the true flow at its centre: a
-finite sphere does not lag behind the fluid. Added is what the controller can not know: a rolling direction and a speed
-that wander (Ornstein-Uhlenbeck process, correlation time one second), and a random walk of the position. Particles
-drift with the flow or lie still.
+The robot moves by xdot = u(f) (cos phi, sin phi) + v(x), the paper's kinematics, with the true flow at its centre;
+where walls hinder it, as hindrance.py describes. Added is what the controller can not know: a rolling direction and a
+speed that wander (Ornstein-Uhlenbeck process, correlation time one second), and a random walk of the position, of which
+Brownian motion is a small part: by Stokes and Einstein D = k T / (6 pi mu a), so a sphere of 50 um radius in water
+walks 0.09 um in a second. Particles drift with the flow or lie still.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,46 @@ from flowrec.flow.sampling import sample, walls_of
 from flowrec.flow.velocity_stencil import velocity_at
 from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField
-from flowrec.rig_settings import Simulated
+from flowrec.rigs.simulated.hindrance import Hindrance, hindered
+from flowrec.rigs.simulated.pump import Pump
+from flowrec.rigs.simulated.world import true_pump
 from flowrec.robot import Robot
+from flowrec.simulated_settings import Simulated
 from flowrec.system.numba_setup import compiled
+from flowrec.units import UM_PER_M
 
 _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 4 um at 1000 um/s
 _CORRELATION_S = 1.0  # of the wander
+_BOLTZMANN_J_K = 1.380649e-23
+_FAXEN = math.sqrt(2.0 / 3.0)  # see hindrance.py
+_NO_WALLS = np.zeros((3, 0, 0), np.float32)
+
+
+@compiled
+def _moves(
+    x: float,
+    y: float,
+    own_x: float,
+    own_y: float,
+    velocity: NDArray[np.float32],
+    wall_px: NDArray[np.float32],
+    strength: float,
+    clearance: NDArray[np.float32],
+    um_per_px: float,
+    radius: float,
+    hindrance: float,
+    walls: NDArray[np.float32],
+) -> tuple[float, float]:
+    """Velocity of the robot at (x, y) um."""
+    if hindrance == 0.0:
+        vx, vy = velocity_at(velocity, wall_px, x / um_per_px, y / um_per_px)
+        return own_x + strength * vx, own_y + strength * vy
+    fx, fy, away = 0.0, 0.0, _FAXEN * radius
+    for dx, dy in ((away, 0.0), (-away, 0.0), (0.0, away), (0.0, -away)):
+        vx, vy = velocity_at(velocity, wall_px, (x + dx) / um_per_px, (y + dy) / um_per_px)
+        fx += 0.25 * strength * vx
+        fy += 0.25 * strength * vy
+    return hindered(x, y, own_x, own_y, fx, fy, hindrance, clearance, walls, um_per_px, radius)
 
 
 @compiled
@@ -41,18 +75,22 @@ def _swim(
     clearance: NDArray[np.float32],
     um_per_px: float,
     radius: float,
+    hindrance: float,
+    walls: NDArray[np.float32],
 ) -> tuple[float, float, int, float]:
     """Advance by len(noise) midpoint steps of dt. Returns x, y (um), steps that touched a wall, last clearance."""
     touched = 0
     free = 0.0
     for n in range(noise.shape[0]):
         # Midpoint rule in the flow, then the random walk.
-        vx, vy = velocity_at(velocity, wall_px, x / um_per_px, y / um_per_px)
-        mx = x + 0.5 * dt * (own_x + strength * vx)
-        my = y + 0.5 * dt * (own_y + strength * vy)
-        vx, vy = velocity_at(velocity, wall_px, mx / um_per_px, my / um_per_px)
-        x += dt * (own_x + strength * vx) + noise[n, 0]
-        y += dt * (own_y + strength * vy) + noise[n, 1]
+        wx, wy = _moves(x, y, own_x, own_y, velocity, wall_px, strength, clearance, um_per_px, radius, hindrance, walls)
+        mx = x + 0.5 * dt * wx
+        my = y + 0.5 * dt * wy
+        wx, wy = _moves(
+            mx, my, own_x, own_y, velocity, wall_px, strength, clearance, um_per_px, radius, hindrance, walls
+        )
+        x += dt * wx + noise[n, 0]
+        y += dt * wy + noise[n, 1]
         free = bilinear(clearance, x / um_per_px, y / um_per_px)
         if free < radius:
             touched += 1
@@ -73,7 +111,15 @@ def _swim(
 
 
 class Swimmer:
-    """Position and wall contacts of the robot. `clearance_um` (h, w): from pixel centres to walls."""
+    """Position and wall contacts of the robot.
+
+    Parameters
+    ----------
+    robot : as it truly is.
+    field, clearance_um : the steady flow; (h, w) from pixel centres to walls.
+    pump : of the flow; None: made of `simulated`.
+    hindrance : None: no drag of the side walls.
+    """
 
     def __init__(
         self,
@@ -83,14 +129,23 @@ class Swimmer:
         field: FlowField,
         clearance_um: NDArray[np.float32],
         um_per_px: float,
+        pump: Pump | None = None,
+        hindrance: Hindrance | None = None,
     ) -> None:
         self.position_um = np.array(position_um, np.float64)
         self.contacts = 0
         self.gone = False
         self._touching = False
         self._time_s = 0.0
-        self._robot = replace(robot, step_out_hz=simulated.step_out_share * robot.step_out_hz)
-        self._simulated = simulated
+        self._robot = robot
+        self._pump = pump if pump is not None else true_pump(simulated)
+        self._hindrance = hindrance if hindrance is not None else Hindrance(0.0, _NO_WALLS)
+        # Of the random walk after a second; the fluid's viscosity is that of the field.
+        diffusion = _BOLTZMANN_J_K * simulated.value("temperature_k") / (6.0 * math.pi * field.viscosity_mpa_s * 1e-3)
+        brownian_um = math.sqrt(2.0 * diffusion / (robot.radius_um * 1e-6)) * UM_PER_M
+        self._walk_um = math.hypot(simulated.value("position_noise_um"), brownian_um)
+        self._heading_noise_rad: float = simulated.value("heading_noise_rad")
+        self._speed_noise: float = simulated.value("speed_noise")
         self._field = field
         self._clearance = clearance_um
         self._um_per_px = um_per_px
@@ -106,9 +161,8 @@ class Swimmer:
         return self._strength(self._time_s) * sample(self._field, self.position_um)
 
     def _strength(self, time_s: float) -> float:
-        """Pulsating flow divided by the steady one."""
-        pulse = self._simulated
-        return 1.0 + pulse.pulsation_share * math.sin(2.0 * math.pi * pulse.pulsation_hz * time_s)
+        """The flow at a time divided by the steady one."""
+        return self._pump.strength(time_s)
 
     @property
     def clearance_um(self) -> float:
@@ -131,10 +185,10 @@ class Swimmer:
         dt = duration_s / steps
         decay = math.exp(-duration_s / _CORRELATION_S)
         self._wander = decay * self._wander + math.sqrt(1 - decay**2) * self._rng.standard_normal(2)
-        noise = self._rng.standard_normal((steps, 2)) * (self._simulated.position_noise_um * math.sqrt(dt))
+        noise = self._rng.standard_normal((steps, 2)) * (self._walk_um * math.sqrt(dt))
         speed = strength * self._robot.rolled_speed_um_s(frequency_hz / strength) if strength > 0 else 0.0
-        speed *= 1.0 + self._simulated.speed_noise * self._wander[1]
-        heading = heading_rad + self._simulated.heading_noise_rad * self._wander[0]
+        speed *= 1.0 + self._speed_noise * self._wander[1]
+        heading = heading_rad + self._heading_noise_rad * self._wander[0]
         touched, free = self._run(speed * math.cos(heading), speed * math.sin(heading), dt, noise)
         # A contact ends when the robot is off the wall by a twentieth of its radius.
         if touched and not self._touching:
@@ -158,6 +212,8 @@ class Swimmer:
             self._clearance,
             self._um_per_px,
             self._robot.radius_um,
+            self._hindrance.share,
+            self._hindrance.walls,
         )
         self.position_um = np.array([x, y])
         return touched, free

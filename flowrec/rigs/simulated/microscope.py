@@ -1,5 +1,9 @@
 """What a bright-field microscope shows of the chip: walls as dark refracting lines, particles as defocused discs.
 
+The optics `disc` draw a particle with the profile that the tracker fits. `oblique` is another one: light from one side,
+so that the rim is bright there and dark on the other side, a softer outline, and a bright spot in the middle where the
+particle acts as a lens.
+
 Noise: shot noise is Gaussian of variance level / photons_per_level, with read noise added. Its normal numbers are
 not drawn again: each row of an image takes a stretch, at a place drawn from the seed, of one pool of a million
 numbers of 1/32 sigma resolution. So single pixels are independent of their neighbours and of the next frame, but the
@@ -20,6 +24,7 @@ from flowrec.chip.registration import Calibration
 from flowrec.declarations import Image
 from flowrec.messages import pixel_type
 from flowrec.rig_settings import CameraSettings
+from flowrec.simulated_settings import Optics
 from flowrec.system.numba_setup import compiled
 
 _POOL = 1 << 20
@@ -37,11 +42,13 @@ def _draw(
     rim: float,
     smear_x: float,
     smear_y: float,
+    lit_x: float,
+    lit_y: float,
 ) -> tuple[int, int, int, int]:
     """Multiply the light of a defocused disc into the scene; returns the touched window x0, y0, x1, y1.
 
     All lengths in pixels. `edge` is the softness of its outline; outside it a bright rim and a faint dark ring.
-    `smear` is the way it goes during the exposure.
+    `smear` is the way it goes during the exposure, `lit` the direction from which oblique light comes (0: from above).
     """
     height, width = scene.shape
     reach = radius + 9.0 * edge + 0.5 * max(abs(smear_x), abs(smear_y))
@@ -60,7 +67,14 @@ def _draw(
                 bright = math.exp(-(((s - 2.0) / 1.1) ** 2))
                 ring = math.exp(-(((s - 4.8) / 1.4) ** 2))
                 core = 0.86 + 0.14 * min(r / radius, 1.0) ** 2
-                light += 1.0 - darkness * core * inside + rim * bright - 0.25 * rim * ring
+                if lit_x == 0.0 and lit_y == 0.0:
+                    light += 1.0 - darkness * core * inside + rim * bright - 0.25 * rim * ring
+                else:
+                    to_x, to_y = x - column - share * smear_x, y - row - share * smear_y
+                    facing = (lit_x * to_x + lit_y * to_y) / max(r, 1e-6)
+                    soft = 1.0 / (1.0 + math.exp(min(1.6 * s, 40.0)))
+                    core = 0.9 - 0.3 * math.exp(-((r / (0.35 * radius)) ** 2)) - 0.1 * facing * min(r / radius, 1.0)
+                    light += 1.0 - darkness * core * soft + rim * bright * (0.6 + 0.5 * facing)
             scene[y, x] *= np.float32(light / copies)
     return x0, y0, x1, y1
 
@@ -92,7 +106,14 @@ def _expose(
 
 
 class Microscope:
-    """Renders frames. `mask` (h, w) is True in fluid."""
+    """Renders frames.
+
+    Parameters
+    ----------
+    mask, um_per_px : (h, w) True in fluid, and the size of its pixels.
+    optics : see above; the direction of oblique light is drawn from the seed.
+    mask_origin_um : where the centre of the mask's first pixel lies, on either axis of the chip frame.
+    """
 
     def __init__(
         self,
@@ -101,13 +122,17 @@ class Microscope:
         calibration: Calibration,
         camera: CameraSettings,
         seed: int,
+        optics: Optics = "disc",
+        mask_origin_um: float = 0.0,
     ) -> None:
         rng = np.random.default_rng([seed, 3])
+        lit_rad = float(np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * math.pi))
+        self._lit = (0.0, 0.0) if optics == "disc" else (math.cos(lit_rad), math.sin(lit_rad))
         self._camera = camera
         self._calibration = calibration
         self._noise = np.random.default_rng([seed, 4])
         self._pool = np.clip(np.rint(self._noise.standard_normal(_POOL) * _NOISE_STEPS), -127, 127).astype(np.int8)
-        self._empty = _empty_scene(mask, um_per_px, calibration, camera, rng)
+        self._empty = _empty_scene(mask, um_per_px, calibration, camera, rng, mask_origin_um)
         self._scene = self._empty.copy()
 
     def add_still(self, point_um: NDArray[np.float64], radius_um: float, darkness: float) -> None:
@@ -123,9 +148,20 @@ class Microscope:
         debris_um: NDArray[np.float64],
         debris_radii_um: NDArray[np.float64],
         debris_darkness: NDArray[np.float64],
+        stage_um: NDArray[np.float64] | None = None,
     ) -> Image:
-        """One frame (h, w): the robot (None: not there) over the debris (n, 2), at the middle of the exposure."""
+        """One frame (h, w): the robot (None: not there) over the debris (n, 2), at the middle of the exposure.
+
+        `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all.
+        """
         still = np.zeros(2)
+        if stage_um is not None:
+            shift = self._calibration.vectors_to_px(stage_um)
+            move = np.column_stack((np.eye(2), shift))
+            size = self._scene.shape[::-1]
+            cv2.warpAffine(self._empty, move, size, dst=self._scene, borderMode=cv2.BORDER_REPLICATE)
+            debris_um = debris_um + stage_um
+            robot_um = None if robot_um is None else robot_um + stage_um
         windows = [
             self._particle(self._scene, point, radius, darkness, still)
             for point, radius, darkness in zip(
@@ -156,9 +192,8 @@ class Microscope:
         column, row = self._calibration.to_px(point_um)
         radius = radius_um / self._calibration.um_per_px
         edge = math.hypot(max(self._camera.blur_px, 0.3), 0.05 * radius)
-        return _draw(
-            scene, column, row, radius, edge, darkness, 0.35 * darkness, float(smear_px[0]), float(smear_px[1])
-        )
+        smear_x, smear_y = (float(way) for way in smear_px)
+        return _draw(scene, column, row, radius, edge, darkness, 0.35 * darkness, smear_x, smear_y, *self._lit)
 
 
 def _empty_scene(
@@ -167,12 +202,14 @@ def _empty_scene(
     calibration: Calibration,
     camera: CameraSettings,
     rng: np.random.Generator,
+    mask_origin_um: float,
 ) -> NDArray[np.float32]:
     """Grey levels (h, w) of the chip without particles."""
     height, width = camera.height_px, camera.width_px
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
-    map_x, map_y = np.moveaxis((calibration.to_um(pixels) / um_per_px).astype(np.float32), -1, 0)
-    outline = _outline_px(mask) * np.float32(um_per_px)
+    places = (calibration.to_um(pixels) - mask_origin_um) / um_per_px
+    map_x, map_y = np.moveaxis(places.astype(np.float32), -1, 0)
+    outline = outline_px(mask) * np.float32(um_per_px)
     distance = cv2.remap(outline, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
     # The milled edge refracts: a dark line with a bright fringe towards the fluid, a fainter pair behind it.
@@ -190,7 +227,7 @@ def _empty_scene(
     # Machined and glued plastic: blotches of several sizes, much fainter in the channel.
     texture = np.zeros((height, width), np.float32)
     for size_um, share in ((12.0, 0.4), (40.0, 0.8), (160.0, 1.0)):
-        texture += share * _blotches(rng, height, width, size_um / calibration.um_per_px)
+        texture += share * blotches(rng, height, width, size_um / calibration.um_per_px)
     light *= 1.0 + texture * (0.004 + 0.014 * solid)
 
     x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None]
@@ -204,7 +241,7 @@ def _empty_scene(
     return np.ascontiguousarray(np.clip(scene, 0.0, 255.0), np.float32)
 
 
-def _outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+def outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Signed distance (h, w) in pixels to a smooth outline behind the pixels of a mask, true within three pixels of it.
 
     The half level of the blurred mask, as in the solver's smooth walls: a blurred straight edge is a Gaussian
@@ -219,7 +256,7 @@ def _outline_px(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.asarray((1.0 - weight) * near + weight * far, np.float32)
 
 
-def _blotches(rng: np.random.Generator, height: int, width: int, size_px: float) -> NDArray[np.float32]:
+def blotches(rng: np.random.Generator, height: int, width: int, size_px: float) -> NDArray[np.float32]:
     """Smooth noise (h, w) of unit variance and a given size of its spots."""
     step = max(size_px / 2.0, 1.0)
     shape = (math.ceil(height / step) + 4, math.ceil(width / step) + 4)

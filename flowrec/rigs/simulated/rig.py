@@ -16,49 +16,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.chip.chip import Chip
-from flowrec.chip.clearance import check_point, clearance_um
+from flowrec.chip.clearance import check_point
 from flowrec.chip.registration import Calibration
 from flowrec.clocks import DeviceClock
 from flowrec.config import ResolvedConfig, registration_of
 from flowrec.control.coils import Coils
 from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.errors import RigError
-from flowrec.flow import FlowSolver
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.ranges import check_ranges
-from flowrec.rig_settings import Camera, Simulated
+from flowrec.rig_settings import Camera
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.world import Shake, World, misregistered, true_pump, true_robot, world_of
 from flowrec.robot import Robot
+from flowrec.simulated_settings import Simulated
 from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _COILS = 3
 _SKEW_PPM = 50.0  # of a crystal, at most
 _STARTED_S = 3600.0  # ago, at most
-
-
-def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver) -> Chip:
-    """The chip with the true boundary values and viscosity, drawn from the seed.
-
-    Each inlet speed times 1 +- (a third of inlet_speed_error to all of it), the viscosity times 1 +-
-    viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across the chip;
-    all uniform. One outlet alone keeps its pressure: only differences drive a flow.
-    """
-    rng = np.random.default_rng([simulated.seed, 5])
-    inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
-    draws = rng.uniform(-1.0, 1.0, len(inlet))
-    viscosity = chip.viscosity_mpa_s * (1.0 + simulated.viscosity_error * float(rng.uniform(-1.0, 1.0)))
-    # At least a third of the error, because an almost correct assumption would leave nothing to refine.
-    wrong = np.sign(draws) * (1.0 + 2.0 * np.abs(draws)) / 3.0
-    values = chip.boundary_values * np.where(inlet, 1.0 + simulated.inlet_speed_error * wrong, 1.0)
-    changed = chip.with_boundary(values, viscosity)
-    if simulated.outlet_pressure_error == 0.0 or np.count_nonzero(~inlet) < 2:
-        return changed
-    pressure = solver.solve(changed).pressure_pa[chip.mask]
-    drop = float(pressure.max() - pressure.min())
-    values = values + np.where(inlet, 0.0, simulated.outlet_pressure_error * drop * draws)
-    return chip.with_boundary(values, viscosity)
 
 
 class _CameraClock:
@@ -88,12 +66,12 @@ class SimulatedRig:
     Parameters
     ----------
     chip, calibration : the assumed chip, and the camera's true view of it.
-    robot : its delay is from `apply` to motion.
+    robot : as it is assumed, with its delay from `apply` to motion; `simulated` says how it truly differs.
     start_um : (2,) centre of the robot on the first frame.
     duration_s : None: without end.
     realtime : pace the frames to the host's clock and stamp them by the camera's clock, fitted to it; no frame is
         skipped.
-    true_field : a flow to use instead of a solved one.
+    true_field : a flow to use instead of a drawn one, between the chip's own walls.
     coils : the relation of field and currents; None: always the full field, with the commanded currents.
 
     Raises RigError, ChipError or UsageError for settings that do not describe a world.
@@ -110,11 +88,13 @@ class SimulatedRig:
     ) -> SimulatedRig:
         """The rig of a resolved configuration."""
         keys = ("um_per_px", "angle_deg", "mirror", "centre_um")
+        camera = config.camera
         true = {key: value for key in keys if (value := getattr(config.simulated, key)) is not None}
+        stated = registration_of(replace(camera, **true), pipeline.chip)
         return cls(
             pipeline.chip,
             config.robot,
-            registration_of(replace(config.camera, **true), pipeline.chip),
+            misregistered(stated, config.simulated, (camera.width_px, camera.height_px)),
             config.camera,
             config.simulated,
             config.mission.start,
@@ -150,8 +130,12 @@ class SimulatedRig:
         self._rate_hz = camera.rate_hz
         self._frames = math.inf if duration_s is None else max(1.0, math.floor(duration_s * self._rate_hz) + 1)
         self._realtime = realtime
-        self._field = true_field
-        self._delay_ns = nanoseconds(robot.delay_s if simulated.delay_s is None else simulated.delay_s)
+        self._given = true_field
+        self._world: World | None = None
+        self._true_robot = true_robot(robot, simulated)
+        self.pump = true_pump(simulated)
+        self._shake = Shake.of(simulated)
+        self._delay_ns = nanoseconds(self._true_robot.delay_s)
         self._now_ns = 0
         self._coils = coils
         # The command in effect and the state of its field; commands on their way, as (stamp of their effect, command).
@@ -183,12 +167,17 @@ class SimulatedRig:
 
     def inputs(self) -> Iterator[Inputs]:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
-        field = self._true_field()
-        walls = clearance_um(self._chip.mask, self._chip.um_per_px)
+        world = self._true_world()
+        field, walls = world.field, world.clearance_um
         radius, seed, px = self._robot.radius_um, self._simulated.seed, self._chip.um_per_px
-        swimmer = Swimmer(self._start_um, self._robot, self._simulated, field, walls, px)
+        swimmer = Swimmer(
+            self._start_um, self._true_robot, self._simulated, field, walls, px, self.pump, world.hindrance
+        )
         debris = Debris(self._chip, self._camera.debris, radius, field, walls, seed)
-        microscope = Microscope(self._chip.mask, px, self._calibration, self._camera, seed)
+        optics = self._simulated.value("optics")
+        microscope = Microscope(
+            world.mask, world.mask_um_per_px, self._calibration, self._camera, seed, optics, world.mask_origin_um
+        )
         moving = slice(0, len(debris.points_um) - debris.still)
         for n in range(moving.stop, len(debris.points_um)):
             microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))
@@ -211,6 +200,7 @@ class SimulatedRig:
                 debris.points_um[moving],
                 debris.radii_um[moving],
                 debris.darkness[moving],
+                None if self._shake is None else self._shake.at(seconds(stamp)),
             )
             arrival_ns = stamp + nanoseconds(camera_clock.delay_s())
             if self._realtime:
@@ -232,16 +222,18 @@ class SimulatedRig:
             index += 1
 
     def _true_field(self) -> FlowField:
-        if self._field is None:
-            solver = FlowSolver(k=self._simulated.k)
-            truth = true_chip(self._chip, self._simulated, solver)
-            self._field = replace(solver.solve(truth), method="truth", note="drawn from the seed of the simulated rig")
-        if self._field.velocity_um_s.shape[:2] != self._chip.mask.shape:
+        return self._true_world().field
+
+    def _true_world(self) -> World:
+        if self._given is not None and self._given.velocity_um_s.shape[:2] != self._chip.mask.shape:
             raise RigError(
-                f"true flow has {self._field.velocity_um_s.shape[:2]} pixels, the chip {self._chip.mask.shape}; "
+                f"true flow has {self._given.velocity_um_s.shape[:2]} pixels, the chip {self._chip.mask.shape}; "
                 "solve it on this chip"
             )
-        return self._field
+        if self._world is None:
+            clear_um = np.array([self._start_um])
+            self._world = world_of(self._chip, self._robot, self._simulated, self._given, clear_um)
+        return self._world
 
     def _advance(self, swimmer: Swimmer, until_ns: int) -> NDArray[np.float64]:
         """Advance the world to a stamp; the field changes exactly when commands take effect. Returns the turns (2,)."""

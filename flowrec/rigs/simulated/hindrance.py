@@ -1,0 +1,158 @@
+"""Drag of the walls on a sphere at small Reynolds numbers: its own motion, and how a flow carries it.
+
+The robot is a sphere of radius a that rolls over the floor of the chip, beside one or two side walls. With l the
+distance of its centre from a wall and g = l / a - 1 the gap in radii, the drag relative to Stokes' 6 pi mu a is
+
+    along the wall     -8/15 ln g + 0.9543 - 64/375 g ln g + 0.4295 g    for g < 1
+                       1 / (1 - 9/16 s + s^3/8 - 45/256 s^4 - s^5/16)    for g >= 1, s = a / l
+    towards the wall   (6 g^2 + 9 g + 2) / (6 g^2 + 2 g)
+
+The first is the lubrication limit of Goldman, Cox and Brenner, Chem. Eng. Sci. 22 (1967) 637, with the next terms of
+Chaoui and Feuillebois, Q. J. Mech. Appl. Math. 56 (2003) 381; it is within 0.3 % of Goldman's exact values. The second
+is Faxen's (1922), within 0.2 % there. The third is Bevan and Prieve's, J. Chem. Phys. 113 (2000) 1228, within 1.5 % of
+Brenner's exact series. The drags of several walls are superposed, as Oseen did: excess adds to excess. In the middle of
+a channel that is within 3 % of Faxen's formula for two walls up to a sphere of half its width.
+
+A roller is driven by the floor, which also holds most of its drag, so a side wall slows it down less than a sphere that
+is pulled through open fluid: by (floor) / (floor + excess of the side walls), in each direction. A force-free sphere of
+50 um radius that rolls 25 um per revolution moves at 8 % of the speed of its surface, which by Goldman's formulas is at
+a gap of 2.7 % of its radius over the floor; so the floor's drag is 2.9. Revolutions do not become fewer: they follow
+the field. Torque and step-out change by at most a fifth (Jeffery 1915: 1.202 at contact) and are left as they are.
+
+The flow carries a sphere of finite size with the mean over its surface, which is Faxen's law 1 + a^2 / 6 Laplacian; in
+a plane that is the mean over four points at sqrt(2/3) a. Beside a wall it lags behind the undisturbed flow, by Goldman,
+Cox and Brenner, Chem. Eng. Sci. 22 (1967) 653, table for a free sphere in a shear flow; for two walls the two factors
+are multiplied. The surface is not smooth: no gap is less than half a percent of the radius.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.interpolation import bilinear
+from flowrec.system.numba_setup import compiled
+
+FLOOR_DRAG = 2.9  # of the roller over its floor, relative to Stokes' drag
+_LEAST_GAP = 0.005  # roughness, in radii
+# Goldman, Cox and Brenner (1967, part II): speed of a free sphere over that of the shear flow at its centre, by ln gap.
+_LAG_AT = np.log(np.array([0.003202, 0.005004, 0.0453, 0.1276, 0.5431, 1.3524, 2.7622, 9.0677]))
+_LAG = np.array([0.45022, 0.47861, 0.65375, 0.76692, 0.92185, 0.97768, 0.99436, 0.9997])
+_FARTHEST_WIDTHS = 4.0  # of the median channel: farther walls do not matter
+
+Rasters = NDArray[np.float32]
+
+
+@compiled
+def drag_along(gap: float) -> float:
+    """Drag along a plane wall over Stokes' drag, at a gap in radii."""
+    gap = max(gap, _LEAST_GAP)
+    if gap < 1.0:
+        log = math.log(gap)
+        return -8.0 / 15.0 * log + 0.954293724783876 - 64.0 / 375.0 * gap * log + 0.4294501325645 * gap
+    s = 1.0 / (1.0 + gap)
+    return 1.0 / (1.0 - 9.0 / 16.0 * s + s**3 / 8.0 - 45.0 / 256.0 * s**4 - s**5 / 16.0)
+
+
+@compiled
+def drag_towards(gap: float) -> float:
+    """Drag of a motion towards a plane wall over Stokes' drag, at a gap in radii."""
+    gap = max(gap, _LEAST_GAP)
+    return (6.0 * gap * gap + 9.0 * gap + 2.0) / (6.0 * gap * gap + 2.0 * gap)
+
+
+@compiled
+def carried(gap: float) -> float:
+    """Speed of a sphere that a shear flow carries along a wall over that of the flow at its centre, at a gap in radii.
+
+    Beyond the table 1 - 5/16 (a / l)^3, of the method of reflections.
+    """
+    gap = max(gap, _LEAST_GAP)
+    if gap > 9.0:
+        return 1.0 - 5.0 / 16.0 / (1.0 + gap) ** 3
+    return float(np.interp(math.log(gap), _LAG_AT, _LAG))
+
+
+@compiled
+def hindered(
+    x: float,
+    y: float,
+    own_x: float,
+    own_y: float,
+    flow_x: float,
+    flow_y: float,
+    share: float,
+    clearance: Rasters,
+    walls: Rasters,
+    um_per_px: float,
+    radius: float,
+) -> tuple[float, float]:
+    """Velocity of the robot at (x, y) um: own motion and flow (mean over its surface), with a share of the hindrance.
+
+    `walls` as in `walls_around`; other arguments as in bodies.py.
+    """
+    i, j = x / um_per_px, y / um_per_px
+    near = bilinear(clearance, i, j)
+    far = max(bilinear(walls[0], i, j) - near, near)
+    near_gap, far_gap = near / radius - 1.0, far / radius - 1.0
+    along = FLOOR_DRAG / (FLOOR_DRAG + drag_along(near_gap) + drag_along(far_gap) - 2.0)
+    across = FLOOR_DRAG / (FLOOR_DRAG + drag_towards(near_gap) + drag_towards(far_gap) - 2.0)
+    lag = 1.0 - share * (1.0 - carried(near_gap) * carried(far_gap))
+    along, across = 1.0 - share * (1.0 - along), 1.0 - share * (1.0 - across)
+    # own + (across - along) n n . own / |n|^2, with n n = (1 + (c, s; s, -c)) / 2.
+    c, s = bilinear(walls[1], i, j), bilinear(walls[2], i, j)
+    size = math.hypot(c, s)
+    if size > 1e-6:
+        c, s = c / size, s / size
+    half = 0.5 * (across - along)
+    return (
+        along * own_x + half * (own_x + c * own_x + s * own_y) + lag * flow_x,
+        along * own_y + half * (own_y + s * own_x - c * own_y) + lag * flow_y,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hindrance:
+    """What the side walls do to the robot: how much of the physics, and where the walls are (`walls_around`)."""
+
+    share: float
+    walls: Rasters
+
+
+def walls_around(clearance_um: NDArray[np.float32], um_per_px: float) -> Rasters:
+    """(3, h, w): from wall to wall through a pixel, um, along its normal; cosine and sine of twice the normal's angle.
+
+    `clearance_um` (h, w) is the distance of pixel centres to the nearest wall. In the middle of a channel, where that
+    has no gradient, the normal is that of the pixels around.
+    """
+    down, right = np.gradient(clearance_um.astype(np.float64))
+    square, mixed = np.asarray(right**2 - down**2), np.asarray(2.0 * right * down)
+    cosine, sine = (cv2.GaussianBlur(part, (0, 0), 1.5, borderType=cv2.BORDER_REPLICATE) for part in (square, mixed))
+    angle = 0.5 * np.arctan2(sine, cosine)
+    fluid = clearance_um > 0.0
+    limit_um = _FARTHEST_WIDTHS * 2.0 * float(np.median(clearance_um[fluid])) if fluid.any() else 0.0
+    width_um = np.zeros(clearance_um.shape)
+    rows, columns = np.nonzero(fluid)
+    step_px = 0.5
+    for sign in (1.0, -1.0):
+        dx, dy = sign * np.cos(angle[fluid]), sign * np.sin(angle[fluid])
+        reached = np.zeros(len(rows))
+        going = np.ones(len(rows), np.bool_)
+        for n in range(1, max(2, math.ceil(limit_um / um_per_px / step_px))):
+            x, y = columns[going] + n * step_px * dx[going], rows[going] + n * step_px * dy[going]
+            nearest_row = np.clip(np.rint(y).astype(np.intp), 0, fluid.shape[0] - 1)
+            nearest_column = np.clip(np.rint(x).astype(np.intp), 0, fluid.shape[1] - 1)
+            inside = fluid[nearest_row, nearest_column]
+            places = np.flatnonzero(going)
+            reached[places[inside]] = n * step_px * um_per_px
+            going[places[~inside]] = False
+            if not going.any():
+                break
+        width_um[fluid] += reached
+    # Steps end within the last fluid pixel: on the average a quarter of a step before the wall, on either side.
+    width_um[fluid] = np.maximum(width_um[fluid] + 0.5 * step_px * um_per_px, 2.0 * clearance_um[fluid])
+    return np.ascontiguousarray(np.stack((width_um, cosine, sine)), np.float32)

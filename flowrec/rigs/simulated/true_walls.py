@@ -1,0 +1,177 @@
+"""True walls that are not the mask's: a mask of half the pixel size, pushed about in patches, with a blocked branch.
+
+The solver makes its smooth outline of this mask as of any other, so the true flow has another grid and another wall.
+Openings stay as they are: near the border the walls are those of the chip's mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import scipy  # its ndimage loads at first use, not at start-up
+from numpy.typing import NDArray
+
+from flowrec.chip.chip import Chip
+from flowrec.chip.clearance import clearance_um, median_width_um
+from flowrec.errors import RigError
+from flowrec.flow.sampling import sample
+from flowrec.messages import FlowField
+from flowrec.rigs.simulated.microscope import blotches, outline_px
+
+REFINED = 2  # cells of the true mask per pixel side
+_PATCH_WIDTHS = 1.0  # correlation length of the error of the walls, in median channel widths
+_BORDER_PX = 6.0  # from here to twice as far from the border the error grows to its full size
+_CORE = 0.6  # of the way from the middle of a channel to its wall that no error reaches, and so between channels
+_SPECK_PX = 30  # a smaller piece of a wall is none
+_FROM_BORDER_WIDTHS = 1.5  # no branch is blocked nearer than this to the border
+_CLEAR_WIDTHS = 2.0  # nor to the start and the goal
+_WIDTHS = (0.6, 1.3)  # times the median, of a place to be blocked: wider ones are junctions
+_FARTHEST_PX = 1.1  # largest level of a pixel centre, as the solver states it
+_BLOCK_LENGTH = 0.6  # half length of the obstacle along the channel, in widths
+
+Mask = NDArray[np.bool_]
+
+
+def true_walls(
+    chip: Chip,
+    wall_error_px: float,
+    blocked_share: float,
+    clear_um: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> tuple[Chip, str]:
+    """The chip with a mask (2 h, 2 w) of its true walls, and what was drawn, in words.
+
+    Parameters
+    ----------
+    wall_error_px : largest shift of a wall, in pixels of the chip; its patches are about as long as a channel is wide.
+    blocked_share : fraction of a channel's width that an obstacle fills, at one place.
+    clear_um : (n, 2) places in um from which the obstacle keeps away.
+
+    Raises RigError if the mask has no place for the obstacle.
+    """
+    outline = cv2.resize(outline_px(chip.mask), None, fx=REFINED, fy=REFINED, interpolation=cv2.INTER_CUBIC)
+    height, width = outline.shape
+    fluid, coarse, words = outline > 0.0, fluid_of(chip.mask), []
+    y, x = np.mgrid[:height, :width]
+    inwards_px = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y)) / REFINED
+    channel = median_width_um(chip) / chip.um_per_px * REFINED
+    if wall_error_px > 0.0:
+        shift = wall_error_px * np.tanh(blotches(rng, height, width, _PATCH_WIDTHS * channel))
+        shift *= np.clip(inwards_px / _BORDER_PX - 1.0, 0.0, 1.0)
+        fluid = _without_specks(((outline + shift > 0.0) | _core(coarse)) & ~_core(~coarse))
+        words.append(f"walls up to {wall_error_px:g} px off")
+    fluid = np.where(inwards_px < 1.0, coarse, fluid)  # openings keep their pixels
+    if blocked_share > 0.0:
+        block, place = _obstacle(fluid, chip, blocked_share, channel, clear_um, rng)
+        fluid &= ~block
+        words.append(f"{100 * blocked_share:.0f} % of a branch blocked at {place[0]:.0f}, {place[1]:.0f} um")
+    pieces, _ = scipy.ndimage.label(fluid)
+    mask = pieces == np.argmax(np.bincount(pieces[fluid]))
+    openings = tuple(replace(o, first=REFINED * o.first, last=REFINED * o.last + REFINED - 1) for o in chip.openings)
+    true = replace(
+        chip, mask=np.ascontiguousarray(mask), um_per_px=chip.um_per_px / REFINED, openings=openings, walls="smooth"
+    )
+    return true, ", ".join(words)
+
+
+def _ridge(inside: Mask) -> tuple[Mask, NDArray[np.float64]]:
+    """The pixels in the middle between walls, and the distance (h, w) of every pixel to the nearest wall, in pixels.
+
+    In the middle the distance has no slope, as in median_width_um.
+    """
+    distance = clearance_um(inside, 1.0).astype(np.float64)
+    return inside & (np.hypot(*np.gradient(distance)) <= 0.55), distance
+
+
+def _core(inside: Mask) -> Mask:
+    """The pixels within _CORE of the way from the middle of a channel to its wall."""
+    ridge, distance = _ridge(inside)
+    if not ridge.any():
+        return np.zeros_like(inside)
+    away, (rows, columns) = scipy.ndimage.distance_transform_edt(~ridge, return_indices=True)
+    return np.asarray(away <= _CORE * distance[rows, columns])
+
+
+def _without_specks(fluid: Mask) -> Mask:
+    """The same without solid pieces of a few pixels, such as a corner of a wall that is cut off."""
+    solid, _ = scipy.ndimage.label(~fluid, np.ones((3, 3)))
+    return np.asarray(fluid | (np.bincount(solid.ravel()) < _SPECK_PX)[solid])
+
+
+def _obstacle(
+    fluid: Mask,
+    chip: Chip,
+    share: float,
+    channel: float,
+    clear_um: NDArray[np.float64],
+    rng: np.random.Generator,
+) -> tuple[Mask, tuple[float, float]]:
+    """The pixels of half an ellipse on one wall of a branch, and the place in um; widths in pixels of `fluid`."""
+    ridge, distance = _ridge(fluid)
+    rows, columns = np.nonzero(ridge)
+    radii = distance[rows, columns]
+    height, width = fluid.shape
+    inwards = np.minimum(np.minimum(columns, width - columns), np.minimum(rows, height - rows))
+    places_um = _centres_um(np.stack((columns, rows), -1), chip)
+    away = np.min(np.hypot(*(places_um[:, None] - clear_um[None]).T), axis=0) if len(clear_um) else np.inf
+    fits = (
+        (2.0 * radii > _WIDTHS[0] * channel)
+        & (2.0 * radii < _WIDTHS[1] * channel)
+        & (inwards > _FROM_BORDER_WIDTHS * channel)
+        & (away > _CLEAR_WIDTHS * channel * chip.um_per_px / REFINED)
+    )
+    if not fits.any():
+        raise RigError(f"chip '{chip.name}' has no branch to block; set simulated.blocked_share = 0")
+    chosen = int(rng.choice(np.flatnonzero(fits)))
+    row, column, radius = rows[chosen], columns[chosen], float(radii[chosen])
+    # The channel runs along the middle pixels around the place.
+    near = np.hypot(rows - row, columns - column) <= 2.0 * radius
+    along = np.linalg.svd(np.stack((columns[near] - column, rows[near] - row), -1).astype(np.float64))[2][0]
+    side = 1.0 if rng.random() < 0.5 else -1.0
+    y, x = np.indices(fluid.shape)
+    down = (x - column) * along[0] + (y - row) * along[1]
+    across = side * ((y - row) * along[0] - (x - column) * along[1])
+    length = _BLOCK_LENGTH * 2.0 * radius
+    bulge = 2.0 * radius * share * np.sqrt(np.clip(1.0 - (down / length) ** 2, 0.0, 1.0))
+    block = (np.abs(down) < length) & (across > radius - bulge) & (across < 2.0 * radius)
+    place = places_um[chosen]
+    return block, (float(place[0]), float(place[1]))
+
+
+def _centres_um(points: NDArray[np.intp], chip: Chip) -> NDArray[np.float64]:
+    """Chip points (..., 2) um of pixels (column, row) of the refined mask."""
+    return (np.asarray(points, np.float64) - 0.5 * (REFINED - 1)) * chip.um_per_px / REFINED
+
+
+def fluid_of(mask: Mask) -> Mask:
+    """A mask with each pixel cut into REFINED x REFINED."""
+    return np.repeat(np.repeat(mask, REFINED, axis=0), REFINED, axis=1)
+
+
+def origin_um(chip: Chip) -> float:
+    """Where the centre of the refined mask's first pixel lies, on either axis of the chip frame."""
+    return -0.5 * (REFINED - 1) * chip.um_per_px / REFINED
+
+
+def on_pixels(field: FlowField, true: Chip, chip: Chip) -> FlowField:
+    """A field of the refined mask as values at the centres of the chip's pixels, with its walls there."""
+    rows, columns = np.indices(chip.mask.shape)
+    centres_um = np.stack((columns, rows), -1) * chip.um_per_px - origin_um(chip)
+    wall_px = at_centres(outline_px(true.mask) / REFINED)
+    velocity = np.where((wall_px > 0.0)[..., None], sample(field, centres_um), 0.0)
+    return replace(
+        field,
+        um_per_px=chip.um_per_px,
+        velocity_um_s=np.ascontiguousarray(velocity, np.float32),
+        pressure_pa=np.where(wall_px > 0.0, at_centres(field.pressure_pa), 0.0).astype(np.float32),
+        wall_px=np.clip(wall_px, -_FARTHEST_PX, _FARTHEST_PX).astype(np.float32),
+    )
+
+
+def at_centres(raster: NDArray[Any]) -> NDArray[np.float32]:
+    """A raster (2 h, 2 w) of the refined mask at the centres of the chip's pixels (h, w): the mean of the four."""
+    height, width = raster.shape
+    return np.asarray(raster.reshape(height // REFINED, REFINED, width // REFINED, REFINED).mean((1, 3)), np.float32)

@@ -1,0 +1,239 @@
+"""Worlds of the simulated rig: what a seed draws, what a preset states, and that the first world stays as it was."""
+
+import math
+from dataclasses import fields, replace
+
+import cv2
+import numpy as np
+import pytest
+import scipy
+
+from flowrec.chip import ChipSettings, clearance_um, load_chip
+from flowrec.chip.clearance import median_width_um
+from flowrec.chip.registration import Calibration
+from flowrec.config import config_from_toml, load_config, to_toml, with_sets
+from flowrec.flow import FlowSolver
+from flowrec.flow.sampling import relative_rmse, sample
+from flowrec.messages import Currents
+from flowrec.pipeline import assemble
+from flowrec.ranges import faults
+from flowrec.resolve import derived, resolve
+from flowrec.rigs.simulated.pump import Pump
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.rigs.simulated.true_walls import at_centres, fluid_of, true_walls
+from flowrec.rigs.simulated.world import Shake, misregistered, true_chip, true_depth_um, true_pump, true_robot
+from flowrec.robot import Robot
+from flowrec.simulated_settings import WORLDS, Simulated
+from tests.conftest import SMALL
+
+CHIP = load_chip(ChipSettings("bifurcation"))
+ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=28.8)
+QUIET = {"position_noise_um": 0.0, "heading_noise_rad": 0.0, "speed_noise": 0.0}
+
+
+def rig_of(*sets):
+    asked = load_config(None, [*SMALL, *sets])
+    chip = load_chip(asked.chip)
+    config = resolve(asked, chip)
+    return SimulatedRig.of(assemble(config, chip), config, 2.0)
+
+
+# Position, flow, clearance and mean grey level of every twelfth frame, as before there were other worlds.
+KIND = {
+    ("chip.name=vessels", "chip.seed=3", "simulated.seed=5", "simulated.pulsation_share=0.2",
+     "simulated.step_out_share=0.8"): [
+        [300.0, 2900.0, 460.004241943, 0.832188129, 130.0, 143.534594727],
+        [589.998327284, 2895.874018127, 477.002117771, -129.966755509, 108.694616164, 143.51685791],
+        [791.886612222, 2936.538903502, 180.592403336, -79.0053986, 0.03519874, 143.528833008],
+        [835.402626824, 2924.738546877, 239.327134345, -112.771988963, -0.000751039, 143.524450684],
+        [814.341746631, 2930.816826533, 186.428307035, -84.881992224, -0.000388961, 143.511035156],
+        [782.533974598, 2934.213962163, 238.988384442, -102.95612365, 6.070961907, 143.516503906],
+    ],
+    ("simulated.seed=2",): [
+        [300.0, 2700.0, 392.803710938, -0.01695754, 190.0, 143.676953125],
+        [544.425658008, 2721.987589229, 389.581429382, 0.031505616, 168.012410771, 143.669421387],
+        [785.96996424, 2829.868834272, 286.732282164, -0.026730309, 60.131165728, 143.67097168],
+        [891.541499382, 2890.0, 166.083572264, -0.164550889, 0.0, 143.66986084],
+        [850.273313839, 2890.0, 165.938708673, -0.18126952, 0.0, 143.677075195],
+        [699.379582937, 2890.0, 165.999580454, 0.018387937, 0.0, 143.681494141],
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("sets", KIND)
+def test_the_first_world_is_what_it_always_was(sets):
+    seen = []
+    with rig_of(*sets, "simulated.world=kind") as rig:
+        for k, inputs in enumerate(rig.inputs()):
+            truth = inputs.truth
+            row = [*truth.position_um, *truth.flow_um_s, truth.clearance_um, inputs.frame.image.mean()]
+            seen += [row] if k % 12 == 0 else []
+            rig.apply(Currents(inputs.stamp_ns, 8.0 + 0.4 * k, 0.05 * k, 5.0, 0.0, np.zeros(3), False))
+    seen = np.array(seen, np.float64)
+    np.testing.assert_allclose(seen[:, :5], np.array(KIND[sets])[:, :5], atol=1e-5)
+    np.testing.assert_allclose(seen[:, 5], np.array(KIND[sets])[:, 5], atol=1e-3)
+
+
+def test_a_session_from_before_the_setting_is_of_the_first_world_and_a_new_one_states_every_number():
+    config = resolve(load_config(None, [*SMALL, "simulated.world=hard", "simulated.depth_error=0.3"]), CHIP)
+    assert config_from_toml(to_toml(config), "session") == config
+    stated = config.simulated
+    assert stated.depth_error == 0.3 and stated.um_per_rev_error == WORLDS["hard"]["um_per_rev_error"]
+    known = [each.name for each in fields(Simulated) if each.name in WORLDS["hard"]]
+    assert set(known) == set(WORLDS["hard"]) and None not in [getattr(stated, name) for name in known]
+    assert not [key for key in derived(load_config(None, SMALL), config) if key.startswith("simulated")]
+    # The settings of the first release, without a world.
+    text = to_toml(config)
+    before = text[: text.index("[simulated]")] + "[simulated]\nseed = 3\nstep_out_share = 0.9\n\n"
+    old = config_from_toml(before + text[text.index("[movie]") :], "session").simulated
+    assert old == Simulated(world="kind", seed=3, step_out_share=0.9)
+    assert with_sets(config, ["simulated.world=moderate"]).simulated.value("um_per_rev_error") == 0.08
+    assert with_sets(config, ["simulated.world=moderate"]).simulated.value("depth_error") == 0.3
+
+
+def test_every_world_states_numbers_within_their_ranges_and_knows_every_setting_of_the_first():
+    for name, preset in WORLDS.items():
+        simulated = Simulated(world=name).with_preset()
+        assert not list(faults(simulated)), name
+        drawn = {"pulsation_hz", "pulsation_phase_deg"}
+        assert set(preset) | drawn == set(WORLDS["kind"])
+        assert all(getattr(Simulated(), key) is None for key in preset)
+
+
+def test_a_stated_error_leaves_what_else_is_drawn_as_it_is():
+    hard = Simulated(world="hard", seed=11)
+    first, other = true_robot(ROBOT, hard), true_robot(ROBOT, replace(hard, step_out_share=0.7, depth_error=0.0))
+    assert (first.um_per_rev, first.delay_s) == (other.um_per_rev, other.delay_s)
+    assert other.step_out_hz == 0.7 * ROBOT.step_out_hz
+    exact = true_robot(ROBOT, replace(hard, um_per_rev_share=0.85, slip=0.1, delay_s=0.05))
+    assert (exact.um_per_rev, exact.delay_s) == (pytest.approx(25.0 * 0.85 * 0.9), 0.05)
+    shares = [true_robot(ROBOT, Simulated(world="moderate", seed=n)).um_per_rev / 25.0 for n in range(200)]
+    assert min(shares) == pytest.approx(0.92, abs=0.004) and max(shares) == pytest.approx(1.08, abs=0.004)
+    assert np.mean(shares) == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_depth_is_the_stated_one_but_for_its_error_and_a_chip_may_have_one_that_nobody_stated():
+    stated = replace(CHIP, depth_um=150.0)
+    assert true_depth_um(CHIP, Simulated()) is None and true_depth_um(stated, Simulated()) == 150.0
+    assert true_depth_um(CHIP, Simulated(world="moderate")) is None
+    depths = [true_depth_um(stated, Simulated(world="moderate", seed=n)) for n in range(50)]
+    assert 135.0 <= min(depths) < 139.0 and 161.0 < max(depths) <= 165.0
+    assert true_depth_um(CHIP, Simulated(depth_um=100.0)) == 100.0
+    assert true_depth_um(stated, Simulated(depth_um=0.0)) is None
+    width_um = median_width_um(CHIP)
+    depths = [true_depth_um(CHIP, Simulated(world="hard", seed=n), 50.0) for n in range(20)]
+    assert all(0.6 * width_um <= depth <= 1.0 * width_um and depth >= 110.0 for depth in depths)
+    # Friction flattens the profile and favours the narrow branch, which in two dimensions w^3 / L nearly closes.
+    solver = FlowSolver()
+    deep, shallow = (solver.solve(true_chip(CHIP, Simulated(seed=1, depth_um=d), solver)) for d in (0.0, 60.0))
+    upper = np.hypot(*shallow.velocity_um_s[60].T).max() / np.hypot(*deep.velocity_um_s[60].T).max()
+    assert upper > 1.1
+
+
+def test_the_drift_of_a_pump_is_a_process_of_time_and_not_of_the_steps_that_it_is_asked_in():
+    drift = {"drift_share": 0.05, "drift_s": 2.0}
+    one, other = (true_pump(Simulated(seed=4, pulsation_share=0.1, pulsation_hz=0.5, **drift)) for _ in range(2))
+    times = np.linspace(0.0, 30.0, 61)
+    late_first = [other.strength(time) for time in times[::-1]][::-1]
+    assert [one.strength(time) for time in times] == late_first
+    long = np.array([Pump(0.0, 1.0, 0.0, 0.05, 2.0, np.random.default_rng(n)).strength(9.0) for n in range(2000)])
+    assert long.mean() == pytest.approx(1.0, abs=0.005) and long.std() == pytest.approx(0.05, rel=0.08)
+    again = Pump(0.0, 1.0, 0.0, 0.05, 2.0, np.random.default_rng(1))
+    series = np.array([again.strength(time) - 1.0 for time in np.arange(0.0, 8000.0, 2.0)])
+    assert np.corrcoef(series[1:], series[:-1])[0, 1] == pytest.approx(math.exp(-1.0), abs=0.06)
+    drawn = [true_pump(Simulated(world="hard", seed=n))._hz for n in range(100)]
+    assert 0.05 <= min(drawn) < 0.08 and 1.4 < max(drawn) <= 2.0
+
+
+@pytest.mark.parametrize(("name", "seed"), [("vessels", 10), ("bifurcation", 0)])
+def test_true_walls_are_off_by_up_to_what_was_asked_in_patches_and_keep_every_channel(name, seed):
+    chip = load_chip(ChipSettings(name, seed=seed))
+    for error_px in (0.33, 1.0):
+        true, words = true_walls(chip, error_px, 0.0, np.zeros((0, 2)), np.random.default_rng(3))
+        assert f"{error_px:g} px" in words and true.um_per_px == 10.0
+        distance = np.abs(clearance_um(fluid_of(chip.mask), 1.0))
+        moved = true.mask != fluid_of(chip.mask)
+        assert moved.mean() > 2e-3
+        assert distance[moved].max() <= 2.0 * (error_px + 0.75)  # fine pixels; a staircase is half a pixel off itself
+        assert (true.mask & ~fluid_of(chip.mask)).any() and (~true.mask & fluid_of(chip.mask)).any()
+        # Channels and islands neither meet nor part.
+        for mask, whole in ((true.mask, chip.mask), (~true.mask, ~chip.mask)):
+            corners = np.ones((3, 3)) if mask is not true.mask else None
+            assert scipy.ndimage.label(mask, corners)[1] == scipy.ndimage.label(whole, corners)[1]
+
+
+def test_a_blocked_branch_keeps_the_rest_of_its_width_and_keeps_away_from_the_start():
+    start = np.array([[3100.0, 3400.0]])  # in the short branch
+    places = []
+    own = true_walls(CHIP, 0.0, 0.0, start, np.random.default_rng(0))[0].mask
+    for seed in range(6):
+        true, words = true_walls(CHIP, 0.0, 0.5, start, np.random.default_rng(seed))
+        x, y = (float(part) for part in words.split(" at ")[1].removesuffix(" um").split(", "))
+        places.append((x, y))
+        assert math.dist((x, y), start[0]) > 2.0 * median_width_um(CHIP) - 1.0
+        row, column = round((y + 5.0) / 10.0), round((x + 5.0) / 10.0)
+        line = slice(max(row - 20, 0), row + 21), column
+        assert 0.35 < true.mask[line].sum() / own[line].sum() < 0.75
+        assert (own & ~true.mask).sum() > 30 and not (true.mask & ~own).any()
+        assert scipy.ndimage.label(true.mask)[1] == 1
+    assert len(set(places)) > 3
+
+
+def test_the_flow_between_true_walls_is_what_the_finer_field_says_at_the_chips_pixels():
+    rig = rig_of("simulated.world=moderate", "simulated.wall_error_px=1", "simulated.seed=2")
+    world = rig._true_world()
+    kind = rig_of("simulated.seed=2", "simulated.world=kind", "simulated.inlet_speed_error=0.15",
+                  "simulated.viscosity_error=0.05")._true_world()  # fmt: skip
+    error = relative_rmse(world.field, kind.field, CHIP.mask).v
+    assert 0.03 < error < 0.35  # other walls, the same inflow
+    assert world.field.velocity_um_s.shape == (*CHIP.mask.shape, 2) and world.mask.shape == (512, 640)
+    inside = at_centres(world.mask.astype(np.float64)) > 0.9
+    speed = np.hypot(*np.moveaxis(world.field.velocity_um_s, -1, 0))
+    assert (speed[inside] > 0.0).mean() > 0.999 and speed[at_centres(world.mask.astype(np.float64)) == 0.0].max() == 0.0
+    # Through the inlet flows what the boundary values say: the flow there is the profile of a straight channel.
+    rows = np.arange(0.0, 5120.0, 2.0)
+    inflow = sample(world.field, np.stack((np.full_like(rows, 60.0), rows), -1))[:, 0].sum() * 2.0
+    opening = next(o for o in CHIP.openings if o.kind == "inlet")
+    assert inflow == pytest.approx(world.field.boundary_values[0] * opening.width_px * 20.0, rel=0.02)
+    assert "walls up to 1 px off" in world.field.note and "um per revolution" in world.field.note
+
+
+def test_the_true_registration_is_off_by_what_the_world_allows_and_turns_about_the_middle():
+    stated, size = Calibration.centred(10.0, (3190.0, 2550.0), (640, 512)), (640, 512)
+    middle_px = np.array([319.5, 255.5])
+    assert misregistered(stated, Simulated(), size) is stated
+    for seed in range(20):
+        true = misregistered(stated, Simulated(world="moderate", seed=seed), size)
+        off_um = np.hypot(*(true.to_um(middle_px) - stated.to_um(middle_px)))
+        assert 5.0 <= off_um <= 10.0
+        assert abs(true.angle_deg) <= 0.2 and abs(true.um_per_px / 10.0 - 1.0) <= 0.003
+    only = Simulated(scale_error=0.02, seed=3)
+    assert misregistered(stated, only, size).to_um(middle_px) == pytest.approx(stated.to_um(middle_px))
+
+
+def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth_not_at_all():
+    swing = Shake.of(Simulated(seed=1, shake_um=10.0, shake_hz=3.0))
+    assert Shake.of(Simulated(seed=1)) is None
+    ways = np.array([swing.at(time) for time in np.linspace(0.0, 1.0, 200)])
+    assert np.hypot(*ways.T).max() == pytest.approx(10.0, rel=1e-3) and np.abs(ways.mean(0)).max() < 0.2
+    sets = ("simulated.seed=1", "camera.debris=0", "simulated.world=kind", "camera.read_noise=0",
+            "camera.photons_per_level=1e6")  # fmt: skip
+    still, shaken = (list(rig_of(*sets, *more).inputs())[:12] for more in ((), ("simulated.shake_um=60",)))
+    assert all(a.truth.same_as(b.truth) for a, b in zip(still, shaken, strict=True))
+    for a, b in zip(still[1:8], shaken[1:8], strict=True):
+        images = (np.float32(a.frame.image), np.float32(b.frame.image))
+        found_px, _ = cv2.phaseCorrelate(*images, cv2.createHanningWindow((320, 256), cv2.CV_32F))
+        expected_px = Shake.of(Simulated(seed=1, shake_um=60.0)).at(a.stamp_ns * 1e-9) / 20.0
+        assert found_px == pytest.approx(expected_px, abs=0.25)
+
+
+def test_oblique_light_is_another_profile_whose_centre_the_tracker_still_finds():
+    for seed in (1, 2):
+        first = next(iter(rig_of(f"simulated.seed={seed}", "camera.debris=0", "simulated.world=kind").inputs()))
+        lit = next(iter(rig_of(f"simulated.seed={seed}", "camera.debris=0", "simulated.optics=oblique").inputs()))
+        assert np.abs(first.frame.image.astype(int) - lit.frame.image).max() > 20
+        asked = load_config(None, SMALL)
+        config = resolve(asked, CHIP)
+        pipeline = assemble(config, CHIP)
+        track, _ = pipeline.tracker.follow(None, None, lit.frame, CHIP, pipeline.calibration, config.robot)
+        assert track.seen and math.dist(track.position_um, lit.truth.position_um) < 0.25 * config.robot.radius_um
