@@ -126,6 +126,11 @@ class ResolvedConfig(Config):
 
 REGISTRATION = "camera.registration"
 _IMAGE_SIZE = ("width_px", "height_px")
+# Settings that a session from before them does not hold, with the values with which it replays unchanged.
+_BEFORE: dict[str, dict[str, Any]] = {
+    "simulated": {"world": FIRST_WORLD},
+    "plan": {"policy_course_share": 1.0, "policy_points_per_radius": 3.0, "policy_points_per_px": 4},
+}
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
 
@@ -172,9 +177,9 @@ def config_from_toml(text: str, where: str) -> ResolvedConfig:
     origin = Origin(where)
     try:
         tree = parse_toml(text)
-        simulated = tree.setdefault("simulated", {})
-        if isinstance(simulated, dict):
-            simulated.setdefault("world", FIRST_WORLD)  # of sessions from before the setting
+        for section, before in _BEFORE.items():
+            own = tree.get(section, {})
+            tree[section] = before | own if isinstance(own, dict) else own
         config = _config_from(ResolvedConfig, tree, origin)
     except (ValueError, RecursionError) as error:  # bad TOML, and absurd numbers and nesting
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error

@@ -28,6 +28,14 @@ def test_a_configuration_survives_its_own_toml() -> None:
     assert config_from_toml(to_toml(config), "test") == config
 
 
+def test_a_session_from_before_a_setting_has_the_value_with_which_it_replays_unchanged() -> None:
+    config = resolve(load_config(None, []), load_chip(Config().chip))
+    older = "".join(line for line in to_toml(config).splitlines(keepends=True) if not line.startswith("policy_"))
+    plan = config_from_toml(older, "test").plan
+    assert (plan.policy_course_share, plan.policy_points_per_radius, plan.policy_points_per_px) == (1.0, 3.0, 4)
+    assert config_from_toml(to_toml(config), "test").plan.policy_points_per_px == config.plan.policy_points_per_px != 4
+
+
 def test_an_unknown_key_is_refused_with_the_nearest_known_one() -> None:
     with pytest.raises(UsageError, match=r"unknown key observer\.metod; did you mean observer\.method\?"):
         load_config(None, ["observer.metod=kalman"])

@@ -15,6 +15,7 @@ from flowrec.control.tracking_laws import Reference, Situation, TrackingLaw, lim
 from flowrec.control.trajectory import follow
 from flowrec.control.wall_barrier import wall_barrier
 from flowrec.enums import Phase
+from flowrec.flow.map_error import CONTROL
 from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
 from flowrec.methods import Method, Methods
 from flowrec.ranges import PositiveShare, Range
@@ -60,8 +61,8 @@ class Controller:
     lag_full_radii: Annotated[float, Range(0.01, 1e3)] = 3.0  # error at which the reference stops and waits
     # fraction of the robot's limit that the reference may use; feedback uses the rest
     pace_share: PositiveShare = 0.95
-    # standard deviation of the map, as a fraction of the flow's speed
-    map_error: Annotated[float, Range(0.0, 10.0)] = 0.3
+    # standard deviation of the map, as a fraction of the flow's speed; None: from the map
+    map_error: Annotated[float, Range(0.0, 10.0)] | None = None
     # assumed lag of an observer without a map behind a changing flow
     observer_lag_s: Annotated[float, Range(0.0, 60.0)] = 0.3
     # clearance that the wall barrier keeps, in robot radii; 0: no wall barrier
@@ -114,7 +115,7 @@ class Controller:
         dt_s = seconds(estimate.stamp_ns - previous.stamp_ns) if previous is not None else 0.0
         sent = previous.sent_um_s if previous is not None else np.zeros((0, 2))
         lag_s = 0.0 if estimate_uses_map else self.observer_lag_s / speed_ratio(robot)
-        flow = corrected_flow(field, estimate, sent, self.map_error, lag_s)
+        flow = corrected_flow(field, estimate, sent, CONTROL.of(field, self.map_error), lag_s)
         now = Situation(
             previous=previous,
             mission=mission,

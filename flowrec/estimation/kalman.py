@@ -25,6 +25,7 @@ import numpy as np
 
 from flowrec.estimation.process_model import ISOTROPIC, Floats, StateLayout, gradient_at, process_noise, propagate
 from flowrec.flow import sample
+from flowrec.flow.map_error import OBSERVER
 from flowrec.messages import Applied, Estimate, FlowField, Track
 from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
@@ -55,7 +56,8 @@ class Kalman:
     flow_noise_um2_s3: Annotated[float, Range(0.0, 1e12)] | None = None
     flow_change: Share = 2e-3  # variance of the flow's change over one radius, relative to its squared speed
     slope_change: Share = 2e-5  # the same for its gradient times the radius
-    map_share: Annotated[float, Range(0.0, 10.0)] = 0.25  # error of a map, as a fraction of the flow and of its changes
+    # error of a map, as a fraction of the flow and of its changes; None: from the map
+    map_share: Annotated[float, Range(0.0, 10.0)] | None = None
     # factor on the variances of all changes: what `flowrec bench observer --session` tunes
     agility: Annotated[float, Range(1e-6, 1e6)] = 1.0
     # innovations are averaged over the time in which the robot covers this distance at v_max
@@ -153,14 +155,14 @@ class Kalman:
         """(n, n) covariance of the process noise of a step that changes the state by (n,)."""
         gain = (_GAIN_DRIFT * robot.um_per_rev) ** 2 * dt
         if self.flow_noise_um2_s3 is not None:
-            q = self.flow_noise_um2_s3 * (1.0 if field is None else self.map_share**2)
+            q = self.flow_noise_um2_s3 * (1.0 if field is None else OBSERVER.of(field, self.map_share) ** 2)
             return process_noise(layout, dt, q * dt, 0.0, gain, self.drift_um2_s)
         displacement = math.hypot(change[0], change[1]) + _REST_FRACTION * robot.max_speed_um_s * dt
         flow = previous.flow_um_s
         speed = math.hypot(flow[0], flow[1], _SLOWEST_FRACTION * robot.max_speed_um_s)
         unit = self.agility * self._noise_scale(previous, robot, dt) * displacement / robot.radius_um * speed**2
         if field is not None:
-            unit *= self.map_share**2
+            unit *= OBSERVER.of(field, self.map_share) ** 2
         gradient = self.slope_change * unit / robot.radius_um**2
         return process_noise(layout, dt, self.flow_change * unit, gradient, gain, self.drift_um2_s)
 

@@ -17,6 +17,7 @@ from typing import Annotated
 import numpy as np
 
 from flowrec.flow import sample
+from flowrec.flow.map_error import STEP_OUT
 from flowrec.messages import Applied, Estimate, FlowField, Health
 from flowrec.ranges import PositiveShare, Range, Share
 from flowrec.robot import Robot
@@ -36,7 +37,7 @@ class StepOut:
     """Settings of the detection."""
 
     window_s: Annotated[float, Range(0.05, 60.0)] = 0.5  # of the means
-    map_error: Share = 0.2  # relative error of the map's flow
+    map_error: Share | None = None  # relative error of the map's flow; None: from the map
     missing_share: Share = 0.3  # fraction of the commanded motion that must be missing besides; 1: never limit
     lower_to: PositiveShare = 0.8  # factor on the frequency in one step
     floor_share: PositiveShare = 0.3  # lowest limit, as a fraction of the robot's own
@@ -95,7 +96,9 @@ class StepOut:
         )
         lower_hz = self.lower_to * min(limit_hz, expected / robot.um_per_rev)
         lower_hz = max(lower_hz, self.floor_share * own_hz)
-        explained = expected - rolled <= self.map_error * carried_um_s + self.missing_share * expected
+        explained = (
+            expected - rolled <= STEP_OUT.of(field, self.map_error) * carried_um_s + self.missing_share * expected
+        )
         if explained or waiting or lower_hz >= limit_hz:
             return now
         return replace(

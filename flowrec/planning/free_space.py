@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um
 from flowrec.errors import FlowError, UsageError
+from flowrec.flow.map_error import COURSE
 from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField
 from flowrec.planning.cost_rasters import CostRasters, Mask, Raster
@@ -61,6 +62,10 @@ class FreeSpace:
     def with_margin(self, margin_um: float) -> FreeSpace:
         """The free space of a robot that keeps another margin from the walls."""
         return self.with_need(self.radius + margin_um / self.um_per_px)
+
+    def with_course_share(self, share: float) -> FreeSpace:
+        """The free space of a robot that is off its course by this fraction of the course error; to be asked first."""
+        return replace(self, swept=self.radius + share * (self.swept - self.radius))
 
     def with_need(self, need: float) -> FreeSpace:
         """The free space of a robot that needs another clearance (px)."""
@@ -108,19 +113,18 @@ class CourseError:
 class FastFlowMargin:
     """Settings of the course error; the times are filled in when a run is resolved, and are 0 before."""
 
-    # ratio of the map's error to the flow's speed
-    map_error: Annotated[float, Range(0.0, 10.0)] = 0.2
+    # ratio of the map's error to the flow's speed; None: from the map
+    map_error: Annotated[float, Range(0.0, 10.0)] | None = None
     # of the rolling direction: three standard deviations
     heading_error_rad: Annotated[float, Range(0.0, 0.5 * math.pi)] = 0.1
     frame_s: Annotated[float, Range(0.0, 10.0)] | None = None  # None: the camera's
     latency_s: Annotated[float, Range(0.0, 10.0)] | None = None  # from command to motion; None: the robot's
 
-    def course_error(self, robot: Robot, speed_um_s: float) -> CourseError:
-        """The course error of a robot that swims at a speed."""
+    def course_error(self, robot: Robot, speed_um_s: float, field: FlowField | None = None) -> CourseError:
+        """The course error of a robot that swims at a speed; without a field that of a map whose error is not known."""
         frame_s, latency_s = self.frame_s or 0.0, self.latency_s or 0.0
-        return CourseError(
-            self.map_error, self.heading_error_rad, frame_s + latency_s, frame_s, speed_um_s, robot.radius_um
-        )
+        map_error = COURSE.of(field, self.map_error)
+        return CourseError(map_error, self.heading_error_rad, frame_s + latency_s, frame_s, speed_um_s, robot.radius_um)
 
 
 def open_space(

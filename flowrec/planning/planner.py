@@ -32,6 +32,9 @@ PLANNERS = Methods(
             "idle_speed_um_s",
             "policy_share",
             "policy_margin_share",
+            "policy_course_share",
+            "policy_points_per_radius",
+            "policy_points_per_px",
             "robust_deviations",
             "flow_error_share",
             "reach_px",
@@ -96,10 +99,14 @@ class Planner:
     # Ratio to the margin in the time to go. Against the flow the fastest way is along the wall, and a policy, which no
     # reference pulls there, keeps off it by itself; a robot that tracks a route needs all of the margin.
     policy_margin_share: Share = 0.2
+    policy_course_share: Share = 0.5  # the same for the course error of `swift`
+    # Points of the time to go per radius of the robot: against the flow the way along the wall lies between the pixels.
+    policy_points_per_radius: Annotated[float, Range(0.1, 100.0)] = 10.0
+    policy_points_per_px: Annotated[int, Range(1, 16)] = 8  # at most, and as many as 2 million points in all allow
     # of the flow, by which it may be worse than believed; fewer where no way is left
     robust_deviations: Annotated[float, Range(0.0, 100.0)] = 1.0
-    # one deviation of a flow that states none, as a ratio of its speed
-    flow_error_share: Annotated[float, Range(0.0, 10.0)] = 0.05
+    # one deviation of a flow that states none, as a ratio of its speed; None: from the map
+    flow_error_share: Annotated[float, Range(0.0, 10.0)] | None = None
     # steps of astar_time and astar_length: 1, 2, 3 give 8, 16, 32 directions
     reach_px: Annotated[int, OneOf(1, 2, 3)] = 3
     paper_radius_px: Annotated[float, Range(1.0, 100.0)] = 3.5  # neighbours of astar_paper; 1.5 gives 8
@@ -124,7 +131,7 @@ class Planner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         method = self._method()
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
-        course_error = self.swift.course_error(robot, robot.speed_limit_um_s)
+        course_error = self.swift.course_error(robot, robot.speed_limit_um_s, field)
         for space, margin_um, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
             start, goal = attach_start(space, start_at), attach_goal(space, goal_at)
             error = start.error or goal.error or why_apart(space, start.node, goal.node)

@@ -59,7 +59,7 @@ class SurveyPlanner:
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         limit_um = distance_um if distance_um is not None else self.distance_um
         start_at = np.asarray(start_um, np.float64)
-        course_error = self.swift.course_error(robot, speed_um_s)
+        course_error = self.swift.course_error(robot, speed_um_s, field)
         for space, _, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
             route = self._downstream(space, field, start_at, chip, speed_um_s, limit_um)
             if route.reachable:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.flow.map_error import RESERVE
 from flowrec.messages import Route
 from flowrec.planning.cost_rasters import interpolated
 from flowrec.planning.eikonal import descend, time_field
@@ -25,9 +26,6 @@ from flowrec.planning.wall_band import extend_to_walls
 
 _FINER = ((6000, 4), (12000, 2))  # with fewer free pixels than these, that many points per pixel,
 _LARGEST_PX = 2_000_000  # as long as the rasters have no more points than these
-# A policy needs points between the pixels where the robot is small: the way along the wall lies between them.
-_POINTS_PER_RADIUS = 3.0
-_FINEST = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +36,11 @@ class TimeField:
     idle_speed_um_s: float | None
     policy_share: float
     policy_margin_share: float
+    policy_course_share: float
+    policy_points_per_radius: float
+    policy_points_per_px: int
     robust_deviations: float
-    flow_error_share: float
+    flow_error_share: float | None
     reach_px: int
     refine: bool
 
@@ -96,10 +97,11 @@ class TimeField:
 
         A route from whose start no time is known is returned as it is: a path without a policy is still a route.
         """
-        space = problem.space.with_margin(self.policy_margin_share * problem.margin_um)
+        course = problem.space.with_course_share(self.policy_course_share)
+        space = course.with_margin(self.policy_margin_share * problem.margin_um)
         px = space.um_per_px
         finest = max(math.isqrt(_LARGEST_PX // space.free.size), 1)
-        finer = min(max(math.ceil(_POINTS_PER_RADIUS / space.radius), 1), _FINEST, finest)
+        finer = min(max(math.ceil(self.policy_points_per_radius / space.radius), 1), self.policy_points_per_px, finest)
         goal = attach_goal(space, problem.goal_um)
         target = space.pixel(goal.node) if goal.point is None else goal.point
         speed = planning_speed_um_s(self.policy_share, problem.robot) / px
@@ -117,4 +119,4 @@ class TimeField:
         field, space = problem.field, problem.space
         if field.std_um_s is not None:
             return np.asarray(field.std_um_s.max(axis=-1) / field.um_per_px, np.float64)
-        return self.flow_error_share * np.sqrt(space.vx * space.vx + space.vy * space.vy)
+        return RESERVE.of(field, self.flow_error_share) * np.sqrt(space.vx * space.vx + space.vy * space.vy)

@@ -115,6 +115,24 @@ def test_what_is_too_fast_with_no_reserve_is_unreachable_and_the_place_is_named(
     assert not route.reachable and "too fast: 130 um/s at" in route.reason and route.time_to_go_s is None
 
 
+def test_in_a_narrow_channel_against_the_flow_the_time_to_go_is_that_of_a_much_finer_grid():
+    mask = channel(
+        h=24, wall=8
+    )  # 8 px wide: the slow flow along the wall is a part of a pixel wide
+    field, swimmer = poiseuille(mask, 90.0), robot(radius_um=17.0)
+    ends = (1100.0, 115.0), (100.0, 115.0)
+
+    def seconds_to_go(**changes):
+        route = replace(FULL, clearance_margin_um=0.0, **changes).plan(field, *ends, chip_of(mask), swimmer)
+        assert route.time_to_go_s is not None
+        column, row = np.rint(np.array(ends[0]) / route.time_to_go_um_per_px).astype(int)
+        return route.time_to_go_s[row, column]
+
+    finest = seconds_to_go(policy_points_per_px=16, policy_points_per_radius=100.0)
+    assert seconds_to_go() < 1.06 * finest
+    assert seconds_to_go(policy_points_per_radius=3.0) > 1.15 * finest
+
+
 def test_robust_deviations_lead_around_a_flow_at_the_edge_and_are_given_up_with_a_remark():
     chip, field = loop(fast=80.0, slow=20.0)
     std = np.zeros_like(field.velocity_um_s)
