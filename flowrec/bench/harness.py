@@ -195,6 +195,18 @@ def paired(ratios: NDArray[np.float64]) -> Results:
     }
 
 
+def mean_with_interval(values: Sequence[float]) -> Results:
+    """Mean of values and its bootstrap 95 % interval (percentiles of resampled means); NaN without a value."""
+    import numpy as np
+
+    if len(values) == 0:
+        return {"mean": math.nan, "interval_95": (math.nan, math.nan)}
+    sample = np.asarray(values, np.float64)
+    means = np.random.default_rng(0).choice(sample, (_BOOTSTRAP_DRAWS, len(sample))).mean(axis=1)
+    low, high = np.percentile(means, (2.5, 97.5))
+    return {"mean": float(sample.mean()), "interval_95": (float(low), float(high))}
+
+
 def peak_mb(key: str = "VmHWM") -> float:
     """Largest memory of this process so far, in MB, or that now (`VmRSS`); NaN if not on Linux.
 

@@ -17,6 +17,7 @@ BENCHES = {
     "observer": "Estimation: error of each observer on the paper's lemniscate; settings that suit a recording.",
     "track": "Control: how closely each law tracks the paper's lemniscate in a vortex; vision: robots of many looks.",
     "missions": "Whole simulated missions: arrivals, wall contacts and time over the least time, policies in pairs.",
+    "worlds": "The refined map in worlds that are not the model's: errors, error bars and warnings of each refiner.",
     "solver": "The flow solver: deviation from exact and published solutions, time and memory.",
     "loop": "The control loop: time of one tick with recording and viewing on and off, and the speed of a replay.",
 }

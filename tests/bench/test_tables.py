@@ -1,6 +1,6 @@
 """Every bench has the rows of the tables of methods and a null model, so that a new method is measured by itself."""
 
-from flowrec.bench import flow, missions, observer, plan, track
+from flowrec.bench import flow, missions, observer, plan, track, worlds
 from flowrec.control.controller import CONTROLLERS
 from flowrec.estimation.observer import OBSERVERS
 from flowrec.planning import PLANNERS
@@ -12,6 +12,7 @@ def test_every_refiner_and_every_planner_has_a_row():
     assert all(flow.METHODS[name].method == name for name in REFINERS)
     assert all(plan.METHODS[name].method == name for name in PLANNERS)
     assert "fvm" in flow.METHODS and "astar_length" in plan.METHODS, "null models"
+    assert "fvm" in worlds.METHODS and ("gain" in worlds.METHODS) == ("gain" in REFINERS), "null models"
 
 
 def test_every_observer_has_a_row_and_knowing_no_flow_is_the_worst_of_all():

@@ -181,9 +181,9 @@ def test_a_blocked_branch_keeps_the_rest_of_its_width_and_keeps_away_from_the_st
 
 def test_the_flow_between_true_walls_is_what_the_finer_field_says_at_the_chips_pixels():
     rig = rig_of("simulated.world=moderate", "simulated.wall_error_px=1", "simulated.seed=2")
-    world = rig._true_world()
+    world = rig.true_world()
     kind = rig_of("simulated.seed=2", "simulated.world=kind", "simulated.inlet_speed_error=0.15",
-                  "simulated.viscosity_error=0.05")._true_world()  # fmt: skip
+                  "simulated.viscosity_error=0.05").true_world()  # fmt: skip
     error = relative_rmse(world.field, kind.field, CHIP.mask).v
     assert 0.03 < error < 0.35  # other walls, the same inflow
     assert world.field.velocity_um_s.shape == (*CHIP.mask.shape, 2) and world.mask.shape == (512, 640)

@@ -40,6 +40,13 @@ class Pump:
         pulsation = 1.0 + self._share * math.sin(2.0 * math.pi * self._hz * time_s + self._phase_rad)
         return (1.0 + self._drift_at(time_s)) * pulsation if self._drift_share > 0.0 else pulsation
 
+    def mean_drift(self, until_s: float) -> float:
+        """Mean of 1 + drift from the start to a time: what a steady map of that time is, over the steady flow."""
+        if self._drift_share == 0.0:
+            return 1.0
+        times = np.arange(0.0, max(until_s, _STEP_S), _STEP_S)
+        return 1.0 + float(np.mean([self._drift_at(float(time)) for time in times]))
+
     def _drift_at(self, time_s: float) -> float:
         place = max(time_s, 0.0) / _STEP_S
         index = int(place)

@@ -167,7 +167,7 @@ class SimulatedRig:
 
     def inputs(self) -> Iterator[Inputs]:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
-        world = self._true_world()
+        world = self.true_world()
         field, walls = world.field, world.clearance_um
         radius, seed, px = self._robot.radius_um, self._simulated.seed, self._chip.um_per_px
         swimmer = Swimmer(
@@ -222,9 +222,10 @@ class SimulatedRig:
             index += 1
 
     def _true_field(self) -> FlowField:
-        return self._true_world().field
+        return self.true_world().field
 
-    def _true_world(self) -> World:
+    def true_world(self) -> World:
+        """Flow and walls as they truly are, for evaluation."""
         if self._given is not None and self._given.velocity_um_s.shape[:2] != self._chip.mask.shape:
             raise RigError(
                 f"true flow has {self._given.velocity_um_s.shape[:2]} pixels, the chip {self._chip.mask.shape}; "

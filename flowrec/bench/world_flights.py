@@ -1,0 +1,281 @@
+"""One flight in a world, what a refinement would have been given in it, and how good each refinement is.
+
+A flight is one mission in a simulated world. Its observations do not depend on how they are refined, so the work order
+of its survey is kept, and any method can refine it later without flying again.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import scipy  # its special loads at first use, not at start-up
+from numpy.typing import NDArray
+
+from flowrec.chip import load_chip
+from flowrec.chip.chip import Chip
+from flowrec.commands.record import refuse_adrift
+from flowrec.config import ResolvedConfig, calibration_of, load_config
+from flowrec.declarations import message_fields
+from flowrec.enums import Phase, WorkOrder
+from flowrec.errors import FlowrecError
+from flowrec.messages import FlowField, Tick
+from flowrec.pipeline import Pipeline, assemble
+from flowrec.resolve import resolve
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run.loop import run
+from flowrec.run.workers import LockstepWorker, work
+from flowrec.topics import BY_FIELD
+from flowrec.units import seconds
+
+# Messages of a work order that are kept; the assumed flow is solved again.
+_KEPT = ("mission", "estimate", "health", "observations")
+_IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compared
+
+# Clauses of a note that are no warning: what was used, and what was not seen.
+_NO_WARNING = re.compile(r"assimilated|\d+ more distrusted|ignored|they say nothing|of (in|out)let|not refined|$")
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What the faults of a world are made of: random numbers of the seed, and the configuration without the fault."""
+
+    rng: np.random.Generator
+    config: ResolvedConfig
+    chip: Chip
+
+    def either(self, size: float) -> float:
+        """1 + size or 1 - size."""
+        return 1.0 + size * (1.0 if self.rng.random() < 0.5 else -1.0)
+
+    def shifted_um(self, pixels: float) -> str:
+        """The centre of the image, shifted by camera pixels in any direction, as a setting."""
+        camera, angle = self.config.camera, self.rng.uniform(0.0, 2.0 * math.pi)
+        middle = 0.5 * (np.array([camera.width_px, camera.height_px]) - 1.0)
+        place = middle + pixels * np.array([math.cos(angle), math.sin(angle)])
+        x, y = calibration_of(self.config, self.chip).to_um(place)
+        return f"[{x:.3f}, {y:.3f}]"
+
+
+# The settings of each world, in [simulated]. Those after the presets have one fault each, as large as stated here, in a
+# world that is `kind` otherwise.
+WORLDS: Mapping[str, Callable[[Given], Sequence[str]]] = {
+    "kind": lambda _: ("world=kind",),
+    "moderate": lambda _: ("world=moderate",),
+    "hard": lambda _: ("world=hard",),
+    "depth": lambda _: ("unstated_depth_widths=0.5",),
+    "um_per_rev": lambda given: (f"um_per_rev_share={given.either(0.15)}",),
+    "slip": lambda _: ("slip=0.15",),
+    "hindrance": lambda _: ("hindrance=1.0",),
+    "drift": lambda _: ("drift_share=0.05", "drift_s=30.0"),
+    "pulsation_0.1": lambda given: (
+        *("pulsation_share=0.3", "pulsation_hz=0.1"),
+        f"pulsation_phase_deg={given.rng.uniform(0.0, 360.0)}",
+    ),
+    "pulsation_1": lambda given: (
+        *("pulsation_share=0.3", "pulsation_hz=1.0"),
+        f"pulsation_phase_deg={given.rng.uniform(0.0, 360.0)}",
+    ),
+    "offset": lambda given: (f"centre_um={given.shifted_um(2.0)}",),  # 20 um where a camera pixel is 10 um
+    "scale": lambda given: (f"um_per_px={given.config.camera.um_per_px * given.either(0.03)}",),
+    "mask": lambda _: ("wall_error_px=1.0",),
+    "blocked": lambda _: ("blocked_share=0.5",),
+    "step_out": lambda _: ("step_out_share=0.7",),
+    "latency": lambda given: (f"delay_s={2.0 * given.config.robot.delay_s}",),
+    "shake": lambda given: (f"shake_um={given.config.camera.um_per_px}", "shake_hz=3.0"),
+    "optics": lambda _: ("optics=oblique",),
+}
+_FAULT_STREAM = 0xFA017
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is flown."""
+
+    world: str
+    chip: str  # bifurcation, straight, vessels-SEED, or the path of a chip or of a vessel case
+    seed: int
+    sets: tuple[str, ...] = ()  # further settings
+
+    def key(self) -> tuple[str, str, int, tuple[str, ...]]:
+        """Identifies the flight."""
+        return self.world, self.chip, self.seed, tuple(self.sets)
+
+
+@dataclass(slots=True)
+class Flight:
+    """A flight as it is kept: one line of JSON.
+
+    Attributes
+    ----------
+    world, chip, seed, sets : those of its case.
+    outcome, note : of the mission; `refused` before anything was driven.
+    contacts : wall contacts, also those of the survey.
+    seconds : from the first frame to the last.
+    truth : what was drawn.
+    drift : the flow during the survey over the steady one, by the drift of the pump.
+    order : messages of the last work order before the navigation that asked for a refinement; {} if there was none.
+    refined : scores by method.
+    """
+
+    world: str
+    chip: str
+    seed: int
+    sets: tuple[str, ...]
+    outcome: str
+    note: str
+    contacts: int = 0
+    seconds: float = 0.0
+    truth: str = ""
+    drift: float = 1.0
+    order: dict[str, Any] = field(default_factory=dict)
+    refined: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, line: Mapping[str, Any]) -> Flight:
+        """The flight of a line."""
+        return cls(**{**line, "sets": tuple(line["sets"])})
+
+    def key(self) -> tuple[str, str, int, tuple[str, ...]]:
+        """That of its case."""
+        return Case(self.world, self.chip, self.seed, self.sets).key()
+
+
+def chip_sets(chip: str) -> tuple[str, ...]:
+    """The settings of a chip by name."""
+    if "." in chip or "/" in chip:
+        return (f"chip.path={chip}",)
+    name, _, seed = chip.partition("-")
+    return (f"chip.name={name}", *((f"chip.seed={seed}",) if seed else ()))
+
+
+def prepared(case: Case) -> tuple[ResolvedConfig, Chip]:
+    """The configuration of a case on its chip.
+
+    Raises FlowrecError where the mission can not be flown.
+    """
+    sets = [*chip_sets(case.chip), f"refine.method={_IN_FLIGHT}", f"simulated.seed={case.seed}", *case.sets]
+    asked = load_config(None, ["simulated.world=kind", *sets])
+    chip = load_chip(asked.chip)
+    rng = np.random.default_rng([case.seed, _FAULT_STREAM, list(WORLDS).index(case.world)])
+    faults = WORLDS[case.world](Given(rng, resolve(asked, chip), chip))
+    asked = load_config(None, ["simulated.world=kind", *(f"simulated.{fault}" for fault in faults), *sets])
+    config = resolve(asked, chip)
+    refuse_adrift(config, chip)
+    return config, chip
+
+
+def fly(case: Case) -> Flight:
+    """Fly a case; nothing is written."""
+    flight = Flight(case.world, case.chip, case.seed, case.sets, "refused", "")
+    try:
+        config, chip = prepared(case)
+    except FlowrecError as error:
+        flight.note = str(error)
+        return flight
+    pipeline = assemble(config, chip)
+    rig = SimulatedRig.of(pipeline, config)
+    orders: list[Tick] = []
+
+    def watch(tick: Tick) -> None:
+        mission, before = tick.mission, orders[-1].mission if orders else None
+        assert mission is not None
+        new = before is None or mission.request != before.request
+        if new and mission.wanted == WorkOrder.REFINE and mission.phase != Phase.NAVIGATE:
+            orders.append(tick)
+
+    report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [], on_tick=watch)
+    flight.outcome, flight.note = report.outcome, report.note
+    flight.contacts, flight.seconds = report.contacts, report.duration_s
+    flight.truth = rig.true_world().field.note
+    if orders:
+        order = orders[-1]
+        flight.order = {name: _as_json(getattr(order, name)) for name in _KEPT if getattr(order, name) is not None}
+        flight.drift = rig.pump.mean_drift(seconds(order.stamp_ns))
+    return flight
+
+
+def refine(flight: Flight, methods: Sequence[str]) -> None:
+    """Refine what a flight has observed by some methods and score them; also the assumed flow, as `assumed`."""
+    if not flight.order:
+        return
+    config, chip = prepared(Case(flight.world, flight.chip, flight.seed, flight.sets))
+    pipeline = assemble(config, chip)
+    truth = SimulatedRig.of(pipeline, config).true_world().field.velocity_um_s * np.float32(flight.drift)
+    order = _order_of(flight, pipeline)
+    assert order.assumed is not None
+    flight.refined["assumed"] = scored(order.assumed, truth, chip.mask)
+    for method in methods:
+        refiner = replace(config.refine, method=method)
+        try:
+            result = work(replace(pipeline, refiner=refiner), order)
+        except FlowrecError as error:
+            flight.refined[method] = {"failed": str(error)}
+            continue
+        assert isinstance(result, FlowField)
+        flight.refined[method] = scored(result, truth, chip.mask)
+
+
+def scored(found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """Scores of a field over the components of the fluid pixels.
+
+    error : relative RMSE of v. within_2_sigma : fraction of the components within two stated standard deviations of
+    the truth; None if none are stated. crps : continuous ranked probability score of the Gaussian (Gneiting and Raftery
+    2007, eq. 21), mean over the components, over the rms speed; without a standard deviation that is the mean
+    absolute error. warned: whether the note says that something is wrong.
+    """
+    true = truth[mask].astype(np.float64)
+    off = found.velocity_um_s[mask].astype(np.float64) - true
+    rms = math.sqrt(float((true**2).sum(axis=1).mean()))
+    score: dict[str, Any] = {"error": math.sqrt(float((off**2).sum(axis=1).mean())) / rms, "within_2_sigma": None}
+    crps = np.abs(off)
+    if found.std_um_s is not None:
+        std = np.maximum(found.std_um_s[mask].astype(np.float64), 1e-9)
+        score["within_2_sigma"] = float((np.abs(off) <= 2.0 * std).mean())
+        z = off / std
+        density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+        crps = std * (z * (2.0 * scipy.special.ndtr(z) - 1.0) + 2.0 * density - 1.0 / math.sqrt(math.pi))
+    score["crps"] = float(crps.mean()) / rms
+    score["expected"] = getattr(found, "error_share", None)
+    return score | {"warned": warned(found.note), "note": found.note}
+
+
+def warned(note: str) -> bool:
+    """Whether a note says more than what was used and what was not seen."""
+    return not all(_NO_WARNING.match(clause.strip()) for clause in note.split(";"))
+
+
+def _as_json(message: Any) -> dict[str, Any]:
+    """A message as plain data; arrays as (shape, values)."""
+    return {
+        each.name: (value.shape, value.ravel().tolist()) if isinstance(value, np.ndarray) else value
+        for each in message_fields(type(message))
+        for value in (getattr(message, each.name),)
+    }
+
+
+def _order_of(flight: Flight, pipeline: Pipeline) -> Tick:
+    """The tick of the work order of a flight, with the assumed flow solved again."""
+    messages: dict[str, Any] = {}
+    for name, data in flight.order.items():
+        kind = BY_FIELD[name].type
+        arrays = {each.name for each in message_fields(kind) if each.dtype is not None}
+        values = {
+            key: np.reshape(value[1], value[0]) if key in arrays and value is not None else value
+            for key, value in data.items()
+        }
+        messages[name] = kind(**values)
+    tick = Tick(stamp_ns=messages["mission"].stamp_ns, **messages)
+    solve = replace(messages["mission"], wanted=WorkOrder.SOLVE.value)
+    assumed = work(pipeline, replace(tick, mission=solve))
+    assert isinstance(assumed, FlowField)
+    return replace(tick, assumed=assumed)
+
+
+def as_line(flight: Flight) -> dict[str, Any]:
+    """A flight as it is written."""
+    return asdict(flight)

@@ -1,0 +1,130 @@
+"""The bench of worlds: a flight is flown once, its observations are kept, its scores are published ones."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.bench import worlds
+from flowrec.bench.harness import mean_with_interval
+from flowrec.bench.world_flights import WORLDS, Case, Given, chip_sets, fly, prepared, refine, scored, warned
+from flowrec.config import load_config
+from flowrec.errors import UsageError
+from flowrec.pipeline import assemble
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.simulated_settings import WORLDS as PRESETS
+from flowrec.simulated_settings import Simulated
+
+TINY = ("camera.width_px=320", "camera.height_px=80", "mission.goal=[2400.0, 620.0]")
+CASE = Case("slip", "straight", 3, TINY)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    flight = fly(CASE)
+    refine(flight, ["fvm", "assimilate"])
+    return flight
+
+
+def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(flown, tmp_path, monkeypatch, capsys):
+    assert (flown.outcome, flown.contacts) == ("reached", 0)
+    assert len(flown.order["observations"]["position_um"][1]) > 10
+    file = tmp_path / "rows.jsonl"
+    line = json.dumps(worlds.as_line(flown))
+    file.write_text(line + "\n" + line[:1000])  # killed while it wrote
+    (kept,) = worlds.kept(file)
+    assert worlds.as_line(kept) == json.loads(line) | {"sets": TINY}
+    again = replace(kept, refined={})
+    refine(again, ["assimilate"])
+    assert again.refined["assimilate"] == flown.refined["assimilate"]
+    assert again.refined["assumed"]["error"] == flown.refined["fvm"]["error"]
+    monkeypatch.setattr(worlds, "fly", None)
+    options = {"worlds": "slip", "chips": "straight", "seeds": 1, "first_seed": 3, "sets": list(TINY), "rows": file}
+    found = worlds.measure(methods="fvm,assimilate", **options)
+    assert file.read_text() == line + "\n"  # nothing was left to do
+    assert found["flights"][0]["refined"] == flown.refined
+    worlds.measure(methods="assimilate", again=True, **options)
+    assert len(list(worlds.kept(file))) == 2
+    json.dumps(found)
+    worlds.show(found)
+    assert "slip" in capsys.readouterr().out
+
+
+def test_every_world_can_be_made_and_a_fault_is_as_large_as_its_name_says():
+    config, chip = prepared(replace(CASE, world="offset"))
+    place_um, camera = config.simulated.centre_um, config.camera
+    assert math.dist(place_um, (2550.0, 630.0)) == pytest.approx(2.0 * camera.um_per_px, abs=0.01)
+    kind, _ = prepared(replace(CASE, world="kind"))
+    sizes = set()
+    for seed in range(6):
+        given = Given(np.random.default_rng(seed), kind, chip)
+        for world, faults in WORLDS.items():
+            made = load_config(None, [f"simulated.{fault}" for fault in ("world=kind", *faults(given))]).simulated
+            assert made.world == (world if world in PRESETS else "kind")
+            assert (made == Simulated(world="kind")) == (world == "kind"), world
+            sizes |= {made.um_per_rev_share} if world == "um_per_rev" else set()
+    assert sizes == {0.85, 1.15}
+    assert chip_sets("vessels-12") == ("chip.name=vessels", "chip.seed=12")
+    assert chip_sets("a/b.npz") == ("chip.path=a/b.npz",)
+
+
+def test_scores_are_the_published_ones():
+    config, chip = prepared(CASE)
+    truth = SimulatedRig.of(assemble(config, chip), config).true_world().field
+    rng = np.random.default_rng(0)
+    std = np.full((*chip.mask.shape, 2), 8.0, np.float32)
+    noisy = truth.velocity_um_s + rng.normal(0.0, 8.0, truth.velocity_um_s.shape).astype(np.float32)
+    score = scored(replace(truth, velocity_um_s=noisy, std_um_s=std), truth.velocity_um_s, chip.mask)
+    rms = math.sqrt((truth.velocity_um_s[chip.mask].astype(float) ** 2).sum(axis=1).mean())
+    assert score["error"] == pytest.approx(8.0 * math.sqrt(2.0) / rms, rel=0.02)
+    assert score["within_2_sigma"] == pytest.approx(0.9545, abs=0.006)
+    # The mean CRPS of a right Gaussian is sigma / sqrt(pi); wider and narrower ones score worse.
+    assert score["crps"] == pytest.approx(8.0 / math.sqrt(math.pi) / rms, rel=0.03)
+    for factor in (0.5, 2.0):
+        other = scored(replace(truth, velocity_um_s=noisy, std_um_s=factor * std), truth.velocity_um_s, chip.mask)
+        assert other["crps"] > 1.02 * score["crps"]
+    bare = scored(replace(truth, velocity_um_s=noisy, std_um_s=None), truth.velocity_um_s, chip.mask)
+    assert bare["crps"] == pytest.approx(8.0 * math.sqrt(2.0 / math.pi) / rms, rel=0.03)
+    assert bare["within_2_sigma"] is None
+
+
+def test_a_summary_counts_worse_maps_and_those_of_which_nothing_was_said(flown):
+    assert not warned(
+        "assimilated 8 observations; 1 more distrusted as outliers; they say nothing about outlet 1 (right)"
+    )
+    assert warned("assimilated 8 observations; neighbours miss alike: something here is not in the model")
+
+    def made(assumed, refined, note):
+        found = {"assumed": {"error": assumed}, "gain": {**SCORE, "error": 0.1}}
+        return replace(flown, refined={**found, "assimilate": {**SCORE, "error": refined, "warned": note}})
+
+    flights = [made(0.2, 0.05, False), made(0.2, 0.3, False), made(0.2, 0.4, True)]
+    found = worlds.scores(flights, "assimilate")
+    assert (found["count"], found["worse"], found["unsaid"]) == (3, 2, 1)
+    assert found["error"]["mean"] == pytest.approx(0.25) and found["within_2_sigma"] == 0.9
+    assert found["over_null"]["mean"] == pytest.approx((0.5 * 3 * 4) ** (1 / 3))
+    low, high = mean_with_interval([0.05, 0.3, 0.4])["interval_95"]
+    assert 0.05 <= low < 0.25 < high < 0.401
+    assert math.isnan(worlds.scores([], "assimilate")["error"]["mean"])
+
+
+SCORE = {"within_2_sigma": 0.9, "crps": 0.01, "warned": False, "expected": None, "note": ""}
+
+
+def test_wrong_requests_are_said_at_once(tmp_path):
+    with pytest.raises(UsageError, match="no world 'mars'"):
+        worlds.measure(worlds="mars")
+    with pytest.raises(UsageError, match="no method 'luck'"):
+        worlds.measure(methods="luck")
+    (tmp_path / "rows.jsonl").write_text("{}\n{}\n")
+    with pytest.raises(UsageError, match=r"line 1: is no flight"):
+        worlds.measure(rows=tmp_path / "rows.jsonl")
+
+
+def test_a_flight_that_can_not_be_flown_is_a_row_and_no_error():
+    flight = fly(replace(CASE, sets=(*TINY, "chip.inlet_speed_um_s=60000")))
+    assert flight.outcome == "refused" and "too swift" in flight.note
+    refine(flight, ["fvm"])
+    assert flight.refined == {}
