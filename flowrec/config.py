@@ -129,6 +129,8 @@ _IMAGE_SIZE = ("width_px", "height_px")
 # Settings that a session from before them does not hold, with the values with which it replays unchanged.
 _BEFORE: dict[str, dict[str, Any]] = {
     "simulated": {"world": FIRST_WORLD},
+    "survey": {"method": "downstream"},
+    "mission": {"reassimilate_observations": 0},
     "plan": {"policy_course_share": 1.0, "policy_points_per_radius": 3.0, "policy_points_per_px": 4},
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)

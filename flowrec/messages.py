@@ -173,6 +173,9 @@ class Route(Message):
     # Narrow channels have several points per pixel.
     time_to_go_s: Annotated[Raster, Shape("h", "w", finite=False)] | None = None
     time_to_go_um_per_px: float = 0.0  # distance between points; 0: that of the chip's pixels
+    # Of a survey: the next stretch is to be ordered on the way. A route that is ordered on the way begins as the one
+    # before, with the same times.
+    more: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -323,6 +326,8 @@ class Mission(Message):
     blind: str = ""  # why it is not seen, human-readable
     field_off: bool = False  # not seen for so long that the field must be off
     input_ended: bool = False  # no more frames come; in the phase observe only
+    # work orders so far that no disturbance has caused: stretches of a survey after the first, refinements on the way
+    routine_orders: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -451,12 +456,12 @@ _ROUTE = {"waypoints_um": 1e-4, "arrival_s": 1e-6, "time_to_go_s": 1e-6}
 _SOLVE = SlowStage((WorkOrder.SOLVE,), reads=(), settings=("flow",))
 _REFINE = SlowStage(
     (WorkOrder.REFINE,),
-    reads=("assumed", "observations"),
+    reads=("assumed", "refined", "observations"),
     settings=("tracker", "observer", "sampler", "refine", "mission"),
 )
 _PLAN = SlowStage(
     (WorkOrder.SURVEY_ROUTE, WorkOrder.ROUTE),
-    reads=("assumed", "refined", "health"),
+    reads=("assumed", "refined", "health", "route", "estimate", "observations", "demand"),
     settings=("robot", "survey", "plan"),
 )
 

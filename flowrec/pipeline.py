@@ -190,6 +190,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         inputs.applied,
         p.tracker.not_found_note(appearance),
         appearance is not None and bool(appearance.note),
+        observations,
     )
     demand = p.controller.control(
         last.demand,

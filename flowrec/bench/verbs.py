@@ -13,6 +13,7 @@ __all__ = ["AsJson", "Overwrite", "Sets", "bench"]
 
 BENCHES = {
     "flow": "Refinement: error of the flow before and after each method (Table I and Fig. 4 of the paper).",
+    "survey": "The survey: error of the flow with as many observations along different ways.",
     "plan": "Planning: path length and travel time of each planner, upstream and downstream, over the least time.",
     "observer": "Estimation: error of each observer on the paper's lemniscate; settings that suit a recording.",
     "track": "Control: how closely each law tracks the paper's lemniscate in a vortex; vision: robots of many looks.",

@@ -24,7 +24,8 @@ from flowrec.pipeline import assemble
 from flowrec.planning import travel_time
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import RunReport, Sink, run
-from flowrec.run.workers import LockstepWorker, Preloaded, no_observations
+from flowrec.run.route_orders import no_observations
+from flowrec.run.workers import LockstepWorker, Preloaded
 from flowrec.session import files_behind
 from flowrec.session_writer import session_writer
 from flowrec.summary import Row, Value, finite

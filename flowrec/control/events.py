@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from flowrec.enums import Action, Alarm, Level, Outcome
+from flowrec.enums import Action, Alarm, Level, Outcome, Phase
 from flowrec.messages import Event, Health, Tick
 from flowrec.units import seconds
 
@@ -50,6 +50,10 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
         return
     if not route.reachable:
         yield f"no route ({route.method}): {route.reason}", Level.WARNING
+        return
+    mission, before = tick.mission, last.mission
+    if mission is not None and before is not None and mission.phase == before.phase in (Phase.SURVEY, Phase.NAVIGATE):
+        yield f"{mission.phase}: {route.reason}", None  # ordered on the way
         return
     length = float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
     yield f"route adopted ({route.method}): {length / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None

@@ -7,12 +7,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 
+from flowrec.control.mission_steps import Frame, at_end, elapsed_s, finish, held, left_s, order, transition
+from flowrec.control.trajectory import position_at
 from flowrec.enums import Action, Outcome, Phase, WorkOrder
-from flowrec.messages import Applied, Demand, Estimate, FlowField, Mission, OperatorEvent, Route, Track
+from flowrec.messages import (
+    Applied,
+    Demand,
+    Estimate,
+    FlowField,
+    Mission,
+    Observations,
+    OperatorEvent,
+    Route,
+    Track,
+)
 from flowrec.ranges import Range
 from flowrec.robot import Robot
 from flowrec.units import seconds
@@ -23,49 +35,8 @@ Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Point = tuple[Coordinate, Coordinate]
 Place = Point | str
 _IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
-_SWEPT_RADII, _RETURNED_RADII = 2.0, 1.0  # from its position, of a held robot
+_ON_THE_WAY = (Phase.SURVEY, Phase.NAVIGATE)  # the robot goes on while an order is under way
 _EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Frame:
-    """What the state machine knows after one frame."""
-
-    track: Track
-    estimate: Estimate
-    assumed: FlowField | None
-    refined: FlowField | None
-    route: Route | None
-    operator: OperatorEvent | None
-    demand: Demand | None  # of the frame before; its error is the distance of the robot from its route
-    robot: Robot
-    applied: Applied | None
-    not_found_note: str
-    refused: bool
-
-    def with_advice(self, note: str) -> str:
-        """A note on a robot that was not found, with the tracker's advice."""
-        return f"{note} {self.not_found_note}" if self.not_found_note else note
-
-    @property
-    def now_ns(self) -> int:
-        return self.track.stamp_ns
-
-    @property
-    def command(self) -> str:
-        """What the operator asked for on this frame, '' if nothing."""
-        return self.operator.action if self.operator is not None and self.operator.stamp_ns == self.now_ns else ""
-
-    def result(self, mission: Mission) -> FlowField | Route | None:
-        """The result that the mission waits for, once it has arrived."""
-        results: dict[str, FlowField | Route | None] = {
-            WorkOrder.SOLVE: self.assumed,
-            WorkOrder.REFINE: self.refined,
-            WorkOrder.SURVEY_ROUTE: self.route,
-            WorkOrder.ROUTE: self.route,
-        }
-        result = results.get(mission.wanted)
-        return result if result is not None and result.request == mission.request else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +57,13 @@ class MissionStateMachine:
     navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
     # no route is followed for longer than this factor times its planned duration, plus 5 s
     patience: Annotated[float, Range(0.1, 1e3)] = 3.0
-    # number of work orders after which a robot that is blown off its route once more gives up
+    # Time before the end of a stretch of the survey at which the next one is ordered; so far ahead of the robot a route
+    # begins that is ordered on the way.
+    lead_s: Annotated[float, Range(0.0, 600.0)] = 2.0
+    # observations after which the map is refined again on the way to the goal, and another route taken if it is better
+    # by more than the map is uncertain; 0: never
+    reassimilate_observations: Annotated[int, Range(0, 1_000_000)] = 0
+    # number of work orders after which a robot that is blown off its route once more gives up, but for routine ones
     orders_limit: Annotated[int, Range(1, 1_000_000)] = 20
     # to see the robot for the first time, or again after the field was switched off
     find_limit_s: Annotated[float, Range(0.01, 1e5)] = 3.0
@@ -113,6 +90,7 @@ class MissionStateMachine:
         applied: Applied | None = None,
         not_found_note: str = "",
         refused: bool = False,
+        observations: Observations | None = None,
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
@@ -121,8 +99,9 @@ class MissionStateMachine:
 
         `not_found_note` is the tracker's advice for a robot that is not found; `refused`: it can not be found.
         """
-        now = _Frame(
-            track, estimate, assumed, refined, route, operator, demand, robot, applied, not_found_note, refused
+        now = Frame(
+            *(track, estimate, assumed, refined, route, operator, demand, robot, applied, not_found_note, refused),
+            observations,
         )
         if self.observes:
             return self._observe(previous if previous is not None else self._first(now), now)
@@ -142,16 +121,17 @@ class MissionStateMachine:
         if without_sight is not previous or previous.blind_since_ns is not None:
             return without_sight
         if previous.held_since_ns is not None:
-            return _held(previous, now)
+            return held(previous, now)
         result = now.result(previous)
-        return previous if previous.wanted and result is None else self._advance(previous, now, result)
+        waits = bool(previous.wanted) and result is None and previous.phase not in _ON_THE_WAY
+        return previous if waits else self._advance(previous, now, result)
 
     @property
     def observes(self) -> bool:
         """Whether the robot is only watched."""
         return Phase.OBSERVE in self.phases
 
-    def _first(self, now: _Frame) -> Mission:
+    def _first(self, now: Frame) -> Mission:
         has_field = now.assumed is not None  # of an earlier session
         nowhere = np.full(2, np.nan)
         return Mission(
@@ -168,29 +148,29 @@ class MissionStateMachine:
             note="",
         )
 
-    def _observe(self, previous: Mission, now: _Frame) -> Mission:
+    def _observe(self, previous: Mission, now: Frame) -> Mission:
         """Wait for the assumed flow and for the end of the frames, then for the refinement."""
         if previous.finished:
             return previous
         mission, operator = previous, now.operator
         if now.command in (Action.STOP, Action.ZERO):
             note = operator.text if operator is not None else ""
-            return _finish(mission, now, Outcome.STOPPED, note or f"operator: {now.command}")
+            return finish(mission, now, Outcome.STOPPED, note or f"operator: {now.command}")
         if now.command == Action.END and not mission.input_ended:
             mission = replace(mission, stamp_ns=now.now_ns, input_ended=True)
         if now.refused:
-            return _finish(mission, now, Outcome.NOT_FOUND, now.not_found_note)
+            return finish(mission, now, Outcome.NOT_FOUND, now.not_found_note)
         if mission.wanted and now.result(mission) is None:
             return mission
         if mission.wanted == WorkOrder.REFINE:
-            return _finish(mission, now, Outcome.OBSERVE_COMPLETE)
+            return finish(mission, now, Outcome.OBSERVE_COMPLETE)
         if not mission.input_ended:
             return replace(mission, stamp_ns=now.now_ns, wanted="") if mission.wanted else mission
         if now.track.seen_ns is None:
-            return _finish(mission, now, Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {_IN_VIEW}"))
-        return _order(mission, now, Phase.OBSERVE, WorkOrder.REFINE)
+            return finish(mission, now, Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {_IN_VIEW}"))
+        return order(mission, now, Phase.OBSERVE, WorkOrder.REFINE)
 
-    def _after_command(self, mission: Mission, now: _Frame) -> Mission:
+    def _after_command(self, mission: Mission, now: Frame) -> Mission:
         """The mission after the operator's command; the mission itself if there is none.
 
         A held mission does not advance, whatever it waits for, and its time limits are suspended.
@@ -198,7 +178,7 @@ class MissionStateMachine:
         command, since_ns = now.command, mission.held_since_ns
         if command in (Action.STOP, Action.ZERO):
             note = now.operator.text if now.operator is not None else ""
-            return _finish(mission, now, Outcome.STOPPED, note or f"operator: {command}")
+            return finish(mission, now, Outcome.STOPPED, note or f"operator: {command}")
         if command == Action.PAUSE and since_ns is None:
             return replace(mission, stamp_ns=now.now_ns, held_since_ns=now.now_ns)
         if command == Action.RESUME and since_ns is not None:
@@ -206,7 +186,7 @@ class MissionStateMachine:
             return replace(mission, stamp_ns=now.now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
         return mission
 
-    def _lost(self, previous: Mission, now: _Frame) -> Mission | None:
+    def _lost(self, previous: Mission, now: Frame) -> Mission | None:
         """The end of a run whose robot was not found, or not seen for too many frames.
 
         A camera that was absent and is back has as much time to find the robot as in the beginning.
@@ -216,19 +196,19 @@ class MissionStateMachine:
             return None
         if previous.phase == Phase.START:
             if now.refused:
-                return _finish(previous, now, Outcome.NOT_FOUND, now.not_found_note)
+                return finish(previous, now, Outcome.NOT_FOUND, now.not_found_note)
             seen_ns = now.track.seen_ns
             if seen_ns is not None and seconds(now.now_ns - seen_ns) <= self.find_limit_s:
                 return None  # it was found, and this image does not show it
-            if _elapsed_s(previous, now) > self.find_limit_s:
+            if elapsed_s(previous, now) > self.find_limit_s:
                 note = f"no robot seen in the image for {self.find_limit_s:g} s; {_IN_VIEW}"
-                return _finish(previous, now, Outcome.NOT_FOUND, now.with_advice(note))
+                return finish(previous, now, Outcome.NOT_FOUND, now.with_advice(note))
         elif now.track.lost_frames > self.lost_limit_frames:
             why = f"{previous.blind}, " if previous.blind else "robot not seen in "
-            return _finish(previous, now, Outcome.LOST, f"{why}{now.track.lost_frames} frames")
+            return finish(previous, now, Outcome.LOST, f"{why}{now.track.lost_frames} frames")
         return None
 
-    def _without_sight(self, previous: Mission, now: _Frame) -> Mission:
+    def _without_sight(self, previous: Mission, now: Frame) -> Mission:
         """Without sight of the robot: hold it, then switch the field off, then end; continue when it is seen again.
 
         If it was carried too far off its route meanwhile, a new one is planned as after any other disturbance. While
@@ -253,7 +233,7 @@ class MissionStateMachine:
         if applied.repeats_image:
             why = f"the camera repeats one image since {seconds(applied.image_since_ns):.1f} s"
         if unseen_s >= self.zero_after_s + self.find_limit_s:
-            return _finish(previous, now, Outcome.LOST, why)
+            return finish(previous, now, Outcome.LOST, why)
         if unseen_s >= self.zero_after_s and not previous.field_off:
             since_ns = now_ns if previous.blind_since_ns is None else previous.blind_since_ns
             return replace(previous, stamp_ns=now_ns, blind_since_ns=since_ns, blind=why, field_off=True)
@@ -261,7 +241,7 @@ class MissionStateMachine:
             return replace(previous, stamp_ns=now_ns, blind_since_ns=now_ns, blind=why)
         return previous
 
-    def _advance(self, previous: Mission, now: _Frame, result: FlowField | Route | None) -> Mission:
+    def _advance(self, previous: Mission, now: Frame, result: FlowField | Route | None) -> Mission:
         """The next state when no work is pending, or its result has just arrived."""
         phase, route = previous.phase, now.route
         if not now.track.seen and phase != Phase.START:
@@ -269,50 +249,73 @@ class MissionStateMachine:
         if phase == Phase.START:
             if isinstance(result, Route):  # of the survey
                 if result.reachable:
-                    return _transition(previous, now, Phase.SURVEY, result.reason)
+                    return transition(previous, now, Phase.SURVEY, result.reason)
                 return self._next_phase(Phase.SURVEY, previous, now, f"no survey: {result.reason}")
             if not now.track.seen:
                 return replace(previous, stamp_ns=now.now_ns, wanted="") if previous.wanted else previous
             if Phase.SURVEY in self.phases:
-                return _order(previous, now, Phase.START, WorkOrder.SURVEY_ROUTE)
+                return order(previous, now, Phase.START, WorkOrder.SURVEY_ROUTE)
             return self._next_phase(Phase.SURVEY, previous, now)
         if phase == Phase.REFINE:
             return self._next_phase(Phase.REFINE, previous, now)
         if phase == Phase.PLAN:
             assert isinstance(result, Route)
             if not result.reachable:
-                return _finish(previous, now, Outcome.UNREACHABLE, result.reason)
+                return finish(previous, now, Outcome.UNREACHABLE, result.reason)
             return self._next_phase(Phase.PLAN, previous, now, result.reason)
         assert route is not None
         if phase == Phase.SURVEY:
-            late = _elapsed_s(previous, now) > self._time_limit_s(self.survey_limit_s, route)
-            if late or _at_end(now, route):
-                return self._next_phase(
-                    Phase.SURVEY, previous, now, "survey cut short by its time limit" if late else ""
-                )
+            return self._survey(previous, now, route, result)
+        return self._navigate(previous, now, route, result)
+
+    def _survey(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
+        """On a stretch: the next one is ordered before its end; an order under way is waited for, at the end at rest.
+
+        The phase ends with the last stretch, or with its time limit.
+        """
+        if result is not None:
+            assert isinstance(result, Route)
+            return transition(previous, now, Phase.SURVEY, result.reason)
+        if previous.wanted:
             return previous
-        return self._navigate(previous, now, route)
+        if elapsed_s(previous, now) > self._time_limit_s(self.survey_limit_s, route):
+            return self._next_phase(Phase.SURVEY, previous, now, "survey cut short by its time limit")
+        near_end = left_s(now, route) <= self.lead_s
+        if route.more:
+            if not (near_end or at_end(now, route)):
+                return previous
+            return order(
+                *(previous, now, Phase.SURVEY, WorkOrder.SURVEY_ROUTE),
+                start_um=route.waypoints_um[-1],
+                routine_orders=previous.routine_orders + 1,
+            )
+        # A survey of several stretches may pass its end on the way.
+        if at_end(now, route) and (near_end or not previous.routine_orders):
+            return self._next_phase(Phase.SURVEY, previous, now)
+        return previous
 
     def _time_limit_s(self, limit_s: float, route: Route) -> float:
         """How long a route may be followed: for a robot that is stuck, waiting does not help."""
         return min(limit_s, self.patience * float(route.arrival_s[-1]) + _EXTRA_S)
 
-    def _navigate(self, previous: Mission, now: _Frame, route: Route) -> Mission:
+    def _navigate(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
         """At the goal, too late, too far off the route, or still on the way."""
         tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius_um
         if math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
-            return _finish(previous, now, Outcome.REACHED)
+            return finish(previous, now, Outcome.REACHED)
         limit_s = self._time_limit_s(self.navigate_limit_s, route)
-        if _elapsed_s(previous, now) > limit_s:
+        if elapsed_s(previous, now) > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
-            return _finish(previous, now, Outcome.TIMEOUT, note)
+            return finish(previous, now, Outcome.TIMEOUT, note)
+        if previous.wanted and result is None:
+            return previous  # one order at a time
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
         if now.demand is None or not now.demand.error_um > limit_um:
-            return previous
-        if previous.request >= self.orders_limit:
+            return self._look_again(previous, now, route, result)
+        if previous.request - previous.routine_orders >= self.orders_limit:
             note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
-            return _finish(previous, now, Outcome.GAVE_UP, note)
-        return _order(
+            return finish(previous, now, Outcome.GAVE_UP, note)
+        return order(
             previous,
             now,
             Phase.PLAN,
@@ -320,83 +323,44 @@ class MissionStateMachine:
             f"blown {now.demand.error_um:.0f} um off the route: planning anew",
         )
 
-    def _next_phase(self, done: Phase, previous: Mission, now: _Frame, note: str = "") -> Mission:
+    def _look_again(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
+        """On the way: after some observations refine the map again, then ask whether another route is better now."""
+        wanted = None
+        if isinstance(result, FlowField):
+            wanted = WorkOrder.ROUTE
+        elif isinstance(result, Route):
+            return transition(previous, now, Phase.NAVIGATE, result.reason)
+        elif self._refines_again(now) and left_s(now, route) > 2.0 * self.lead_s:
+            wanted = WorkOrder.REFINE
+        if wanted is None:
+            return previous
+        assert now.demand is not None
+        return order(
+            *(previous, now, Phase.NAVIGATE, wanted),
+            start_um=position_at(route, now.demand.progress_s + self.lead_s),
+            routine_orders=previous.routine_orders + 1,
+        )
+
+    def _refines_again(self, now: Frame) -> bool:
+        """Whether enough observations have been made since the map was refined."""
+        observations, refined = now.observations, now.refined
+        if not self.reassimilate_observations or Phase.REFINE not in self.phases:
+            return False
+        if observations is None or observations.time_s is None or refined is None:
+            return False
+        new = observations.time_s > seconds(refined.stamp_ns)
+        return int(np.count_nonzero(new)) >= self.reassimilate_observations
+
+    def _next_phase(self, done: Phase, previous: Mission, now: Frame, note: str = "") -> Mission:
         """Enter the first selected phase after `done`, or end the run."""
         selected: set[str] = {*self.phases, Phase.PLAN} if Phase.NAVIGATE in self.phases else set(self.phases)
         name = next((name for name in PHASES[PHASES.index(done) + 1 :] if name in selected), None)
         if name is None:
-            return _finish(previous, now, Outcome(f"{done} complete"), note)
+            return finish(previous, now, Outcome(f"{done} complete"), note)
         phase, orders = Phase(name), {"refine": WorkOrder.REFINE, "plan": WorkOrder.ROUTE}
         if name in orders:
-            return _order(previous, now, phase, orders[name], note)
-        return _transition(previous, now, phase, note)
-
-
-def _held(previous: Mission, now: _Frame) -> Mission:
-    """Whether a held robot is swept away: from two radii off its position on, until it is back within one."""
-    if not now.track.seen or now.demand is None or not math.isfinite(now.demand.error_um):
-        return previous
-    limit_radii = _RETURNED_RADII if previous.swept else _SWEPT_RADII
-    swept = now.demand.error_um > limit_radii * now.robot.radius_um
-    return previous if swept == previous.swept else replace(previous, stamp_ns=now.now_ns, swept=swept)
-
-
-def _elapsed_s(mission: Mission, now: _Frame) -> float:
-    """How long the phase has lasted, without the time during which it was held."""
-    held_ns = mission.held_ns
-    if mission.held_since_ns is not None:
-        held_ns += now.now_ns - mission.held_since_ns
-    return seconds(now.now_ns - mission.since_ns - held_ns)
-
-
-def _at_end(now: _Frame, route: Route) -> bool:
-    """Whether the robot is at the end of a route, or the reference is and the robot as near as it comes."""
-    if math.dist(now.estimate.position_um, route.waypoints_um[-1]) <= now.robot.radius_um:
-        return True
-    demand = now.demand
-    return (
-        demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * now.robot.radius_um
-    )
-
-
-def _transition(
-    previous: Mission, now: _Frame, phase: Phase, note: str = "", wanted: WorkOrder | None = None, **changes: Any
-) -> Mission:
-    """The mission in a phase, which begins now unless it is the present one."""
-    new = phase != previous.phase
-    return replace(
-        previous,
-        stamp_ns=now.now_ns,
-        phase=phase.value,
-        since_ns=now.now_ns if new else previous.since_ns,
-        held_ns=0 if new else previous.held_ns,
-        wanted=wanted.value if wanted is not None else "",
-        note=note,
-        **changes,
-    )
-
-
-def _order(previous: Mission, now: _Frame, phase: Phase, wanted: WorkOrder, note: str = "") -> Mission:
-    """The mission in a phase that waits for a new work order."""
-    request, start_um = previous.request + 1, now.estimate.position_um
-    return _transition(previous, now, phase, note, wanted, request=request, requested_ns=now.now_ns, start_um=start_um)
-
-
-def _finish(previous: Mission, now: _Frame, outcome: Outcome, note: str = "") -> Mission:
-    """The finished mission."""
-    return _transition(
-        previous,
-        now,
-        Phase.DONE,
-        note,
-        finished=True,
-        outcome=outcome.value,
-        held_since_ns=None,
-        swept=False,
-        blind_since_ns=None,
-        blind="",
-        field_off=False,
-    )
+            return order(previous, now, phase, orders[name], note)
+        return transition(previous, now, phase, note)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,9 @@ Vector = NDArray[np.float64]
 
 
 def follow(now: Situation, route: Route, lag_free_um: float, lag_full_um: float, pace_fraction: float) -> Reference:
-    """The reference on its way along the route; at the start when the phase or the route has just begun.
+    """The reference on its way along the route; at the start when the phase has just begun.
+
+    A route that is adopted within a phase begins as the one before, with the same times, so the reference goes on.
 
     Parameters
     ----------
@@ -23,7 +25,7 @@ def follow(now: Situation, route: Route, lag_free_um: float, lag_full_um: float,
     pace_fraction : fraction of the robot's speed limit that the reference may use; feedback uses the rest.
     """
     robot, estimate, previous = now.robot, now.estimate, now.previous
-    if previous is None or now.mission.since_ns > previous.stamp_ns or route.stamp_ns > previous.stamp_ns:
+    if previous is None or now.mission.since_ns > previous.stamp_ns:
         progress_s, pace = 0.0, 1.0
     else:
         position = position_at(route, previous.progress_s)

@@ -28,6 +28,7 @@ class FlowUncertainty:
         1 everywhere for the relative error of um per revolution.
     covariance : (p + r, p + r) of all unknowns.
     error_um_s : (n,) standard deviation of a component that no unknown explains.
+    noise_factor : by which the noise of observations was wider than stated, neighbours that err alike included.
     """
 
     mean_um_s: Floats
@@ -35,6 +36,7 @@ class FlowUncertainty:
     rolled: Floats
     covariance: Floats
     error_um_s: Floats
+    noise_factor: float = 1.0
 
     @property
     def std_um_s(self) -> Floats:
@@ -43,6 +45,12 @@ class FlowUncertainty:
         modes = np.tensordot(self.covariance[:count, :count], self.columns_um_s, axes=1)
         variance = (modes * self.columns_um_s).sum(axis=0)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0) + self.error_um_s[:, None] ** 2))
+
+    @property
+    def error_share(self) -> float:
+        """The expected relative error of the flow over the mask, as in `FlowField.error_share`."""
+        speed = float(np.sqrt((self.mean_um_s**2).sum()))
+        return float(np.sqrt((self.std_um_s**2).sum())) / max(speed, 1e-300)
 
     def with_covariance(self, covariance: Floats) -> FlowUncertainty:
         """The same modes with another covariance (p + r, p + r)."""

@@ -2,6 +2,6 @@
 
 from flowrec.planning.planner import PLANNERS, Planner, warm_up
 from flowrec.planning.route import travel_time
-from flowrec.planning.survey import SurveyPlanner
+from flowrec.planning.survey import SURVEYS, SurveyPlanner
 
-__all__ = ["PLANNERS", "Planner", "SurveyPlanner", "travel_time", "warm_up"]
+__all__ = ["PLANNERS", "SURVEYS", "Planner", "SurveyPlanner", "travel_time", "warm_up"]

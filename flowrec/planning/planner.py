@@ -11,13 +11,15 @@ from numpy.typing import ArrayLike
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.errors import UsageError
+from flowrec.flow.uncertainty import FlowUncertainty
 from flowrec.messages import FlowField, Route
 from flowrec.methods import Method, Methods
 from flowrec.planning.feasibility import narrowest, too_swift, why_apart
 from flowrec.planning.free_space import FastFlowMargin, spaces_by_margin
 from flowrec.planning.problem import Problem, attach_goal, attach_start
 from flowrec.planning.route import no_route, planning_speed_um_s
-from flowrec.planning.survey import SurveyPlanner
+from flowrec.planning.survey import SURVEYS, SurveyPlanner
+from flowrec.planning.survey_design import Sampling, SurveyOrder
 from flowrec.ranges import OneOf, PositiveShare, Range, Seed, Share, check_ranges
 from flowrec.robot import Robot
 
@@ -111,6 +113,8 @@ class Planner:
     reach_px: Annotated[int, OneOf(1, 2, 3)] = 3
     paper_radius_px: Annotated[float, Range(1.0, 100.0)] = 3.5  # neighbours of astar_paper; 1.5 gives 8
     refine: bool = True  # the path of time_field and astar_time
+    # on the way, another route is taken if it gains more than so many standard deviations of the gain
+    replan_deviations: Annotated[float, Range(0.0, 100.0)] = 2.0
     rrt: RrtSettings = setting(default_factory=RrtSettings)
 
     def plan(self, field: FlowField, start_um: ArrayLike, goal_um: ArrayLike, chip: Chip, robot: Robot) -> Route:
@@ -168,7 +172,13 @@ def warm_up() -> None:
         0, 0, "none", 1.0, velocity, np.zeros((9, 24), np.float32), None, chip.boundary_values, 1.0, 1000.0, ""
     )
     robot = Robot(radius_um=0.5, max_speed_um_s=5.0, step_out_hz=10.0)
-    SurveyPlanner().plan(field, (2.0, 4.0), chip, robot)
+    modes = velocity[chip.mask].astype(np.float64)
+    nothing = np.zeros((0, len(modes)))
+    uncertainty = FlowUncertainty(modes, modes[None], nothing, 0.1 * np.eye(1), np.zeros(len(modes)))
+    start_um, goal_um, sampling = np.array([2.0, 4.0]), np.array([20.0, 4.0]), Sampling(1.0, 0.0, 0.1)
+    for row in SURVEYS.values():
+        order = SurveyOrder(field, start_um, chip, robot, goal_um, uncertainty, sampling)
+        SurveyPlanner(method=row.name).plan(order)
     for row in PLANNERS.values():
         if not row.extra:
             Planner(method=row.name).plan(field, (2.0, 4.0), (20.0, 4.0), chip, robot)

@@ -1,40 +1,66 @@
-"""The survey's route: downstream in the assumed flow, in the middle of the channel, over a limited distance."""
+"""The survey's routes: where the robot looks at the flow before the mission plans its way; and the table of methods."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, Protocol
 
-import numpy as np
-import scipy  # its ndimage loads at first use, not at start-up
-from numpy.typing import ArrayLike, NDArray
+from flowrec.messages import Route
+from flowrec.methods import Method, Methods
+from flowrec.planning.free_space import FastFlowMargin
+from flowrec.planning.survey_design import SurveyOrder
+from flowrec.ranges import PositiveShare, Range, Share
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.openings import distance_px
-from flowrec.messages import FlowField, Route
-from flowrec.planning.cost_rasters import Mask, Raster
-from flowrec.planning.free_space import FastFlowMargin, FreeSpace, spaces_by_margin
-from flowrec.planning.grid_search import TRAVEL_TIME, backtrack, directions, search
-from flowrec.planning.path_refinement import refine_path
-from flowrec.planning.problem import attach_start, with_ends
-from flowrec.planning.route import no_route, planning_speed_um_s, timed_route
-from flowrec.ranges import PositiveShare, Range
-from flowrec.robot import Robot
+_ALL = ("speed_share", "clearance_margin_um", "swift", "middle_pull", "outlet_gap_radii")
+_NO_PRIOR = "downstream"  # the method that needs none
 
-_METHOD = "survey"
+SURVEYS = Methods(
+    "survey.method",
+    Method(
+        "information",
+        "flowrec.planning.survey_information:Information",
+        "stretch by stretch to where observations lower the error of the flow most per second, while it is worth it",
+        (
+            *_ALL,
+            "fast_share",
+            "drift_share",
+            "route_share",
+            "detour_share",
+            "robust_deviations",
+            "model_share",
+            "places",
+            "worth",
+        ),
+        needs=("uncertainty",),
+    ),
+    Method(
+        "downstream",
+        "flowrec.planning.survey_downstream:Downstream",
+        "one path with the main stream, over a limited distance",
+        (*_ALL, "distance_um", "share"),
+    ),
+)
+
+
+class SurveyMethod(Protocol):
+    """What the target of a row is: a class whose fields are the row's options, with this verb."""
+
+    def plan(self, order: SurveyOrder) -> Route:
+        """The route of the survey, or no route with its reason.
+
+        `more` of the route says whether another stretch is to be asked for on the way; it then begins as the route
+        that the order holds as `present`, with the same times.
+        """
+        ...
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyPlanner:
-    """A path with the flow that brings the robot past as much of it as the distance allows.
+    """Settings of all methods; a method reads those that its row in SURVEYS names."""
 
-    A streamline may end in a stagnation point or circle behind a step. So every node is reached on its fastest path
-    from the start (Dijkstra's algorithm on travel time, at a higher cost near walls), and of the paths short enough the
-    one is taken with the largest work of the flow, the integral of v . dl. It follows the main stream through every
-    junction and can neither stop nor circle.
-    """
-
-    distance_um: Annotated[float, Range(1.0, 1e7)] | None = None  # None: `share` of the longest path downstream
+    method: Annotated[str, SURVEYS] = "downstream"
+    # of `downstream`; None: `share` of the longest path downstream
+    distance_um: Annotated[float, Range(1.0, 1e7)] | None = None
     share: PositiveShare | None = None  # None: 1/8; 1/2 where there are several inlets or outlets to tell apart
     # ratio to the robot's speed limit: slower than usual, to observe more on the way
     speed_share: PositiveShare = 0.5
@@ -43,11 +69,27 @@ class SurveyPlanner:
     # additional cost of a pixel next to the wall, as a ratio to that of one in the middle
     middle_pull: Annotated[float, Range(0.0, 1e3)] = 2.0
     outlet_gap_radii: Annotated[float, Range(0.0, 1e3)] = 3.0  # between the end of the route and any opening
+    # Of `information`: other ratios to the speed limit at which a stretch may be travelled. A drift observes the flow
+    # almost without the robot's own motion, so it is tried only where constants of the robot are in doubt.
+    fast_share: PositiveShare = 0.85
+    drift_share: PositiveShare = 0.15
+    # Of the squared error that is to be lowered, the part that counts on the ways to the goal; the rest is the map's.
+    route_share: Share = 0.5
+    # A way to the goal that takes longer than the fastest by this ratio counts for a third of it.
+    detour_share: Annotated[float, Range(0.01, 100.0)] = 0.5
+    # of the flow, by which it may be worse than believed where the goal must stay within reach; fewer where no way is
+    robust_deviations: Annotated[float, Range(0.0, 100.0)] = 1.0
+    # Of the speed of the flow, one standard deviation of what the model does not explain, the same all over a place:
+    # what is known as well as this is not looked at again.
+    model_share: Annotated[float, Range(0.0, 10.0)] = 0.05
+    places: Annotated[int, Range(1, 10_000)] = 120  # at most so many ends of a stretch are compared, per speed
+    # The survey ends when a crossing's time of it would lower the relative error of the flow by less than this.
+    worth: Annotated[float, Range(0.0, 10.0)] = 0.02
 
-    def plan(
-        self, field: FlowField, start_um: ArrayLike, chip: Chip, robot: Robot, distance_um: float | None = None
-    ) -> Route:
-        """Route (stamp and request 0) downstream from a start (2,) um, at most `distance_um` long.
+    def plan(self, order: SurveyOrder) -> Route:
+        """The route (stamp and request 0) of the survey as far as it is decided, or no route with the reason.
+
+        A method that needs the uncertainty of the flow is replaced by one that does not, where there is none.
 
         Raises
         ------
@@ -56,82 +98,10 @@ class SurveyPlanner:
         FlowError
             If the field is not finite.
         """
-        speed_um_s = planning_speed_um_s(self.speed_share, robot)
-        limit_um = distance_um if distance_um is not None else self.distance_um
-        start_at = np.asarray(start_um, np.float64)
-        course_error = self.swift.course_error(robot, speed_um_s, field)
-        for space, _, less in spaces_by_margin(chip, field, robot, self.clearance_margin_um, course_error):
-            route = self._downstream(space, field, start_at, chip, speed_um_s, limit_um)
-            if route.reachable:
-                return replace(route, reason="; ".join(filter(None, (less, route.reason))))
-        return route
-
-    def _downstream(
-        self,
-        space: FreeSpace,
-        field: FlowField,
-        start_um: NDArray[np.float64],
-        chip: Chip,
-        speed_um_s: float,
-        limit_um: float | None,
-    ) -> Route:
-        start = attach_start(space, start_um)
-        if start.error:
-            return no_route(_METHOD, start.error)
-        px = space.um_per_px
-        # Time costs most next to the walls and least in the middle of the channel.
-        weight = 1.0 + self.middle_pull * (space.need / np.maximum(space.clearance, space.need)) ** 2
-        cost, parent = search(space, TRAVEL_TIME, directions(2), speed_um_s / px, start.node, weight=weight)
-        length, work = _along_tree(cost, parent, space)
-        y, x = np.indices(space.free.shape)
-        far = np.ones(space.free.shape, np.bool_)
-        for opening in chip.openings:
-            far &= distance_px(opening, x, y, space.free.shape) >= self.outlet_gap_radii * space.radius
-        allowed = np.isfinite(cost) & (work > 0.0) & far.ravel()
-        allowed[start.node] = False
-        if not allowed.any():
-            return no_route(_METHOD, "nothing lies downstream of the start before the chip ends")
-        share = self.share if self.share is not None else 0.125 if len(chip.openings) <= 2 else 0.5
-        limit_px = share * length[_most_work(work, allowed)] if limit_um is None else limit_um / px
-        allowed &= length <= limit_px
-        if not allowed.any():
-            return no_route(
-                _METHOD, f"there is no place to survey within {limit_px * px:.0f} um downstream of the start"
-            )
-        central = allowed & _central(space.clearance).ravel()
-        end = _most_work(work, central if central.any() else allowed)
-        path = with_ends(space, backtrack(parent, end, space.width), start, None)
-        rasters = space.cost_rasters(speed_um_s / px)._replace(clearance=space.clearance)
-        for candidate in (refine_path(path, rasters, weight), path):
-            route = timed_route(_METHOD, field, candidate * px, speed_um_s)
-            if route.reachable:
-                return replace(route, reason=start.remark)
-        return route
-
-
-def _along_tree(
-    cost: NDArray[np.float64], parent: NDArray[np.int64], space: FreeSpace
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Length (h*w,) in px and work of the flow (h*w,) in px2/s along the path to each node of the search's tree."""
-    length, work = np.zeros(len(cost)), np.zeros(len(cost))
-    vx, vy = space.vx.ravel(), space.vy.ravel()
-    # A parent costs less than its children, so in the order of cost one pass is enough.
-    for node in np.argsort(cost, kind="stable")[: int(np.isfinite(cost).sum())]:
-        before = parent[node]
-        if before < 0:
-            continue
-        dx = node % space.width - before % space.width
-        dy = node // space.width - before // space.width
-        length[node] = length[before] + np.hypot(dx, dy)
-        work[node] = work[before] + 0.5 * (dx * (vx[node] + vx[before]) + dy * (vy[node] + vy[before]))
-    return length, work
-
-
-def _most_work(work: NDArray[np.float64], allowed: NDArray[np.bool_]) -> int:
-    """The allowed node (flat index) with the largest work of the flow along its path."""
-    return int(np.argmax(np.where(allowed, work, -np.inf)))
-
-
-def _central(clearance: Raster) -> Mask:
-    """(h, w) pixels near the middle of a channel: within two pixels none has more than one pixel more clearance."""
-    return np.asarray(clearance >= scipy.ndimage.maximum_filter(clearance, 5) - 1.0)
+        row, remark = SURVEYS[self.method], ""
+        if "uncertainty" in row.needs and order.uncertainty is None:
+            remark = f"survey {_NO_PRIOR}: nothing says how wrong the assumed flow may be"
+            row = SURVEYS[_NO_PRIOR]
+        method: SurveyMethod = row.load()(**{option: getattr(self, option) for option in row.options})
+        route = method.plan(order)
+        return replace(route, reason="; ".join(filter(None, (remark, route.reason)))) if remark else route

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from flowrec.chip.chip import Chip
@@ -22,12 +24,13 @@ def flow_uncertainty(
     try:
         if operator.count == 0:
             model = settings._linear_model(chip, solver)  # noqa: SLF001
-            covariance, mean = np.eye(len(model.columns)), model.base
+            covariance, mean, factor = np.eye(len(model.columns)), model.base, 1.0
         else:
             found = settings._posterior(operator, chip, solver)  # noqa: SLF001
             model, covariance = found.model, found.found.covariance
+            factor = found.found.noise_factor * math.sqrt(found.found.correlation_length)
             mean = model.base + np.tensordot(found.found.mean, model.columns, axes=1) + found.nonlinear
     except FlowError:
         return None
     error = np.sqrt((model.error_std**2).mean(axis=1))
-    return FlowUncertainty(mean, model.columns, np.zeros((0, len(mean))), covariance, error)
+    return FlowUncertainty(mean, model.columns, np.zeros((0, len(mean))), covariance, error, factor)

@@ -10,21 +10,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
-import numpy as np
-
-from flowrec.enums import WorkOrder
-from flowrec.messages import FlowField, Mission, Observations, Route, Tick
+from flowrec.enums import Phase, WorkOrder
+from flowrec.errors import FlowError
+from flowrec.messages import FlowField, Mission, Route, Tick
 from flowrec.pipeline import Pipeline
+from flowrec.run.route_orders import observations_of, route, survey_route
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
 from flowrec.units import nanoseconds
 
 Result = FlowField | Route
 Results = Mapping[str, Result]  # by field of Tick
-
-
-def no_observations(stamp_ns: int) -> Observations:
-    """The empty set, for a run that refines before it has surveyed."""
-    return Observations(stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
 
 
 def ordered(tick: Tick) -> tuple[Mission, str]:
@@ -40,20 +35,24 @@ def work(pipeline: Pipeline, order: Tick) -> Result:
     if mission.wanted == WorkOrder.SOLVE:
         result = pipeline.solver.solve(pipeline.chip)
     elif mission.wanted == WorkOrder.REFINE:
-        assert order.assumed is not None
-        if pipeline.hindsight is not None:
-            observations = pipeline.hindsight(order.stamp_ns)
-        else:
-            observations = pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
-        result = pipeline.refiner.refine(order.assumed, observations, pipeline.chip, pipeline.solver)
+        result = _refined(pipeline, order, mission)
+    elif mission.wanted == WorkOrder.SURVEY_ROUTE:
+        result = survey_route(pipeline, order, mission)
     else:
-        assert order.field is not None
-        if mission.wanted == WorkOrder.SURVEY_ROUTE:
-            result = pipeline.survey.plan(order.field, mission.start_um, pipeline.chip, pipeline.robot)
-        else:
-            robot = pipeline.robot.limited_to(order.health.limit_hz if order.health is not None else None)
-            result = pipeline.planner.plan(order.field, mission.start_um, mission.goal_um, pipeline.chip, robot)
+        result = route(pipeline, order, mission)
     return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
+
+
+def _refined(pipeline: Pipeline, order: Tick, mission: Mission) -> FlowField:
+    """The refined flow; on the way to the goal the one before, where the new one can not be computed."""
+    assert order.assumed is not None
+    observations = observations_of(pipeline, order)
+    try:
+        return pipeline.refiner.refine(order.assumed, observations, pipeline.chip, pipeline.solver)
+    except FlowError as error:
+        if mission.phase != Phase.NAVIGATE or order.refined is None:
+            raise
+        return replace(order.refined, note=f"not refined again: {error}")
 
 
 class Worker(Protocol):

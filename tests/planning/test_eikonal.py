@@ -116,9 +116,7 @@ def test_what_is_too_fast_with_no_reserve_is_unreachable_and_the_place_is_named(
 
 
 def test_in_a_narrow_channel_against_the_flow_the_time_to_go_is_that_of_a_much_finer_grid():
-    mask = channel(
-        h=24, wall=8
-    )  # 8 px wide: the slow flow along the wall is a part of a pixel wide
+    mask = channel(h=24, wall=8)  # 8 px wide: the slow flow along the wall is a part of a pixel wide
     field, swimmer = poiseuille(mask, 90.0), robot(radius_um=17.0)
     ends = (1100.0, 115.0), (100.0, 115.0)
 

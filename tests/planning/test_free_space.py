@@ -2,9 +2,9 @@
 
 import pytest
 
-from flowrec.planning import Planner, SurveyPlanner
+from flowrec.planning import Planner
 from flowrec.planning.free_space import FastFlowMargin, open_space
-from tests.planning.worlds import PX, channel, chip_of, field_of, poiseuille, robot
+from tests.planning.worlds import PX, channel, chip_of, downstream, field_of, poiseuille, robot
 
 FAST = FastFlowMargin(map_error=0.2, heading_error_rad=0.1, frame_s=0.05, latency_s=0.05)
 
@@ -49,8 +49,8 @@ def test_where_the_drift_fills_the_channel_the_place_and_the_reason_are_named(me
 def test_no_survey_leads_into_what_is_too_swift():
     mask = channel()
     field = poiseuille(mask, 20000.0)
-    assert SurveyPlanner().plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
-    assert not SurveyPlanner(swift=FAST).plan(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
+    assert downstream(field, (100.0, 195.0), chip_of(mask), robot(30000.0)).reachable
+    assert not downstream(field, (100.0, 195.0), chip_of(mask), robot(30000.0), swift=FAST).reachable
 
 
 def test_the_time_to_go_lets_the_robot_as_near_to_the_wall_as_it_fits_between_the_pixels():

@@ -5,13 +5,12 @@ from flowrec.chip import ChipSettings, clearance_um, load_chip
 from flowrec.chip.clearance import opening_point_um
 from flowrec.flow import FlowSolver, sample
 from flowrec.interpolation import bilinear
-from flowrec.planning import SurveyPlanner
-from tests.planning.worlds import PX, channel, chip_of, field_of, length_um, loop, robot
+from tests.planning.worlds import PX, channel, chip_of, downstream, field_of, length_um, loop, robot
 
 
 def test_the_survey_goes_with_the_main_stream_and_stops_before_the_outlet():
     chip, field = loop()
-    route = SurveyPlanner(distance_um=1e5).plan(field, (60.0, 205.0), chip, robot(200.0))
+    route = downstream(field, (60.0, 205.0), chip, robot(200.0), distance_um=1e5)
     assert route.reachable, route.reason
     assert route.waypoints_um[:, 1].max() < 300.0, "the fast branch"
     end_um = (chip.mask.shape[1] - 0.5) * PX - route.waypoints_um[-1, 0]
@@ -23,8 +22,8 @@ def test_the_survey_goes_with_the_main_stream_and_stops_before_the_outlet():
 def test_the_survey_is_as_long_as_asked_and_a_share_of_the_way_when_nothing_is_asked():
     chip, field = loop()
     start = (60.0, 205.0)
-    assert length_um(SurveyPlanner().plan(field, start, chip, robot(200.0), 400.0)) == pytest.approx(400.0, abs=15.0)
-    assert length_um(SurveyPlanner(share=0.5).plan(field, start, chip, robot(200.0))) == pytest.approx(650.0, abs=20.0)
+    assert length_um(downstream(field, start, chip, robot(200.0), distance_um=400.0)) == pytest.approx(400.0, abs=15.0)
+    assert length_um(downstream(field, start, chip, robot(200.0), share=0.5)) == pytest.approx(650.0, abs=20.0)
 
 
 @pytest.mark.parametrize("name", ["bifurcation", "vessels"])
@@ -33,7 +32,7 @@ def test_in_a_solved_flow_the_survey_runs_downstream_all_the_way_clear_of_walls(
     field = FlowSolver().solve(chip)
     swimmer = robot(600.0, radius_um=2.4 * chip.um_per_px)
     start = opening_point_um(chip, "inlet", 5 * swimmer.radius_um)
-    route = SurveyPlanner(distance_um=1e6).plan(field, start, chip, swimmer)
+    route = downstream(field, start, chip, swimmer, distance_um=1e6)
     assert route.reachable, route.reason
     points = route.waypoints_um[::4]
     with_flow = np.einsum("ij,ij->i", np.diff(points, axis=0), sample(field, 0.5 * (points[1:] + points[:-1])))
@@ -46,5 +45,5 @@ def test_in_a_solved_flow_the_survey_runs_downstream_all_the_way_clear_of_walls(
 def test_a_start_at_the_very_end_and_still_fluid_have_nothing_downstream():
     mask = channel()
     start = (600.0, 195.0)
-    assert "nothing lies downstream" in SurveyPlanner().plan(field_of(mask, 0.0), start, chip_of(mask), robot()).reason
-    assert "in a wall" in SurveyPlanner().plan(field_of(mask, 9.0), (600.0, 20.0), chip_of(mask), robot()).reason
+    assert "nothing lies downstream" in downstream(field_of(mask, 0.0), start, chip_of(mask), robot()).reason
+    assert "in a wall" in downstream(field_of(mask, 9.0), (600.0, 20.0), chip_of(mask), robot()).reason

@@ -4,6 +4,8 @@ import numpy as np
 
 from flowrec.chip.chip import Chip, Opening
 from flowrec.messages import FlowField
+from flowrec.planning import SurveyPlanner
+from flowrec.planning.survey_design import SurveyOrder
 from flowrec.robot import Robot
 
 PX = 10.0
@@ -58,3 +60,9 @@ def loop(fast=140.0, slow=40.0):
 
 def length_um(route):
     return float(np.hypot(*np.diff(route.waypoints_um, axis=0).T).sum())
+
+
+def downstream(field, start_um, chip, swimmer, **settings):
+    """The route of a survey downstream."""
+    planner = SurveyPlanner(method="downstream", **settings)
+    return planner.plan(SurveyOrder(field, np.array(start_um, float), chip, swimmer))

@@ -1,0 +1,258 @@
+"""`flowrec bench survey`: error of the assimilated flow with as many observations along different ways.
+
+A case is read without its truth, which is read to make observations and to score the result. Only the ways of the
+survey are those of a robot that starts at the inlet and must still reach the outlet; the others say what is possible.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from flowrec.bench.flow import make_up
+from flowrec.bench.harness import Cases, Names, Results, chosen, print_rows, vessel_cases
+from flowrec.chip.vessel_case import NOISES, read_observations, read_true_velocity
+from flowrec.config import ResolvedConfig, load_config
+from flowrec.errors import FlowError
+from flowrec.flow import FlowSolver, sample
+from flowrec.flow.sampling import relative_rmse
+from flowrec.messages import FlowField, Observations, Route
+from flowrec.planning.survey import SurveyPlanner
+from flowrec.planning.survey_design import Sampling, SurveyOrder, covariance_after, place_information
+from flowrec.refine import Refiner
+from flowrec.refine.training.vessels import thin
+from flowrec.resolve import resolve
+from flowrec.terminal import progress, say
+
+RANDOM_CASES = 20
+_MOST_STRETCHES = 60
+Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """A case, and how it is observed."""
+
+    name: str
+    config: ResolvedConfig
+    chip: Any
+    assumed: FlowField
+    truth: FlowField
+    count: int  # of the observations
+    spacing_um: float  # between two along the given way
+    noise_um_s: float
+    given_um: Points  # (count, 2) the places along the given way
+    rng: np.random.Generator
+
+    def observe(self, places_um: Points) -> Observations:
+        """The true flow at places (n, 2), with noise."""
+        flow = sample(self.truth, places_um)
+        flow = flow + self.noise_um_s * self.rng.standard_normal(flow.shape)
+        return Observations(0, places_um, flow, np.full(len(places_um), self.noise_um_s))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """The places of the observations, and how long a robot takes to see them; None: it can not be said."""
+
+    places_um: Points
+    seconds: float | None = None
+    reason: str = ""
+
+
+def given(task: Task) -> Seen:
+    """The places that the case holds: a path along the skeleton between two openings."""
+    return Seen(task.given_um)
+
+
+def random(task: Task) -> Seen:
+    """Random places of the skeleton."""
+    places = np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px
+    return Seen(places[task.rng.permutation(len(places))[: task.count]].astype(np.float64))
+
+
+def prior(task: Task) -> Seen:
+    """The places of the skeleton, one after the other, that lower the stated error of the map most."""
+    uncertainty = task.config.refine.uncertainty(task.assumed, _none(), task.chip, task.config.flow)
+    assert uncertainty is not None
+    places = (np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px).astype(np.float64)
+    need, each = place_information(uncertainty, task.noise_um_s, task.chip, places)
+    covariance, left, taken = uncertainty.covariance, list(range(len(places))), []
+    for _ in range(min(task.count, len(places))):
+        errors = [need.error(covariance_after(covariance, each[k])) for k in left]
+        best = left.pop(int(np.argmin(errors)))
+        covariance = covariance_after(covariance, each[best])
+        taken.append(best)
+    return Seen(places[taken])
+
+
+def survey(task: Task, planner: SurveyPlanner) -> Seen:
+    """Places evenly spread along the way of a survey until it has had enough."""
+    config = task.config
+    start = np.array(config.mission.start)
+    sampling = Sampling(2.0 * task.spacing_um, 0.0, task.noise_um_s)
+    route: Route | None = None
+    places = np.zeros((0, 2))
+    for _ in range(_MOST_STRETCHES):
+        observed = task.observe(places)
+        uncertainty = config.refine.uncertainty(task.assumed, observed, task.chip, config.flow)
+        ends = 0.0 if route is None else float(route.arrival_s[-1])
+        order = SurveyOrder(
+            *(task.assumed, start, task.chip, config.robot, np.array(config.mission.goal)),
+            *(uncertainty, sampling, observed, route, ends),
+        )
+        new = planner.plan(order)
+        if not new.reachable:
+            break
+        route, start = new, new.waypoints_um[-1]
+        places = _along(route, sampling.spacing_um)
+        if not route.more:
+            break
+    if route is None:
+        return Seen(places, reason=new.reason)
+    length = float(np.hypot(*np.diff(route.waypoints_um, axis=0).T).sum())
+    places = _along(route, length / max(task.count - 1, 1) * (1.0 - 1e-9))
+    return Seen(places[: task.count], float(route.arrival_s[-1]), route.reason)
+
+
+def _along(route: Route, spacing_um: float) -> Points:
+    """Places (n, 2) along a route at equal distances, its start first."""
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route.waypoints_um, axis=0).T))])
+    at = np.arange(0.0, length[-1] + 1e-9, spacing_um)
+    return np.column_stack([np.interp(at, length, route.waypoints_um[:, c]) for c in (0, 1)])
+
+
+def _none() -> Observations:
+    return Observations(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+_EXPLORE = SurveyPlanner(method="information", route_share=0.0)
+WAYS: dict[str, Callable[[Task], Seen]] = {
+    "given": given,
+    "downstream": lambda task: survey(task, SurveyPlanner(method="downstream", share=1.0)),
+    "random": random,
+    "information": lambda task: survey(task, _EXPLORE),
+    "information:longer": lambda task: survey(task, replace(_EXPLORE, worth=0.5 * _EXPLORE.worth)),
+    "prior": prior,
+}
+
+
+def measure(
+    cases: Cases = None,
+    ways: Names = None,
+    noise: Annotated[Literal["00", "02", "05", "10"], typer.Option(help="Noise of the observations in %.")] = "05",
+    share: Annotated[Literal["05", "10", "20"], typer.Option(help="Observed part of the skeleton in %.")] = "10",
+    count: Annotated[int, typer.Option(min=1, help="Random cases, where no folder is given.")] = RANDOM_CASES,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 1,
+    draws: Annotated[int, typer.Option(min=1, help="Draws of the noise per case; the error is their mean.")] = 4,
+) -> Results:
+    """Rows by case and way, and a summary by way.
+
+    Raises
+    ------
+    UsageError
+        If there is no case or no such way.
+    """
+    names = chosen("bench survey: no way", ways, WAYS)
+    rows: list[dict[str, Any]] = []
+    with ExitStack() as stack:
+        if cases is None:
+            cases = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            make_up(cases, count, seed)
+        paths = vessel_cases(cases)
+        done = stack.enter_context(progress("surveying", len(paths)))
+        for number, path in enumerate(paths, 1):
+            rows += surveyed(path, names, noise, share, draws)
+            done(number)
+    return {
+        **{"noise": noise, "share": share, "rows": rows},
+        "summary": {name: summary([row for row in rows if row["way"] == name]) for name in names},
+    }
+
+
+def surveyed(path: Path, names: Sequence[str], noise: str, share: str, draws: int) -> list[dict[str, Any]]:
+    """The rows of a case."""
+    config = resolve_case(path)
+    chip, solver = config[1], FlowSolver(2)
+    seen = read_observations(path, noise, share)
+    assumed = solver.solve(chip)
+    truth = replace(assumed, velocity_um_s=read_true_velocity(path).astype(np.float32))
+    steps = np.hypot(*np.diff(seen.position_um, axis=0).T)
+    sigma = max(float(seen.std_um_s[0]), 1e-3 * NOISES["05"] * float(np.abs(assumed.velocity_um_s).max()))
+    rows = []
+    for name in names:
+        task = Task(
+            *(path.stem, config[0], chip, assumed, truth, len(seen.std_um_s), float(steps.mean()), sigma),
+            *(seen.position_um, np.random.default_rng([1, *path.stem.encode()])),
+        )
+        row: dict[str, Any] = {"case": path.stem, "way": name, "count": None, "error": None, "seconds": None}
+        try:
+            found = WAYS[name](task)
+        except FlowError as fault:
+            rows.append(row | {"reason": str(fault)})
+            continue
+        fields = (
+            Refiner("assimilate").refine(assumed, task.observe(found.places_um), chip, solver) for _ in range(draws)
+        )
+        error = float(np.mean([relative_rmse(each, truth, chip.mask).v for each in fields]))
+        rows.append(
+            row
+            | {"count": len(found.places_um), "error": error, "seconds": found.seconds, "reason": found.reason}
+            | {"crossing_s": crossing_s(config[0], chip, assumed)}
+        )
+    return rows
+
+
+def crossing_s(config: ResolvedConfig, chip: Any, assumed: FlowField) -> float | None:
+    """The planned time from start to goal in the assumed flow."""
+    route = config.plan.plan(assumed, config.mission.start, config.mission.goal, chip, config.robot)
+    return float(route.arrival_s[-1]) if route.reachable else None
+
+
+def resolve_case(path: Path) -> tuple[ResolvedConfig, Any]:
+    """The configuration of a mission on a case, and its chip."""
+    from flowrec.chip import load_chip
+
+    asked = load_config(None, [f"chip.path={path}"])
+    chip = load_chip(asked.chip)
+    return resolve(asked, chip), chip
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Mean and worst error over the cases, and the mean duration in crossings of the chip."""
+    errors = np.array([row["error"] for row in rows if row["error"] is not None])
+    times = [row["seconds"] / row["crossing_s"] for row in rows if row["seconds"] and row.get("crossing_s")]
+    if not len(errors):
+        return {"cases": 0, "mean": None, "median": None, "worst": None, "crossings": None, "count": None}
+    return {
+        "cases": len(errors),
+        "mean": float(errors.mean()),
+        "median": float(np.median(errors)),
+        "worst": float(errors.max()),
+        "crossings": float(np.mean(times)) if times else None,
+        "count": float(np.mean([row["count"] for row in rows if row["count"] is not None])),
+    }
+
+
+def show(results: Results) -> None:
+    """Print the summary by way."""
+    print_rows(
+        f"Error of the assimilated flow, noise {results['noise']} %, as many observations as {results['share']} % of "
+        "the skeleton",
+        [{"way": name, **line} for name, line in results["summary"].items()],
+        {
+            **{"way": "{way}", "cases": "{cases}", "observations": "{count:.0f}", "mean": "{mean:.4f}"},
+            **{"median": "{median:.4f}", "worst": "{worst:.4f}", "time / crossing": "{crossings:.1f}"},
+        },
+    )
+    for row in results["rows"]:
+        if row["error"] is None or row["count"] == 0:
+            say(f"{row['case']} {row['way']}: {row['reason']}")

@@ -1,0 +1,143 @@
+"""What the mission's state machine knows after a frame, and the steps from one state to the next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from flowrec.enums import Outcome, Phase, WorkOrder
+from flowrec.messages import (
+    Applied,
+    Demand,
+    Estimate,
+    FlowField,
+    Mission,
+    Observations,
+    OperatorEvent,
+    Route,
+    Track,
+)
+from flowrec.robot import Robot
+from flowrec.units import seconds
+
+_SWEPT_RADII, _RETURNED_RADII = 2.0, 1.0  # from its position, of a held robot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What the state machine knows after one frame."""
+
+    track: Track
+    estimate: Estimate
+    assumed: FlowField | None
+    refined: FlowField | None
+    route: Route | None
+    operator: OperatorEvent | None
+    demand: Demand | None  # of the frame before; its error is the distance of the robot from its route
+    robot: Robot
+    applied: Applied | None
+    not_found_note: str
+    refused: bool
+    observations: Observations | None
+
+    def with_advice(self, note: str) -> str:
+        """A note on a robot that was not found, with the tracker's advice."""
+        return f"{note} {self.not_found_note}" if self.not_found_note else note
+
+    @property
+    def now_ns(self) -> int:
+        return self.track.stamp_ns
+
+    @property
+    def command(self) -> str:
+        """What the operator asked for on this frame, '' if nothing."""
+        return self.operator.action if self.operator is not None and self.operator.stamp_ns == self.now_ns else ""
+
+    def result(self, mission: Mission) -> FlowField | Route | None:
+        """The result that the mission waits for, once it has arrived."""
+        results: dict[str, FlowField | Route | None] = {
+            WorkOrder.SOLVE: self.assumed,
+            WorkOrder.REFINE: self.refined,
+            WorkOrder.SURVEY_ROUTE: self.route,
+            WorkOrder.ROUTE: self.route,
+        }
+        result = results.get(mission.wanted)
+        return result if result is not None and result.request == mission.request else None
+
+
+def held(previous: Mission, now: Frame) -> Mission:
+    """Whether a held robot is swept away: from two radii off its position on, until it is back within one."""
+    if not now.track.seen or now.demand is None or not math.isfinite(now.demand.error_um):
+        return previous
+    limit_radii = _RETURNED_RADII if previous.swept else _SWEPT_RADII
+    swept = now.demand.error_um > limit_radii * now.robot.radius_um
+    return previous if swept == previous.swept else replace(previous, stamp_ns=now.now_ns, swept=swept)
+
+
+def elapsed_s(mission: Mission, now: Frame) -> float:
+    """How long the phase has lasted, without the time during which it was held."""
+    held_ns = mission.held_ns
+    if mission.held_since_ns is not None:
+        held_ns += now.now_ns - mission.held_since_ns
+    return seconds(now.now_ns - mission.since_ns - held_ns)
+
+
+def at_end(now: Frame, route: Route) -> bool:
+    """Whether the robot is at the end of a route, or the reference is and the robot as near as it comes."""
+    if math.dist(now.estimate.position_um, route.waypoints_um[-1]) <= now.robot.radius_um:
+        return True
+    demand = now.demand
+    return (
+        demand is not None and demand.progress_s >= route.arrival_s[-1] and demand.error_um < 2.0 * now.robot.radius_um
+    )
+
+
+def left_s(now: Frame, route: Route) -> float:
+    """Planned time until the reference is at the end of a route."""
+    progress_s = now.demand.progress_s if now.demand is not None else 0.0
+    return float(route.arrival_s[-1]) - progress_s
+
+
+def transition(
+    previous: Mission, now: Frame, phase: Phase, note: str = "", wanted: WorkOrder | None = None, **changes: Any
+) -> Mission:
+    """The mission in a phase, which begins now unless it is the present one."""
+    new = phase != previous.phase
+    return replace(
+        previous,
+        stamp_ns=now.now_ns,
+        phase=phase.value,
+        since_ns=now.now_ns if new else previous.since_ns,
+        held_ns=0 if new else previous.held_ns,
+        wanted=wanted.value if wanted is not None else "",
+        note=note,
+        **changes,
+    )
+
+
+def order(previous: Mission, now: Frame, phase: Phase, wanted: WorkOrder, note: str = "", **changes: Any) -> Mission:
+    """The mission in a phase that waits for a new work order, whose route begins at the robot unless stated."""
+    asked: dict[str, Any] = {
+        "request": previous.request + 1,
+        "requested_ns": now.now_ns,
+        "start_um": now.estimate.position_um,
+    }
+    return transition(previous, now, phase, note, wanted, **asked | changes)
+
+
+def finish(previous: Mission, now: Frame, outcome: Outcome, note: str = "") -> Mission:
+    """The finished mission."""
+    return transition(
+        previous,
+        now,
+        Phase.DONE,
+        note,
+        finished=True,
+        outcome=outcome.value,
+        held_since_ns=None,
+        swept=False,
+        blind_since_ns=None,
+        blind="",
+        field_off=False,
+    )

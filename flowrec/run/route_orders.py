@@ -1,0 +1,106 @@
+"""Work orders for routes: what a survey and a plan are given, of what was known in the tick of the order."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flowrec.enums import Phase
+from flowrec.estimation.kalman import memory_s
+from flowrec.flow.uncertainty import FlowUncertainty
+from flowrec.messages import Mission, Observations, Route, Tick
+from flowrec.pipeline import Pipeline
+from flowrec.planning.replanning import better_route
+from flowrec.planning.survey_design import Sampling, SurveyOrder
+from flowrec.units import seconds
+
+_RECENT = 20  # observations, of which the noise of the next ones is expected
+
+
+def no_observations(stamp_ns: int) -> Observations:
+    """The empty set, for a run that refines before it has surveyed."""
+    return Observations(stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+
+
+def observations_of(pipeline: Pipeline, order: Tick) -> Observations:
+    """The observations that a refinement is given."""
+    if pipeline.hindsight is not None:
+        return pipeline.hindsight(order.stamp_ns)
+    return pipeline.sampler.treat(order.observations or no_observations(order.stamp_ns))
+
+
+def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
+    """The survey as far as it is decided: the way that the robot is on, and the next stretch."""
+    field = order.field
+    assert field is not None
+    under_way = mission.phase == Phase.SURVEY
+    present = order.route if under_way else None
+    progress_s, left_s = 0.0, pipeline.mission.survey_limit_s
+    if present is not None:
+        progress_s = order.demand.progress_s if order.demand is not None else 0.0
+        spent_s = seconds(order.stamp_ns - mission.since_ns - mission.held_ns)
+        left_s -= spent_s + float(present.arrival_s[-1]) - progress_s
+    return pipeline.survey.plan(
+        SurveyOrder(
+            field,
+            mission.start_um,
+            pipeline.chip,
+            pipeline.robot,
+            mission.goal_um,
+            _uncertainty(pipeline, order),
+            _sampling(pipeline, order),
+            observations_of(pipeline, order),
+            present,
+            progress_s,
+            left_s,
+            pipeline.mission.lead_s,
+        )
+    )
+
+
+def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
+    """The way to the goal; on the way there the present one, unless another is better."""
+    field = order.field
+    assert field is not None
+    robot = pipeline.robot.limited_to(order.health.limit_hz if order.health is not None else None)
+    if mission.phase != Phase.NAVIGATE:
+        return pipeline.planner.plan(field, mission.start_um, mission.goal_um, pipeline.chip, robot)
+    assert order.route is not None and order.demand is not None
+    return better_route(
+        pipeline.planner,
+        field,
+        _uncertainty(pipeline, order),
+        order.route,
+        order.demand.progress_s + pipeline.mission.lead_s,
+        mission.goal_um,
+        pipeline.chip,
+        robot,
+    )
+
+
+def _uncertainty(pipeline: Pipeline, order: Tick) -> FlowUncertainty | None:
+    assert order.assumed is not None
+    observations = observations_of(pipeline, order)
+    return pipeline.refiner.uncertainty(order.assumed, observations, pipeline.chip, pipeline.solver)
+
+
+def _sampling(pipeline: Pipeline, order: Tick) -> Sampling:
+    """The observations to expect: as near to each other as the sampler takes them, as noisy as the latest ones.
+
+    Before the first, their noise follows from the present estimate, as in the sampler.
+    """
+    sampler, robot = pipeline.sampler, pipeline.robot
+    assert order.estimate is not None
+    covariance, made = order.estimate.covariance, order.observations
+    if made is not None and len(made.std_um_s):
+        noise = float(np.median(made.std_um_s[-_RECENT:]))
+    else:
+        settled = sampler.settled_share * robot.max_speed_um_s
+        noise = max(min(math.sqrt(covariance[2, 2] + covariance[3, 3]), settled), sampler.floor_um_s)
+    return Sampling(
+        max(sampler.spacing_radii * robot.radius_um, 1e-6),
+        sampler.memories * memory_s(covariance),
+        noise,
+        sampler.rolling_share,
+    )

@@ -1,0 +1,185 @@
+"""The survey by information: it goes where the flow is not known, from where the goal can still be reached."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.chip.chip import Opening
+from flowrec.flow.uncertainty import FlowUncertainty
+from flowrec.interpolation import nearest_pixels
+from flowrec.planning.survey import SurveyPlanner
+from flowrec.planning.survey_design import Looks, Need, Sampling, SurveyOrder, covariance_after
+from tests.planning.worlds import PX, chip_of, field_of, length_um, robot
+
+SPEED_UM_S = 60.0
+STEM, UPPER, LOWER = (300.0, 445.0), (1250.0, 145.0), (1250.0, 745.0)
+
+
+def junction(upper=20.0, lower=20.0, stem=40.0):
+    """A stem from the left, 9 px wide, that parts into an upper and a lower branch; both end at the right."""
+    mask = np.zeros((90, 140), bool)
+    vx, vy = np.zeros(mask.shape), np.zeros(mask.shape)
+    mask[40:49, :40] = mask[10:79, 40:49] = mask[10:19, 40:] = mask[70:79, 40:] = True
+    vx[40:49, :40] = stem
+    vy[10:40, 40:49], vy[49:79, 40:49] = -upper, lower
+    vx[10:19, 40:], vx[70:79, 40:] = upper, lower
+    openings = (
+        Opening("left", 40, 48, "inlet", stem),
+        Opening("right", 10, 18, "outlet", 0.0),
+        Opening("right", 70, 78, "outlet", 0.0),
+    )
+    return chip_of(mask, openings), field_of(mask, vx, vy)
+
+
+def unknown(chip, field, seen=(1.0, 1.0), rolled=None):
+    """The flow of the upper and of the lower branch are each in doubt by a factor, with these standard deviations."""
+    velocity = field.velocity_um_s[chip.mask].astype(float)
+    rows = np.nonzero(chip.mask)[0]
+    columns = np.stack([velocity * (rows < 40)[:, None], velocity * (rows > 48)[:, None]])
+    deviations = [*seen, *([] if rolled is None else [rolled])]
+    constants = np.ones((len(deviations) - 2, len(velocity)))
+    return FlowUncertainty(velocity, columns, constants, np.diag(np.square(deviations)), np.zeros(len(velocity)))
+
+
+def ordered(chip, field, uncertainty, start=STEM, goal=UPPER, **more):
+    sampling = Sampling(spacing_um=20.0, interval_s=0.0, noise_um_s=2.0)
+    return SurveyOrder(field, np.array(start), chip, robot(SPEED_UM_S), np.array(goal), uncertainty, sampling, **more)
+
+
+def planner(**settings):
+    return SurveyPlanner(method="information", worth=0.01, **settings)
+
+
+def branch_of(route):
+    return "upper" if route.waypoints_um[-1, 1] < 400.0 else "lower"
+
+
+@pytest.mark.parametrize(("seen", "goes"), [((0.02, 0.3), "lower"), ((0.3, 0.02), "upper")])
+def test_where_one_branch_is_known_the_next_stretch_goes_into_the_other(seen, goes):
+    chip, field = junction()
+    # The goal lies in the branch that is known.
+    goal = UPPER if goes == "lower" else LOWER
+    route = planner().plan(ordered(chip, field, unknown(chip, field, seen), goal=goal))
+    assert route.reachable and route.more, route.reason
+    assert branch_of(route) == goes
+
+
+def test_the_gain_that_is_expected_is_the_one_that_observations_bring():
+    chip, field = junction()
+    uncertainty = unknown(chip, field, (0.3, 0.3))
+    sampling = Sampling(spacing_um=20.0, interval_s=0.0, noise_um_s=2.0)
+    looks = Looks.none(uncertainty, sampling, chip, 30.0, 0.0)
+    way = np.array([[445.0, 300.0], [445.0, 145.0], [1245.0, 145.0]])
+    expected = covariance_after(uncertainty.covariance, looks.information(way, np.array([0.0, 5.0, 30.0])))
+    # One leg of 155 um and one of 800 um, each seen in its middle, along the flow of 20 um/s.
+    precision = 1.0 / 0.3**2 + (955.0 / 20.0) * 20.0**2 / 2.0**2
+    assert expected[0, 0] == pytest.approx(1.0 / precision)
+    assert expected[1, 1] == pytest.approx(0.3**2)
+    need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
+    assert need.error(uncertainty.covariance) == pytest.approx(0.3 * np.sqrt(upper_part(chip, field)))
+    assert need.error(expected) < need.error(uncertainty.covariance)
+
+
+def upper_part(chip, field):
+    """The part of the squared speed that is in doubt."""
+    square = (field.velocity_um_s[chip.mask].astype(float) ** 2).sum(axis=1)
+    rows = np.nonzero(chip.mask)[0]
+    return square[(rows < 40) | (rows > 48)].sum() / square.sum()
+
+
+def test_a_place_that_has_been_looked_at_tells_little_more_of_the_flow_but_of_the_robot_that_moves_otherwise():
+    chip, field = junction()
+    uncertainty = unknown(chip, field, (0.3, 0.3), rolled=0.2)
+    sampling = Sampling(spacing_um=1.0, interval_s=0.0, noise_um_s=1.0)
+    new = Looks.none(uncertainty, sampling, chip, 12.0, 0.05)
+    place = np.array([[1000.0, 145.0]])
+    same_way = np.array([[990.0, 145.0], [1010.0, 145.0]])
+    with_flow, against = np.array([0.0, 20.0 / 50.0]), np.array([0.0, 20.0 / 10.0])
+    old = new.after_places(np.repeat(place, 50, axis=0), np.tile([30.0, 0.0], (50, 1)))
+    fresh, again = new.information(same_way, with_flow), old.information(same_way, with_flow)
+    assert again[0, 0] < 0.01 * fresh[0, 0]
+    turned = old.information(same_way[::-1], against)
+    # Its own velocity is -30 um/s now, 60 um/s from the one before: 20 looks with a variance of 1, nearly all of it.
+    assert turned[2, 2] > 100.0 * again[2, 2]
+
+
+def test_where_um_per_rev_is_in_doubt_the_stretches_vary_the_own_motion():
+    chip, field = junction(upper=25.0, lower=25.0, stem=45.0)
+    uncertainty = unknown(chip, field, (0.02, 0.3), rolled=0.3)
+    sampling = Sampling(spacing_um=20.0, interval_s=0.0, noise_um_s=2.0)
+    own, route, start, progress = [], None, STEM, 0.0
+    for _ in range(6):
+        order = replace(
+            ordered(chip, field, uncertainty, start=start, present=route, progress_s=progress), sampling=sampling
+        )
+        new = planner().plan(order)
+        if not new.more:
+            break
+        since = 0 if route is None else len(route.waypoints_um)
+        points, times = new.waypoints_um[max(since - 1, 0) :], new.arrival_s[max(since - 1, 0) :]
+        rows, columns = nearest_pixels(0.5 * (points[1:] + points[:-1]) / PX, chip.mask.shape)
+        through = np.diff(points, axis=0) / np.diff(times)[:, None] - field.velocity_um_s[rows, columns]
+        own += through.tolist()
+        covariance = covariance_after(
+            uncertainty.covariance, Looks.none(uncertainty, sampling, chip, 4.0, 0.05).information(points, times)
+        )
+        uncertainty = uncertainty.with_covariance(covariance)
+        route, start, progress = new, new.waypoints_um[-1], float(new.arrival_s[-1])
+    known = uncertainty.covariance[2, 2] ** 0.5
+    assert known < 0.05, "the stretches tell the robot's motion from the flow"
+    along = np.array(own)[:, 0]
+    assert along.max() - along.min() > 0.5 * SPEED_UM_S
+
+
+def test_a_stretch_from_which_the_goal_can_not_be_reached_is_never_chosen():
+    # The lower branch flows faster than the robot: whoever enters it is carried out.
+    chip, field = junction(lower=75.0)
+    doubt = unknown(chip, field, (0.02, 0.5))
+    for start in (STEM, (900.0, 145.0)):
+        route = planner(robust_deviations=0.0).plan(ordered(chip, field, doubt, start=start))
+        assert not len(route.waypoints_um) or route.waypoints_um[:, 1].max() < 600.0, route.reason
+    # A flow that may be as fast is as forbidden: 45 um/s believed, 67 um/s with one deviation.
+    chip, field = junction(lower=45.0)
+    route = planner(robust_deviations=1.0).plan(ordered(chip, field, unknown(chip, field, (0.02, 0.5))))
+    assert not len(route.waypoints_um) or route.waypoints_um[:, 1].max() < 600.0, route.reason
+    assert (
+        branch_of(planner(robust_deviations=0.0).plan(ordered(chip, field, unknown(chip, field, (0.02, 0.5)))))
+        == "lower"
+    )
+    # From where the goal is out of reach, nothing is surveyed.
+    chip, field = junction(lower=75.0)
+    lost = planner().plan(ordered(chip, field, doubt, start=LOWER))
+    assert not lost.reachable and "can not be reached" in lost.reason
+
+
+def test_the_survey_ends_when_nothing_is_worth_its_time_or_none_is_left():
+    chip, field = junction()
+    known = planner().plan(ordered(chip, field, unknown(chip, field, (0.01, 0.01))))
+    assert not known.reachable and known.reason.startswith("enough"), known.reason
+    doubt = unknown(chip, field, (0.3, 0.3))
+    first = planner().plan(ordered(chip, field, doubt))
+    assert first.more
+    end = {"start": first.waypoints_um[-1], "present": first, "progress_s": 0.0}
+    late = planner().plan(ordered(chip, field, doubt, left_s=0.1, **end))
+    assert not late.more and late.reachable
+    np.testing.assert_array_equal(late.waypoints_um, first.waypoints_um)
+
+
+def test_the_next_stretch_continues_the_present_way_with_its_times():
+    chip, field = junction()
+    doubt = unknown(chip, field, (0.3, 0.3))
+    first = planner().plan(ordered(chip, field, doubt))
+    second = planner().plan(ordered(chip, field, doubt, start=first.waypoints_um[-1], present=first, progress_s=0.0))
+    assert branch_of(first) != branch_of(second), "what the first will have seen counts already"
+    count = len(first.waypoints_um)
+    np.testing.assert_array_equal(second.waypoints_um[:count], first.waypoints_um)
+    np.testing.assert_array_equal(second.arrival_s[:count], first.arrival_s)
+    assert (np.diff(second.arrival_s) > 0.0).all() and length_um(second) > length_um(first)
+
+
+def test_without_a_prior_the_survey_goes_downstream_and_says_so():
+    chip, field = junction()
+    route = planner().plan(replace(ordered(chip, field, None), uncertainty=None))
+    assert route.reachable and not route.more
+    assert route.reason.startswith("survey downstream")
