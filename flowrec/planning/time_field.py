@@ -106,13 +106,17 @@ class TimeField:
         target = space.pixel(goal.node) if goal.point is None else goal.point
         speed = planning_speed_um_s(self.policy_share, problem.robot) / px
         fine = space.cost_rasters(speed, deviations * self._deviation(problem)).finer(finer)
-        times = time_field(fine, finer * target)
         clearance = finer * interpolated(space.clearance, finer)
-        policy = extend_to_walls(times, fine.free, clearance, fine.need, finer * speed).astype(np.float32)
         column, row = np.rint(finer * route.waypoints_um[0] / px).astype(int)
-        if not np.isfinite(policy[row, column]):
-            return route
-        return replace(route, time_to_go_s=policy, time_to_go_um_per_px=px / finer)
+        # Two free pixels that touch at their corners are joined, but between them the robot may not fit: the wall
+        # barrier would stop it there. Such a way is used only if there is no other.
+        fits = fine.free & (clearance >= finer * space.radius)
+        for free in (fits, fine.free):
+            times = time_field(fine._replace(free=free), finer * target)
+            policy = extend_to_walls(times, free, clearance, fine.need, finer * speed).astype(np.float32)
+            if np.isfinite(policy[row, column]):
+                return replace(route, time_to_go_s=policy, time_to_go_um_per_px=px / finer)
+        return route
 
     def _deviation(self, problem: Problem) -> NDArray[np.float64]:
         """(h, w) px/s, one standard deviation of the flow; a ratio of its speed if the field states none."""
