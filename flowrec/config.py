@@ -127,11 +127,15 @@ class ResolvedConfig(Config):
 REGISTRATION = "camera.registration"
 _IMAGE_SIZE = ("width_px", "height_px")
 # Settings that a session from before them does not hold, with the values with which it replays unchanged.
-_BEFORE: dict[str, dict[str, Any]] = {
-    "simulated": {"world": FIRST_WORLD},
-    "survey": {"method": "downstream"},
-    "mission": {"reassimilate_observations": 0},
-    "plan": {"policy_course_share": 1.0, "policy_points_per_radius": 3.0, "policy_points_per_px": 4},
+_BEFORE: dict[str, Any] = {
+    "simulated.world": FIRST_WORLD,
+    "survey.method": "downstream",
+    "mission.reassimilate_observations": 0,
+    "mission.replan_slower": 0.0,
+    "plan.policy_course_share": 1.0,
+    "plan.policy_points_per_radius": 3.0,
+    "plan.policy_points_per_px": 4,
+    "health.step_out.learned": False,
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
@@ -179,9 +183,13 @@ def config_from_toml(text: str, where: str) -> ResolvedConfig:
     origin = Origin(where)
     try:
         tree = parse_toml(text)
-        for section, before in _BEFORE.items():
-            own = tree.get(section, {})
-            tree[section] = before | own if isinstance(own, dict) else own
+        for key, value in _BEFORE.items():
+            *sections, name = key.split(".")
+            table: Any = tree
+            for section in sections:
+                table = table.setdefault(section, {}) if isinstance(table, dict) else None
+            if isinstance(table, dict):
+                table.setdefault(name, value)
         config = _config_from(ResolvedConfig, tree, origin)
     except (ValueError, RecursionError) as error:  # bad TOML, and absurd numbers and nesting
         raise UsageError(f"{where}: not valid TOML ({error}); mend that line") from error

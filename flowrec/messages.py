@@ -328,6 +328,7 @@ class Mission(Message):
     input_ended: bool = False  # no more frames come; in the phase observe only
     # work orders so far that no disturbance has caused: stretches of a survey after the first, refinements on the way
     routine_orders: int = 0
+    planned_um_s: float | None = None  # speed limit of the robot at the latest work order; None: not recorded
 
 
 @dataclass(frozen=True, slots=True, eq=False)

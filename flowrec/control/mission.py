@@ -25,7 +25,7 @@ from flowrec.messages import (
     Route,
     Track,
 )
-from flowrec.ranges import Range
+from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
@@ -73,6 +73,9 @@ class MissionStateMachine:
     hold_after_s: Annotated[float, Range(0.0, 60.0)] = 0.5
     # time without sight of the robot after which the field is switched off until it is seen again
     zero_after_s: Annotated[float, Range(0.0, 60.0)] = 1.4
+    # fraction of the speed limit with which a route was planned, below which a new one is planned: the robot has
+    # stepped out on the way; 0: never
+    replan_slower: Share = 0.95
     # distance from the route beyond which a new one is planned; None: six radii
     replan_error_um: Annotated[float, Range(1.0, math.inf)] | None = None
 
@@ -309,6 +312,10 @@ class MissionStateMachine:
             return finish(previous, now, Outcome.TIMEOUT, note)
         if previous.wanted and result is None:
             return previous  # one order at a time
+        planned_um_s, able_um_s = previous.planned_um_s, now.robot.speed_limit_um_s
+        if planned_um_s is not None and able_um_s < self.replan_slower * planned_um_s:
+            note = f"the robot reaches {able_um_s:.0f} um/s and not {planned_um_s:.0f}: planning anew"
+            return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, note)
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
         if now.demand is None or not now.demand.error_um > limit_um:
             return self._look_again(previous, now, route, result)

@@ -122,6 +122,7 @@ def order(previous: Mission, now: Frame, phase: Phase, wanted: WorkOrder, note: 
         "request": previous.request + 1,
         "requested_ns": now.now_ns,
         "start_um": now.estimate.position_um,
+        "planned_um_s": now.robot.speed_limit_um_s,
     }
     return transition(previous, now, phase, note, wanted, **asked | changes)
 

@@ -6,6 +6,9 @@ first, therefore
 - the missing distance, as a mean over `window_s` at a high frequency, must exceed what the map's error can explain;
 - after the frequency was lowered, a robot that had stepped out rolls faster, while one in a flow that differs from the
   map rolls slower in proportion. In the first case the limit stays for the rest of the run; in the second it is lifted.
+
+The limit follows from what was rolled: above its step-out frequency f_c a robot rolls, by Adler's equation, the fraction
+s = 1 - sqrt(1 - (f_c / f)^2) of what a field of frequency f asks for, so f_c = f sqrt(1 - (1 - s)^2).
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ _SETTLED = 0.6  # fraction of the window's weight that must be present
 _IMPROVEMENT = -0.5
 _FREE_RADII = 1.3  # from a wall: nearer to it the robot may touch it or be slowed by it
 _HIGH = 0.5  # fraction of the frequency limit below which step-out is not looked for
+_FULL = 0.8  # the same for a single frame whose motion enters the mean that the step-out frequency is found from
+_LEAST_STEP = 0.95  # a learned limit falls at least to this fraction of the one before
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +44,8 @@ class StepOut:
     window_s: Annotated[float, Range(0.05, 60.0)] = 0.5  # of the means
     map_error: Share | None = None  # relative error of the map's flow; None: from the map
     missing_share: Share = 0.3  # fraction of the commanded motion that must be missing besides; 1: never limit
-    lower_to: PositiveShare = 0.8  # factor on the frequency in one step
+    learned: bool = True  # the limit is step_out_margin times what Adler's equation gives; False: lowered in steps
+    lower_to: PositiveShare = 0.8  # factor on the frequency in one such step
     floor_share: PositiveShare = 0.3  # lowest limit, as a fraction of the robot's own
     wait_s: Annotated[float, Range(0.0, 1e6)] = 10.0  # before another step after one that did not help
 
@@ -76,6 +82,9 @@ class StepOut:
             return replace(now, rolled_sums=_NONE)
         if field is None or dt <= 0.0 or turns <= 0.0 or not before.seen or wall_um < _FREE_RADII * robot.radius_um:
             return now
+        limit_hz = own_hz if previous.limit_hz is None else previous.limit_hz
+        if self.learned and turns < _FULL * limit_hz * dt:
+            return now
         heading = applied.turns / turns
         carried = dt * sample(field, 0.5 * (before.measured_um + estimate.measured_um))
         rolled_um = float((estimate.measured_um - before.measured_um - carried) @ heading)
@@ -84,7 +93,6 @@ class StepOut:
         now = replace(now, rolled_sums=sums)
         time_s = float(sums[3])
         rolled, expected, carried_um_s = (sums[:3] / time_s).tolist()
-        limit_hz = own_hz if previous.limit_hz is None else previous.limit_hz
         if time_s < _SETTLED * self.window_s or expected < _HIGH * limit_hz * robot.um_per_rev:
             return now
         if rolled_before.size:
@@ -94,7 +102,12 @@ class StepOut:
         waiting = (
             previous.limit_hz is None and limited_ns is not None and seconds(now.stamp_ns - limited_ns) < self.wait_s
         )
-        lower_hz = self.lower_to * min(limit_hz, expected / robot.um_per_rev)
+        if self.learned:
+            slipped = 1.0 - min(max(rolled / expected, 0.0), 1.0)
+            found_hz = expected / robot.um_per_rev * math.sqrt(1.0 - slipped**2)
+            lower_hz = min(robot.step_out_margin * found_hz, _LEAST_STEP * limit_hz)
+        else:
+            lower_hz = self.lower_to * min(limit_hz, expected / robot.um_per_rev)
         lower_hz = max(lower_hz, self.floor_share * own_hz)
         explained = (
             expected - rolled <= STEP_OUT.of(field, self.map_error) * carried_um_s + self.missing_share * expected

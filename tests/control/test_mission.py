@@ -53,6 +53,7 @@ class World:
     def __init__(self, **settings) -> None:  # type: ignore[no-untyped-def]
         self.machine = MissionStateMachine(start=(0.0, 500.0), goal=GOAL, **settings)
         self.mission: Mission | None = None
+        self.robot = ROBOT
         self.time_s = 0.0
         self.results: dict[str, object] = {"assumed": None, "refined": None, "route": None}
         self.seen_ns: int | None = None
@@ -87,7 +88,7 @@ class World:
             *self.results.values(),
             event,
             demand,
-            ROBOT,  # type: ignore[arg-type]
+            self.robot,  # type: ignore[arg-type]
             applied if self.absent_ns is not None else None,
             observations=seen_flow,
         )
@@ -170,6 +171,25 @@ def test_blown_off_its_route_the_robot_plans_anew_from_where_it_is_until_it_is_n
         np.testing.assert_array_equal(ordered.start_um, [300.0, 800.0])
     world.tick(route=route(4))
     assert world.tick(error_um=400.0).outcome == "gave up"
+
+
+def test_a_robot_that_turns_out_slower_than_planned_gets_a_new_route_or_the_reason_why_there_is_none() -> None:
+    world = World(phases=("navigate",))
+    world.tick(assumed=field(0))
+    world.tick()
+    world.tick(route=route(1))
+    world.robot = ROBOT.limited_to(0.96 * 24.0)
+    assert world.tick().phase == "navigate", "a little slower is no other plan"
+    world.robot = ROBOT.limited_to(0.7 * 24.0)
+    ordered = world.tick(at=(300.0, 800.0))
+    assert ordered.wanted == "route" and "the robot reaches 420 um/s and not 600" in ordered.note
+    np.testing.assert_array_equal(ordered.start_um, [300.0, 800.0])
+    assert world.tick(route=route(2)).phase == "navigate"
+    assert world.tick().phase == "navigate", "planned with that speed already"
+    world.robot = ROBOT.limited_to(0.5 * 24.0)
+    world.tick()
+    refused = world.tick(route=route(3, reachable=False))
+    assert (refused.outcome, refused.note) == ("unreachable", "too narrow")
 
 
 def test_a_robot_that_is_stuck_does_not_wait_for_ever() -> None:

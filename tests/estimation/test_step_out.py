@@ -73,6 +73,10 @@ def test_a_robot_that_steps_out_is_slowed_down_until_it_rolls_as_it_should(map_e
     rolled, asked = found[-1].rolled_sums[:2]
     assert rolled > 0.6 * asked
     assert next(each.stamp_ns for each in found if each.limit_hz is not None) < 1e9
+    if map_error == 0.0:
+        assert settled == pytest.approx(ROBOT.step_out_margin * 0.7 * 24.0, rel=0.03), (
+            "the true step-out, and the margin"
+        )
 
 
 @pytest.mark.parametrize("share", [0.7, 1.0, 1.4])
@@ -86,10 +90,10 @@ def test_a_map_that_is_wrong_by_up_to_40_percent_and_a_robot_that_rolls_as_it_sh
 def test_a_limit_that_does_not_help_is_lifted_and_not_tried_again_at_once() -> None:
     found = swum(9.0, 400.0, 0.0, step_out_hz=28.8)  # a flow that the map knows nothing of
     seen = limits(found)
-    assert len(seen) == 3 and seen[0] is None and seen[1] == pytest.approx(0.8 * 24.0, rel=0.02) and seen[2] is None
+    assert len(seen) == 3 and seen[0] is None and seen[1] is not None and seen[1] < 0.8 * 24.0 and seen[2] is None
     lowered, lifted = [k for k in range(1, len(found)) if found[k].limit_hz != found[k - 1].limit_hz]
     told = [event_of(Tick(k - 1, health=found[k - 1]), Tick(k, health=found[k])) for k in (lowered, lifted)]
-    assert told[0] is not None and told[0].level == "warning" and "limited to 19.2 Hz" in told[0].text
+    assert told[0] is not None and told[0].level == "warning" and f"limited to {seen[1]:.1f} Hz" in told[0].text
     assert told[1] is not None and "no step-out" in told[1].text
 
 
