@@ -155,6 +155,9 @@ class FlowField(Message):
     parameter_names: str = ""
     parameters: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
     parameter_std: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
+    # How the viscosity over viscosity_mpa_s depends on the shear rate, for people; the chip holds the law. '': it does
+    # not, or not stated.
+    viscosity_law: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flowrec.chip.fluid import Law, ViscositySettings
 from flowrec.ranges import Range, Seed
 
 Side = Literal["left", "right", "top", "bottom"]
@@ -34,6 +35,7 @@ class ChipSettings:
     # Openings that are inlets, all others outlets at 0 Pa: "left:0" is the first on the left from the top,
     # "top:1" the second on the top from the left, "left" every one on the left.
     inlets: tuple[str, ...] = ()
+    viscosity: ViscositySettings = field(default_factory=ViscositySettings)  # how it depends on the shear rate
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ class Chip:
     walls: Walls = "smooth"
     # (h, w) friction of each pixel beside that of the depth, as 12 / depth^2: the force is -mu times this times v
     friction_per_um2: NDArray[np.float64] | None = None
+    law: Law | None = None  # viscosity over viscosity_mpa_s as a function of shear rate; None: Newtonian
 
     @property
     def size_um(self) -> tuple[float, float]:

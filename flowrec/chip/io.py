@@ -9,6 +9,10 @@
     name = "y_junction"       # the stem of the file
     inlet_speed_um_s = 200.0  # of inlets that are found, not listed
 
+    [viscosity]               # left out: Newtonian; see fluid.py
+    law = "power_law"
+    exponent = 0.7
+
     [[opening]]               # left out: found automatically, see openings.py
     side = "left"             # left, right, top, bottom
     first = 100               # first and last pixel of fluid on that side, from 0, both inclusive
@@ -36,6 +40,16 @@ import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings, Kind, Opening, Side, Walls
+from flowrec.chip.fluid import (
+    BLOOD_KG_M3,
+    BLOOD_MPA_S,
+    LAWS,
+    Law,
+    ViscositySettings,
+    law_of,
+    law_settings,
+    with_settings,
+)
 from flowrec.chip.openings import (
     DEFAULT_INLET_UM_S,
     border,
@@ -48,6 +62,7 @@ from flowrec.chip.openings import (
 from flowrec.chip.synthetic import bifurcation, straight, vessels
 from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import ChipError
+from flowrec.ranges import hints
 from flowrec.system.toml_file import parse_toml
 
 MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
@@ -64,7 +79,8 @@ _NUMBERS = {  # by key, the value where the TOML has none
     "depth_um": None,
     "inlet_speed_um_s": DEFAULT_INLET_UM_S,
 }
-CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "opening")
+CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "viscosity", "opening")
+_OF_BLOOD = {"viscosity_mpa_s": BLOOD_MPA_S, "density_kg_m3": BLOOD_KG_M3}  # where nothing else is stated
 _OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
 
 
@@ -88,7 +104,9 @@ def load_chip(settings: ChipSettings) -> Chip:
         for key in ("um_per_px", "walls", "viscosity_mpa_s", "density_kg_m3", "depth_um")
         if (value := getattr(settings, key)) is not None
     }
-    chip = replace(chip, **given)
+    law = with_settings(chip.law, settings.viscosity, where)
+    of_blood = _OF_BLOOD if settings.viscosity.law == "blood" else {}
+    chip = replace(chip, law=law, **(of_blood | given))
     if settings.depth_um == 0.0:
         chip = replace(chip, depth_um=None)
     if settings.inlets:
@@ -113,6 +131,9 @@ def chip_files(chip: Chip) -> tuple[bytes, str]:
     if chip.depth_um is not None:
         lines.append(f"depth_um = {float(chip.depth_um)!r}")
     lines += [f'walls = "{chip.walls}"', 'fluid = "bright"']
+    law = law_settings(chip.law)
+    if law:
+        lines += ["", "[viscosity]", *(f"{key} = {json.dumps(value)}" for key, value in law.items())]
     for o in chip.openings:
         value = "speed_um_s" if o.kind == "inlet" else "pressure_pa"
         lines += ["", "[[opening]]", f'side = "{o.side}"', f"first = {int(o.first)}", f"last = {int(o.last)}"]
@@ -130,7 +151,8 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
     except (ValueError, RecursionError) as error:  # besides bad TOML, numbers and nesting beyond all measure
         raise ChipError(f"{where}: not valid TOML ({error}); mend that line") from error
     _refuse_unknown(table, CHIP_KEYS, where)
-    number: dict[str, Any] = {key: _number(table, key, where, default) for key, default in _NUMBERS.items()}
+    law, of_law = _law(table.get("viscosity", {}), where)
+    number: dict[str, Any] = {key: _number(table, key, where, value) for key, value in (_NUMBERS | of_law).items()}
     if um_per_px is not None:
         number["um_per_px"] = um_per_px
     if number["um_per_px"] is None:
@@ -152,6 +174,7 @@ def chip_from_files(png_bytes: bytes, toml_text: str, where: str = "chip", um_pe
         number["density_kg_m3"],
         number["depth_um"],
         cast(Walls, _choice(table, "walls", get_args(Walls), where) or "smooth"),
+        law=law,
     )
     check_chip(chip, where)
     return chip
@@ -221,6 +244,28 @@ def _number(table: Mapping[str, Any], key: str, where: str, default: float | Non
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise ChipError(f"{where}: {key} = {value!r}; it must be a number")
     return float(value)
+
+
+def _law(table: Any, where: str) -> tuple[Law | None, dict[str, float]]:
+    """The law in the table [viscosity], and the numbers of its fluid."""
+    if not isinstance(table, dict):
+        raise ChipError(f'{where}: viscosity = {table!r}; write [viscosity] above law = "power_law"')
+    known = hints(ViscositySettings)
+    _refuse_unknown(table, tuple(known), where)
+    for key, value in table.items():
+        if key in ("law", "function"):
+            valid = isinstance(value, str)
+        else:
+            numbers = value if key in ("rates_1_s", "ratios") and isinstance(value, list) else [value]
+            valid = all(isinstance(number, (int, float)) and not isinstance(number, bool) for number in numbers)
+        if not valid:
+            raise ChipError(
+                f"{where}: viscosity.{key} = {value!r} is no {'text' if key in ('law', 'function') else 'number'}"
+            )
+    _choice(table, "law", tuple(LAWS), where)
+    values = {key: tuple(map(float, value)) if isinstance(value, list) else value for key, value in table.items()}
+    settings = ViscositySettings(**values)
+    return law_of(settings, where), _OF_BLOOD if settings.law == "blood" else {}
 
 
 def _choice(table: Mapping[str, Any], key: str, choices: tuple[str, ...], where: str) -> str | None:

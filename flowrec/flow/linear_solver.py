@@ -110,6 +110,7 @@ def chip_key(chip: Chip) -> Hashable:
         chip.depth_um,
         chip.walls,
         friction_key(chip),
+        chip.law,
     )
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
 from flowrec.flow.centre_values import centre_operator
 from flowrec.flow.contour_smoothing import Floats, Ints
@@ -48,6 +49,7 @@ class Momentum:
     centre: Any  # (2 n, faces) velocity at the centres of the n fluid pixels: x and y of each in turn
     # (faces, 4) viscous drag of the image's left, right, top and bottom border per unit of its speed along x or y
     sliding: Floats
+    profiles: tuple[Profiles, Profiles]  # of the u faces, and of the v faces with rows and columns exchanged
 
     def convection(self, flux: Floats) -> Floats:
         """N(q) (faces,): the momentum that leaves each control volume."""
@@ -136,6 +138,7 @@ def assemble(grid: Grid) -> Momentum:
         outlet,
         _per_flux(centre_operator(grid, upright, level), fraction),
         sliding,
+        (upright, level),
     )
 
 
@@ -166,32 +169,18 @@ def _add_component(
     operators.viscous.add(me[:, None], profiles.columns[row], -2.0 * half_volume[:, None] * profiles.weights[row, 2])
     sliding[me] = 2.0 * half_volume[:, None] * profiles.border[row, 2]
     # Along the flow, at the height t of the middle of the fluid part.
-    t = 0.5 * (own.low + own.high)[j, i] - 0.5
-    here = _level_at(walls.level, j, i, t)
-    whole = own.high - own.low > 1.0 - 1e-12
-    inner, line, distance, simple = [], [], [], whole[j, i].copy()
-    for step in (1, -1):
-        inside = (i + step >= 0) & (i + step <= w)
-        beyond = np.clip(i + step, 0, w)
-        there = _level_at(walls.level, j, beyond, t)
-        open_ = inside & (kind[j, beyond] != WALL) & (there > 0.0)
-        line.append(np.where(open_, profiles.place[j, beyond], -1))
-        inner.append(inside)
-        to_wall = np.where(there > 0.0, 1.0, here / np.maximum(here - there, 1e-12))
-        distance.append(np.where(open_, 1.0, np.clip(to_wall, NEAREST, 1.0)))
-        simple &= ~inside | (open_ & whole[j, beyond]) | (~open_ & (distance[-1] == 1.0))
-    total = np.where(inner[0] & inner[1], 0.5 * (distance[0] + distance[1]), 1.0)
-    cut = ~simple
-    own_middle = profiles.value(row[cut], t[cut])
+    lines = neighbouring_lines(own, profiles, walls, j, i)
+    inner, line, simple, cut = lines.inner, lines.line, lines.simple, ~lines.simple
+    own_middle = profiles.value(row[cut], lines.t[cut])
     for side, step in enumerate((1, -1)):
-        factor = inner[side] / (total * distance[side])
+        factor = inner[side] / (lines.total * lines.distance[side])
         seen = simple & (line[side] >= 0)
         # Where nothing is cut, averages over whole faces can stand for point values.
         operators.viscous.add(me[simple], me[simple], factor[simple])
         operators.viscous.add(me[seen], profiles.columns[line[side][seen], 1], -factor[seen])
         operators.viscous.add(me[cut, None], profiles.columns[row[cut]], factor[cut, None] * own_middle)
         seen = cut & (line[side] >= 0)
-        there = profiles.value(line[side][seen], t[seen])
+        there = profiles.value(line[side][seen], lines.t[seen])
         operators.viscous.add(me[seen, None], profiles.columns[line[side][seen]], -factor[seen, None] * there)
         operators.gradient.add(me, around[j + 1, i + (step > 0)], -float(step))
 
@@ -213,6 +202,41 @@ def _add_component(
             operators.side_velocity.put(side, me, 0, me, np.where(opened, 0.5, 1.0 * (cross_kinds[place] == OUTLET)))
             operators.side_velocity.put(side, me, 1, neighbour, 0.5 * opened)
     return profiles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NeighbouringLines:
+    """What lies to the right and to the left, in this order, of upright faces (n,), at the height t of each face."""
+
+    t: Floats  # (n,) middle of the fluid part, from the middle of the cell's side
+    inner: tuple[NDArray[np.bool_], NDArray[np.bool_]]  # (n,) not beyond the image's border
+    line: tuple[Ints, Ints]  # (n,) rows of the profiles of the faces there; -1 where a wall comes first
+    distance: tuple[Floats, Floats]  # (n,) to that face or to the wall, in cells
+    simple: NDArray[np.bool_]  # (n,) no wall cuts these faces
+    total: Floats  # (n,) distance between the middles of both ways; 1 on the border
+
+
+def neighbouring_lines(own: Faces, profiles: Profiles, walls: LevelSet, j: Ints, i: Ints) -> NeighbouringLines:
+    """Of the upright faces (j, i)."""
+    w = own.kind.shape[1] - 1
+    t = 0.5 * (own.low + own.high)[j, i] - 0.5
+    here = _level_at(walls.level, j, i, t)
+    whole = own.high - own.low > 1.0 - 1e-12
+    inner, line, distance, simple = [], [], [], whole[j, i].copy()
+    for step in (1, -1):
+        inside = (i + step >= 0) & (i + step <= w)
+        beyond = np.clip(i + step, 0, w)
+        there = _level_at(walls.level, j, beyond, t)
+        open_ = inside & (own.kind[j, beyond] != WALL) & (there > 0.0)
+        line.append(np.where(open_, profiles.place[j, beyond], -1))
+        inner.append(inside)
+        to_wall = np.where(there > 0.0, 1.0, here / np.maximum(here - there, 1e-12))
+        distance.append(np.where(open_, 1.0, np.clip(to_wall, NEAREST, 1.0)))
+        simple &= ~inside | (open_ & whole[j, beyond]) | (~open_ & (distance[-1] == 1.0))
+    total = np.where(inner[0] & inner[1], 0.5 * (distance[0] + distance[1]), 1.0)
+    return NeighbouringLines(
+        t, (inner[0], inner[1]), (line[0], line[1]), (distance[0], distance[1]), simple, np.asarray(total)
+    )
 
 
 def _level_at(level: Floats, j: Ints, i: Ints, t: Floats) -> Floats:

@@ -6,6 +6,7 @@ factorisation serves all of them.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -201,11 +202,16 @@ class System:
 
 def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel, from the cache if they are there."""
-    openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
-    mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
-    key = ("system", *mask, openings, chip.walls, k, depth_friction(chip, k), friction_key(chip))
+    key = ("system", *geometry_key(chip, k))
     equations: System = cached(key, cell_count(chip, k), lambda: _made(chip, k))
     return equations
+
+
+def geometry_key(chip: Chip, k: int) -> tuple[Hashable, ...]:
+    """All of a chip that the matrices depend on, as part of a cache key."""
+    openings = tuple((o.side, o.first, o.last, o.kind) for o in chip.openings)
+    mask = (chip.mask.shape, np.packbits(chip.mask).tobytes())
+    return (*mask, openings, chip.walls, k, depth_friction(chip, k), friction_key(chip))
 
 
 def _made(chip: Chip, k: int) -> System:

@@ -1,8 +1,8 @@
 """Derivatives of a chip's flow with respect to boundary values and fluid, and the nonlinear remainder.
 
-Without inertia a flow is exactly linear in inlet speeds and in p_out / mu, so viscosity alone changes nothing. With
-inertia the modes are the derivatives at the chip's own values, and a few steps with the same factors lead from the
-linear prediction to the Navier-Stokes solution. All of it depends on the chip alone, never on earlier calls.
+Without inertia a Newtonian flow is exactly linear in inlet speeds and in p_out / mu, so viscosity alone changes nothing.
+With inertia or a law of viscosity the modes are the derivatives at the chip's own values, and a few steps with the same
+factors lead from the linear prediction to the solution. All of it depends on the chip alone, never on earlier calls.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from flowrec.flow.contour_smoothing import Floats
+from flowrec.flow.generalised import GeneralisedSystem
 from flowrec.flow.grid import Grid, GridOpening
 from flowrec.flow.linear_solver import Factors
 from flowrec.flow.newton_solver import Scales, System
@@ -37,11 +38,12 @@ class Sensitivities:
     """First-order expansion around a chip's own flow in P parameters, and iterations to the full solution.
 
     Parameters: one per opening (inlet: mean speed, um/s; outlet: pressure at the chip's own viscosity, Pa), ln nu with
-    nu = mu / rho, then, where requested, ln of the depth friction, and a skew and a flat part (um/s) per inlet.
+    nu = mu / rho, then, where requested, ln of the depth friction, a skew and a flat part (um/s) per inlet, and the
+    unknowns of the chip's law of viscosity (`law_unknowns`).
     Velocities are compact: (..., n, 2) um/s at the centres of the n fluid pixels of the mask in raster order.
     """
 
-    equations: System
+    equations: System | GeneralisedSystem
     factors: Factors  # of the equations linearised around `flux`
     scales: Scales
     with_friction: bool  # ln of the depth friction is a parameter
@@ -50,6 +52,7 @@ class Sensitivities:
     cell_average: Any  # (n, cells) cell values to pixels
     base: Floats  # (n, 2) the chip's own flow
     modes: Floats  # (P, n, 2) per unit
+    law_unknowns: tuple[str, ...] = ()  # the last parameters
 
     @property
     def wall_px(self) -> NDArray[np.float32]:
@@ -67,7 +70,8 @@ class Sensitivities:
 
     def approach(self, offset: Floats, remainder: Remainder) -> Remainder:
         """One step with frozen factors towards the Navier-Stokes solution, for parameters `offset` (P,)."""
-        if self.scales.inertia == 0.0 and not self._friction_change(offset):
+        newtonian = isinstance(self.equations, System)
+        if newtonian and self.scales.inertia == 0.0 and not self._friction_change(offset):
             return Remainder(remainder.flux, 0.0)
         flux = self.flux + self.flux_modes @ offset + remainder.flux
         curl = self.equations.stream.curl
@@ -83,8 +87,11 @@ class Sensitivities:
         scales = self.scales
         drive = scales.drive + scales.drive_per_unit * offset[: self.openings]
         inertia = scales.inertia * float(np.exp(-offset[self.openings]))
-        load = self.equations.residual(flux, drive, inertia)
         friction = self._friction_change(offset)
+        if isinstance(self.equations, GeneralisedSystem):
+            law = offset[len(offset) - len(self.law_unknowns) :]
+            return self.equations.changed(friction, law).residual(flux, drive, inertia)
+        load = self.equations.residual(flux, drive, inertia)
         return load + friction * scales.friction * (self.equations.momentum.volume * flux) if friction else load
 
     def pressure(self, offset: Floats, remainder: Remainder) -> Floats:
@@ -97,10 +104,13 @@ class Sensitivities:
         return self.equations.velocity(flux) * UM_PER_M
 
 
-def sensitivities(equations: System, scales: Scales, flux: Floats, friction: bool, shapes: bool) -> Sensitivities:
+def sensitivities(
+    equations: System | GeneralisedSystem, scales: Scales, flux: Floats, friction: bool, shapes: bool, law: bool = False
+) -> Sensitivities:
     """Expansion around a flow `flux` (faces,).
 
-    `friction` makes ln of the depth friction a parameter, `shapes` the shapes of the inlets' profiles.
+    `friction` makes ln of the depth friction a parameter, `shapes` the shapes of the inlets' profiles, `law` the unknowns
+    of the law of viscosity.
     """
     stream, momentum, grid = equations.stream, equations.momentum, equations.grid
     factors, operator = equations.tangent(flux, scales.inertia)
@@ -111,12 +121,20 @@ def sensitivities(equations: System, scales: Scales, flux: Floats, friction: boo
     push = [momentum.outlet * scales.drive_per_unit, scales.inertia * momentum.convection(flux)[:, None]]
     if friction:
         given.append(none)
-        push.append(-scales.friction * (momentum.volume * flux)[:, None])
+        if isinstance(equations, GeneralisedSystem):
+            push.append(-equations.force_by_friction(flux)[:, None])
+        else:
+            push.append(-scales.friction * (momentum.volume * flux)[:, None])
     if shapes:
         for opening in grid.openings:
             if opening.kind == "inlet":
                 given += [_shape(grid, opening, skew)[:, None] / UM_PER_M for skew in (True, False)]
                 push += [none, none]
+    unknowns: tuple[str, ...] = ()
+    if law and isinstance(equations, GeneralisedSystem):
+        unknowns = equations.law.unknowns
+        given += [none] * len(unknowns)
+        push.append(-equations.force_by_unknowns(flux))
     prescribed = np.concatenate(given, axis=1)
     force = stream.curl.T @ (np.concatenate(push, axis=1) - operator @ prescribed)
     modes = np.asarray(stream.curl @ factors.solve(np.ascontiguousarray(force)) + prescribed)
@@ -130,6 +148,7 @@ def sensitivities(equations: System, scales: Scales, flux: Floats, friction: boo
         _cell_average(grid),
         equations.velocity(flux) * UM_PER_M,
         np.ascontiguousarray((momentum.centre @ modes).T).reshape(modes.shape[1], -1, 2) * UM_PER_M,
+        unknowns,
     )
 
 

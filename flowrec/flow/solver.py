@@ -8,8 +8,10 @@ from typing import Annotated
 import numpy as np
 
 from flowrec.chip.chip import Chip
+from flowrec.chip.fluid import law_text
 from flowrec.errors import FlowError
 from flowrec.flow.contour_smoothing import Floats
+from flowrec.flow.generalised import GeneralisedSystem, generalised_system
 from flowrec.flow.linear_solver import cached, cell_count, chip_key
 from flowrec.flow.newton_solver import NotConvergedError, Scales, System, system
 from flowrec.flow.sampling import fluid_image
@@ -23,7 +25,10 @@ ROUNDING = 1e-9  # smaller residuals are rounding errors: their digits differ be
 
 @dataclass(frozen=True, slots=True)
 class FlowSolver:
-    """Steady incompressible flow by finite volumes on a staggered grid, with Newton's method."""
+    """Steady incompressible flow by finite volumes on a staggered grid, with Newton's method.
+
+    The matrices of a Newtonian fluid do not depend on its viscosity; those of a law of viscosity are made for each flow.
+    """
 
     k: Annotated[int, OneOf(1, 2, 4)] = 1  # subcells per pixel side: 1, 2 or 4
     max_iterations: Annotated[int, Range(1, 10_000)] = 40
@@ -54,28 +59,39 @@ class FlowSolver:
             density_kg_m3=chip.density_kg_m3,
             note=f"residual {'below 1e-9' if residual < ROUNDING else f'{residual:.0e}'}",
             wall_px=equations.grid.wall_px,
+            viscosity_law=law_text(chip.law),
         )
 
-    def sensitivities(self, chip: Chip, friction: bool = False, shapes: bool = False) -> Sensitivities:
+    def sensitivities(
+        self, chip: Chip, friction: bool = False, shapes: bool = False, law: bool = False
+    ) -> Sensitivities:
         """Derivatives of the flow of `solve` with respect to boundary values and fluid, from the cache if possible.
 
         `friction` makes ln of the depth friction a parameter of a chip that has a depth, `shapes` the shapes of the
-        inlets' profiles. Raises FlowError as `solve` does.
+        inlets' profiles, `law` the unknowns of the chip's law of viscosity. Raises FlowError as `solve` does.
         """
         friction = friction and chip.depth_um is not None
+        law = law and chip.law is not None
 
         def compute() -> Sensitivities:
-            return sensitivities(*self._steady(chip), friction, shapes)
+            return sensitivities(*self._steady(chip), friction, shapes, law)
 
-        expansion: Sensitivities = cached((self, chip_key(chip), friction, shapes), cell_count(chip, self.k), compute)
+        expansion: Sensitivities = cached(
+            (self, chip_key(chip), friction, shapes, law), cell_count(chip, self.k), compute
+        )
         return expansion
 
-    def _steady(self, chip: Chip) -> tuple[System, Scales, Floats]:
+    def _steady(self, chip: Chip) -> tuple[System | GeneralisedSystem, Scales, Floats]:
         """Equations of the chip, its scales and its fluxes (faces,) in m/s."""
         if self.k not in (1, 2, 4):
             raise FlowError(f"flow.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
         _check(chip)
-        equations, scales = system(chip, self.k), Scales.of(chip, self.k, self.convection)
+        scales = Scales.of(chip, self.k, self.convection)
+        equations: System | GeneralisedSystem
+        if chip.law is None:
+            equations = system(chip, self.k)
+        else:
+            equations = generalised_system(chip, chip.law, self.k)
         try:
             # In the cache, because an assimilation needs the assumed flow again.
             flux: Floats = cached(

@@ -39,6 +39,11 @@ class Profiles:
         w = self.weights[rows]
         return np.asarray(w[:, 0] + t[:, None] * (w[:, 1] + t[:, None] * w[:, 2]))
 
+    def slope(self, rows: Ints, t: Floats) -> Floats:
+        """Weights (m, 3) of the columns in the derivative along the line at t (m,), per cell."""
+        w = self.weights[rows]
+        return np.asarray(w[:, 1] + 2.0 * t[:, None] * w[:, 2])
+
 
 def line_profiles(faces: Faces, walls: LevelSet, cross: NDArray[np.int8]) -> Profiles:
     """Parabolas of the upright faces along the upright grid lines.
