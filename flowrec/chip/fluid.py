@@ -134,7 +134,7 @@ class CarreauYasuda:
         return slit_factor(self.exponent)
 
     def _parts(self, rate2: Floats) -> tuple[Floats, Floats, Floats]:
-        """(time gamma)^2 where that is not negligible, its a / 2 th power, and the thinning (1 + that)^((n - 1) / a)."""
+        """(time gamma)^2, not below a negligible value, that to the power of a / 2, and (1 + that)^((n - 1) / a)."""
         square = np.maximum(rate2 * self.time_s**2, 1e-24)
         scaled = square ** (0.5 * self.yasuda)
         return square, scaled, (1.0 + scaled) ** ((self.exponent - 1.0) / self.yasuda)
@@ -196,7 +196,7 @@ class Table:
 
 @lru_cache(maxsize=8)
 def _curves(table: Table) -> tuple[Any, Any, tuple[float, float]]:
-    """ln f as a function of ln gamma, its derivative, and the ends of the table."""
+    """Return ln f as a function of ln gamma, its derivative, and the ends of the table."""
     from scipy.interpolate import PchipInterpolator
 
     places = np.log(table.rates_1_s)
@@ -207,8 +207,8 @@ def _curves(table: Table) -> tuple[Any, Any, tuple[float, float]]:
 def slit_factor(exponent: float) -> float:
     """Factor c of a power law, exact: its drag between plates is K ((2 n + 1) / n)^n V^n (2 / H)^(n + 1).
 
-    So c^(n - 1) = ((2 n + 1) / (3 n))^n; R. B. Bird, R. C. Armstrong, O. Hassager, Dynamics of Polymeric Liquids 1 (1987),
-    flow through a thin slit.
+    So c^(n - 1) = ((2 n + 1) / (3 n))^n. Flow through a thin slit: R. B. Bird, R. C. Armstrong, O. Hassager,
+    Dynamics of Polymeric Liquids 1 (1987), chapter 4.
     """
     if abs(exponent - 1.0) < 1e-6:
         return float(np.exp(-1.0 / 3.0))
@@ -253,7 +253,7 @@ def from_function(function: str) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class ViscositySettings:
-    """Section [chip.viscosity] of a configuration, [viscosity] of a chip's TOML; None: of the chip, or as in the law."""
+    """Section [chip.viscosity], and [viscosity] of a chip's TOML. None: that of the chip, or the default of the law."""
 
     law: Annotated[str, LAWS] | None = None
     exponent: Annotated[float, Range(0.1, 3.0)] | None = None  # n; below 1: thinner at higher shear rates
@@ -306,7 +306,7 @@ def with_settings(law: Law | None, settings: ViscositySettings, where: str) -> L
     if not given:
         return law
     own = law_settings(law) if settings.law is None else {}
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
+    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
     return law_of(ViscositySettings(**(values | given)), where)
 
 
@@ -344,13 +344,13 @@ def _check_table(table: Table, where: str) -> None:
         )
     if ratios.max() > LARGEST * ratios.min():
         raise ChipError(
-            f"{what} varies by a factor of {ratios.max() / ratios.min():.0e}; more than {LARGEST:.0e} can not be computed: "
+            f"{what} varies by a factor of {ratios.max() / ratios.min():.0e}; at most {LARGEST:.0e} can be computed: "
             "let it level off"
         )
     slopes = np.diff(np.log(ratios)) / np.diff(np.log(rates))
     if slopes.min() < STEEPEST:
         at = rates[int(slopes.argmin())]
         raise ChipError(
-            f"{what} falls as shear rate^{slopes.min():.2f} at {at:.3g} /s, so the stress does not grow there; the power has "
-            f"to be above {STEEPEST}"
+            f"{what} falls as shear rate^{slopes.min():.2f} at {at:.3g} /s, so the stress does not grow there; the "
+            f"power has to be above {STEEPEST}"
         )

@@ -263,7 +263,9 @@ def _law(table: Any, where: str) -> tuple[Law | None, dict[str, float]]:
                 f"{where}: viscosity.{key} = {value!r} is no {'text' if key in ('law', 'function') else 'number'}"
             )
     _choice(table, "law", tuple(LAWS), where)
-    values = {key: tuple(map(float, value)) if isinstance(value, list) else value for key, value in table.items()}
+    values: dict[str, Any] = {
+        key: tuple(map(float, value)) if isinstance(value, list) else value for key, value in table.items()
+    }
     settings = ViscositySettings(**values)
     return law_of(settings, where), _OF_BLOOD if settings.law == "blood" else {}
 

@@ -22,9 +22,11 @@ import scipy.sparse as sp
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.fluid import Law
+from flowrec.flow import newton_solver
 from flowrec.flow import stress as stresses
 from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.grid import Grid
+from flowrec.flow.level_set import LevelSet
 from flowrec.flow.linear_solver import Factors, cached, cell_count, factorise
 from flowrec.flow.momentum import Momentum
 from flowrec.flow.newton_solver import (
@@ -52,6 +54,9 @@ FIRST = 0.5
 # Factors are kept as long as each step is at most this fraction of the last one; a step with old factors costs a
 # fifteenth of new ones. DEPTH steps are mixed.
 KEEPING, DEPTH = 0.8, 4
+SMALL = 1e-5  # change of an unknown of the law for the derivative of its slit factor
+# Convection whose largest force is less than this fraction of the largest viscous one is left out of the matrix.
+NEGLIGIBLE = 0.01
 # How continuation proceeds from the Newtonian flow to that of the law.
 INTERMEDIATE_TOLERANCE = 1e-2
 SMALLEST_STRIDE = 0.02
@@ -164,19 +169,31 @@ class GeneralisedSystem:
 
     def force_by_unknowns(self, flux: Floats) -> Floats:
         """(faces, P) derivatives of the viscous force with respect to the law's unknowns."""
-        found = self.law.by_unknowns(self._viscosity(flux).rate2)
-        return np.array([self._viscous(values, flux) for values in found]).reshape(len(found), -1).T
+        found = self._viscosity(flux)
+        by_depth = found.slope * self._across_depth(found, flux)
+        changes = np.eye(len(self.law.unknowns)) * SMALL
+        factors = [
+            (np.log(self.law.changed(change).slit_factor) - np.log(self.law.changed(-change).slit_factor)) / SMALL
+            for change in changes
+        ]
+        values = zip(self.law.by_unknowns(found.rate2), factors, strict=True)
+        forces = [self._viscous(value + factor * by_depth, flux) for value, factor in values]
+        return np.array(forces).reshape(len(forces), -1).T
 
     def force_by_friction(self, flux: Floats) -> Floats:
         """(faces,) derivative of the viscous force with respect to ln of the depth friction."""
         stress, found = self.operators.stress, self._viscosity(flux)
         drag = (stress.at @ found.value) * (stress.strain @ flux)
         drag[: stress.viscous] = 0.0
-        speed2 = found.weighted * (stress.gradient @ flux)
-        speed2[: stress.planar] = 0.0
-        return np.asarray(
-            stress.gather @ self._dragged(drag) + self._viscous(found.slope * (stress.square @ speed2), flux)
-        )
+        by_rate = self._viscous(found.slope * self._across_depth(found, flux), flux)
+        return np.asarray(stress.gather @ self._dragged(drag) + by_rate)
+
+    def _across_depth(self, found: _Viscosity, flux: Floats) -> Floats:
+        """(m,) the part of gamma^2 that the depth adds."""
+        stress = self.operators.stress
+        squares = found.weighted * (stress.gradient @ flux)
+        squares[: stress.planar] = 0.0
+        return np.asarray(stress.square @ squares)
 
     def steady(
         self, drive: Floats, inertia: float, max_iterations: int, tolerance: float, push: Floats | float = 0.0
@@ -200,7 +217,7 @@ class GeneralisedSystem:
             goal = min(reached + stride, 1.0)
             equations = replace(self, strength=self.strength * goal)
             near = tolerance if goal == 1.0 else max(tolerance, INTERMEDIATE_TOLERANCE)
-            result, used, step = equations._newton(flux, drive, push, goal * inertia, left, near)
+            result, used, step = equations.newton(flux, drive, push, goal * inertia, left, near)
             left -= used
             if result is not None:
                 if goal == 1.0:
@@ -211,7 +228,7 @@ class GeneralisedSystem:
             if left <= 0 or stride < SMALLEST_STRIDE:
                 raise NotConvergedError(step)
 
-    def _newton(
+    def newton(
         self,
         flux: Floats,
         drive: Floats,
@@ -302,11 +319,16 @@ class GeneralisedSystem:
 
     def _matrix(self, flux: Floats, inertia: float, trust: Floats | float) -> Any:
         """Of the equations for stream functions, linearised around a flow."""
+        curl = self.stream.curl
         matrix = self._linearised(flux, trust, *self.operators.on_streams)
-        if inertia:
-            curl = self.stream.curl
+        if inertia and self._inertial(flux, inertia):
             matrix = matrix + inertia * (curl.T @ self.momentum.convection_jacobian(flux) @ curl)
         return matrix
+
+    def _inertial(self, flux: Floats, inertia: float) -> bool:
+        """Whether convection is large enough to matter for convergence."""
+        convection = np.abs(inertia * self.momentum.convection(flux)).max()
+        return bool(convection > NEGLIGIBLE * np.abs(self._viscous(self._viscosity(flux).value, flux)).max())
 
     def tangent(self, flux: Floats, inertia: float) -> tuple[Factors, Any]:
         """Factors and operator (faces, faces) of the equations linearised around a flow."""
@@ -314,20 +336,31 @@ class GeneralisedSystem:
         operator = self._linearised(flux, 1.0, stress.gather, stress.strain, stress.gradient)
         if inertia:
             operator = operator + inertia * self.momentum.convection_jacobian(flux)
-        return factorise(self._matrix(flux, inertia, 1.0)), sp.csr_array(operator)
+        curl = self.stream.curl
+        return factorise(curl.T @ operator @ curl), sp.csr_array(operator)
 
 
 def generalised_system(chip: Chip, law: Law, k: int) -> GeneralisedSystem:
     """The equations of a law on a chip's geometry, whose operators come from the cache if they are there."""
     key: Hashable = ("stress", *geometry_key(chip, k))
-    operators: StressOperators = cached(key, cell_count(chip, k), lambda: _operators(system(chip, k), chip, k))
-    return GeneralisedSystem(operators, law, k / (chip.um_per_px * M_PER_UM))
+    operators: StressOperators = cached(key, cell_count(chip, k), lambda: _operators(system(chip, k), chip))
+    return GeneralisedSystem(operators, law, _per_cell(chip, k))
 
 
-def _operators(equations: System, chip: Chip, k: int) -> StressOperators:
+def assembled(chip: Chip, law: Law, k: int, walls: LevelSet | None = None) -> GeneralisedSystem:
+    """The same without the cache. `walls` replaces the walls of the mask."""
+    operators = _operators(newton_solver.assembled(chip, k, walls), chip)
+    return GeneralisedSystem(operators, law, _per_cell(chip, k))
+
+
+def _per_cell(chip: Chip, k: int) -> float:
+    return k / (chip.um_per_px * M_PER_UM)
+
+
+def _operators(equations: System, chip: Chip) -> StressOperators:
     friction = None
     if chip.depth_um is not None or chip.friction_per_um2 is not None:
-        friction = np.full(equations.grid.faces, depth_friction(chip, k))
+        friction = np.full(equations.grid.faces, depth_friction(chip, equations.grid.k))
         if chip.friction_per_um2 is not None:
             friction += local_friction(chip.friction_per_um2, chip.um_per_px, equations.grid)
     return StressOperators(equations, stresses.assemble(equations.grid, equations.momentum, friction))

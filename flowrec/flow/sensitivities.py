@@ -1,8 +1,9 @@
 """Derivatives of a chip's flow with respect to boundary values and fluid, and the nonlinear remainder.
 
-Without inertia a Newtonian flow is exactly linear in inlet speeds and in p_out / mu, so viscosity alone changes nothing.
-With inertia or a law of viscosity the modes are the derivatives at the chip's own values, and a few steps with the same
-factors lead from the linear prediction to the solution. All of it depends on the chip alone, never on earlier calls.
+Without inertia a Newtonian flow is exactly linear in inlet speeds and in p_out / mu, so viscosity alone changes
+nothing. With inertia or a law of viscosity the modes are the derivatives at the chip's own values, and a few steps with
+the same factors lead from the linear prediction to the solution. All of it depends on the chip alone, never on earlier
+calls.
 """
 
 from __future__ import annotations
@@ -109,8 +110,8 @@ def sensitivities(
 ) -> Sensitivities:
     """Expansion around a flow `flux` (faces,).
 
-    `friction` makes ln of the depth friction a parameter, `shapes` the shapes of the inlets' profiles, `law` the unknowns
-    of the law of viscosity.
+    `friction` makes ln of the depth friction a parameter, `shapes` the shapes of the inlets' profiles, `law` the
+    unknowns of the law of viscosity.
     """
     stream, momentum, grid = equations.stream, equations.momentum, equations.grid
     factors, operator = equations.tangent(flux, scales.inertia)

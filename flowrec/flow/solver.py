@@ -27,7 +27,7 @@ ROUNDING = 1e-9  # smaller residuals are rounding errors: their digits differ be
 class FlowSolver:
     """Steady incompressible flow by finite volumes on a staggered grid, with Newton's method.
 
-    The matrices of a Newtonian fluid do not depend on its viscosity; those of a law of viscosity are made for each flow.
+    The matrices of a Newtonian fluid do not depend on its viscosity; those of another fluid are made for each flow.
     """
 
     k: Annotated[int, OneOf(1, 2, 4)] = 1  # subcells per pixel side: 1, 2 or 4
@@ -87,11 +87,7 @@ class FlowSolver:
             raise FlowError(f"flow.k = {self.k} on chip '{chip.name}': choose 1, 2 or 4 subcells per pixel side")
         _check(chip)
         scales = Scales.of(chip, self.k, self.convection)
-        equations: System | GeneralisedSystem
-        if chip.law is None:
-            equations = system(chip, self.k)
-        else:
-            equations = generalised_system(chip, chip.law, self.k)
+        equations = system(chip, self.k) if chip.law is None else generalised_system(chip, chip.law, self.k)
         try:
             # In the cache, because an assimilation needs the assumed flow again.
             flux: Floats = cached(

@@ -154,7 +154,9 @@ def scaled_rows(factors: NDArray[Any], matrix: Any) -> Any:
     return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
-def _mean_at(points: int, places: tuple[Ints, Ints], values: tuple[Any, Any], known: tuple[Bools, Bools] | None) -> Any:
+def _mean_at(
+    points: int, places: tuple[Ints, Ints], values: tuple[Any, Any], known: tuple[Bools, Bools] | None
+) -> tuple[Any, Bools]:
     """(points, faces) means of gradients over those at the same point; and which points (points,) have one."""
     place = np.concatenate(places)
     chosen = np.ones(len(place), bool) if known is None else np.concatenate(known)
@@ -179,11 +181,13 @@ def _corner_gradients(grid: Grid, u: _Component, v: _Component, points: int) -> 
     if grid.walls.staircase:
         n_x, n_y = has_v.astype(np.float64), has_u.astype(np.float64)
     else:
-        slopes = [slope[::2, ::2].ravel() for slope in np.gradient(level)]
-        n_y, n_x = (np.concatenate([np.zeros(points - len(slope)), slope]) for slope in slopes)
+        n_x, n_y = np.zeros((2, points))
+        n_y[grid.fluid.size :] = np.gradient(level, axis=0)[::2, ::2].ravel()
+        n_x[grid.fluid.size :] = np.gradient(level, axis=1)[::2, ::2].ravel()
     length = np.maximum(np.hypot(n_x, n_y), 1e-12)
     n_x, n_y = n_x / length, n_y / length
-    solid = np.concatenate([np.zeros(points - len(level[::2, ::2].ravel()), bool), (level[::2, ::2] <= 0.0).ravel()])
+    solid = np.zeros(points, bool)
+    solid[grid.fluid.size :] = (level[::2, ::2] <= 0.0).ravel()
     # U' by least squares from u_y = U' n_y^2 and v_x = -U' n_x^2, as far as they are known.
     weight = np.maximum(has_u * n_y**4 + has_v * n_x**4, LEAST_WEIGHT)
     wall = scaled_rows(solid * n_y**2 / weight, u_y) - scaled_rows(solid * n_x**2 / weight, v_x)
