@@ -285,15 +285,15 @@ def law_of(settings: ViscositySettings, where: str) -> Law | None:
             known = f"it has {', '.join(row.options)}" if row.options else "it has none"
             able = " or ".join(other.name for other in LAWS.values() if key in other.options)
             raise ChipError(
-                f"{where}: viscosity.{key} is no setting of the law {name}, {known}; set viscosity.law = {able}"
+                f"{where}: chip.viscosity.{key} is not for the law {name}, {known}; set chip.viscosity.law = {able}"
             )
-    fault = next(faults(settings, "viscosity."), None)
+    fault = next(faults(settings, "chip.viscosity."), None)
     if fault is not None:
         raise ChipError(f"{where}: {fault}")
     needed = {"table": ("rates_1_s", "ratios"), "function": ("function",)}.get(name, ())
     for key in needed:
         if key not in given:
-            raise ChipError(f"{where}: the law {name} needs viscosity.{key}")
+            raise ChipError(f"{where}: the law {name} needs chip.viscosity.{key}")
     law: Law | None = row.load()(**given)
     if isinstance(law, Table):
         _check_table(law, where)
@@ -335,7 +335,7 @@ def _check_table(table: Table, where: str) -> None:
     what = f"{where}: the viscosity"
     if len(rates) < 2 or len(rates) != len(ratios) or not (np.diff(rates) > 0.0).all():
         raise ChipError(
-            f"{where}: viscosity.rates_1_s and ratios have to be equally long, at least 2, with rates ascending"
+            f"{where}: chip.viscosity.rates_1_s and ratios have to be equally long, at least 2, with rates ascending"
         )
     wrong = np.flatnonzero(~(np.isfinite(ratios) & (ratios > 0.0)))
     if len(wrong):

@@ -112,17 +112,17 @@ def test_a_function_becomes_a_table_that_needs_it_no_more(tmp_path, monkeypatch)
             "viscosity.exponent = 0: must be from 0.1 to 3; the nearest is 0.1",
         ),
         (ViscositySettings("power_law", exponent=-1.0), "nearest is 0.1"),
-        (ViscositySettings("power_law", time_s=1.0), "viscosity.time_s is no setting of the law power_law, it has exp"),
+        (ViscositySettings("power_law", time_s=1.0), "viscosity.time_s is not for the law power_law, it has exp"),
         (
             ViscositySettings(exponent=0.5),
-            "of the law newtonian, it has none; set viscosity.law = power_law or carreau",
+            "of the law newtonian, it has none; set chip.viscosity.law = power_law or carreau",
         ),
         (ViscositySettings("carreau_yasuda", time_s=np.inf), "viscosity.time_s = inf"),
         (ViscositySettings("carreau_yasuda", infinite_share=np.nan), "viscosity.infinite_share = nan"),
-        (ViscositySettings("table"), "the law table needs viscosity.rates_1_s"),
+        (ViscositySettings("table"), "the law table needs chip.viscosity.rates_1_s"),
         (ViscositySettings("table", rates_1_s=(1.0, 1.0), ratios=(1.0, 1.0)), "rates ascending"),
         (ViscositySettings("table", rates_1_s=(1.0, 1e3), ratios=(1e-8, 1.0)), "can be computed"),
-        (ViscositySettings("function"), "needs viscosity.function"),
+        (ViscositySettings("function"), "needs chip.viscosity.function"),
     ],
 )
 def test_a_law_without_a_flow_is_refused_in_one_line(settings, words):
