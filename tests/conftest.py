@@ -23,7 +23,7 @@ settings.register_profile("flowrec", deadline=None)
 settings.load_profile("flowrec")
 
 HANG_S = 120.0  # a wait as long as this one hangs; no test asserts how quick something is
-SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1"]
+SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1", "simulated.world=kind"]
 
 # For tests of what happens in real time: other tests beside them would be the cause of their failures.
 needs_quiet = pytest.mark.skipif(

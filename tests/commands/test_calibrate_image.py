@@ -23,7 +23,7 @@ from flowrec.rig_settings import CameraSettings
 POSE = ("angle_deg=182", "mirror=true", "centre_um=[3340,2350]", "um_per_px=20.4")
 TRUE = [f"simulated.{each}" for each in POSE]
 CHIP = ["chip.name=bifurcation"]
-SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1"]
+SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1", "simulated.world=kind"]
 
 
 @pytest.fixture(scope="module")

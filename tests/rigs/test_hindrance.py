@@ -19,7 +19,7 @@ from flowrec.rigs.simulated.hindrance import (
 from flowrec.robot import Robot
 from flowrec.simulated_settings import Simulated
 
-QUIET = Simulated(position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
+QUIET = Simulated(world="kind", position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
 RADIUS_UM, PX = 50.0, 20.0
 
 

@@ -15,7 +15,7 @@ def drifter(share: float) -> Swimmer:
     robot = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0)
     velocity = np.zeros((40, 200, 2), np.float32)
     velocity[..., 0] = 100.0
-    quiet = Simulated(pulsation_share=share, pulsation_hz=2.0, position_noise_um=0.0)
+    quiet = Simulated(world="kind", pulsation_share=share, pulsation_hz=2.0, position_noise_um=0.0)
     field = FlowField(0, 0, "made up", 20.0, velocity, np.zeros((40, 200)), None, np.zeros(0), 1.0, 1000.0, "")
     return Swimmer((400.0, 400.0), robot, quiet, field, np.full((40, 200), 500.0, np.float32), 20.0)
 

@@ -19,7 +19,7 @@ from flowrec.robot import Robot
 from flowrec.simulated_settings import Simulated
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
-EXACT = Simulated(position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
+EXACT = Simulated(world="kind", position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
 STRAIGHT = load_chip(ChipSettings("straight"))  # rows 22 to 41 of 64, 20 um a pixel: y from 430 to 830 um
 CAMERA = Camera(width_px=256, height_px=64, rate_hz=30.0, um_per_px=STRAIGHT.size_um[0] / 256, debris=0)
 MIDDLE = 31.5 * 20.0
@@ -73,7 +73,7 @@ def test_zero_acts_at_once_and_no_field_comes_back_until_the_rig_is_entered_agai
 def test_the_same_seed_and_commands_give_the_same_bytes_at_any_pace():
     commands = {2: command(10.0, 0.3), 9: command(15.0, -0.5)}
     camera = replace(CAMERA, debris=12)
-    simulated = Simulated(seed=5)
+    simulated = Simulated(world="kind", seed=5)
     first, second = (fly(rig_with(simulated=simulated, camera=camera, flow=steady(200.0)), commands) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert a.frame.same_as(b.frame)
@@ -222,13 +222,13 @@ def test_debris_drifts_with_the_flow_and_never_runs_out():
 def test_the_true_world_differs_from_the_assumed_one_within_its_bounds():
     chip = load_chip(ChipSettings("vessels", seed=2))
     solver = FlowSolver(1)
-    worlds = [true_chip(chip, Simulated(seed=seed), solver) for seed in range(12)]
+    worlds = [true_chip(chip, Simulated(world="kind", seed=seed), solver) for seed in range(12)]
     inlets = np.array([world.boundary_values[0] for world in worlds]) / chip.boundary_values[0]
     assert np.all(np.abs(inlets - 1.0) <= 0.25)
     assert np.all(np.abs(inlets - 1.0) >= 0.25 / 3.0)
     assert np.ptp(inlets) > 0.1
     assert all(np.any(world.boundary_values[1:] != 0.0) for world in worlds)
-    exact = Simulated(inlet_speed_error=0.0, outlet_pressure_error=0.0, viscosity_error=0.0)
+    exact = Simulated(world="kind", inlet_speed_error=0.0, outlet_pressure_error=0.0, viscosity_error=0.0)
     same = true_chip(chip, exact, solver)
     assert np.array_equal(same.boundary_values, chip.boundary_values)
     assert same.viscosity_mpa_s == chip.viscosity_mpa_s

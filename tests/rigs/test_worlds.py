@@ -20,7 +20,7 @@ from flowrec.ranges import faults
 from flowrec.resolve import derived, resolve
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.rigs.simulated.true_walls import at_centres, fluid_of, true_walls
+from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
 from flowrec.rigs.simulated.world import Shake, misregistered, true_chip, true_depth_um, true_pump, true_robot
 from flowrec.robot import Robot
 from flowrec.simulated_settings import WORLDS, Simulated
@@ -114,25 +114,31 @@ def test_a_stated_error_leaves_what_else_is_drawn_as_it_is():
 
 def test_the_depth_is_the_stated_one_but_for_its_error_and_a_chip_may_have_one_that_nobody_stated():
     stated = replace(CHIP, depth_um=150.0)
-    assert true_depth_um(CHIP, Simulated()) is None and true_depth_um(stated, Simulated()) == 150.0
+    assert (
+        true_depth_um(CHIP, Simulated(world="kind")) is None and true_depth_um(stated, Simulated(world="kind")) == 150.0
+    )
     assert true_depth_um(CHIP, Simulated(world="moderate")) is None
     depths = [true_depth_um(stated, Simulated(world="moderate", seed=n)) for n in range(50)]
     assert 135.0 <= min(depths) < 139.0 and 161.0 < max(depths) <= 165.0
-    assert true_depth_um(CHIP, Simulated(depth_um=100.0)) == 100.0
-    assert true_depth_um(stated, Simulated(depth_um=0.0)) is None
+    assert true_depth_um(CHIP, Simulated(world="kind", depth_um=100.0)) == 100.0
+    assert true_depth_um(stated, Simulated(world="kind", depth_um=0.0)) is None
     width_um = median_width_um(CHIP)
     depths = [true_depth_um(CHIP, Simulated(world="hard", seed=n), 50.0) for n in range(20)]
     assert all(0.6 * width_um <= depth <= 1.0 * width_um and depth >= 110.0 for depth in depths)
     # Friction flattens the profile and favours the narrow branch, which in two dimensions w^3 / L nearly closes.
     solver = FlowSolver()
-    deep, shallow = (solver.solve(true_chip(CHIP, Simulated(seed=1, depth_um=d), solver)) for d in (0.0, 60.0))
+    deep, shallow = (
+        solver.solve(true_chip(CHIP, Simulated(world="kind", seed=1, depth_um=d), solver)) for d in (0.0, 60.0)
+    )
     upper = np.hypot(*shallow.velocity_um_s[60].T).max() / np.hypot(*deep.velocity_um_s[60].T).max()
     assert upper > 1.1
 
 
 def test_the_drift_of_a_pump_is_a_process_of_time_and_not_of_the_steps_that_it_is_asked_in():
     drift = {"drift_share": 0.05, "drift_s": 2.0}
-    one, other = (true_pump(Simulated(seed=4, pulsation_share=0.1, pulsation_hz=0.5, **drift)) for _ in range(2))
+    one, other = (
+        true_pump(Simulated(world="kind", seed=4, pulsation_share=0.1, pulsation_hz=0.5, **drift)) for _ in range(2)
+    )
     times = np.linspace(0.0, 30.0, 61)
     late_first = [other.strength(time) for time in times[::-1]][::-1]
     assert [one.strength(time) for time in times] == late_first
@@ -151,15 +157,25 @@ def test_true_walls_are_off_by_up_to_what_was_asked_in_patches_and_keep_every_ch
     for error_px in (0.33, 1.0):
         true, words = true_walls(chip, error_px, 0.0, np.zeros((0, 2)), np.random.default_rng(3))
         assert f"{error_px:g} px" in words and true.um_per_px == 10.0
-        distance = np.abs(clearance_um(fluid_of(chip.mask), 1.0))
-        moved = true.mask != fluid_of(chip.mask)
+        distance = np.abs(clearance_um(cut_up(chip.mask, 2), 1.0))
+        moved = true.mask != cut_up(chip.mask, 2)
         assert moved.mean() > 2e-3
         assert distance[moved].max() <= 2.0 * (error_px + 0.75)  # fine pixels; a staircase is half a pixel off itself
-        assert (true.mask & ~fluid_of(chip.mask)).any() and (~true.mask & fluid_of(chip.mask)).any()
+        assert (true.mask & ~cut_up(chip.mask, 2)).any() and (~true.mask & cut_up(chip.mask, 2)).any()
         # Channels and islands neither meet nor part.
         for mask, whole in ((true.mask, chip.mask), (~true.mask, ~chip.mask)):
             corners = np.ones((3, 3)) if mask is not true.mask else None
             assert scipy.ndimage.label(mask, corners)[1] == scipy.ndimage.label(whole, corners)[1]
+
+
+def test_the_mask_of_a_large_chip_keeps_its_pixel_size_and_every_one_of_its_channels():
+    mask = np.zeros((240, 500), np.bool_)
+    mask[20:110], mask[130:220] = True, True
+    large = replace(CHIP, mask=mask, openings=CHIP.openings)
+    true, _ = true_walls(large, 1.0, 0.0, np.zeros((0, 2)), np.random.default_rng(1))
+    assert true.mask.shape == mask.shape and true.um_per_px == 20.0 and true.openings == large.openings
+    assert scipy.ndimage.label(true.mask)[1] == 2 and 200 < (true.mask != mask).sum() < 3000
+    assert at_centres(true.mask.astype(float), large).shape == mask.shape
 
 
 def test_a_blocked_branch_keeps_the_rest_of_its_width_and_keeps_away_from_the_start():
@@ -187,9 +203,11 @@ def test_the_flow_between_true_walls_is_what_the_finer_field_says_at_the_chips_p
     error = relative_rmse(world.field, kind.field, CHIP.mask).v
     assert 0.03 < error < 0.35  # other walls, the same inflow
     assert world.field.velocity_um_s.shape == (*CHIP.mask.shape, 2) and world.mask.shape == (512, 640)
-    inside = at_centres(world.mask.astype(np.float64)) > 0.9
+    inside = at_centres(world.mask.astype(np.float64), CHIP) > 0.9
     speed = np.hypot(*np.moveaxis(world.field.velocity_um_s, -1, 0))
-    assert (speed[inside] > 0.0).mean() > 0.999 and speed[at_centres(world.mask.astype(np.float64)) == 0.0].max() == 0.0
+    assert (speed[inside] > 0.0).mean() > 0.999 and speed[
+        at_centres(world.mask.astype(np.float64), CHIP) == 0.0
+    ].max() == 0.0
     # Through the inlet flows what the boundary values say: the flow there is the profile of a straight channel.
     rows = np.arange(0.0, 5120.0, 2.0)
     inflow = sample(world.field, np.stack((np.full_like(rows, 60.0), rows), -1))[:, 0].sum() * 2.0
@@ -201,18 +219,18 @@ def test_the_flow_between_true_walls_is_what_the_finer_field_says_at_the_chips_p
 def test_the_true_registration_is_off_by_what_the_world_allows_and_turns_about_the_middle():
     stated, size = Calibration.centred(10.0, (3190.0, 2550.0), (640, 512)), (640, 512)
     middle_px = np.array([319.5, 255.5])
-    assert misregistered(stated, Simulated(), size) is stated
+    assert misregistered(stated, Simulated(world="kind"), size) is stated
     for seed in range(20):
         true = misregistered(stated, Simulated(world="moderate", seed=seed), size)
         off_um = np.hypot(*(true.to_um(middle_px) - stated.to_um(middle_px)))
         assert 5.0 <= off_um <= 10.0
         assert abs(true.angle_deg) <= 0.2 and abs(true.um_per_px / 10.0 - 1.0) <= 0.003
-    only = Simulated(scale_error=0.02, seed=3)
+    only = Simulated(world="kind", scale_error=0.02, seed=3)
     assert misregistered(stated, only, size).to_um(middle_px) == pytest.approx(stated.to_um(middle_px))
 
 
 def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth_not_at_all():
-    swing = Shake.of(Simulated(seed=1, shake_um=10.0, shake_hz=3.0))
+    swing = Shake.of(Simulated(world="kind", seed=1, shake_um=10.0, shake_hz=3.0))
     assert Shake.of(Simulated(seed=1)) is None
     ways = np.array([swing.at(time) for time in np.linspace(0.0, 1.0, 200)])
     assert np.hypot(*ways.T).max() == pytest.approx(10.0, rel=1e-3) and np.abs(ways.mean(0)).max() < 0.2
@@ -223,7 +241,7 @@ def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth
     for a, b in zip(still[1:8], shaken[1:8], strict=True):
         images = (np.float32(a.frame.image), np.float32(b.frame.image))
         found_px, _ = cv2.phaseCorrelate(*images, cv2.createHanningWindow((320, 256), cv2.CV_32F))
-        expected_px = Shake.of(Simulated(seed=1, shake_um=60.0)).at(a.stamp_ns * 1e-9) / 20.0
+        expected_px = Shake.of(Simulated(world="kind", seed=1, shake_um=60.0)).at(a.stamp_ns * 1e-9) / 20.0
         assert found_px == pytest.approx(expected_px, abs=0.25)
 
 

@@ -43,7 +43,7 @@ def words(sets: tuple[str, ...]) -> list[str]:
 
 def still_scene(folder: Path) -> tuple[str, ...]:
     """Settings of an emulated camera that shows a robot at rest, with other noise in every image."""
-    config = load_config(None, [*COMMON, "camera.rate_hz=40.0", "simulated.seed=5"])
+    config = load_config(None, [*COMMON, "camera.rate_hz=40.0", "simulated.seed=5", "simulated.world=kind"])
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
     rig = SimulatedRig.of(assemble(resolved, chip), resolved)

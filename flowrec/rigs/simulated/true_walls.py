@@ -1,7 +1,8 @@
 """True walls that are not the mask's: a mask of half the pixel size, pushed about in patches, with a blocked branch.
 
 The solver makes its smooth outline of this mask as of any other, so the true flow has another grid and another wall.
-Openings stay as they are: near the border the walls are those of the chip's mask.
+Openings stay as they are: near the border the walls are those of the chip's mask. The mask of a chip so large that its
+true flow would take minutes keeps its pixel size, and only whole pixels of it are pushed about.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from flowrec.flow.sampling import sample
 from flowrec.messages import FlowField
 from flowrec.rigs.simulated.microscope import blotches, outline_px
 
-REFINED = 2  # cells of the true mask per pixel side
+_REFINED, _LARGEST_PX = 2, 40_000  # cells of the true mask per pixel side; fluid pixels of a larger chip are not cut
 _PATCH_WIDTHS = 1.0  # correlation length of the error of the walls, in median channel widths
 _BORDER_PX = 6.0  # from here to twice as far from the border the error grows to its full size
 _CORE = 0.6  # of the way from the middle of a channel to its wall that no error reaches, and so between channels
 _SPECK_PX = 30  # a smaller piece of a wall is none
 _FROM_BORDER_WIDTHS = 1.5  # no branch is blocked nearer than this to the border
-_CLEAR_WIDTHS = 2.0  # nor to the start and the goal
+_CLEAR_WIDTHS = 2.0  # nor to the start
 _WIDTHS = (0.6, 1.3)  # times the median, of a place to be blocked: wider ones are junctions
 _FARTHEST_PX = 1.1  # largest level of a pixel centre, as the solver states it
 _BLOCK_LENGTH = 0.6  # half length of the obstacle along the channel, in widths
@@ -42,7 +43,7 @@ def true_walls(
     clear_um: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> tuple[Chip, str]:
-    """The chip with a mask (2 h, 2 w) of its true walls, and what was drawn, in words.
+    """The chip with a mask (c h, c w) of its true walls, c = 2 or for large chips 1, and what was drawn, in words.
 
     Parameters
     ----------
@@ -52,29 +53,32 @@ def true_walls(
 
     Raises RigError if the mask has no place for the obstacle.
     """
-    outline = cv2.resize(outline_px(chip.mask), None, fx=REFINED, fy=REFINED, interpolation=cv2.INTER_CUBIC)
+    cut = _REFINED if np.count_nonzero(chip.mask) <= _LARGEST_PX else 1
+    outline = cv2.resize(outline_px(chip.mask), None, fx=cut, fy=cut, interpolation=cv2.INTER_CUBIC)
     height, width = outline.shape
-    fluid, coarse, words = outline > 0.0, fluid_of(chip.mask), []
+    coarse, words = cut_up(chip.mask, cut), []
     y, x = np.mgrid[:height, :width]
-    inwards_px = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y)) / REFINED
-    channel = median_width_um(chip) / chip.um_per_px * REFINED
+    inwards_px = np.minimum(np.minimum(x, width - 1 - x), np.minimum(y, height - 1 - y)) / cut
+    channel = median_width_um(chip) / chip.um_per_px * cut
     if wall_error_px > 0.0:
         shift = wall_error_px * np.tanh(blotches(rng, height, width, _PATCH_WIDTHS * channel))
-        shift *= np.clip(inwards_px / _BORDER_PX - 1.0, 0.0, 1.0)
-        fluid = _without_specks(((outline + shift > 0.0) | _core(coarse)) & ~_core(~coarse))
+        outline = outline + shift * np.clip(inwards_px / _BORDER_PX - 1.0, 0.0, 1.0)
         words.append(f"walls up to {wall_error_px:g} px off")
-    fluid = np.where(inwards_px < 1.0, coarse, fluid)  # openings keep their pixels
-    if blocked_share > 0.0:
-        block, place = _obstacle(fluid, chip, blocked_share, channel, clear_um, rng)
-        fluid &= ~block
-        words.append(f"{100 * blocked_share:.0f} % of a branch blocked at {place[0]:.0f}, {place[1]:.0f} um")
-    pieces, _ = scipy.ndimage.label(fluid)
-    mask = pieces == np.argmax(np.bincount(pieces[fluid]))
-    openings = tuple(replace(o, first=REFINED * o.first, last=REFINED * o.last + REFINED - 1) for o in chip.openings)
+    fluid = ((outline > 0.0) | _core(coarse)) & ~_core(~coarse)
+    fluid = np.where(inwards_px < 1.0, coarse, _without_specks(fluid))  # openings keep their pixels
     true = replace(
-        chip, mask=np.ascontiguousarray(mask), um_per_px=chip.um_per_px / REFINED, openings=openings, walls="smooth"
+        chip,
+        um_per_px=chip.um_per_px / cut,
+        openings=tuple(replace(o, first=cut * o.first, last=cut * o.last + cut - 1) for o in chip.openings),
+        walls="smooth",
     )
-    return true, ", ".join(words)
+    if blocked_share > 0.0:
+        block, place = _obstacle(
+            replace(true, mask=fluid), origin_um(true, chip), blocked_share, channel, clear_um, rng
+        )
+        fluid = fluid & ~block
+        words.append(f"{100 * blocked_share:.0f} % of a branch blocked at {place[0]:.0f}, {place[1]:.0f} um")
+    return replace(true, mask=np.ascontiguousarray(fluid)), ", ".join(words)
 
 
 def _ridge(inside: Mask) -> tuple[Mask, NDArray[np.float64]]:
@@ -96,35 +100,38 @@ def _core(inside: Mask) -> Mask:
 
 
 def _without_specks(fluid: Mask) -> Mask:
-    """The same without solid pieces of a few pixels, such as a corner of a wall that is cut off."""
+    """The same without pieces of a few pixels, of fluid or of walls, such as a corner that is cut off."""
     solid, _ = scipy.ndimage.label(~fluid, np.ones((3, 3)))
-    return np.asarray(fluid | (np.bincount(solid.ravel()) < _SPECK_PX)[solid])
+    fluid = fluid | (np.bincount(solid.ravel()) < _SPECK_PX)[solid]
+    pieces, _ = scipy.ndimage.label(fluid)
+    return np.asarray(fluid & (np.bincount(pieces.ravel()) >= _SPECK_PX)[pieces])
 
 
 def _obstacle(
-    fluid: Mask,
-    chip: Chip,
+    true: Chip,
+    origin: float,
     share: float,
     channel: float,
     clear_um: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> tuple[Mask, tuple[float, float]]:
-    """The pixels of half an ellipse on one wall of a branch, and the place in um; widths in pixels of `fluid`."""
+    """The pixels of half an ellipse on one wall of a branch, and the place in um; `channel` is a width in pixels."""
+    fluid = true.mask
     ridge, distance = _ridge(fluid)
     rows, columns = np.nonzero(ridge)
     radii = distance[rows, columns]
     height, width = fluid.shape
     inwards = np.minimum(np.minimum(columns, width - columns), np.minimum(rows, height - rows))
-    places_um = _centres_um(np.stack((columns, rows), -1), chip)
+    places_um = origin + np.stack((columns, rows), -1) * true.um_per_px
     away = np.min(np.hypot(*(places_um[:, None] - clear_um[None]).T), axis=0) if len(clear_um) else np.inf
     fits = (
         (2.0 * radii > _WIDTHS[0] * channel)
         & (2.0 * radii < _WIDTHS[1] * channel)
         & (inwards > _FROM_BORDER_WIDTHS * channel)
-        & (away > _CLEAR_WIDTHS * channel * chip.um_per_px / REFINED)
+        & (away > _CLEAR_WIDTHS * channel * true.um_per_px)
     )
     if not fits.any():
-        raise RigError(f"chip '{chip.name}' has no branch to block; set simulated.blocked_share = 0")
+        raise RigError(f"chip '{true.name}' has no branch to block; set simulated.blocked_share = 0")
     chosen = int(rng.choice(np.flatnonzero(fits)))
     row, column, radius = rows[chosen], columns[chosen], float(radii[chosen])
     # The channel runs along the middle pixels around the place.
@@ -141,37 +148,33 @@ def _obstacle(
     return block, (float(place[0]), float(place[1]))
 
 
-def _centres_um(points: NDArray[np.intp], chip: Chip) -> NDArray[np.float64]:
-    """Chip points (..., 2) um of pixels (column, row) of the refined mask."""
-    return (np.asarray(points, np.float64) - 0.5 * (REFINED - 1)) * chip.um_per_px / REFINED
+def cut_up(mask: Mask, cut: int) -> Mask:
+    """A mask with each pixel cut into cut x cut."""
+    return np.repeat(np.repeat(mask, cut, axis=0), cut, axis=1)
 
 
-def fluid_of(mask: Mask) -> Mask:
-    """A mask with each pixel cut into REFINED x REFINED."""
-    return np.repeat(np.repeat(mask, REFINED, axis=0), REFINED, axis=1)
-
-
-def origin_um(chip: Chip) -> float:
-    """Where the centre of the refined mask's first pixel lies, on either axis of the chip frame."""
-    return -0.5 * (REFINED - 1) * chip.um_per_px / REFINED
+def origin_um(true: Chip, chip: Chip) -> float:
+    """Where the centre of the first pixel of the true mask lies, on either axis of the chip frame."""
+    return 0.5 * (true.um_per_px - chip.um_per_px)
 
 
 def on_pixels(field: FlowField, true: Chip, chip: Chip) -> FlowField:
-    """A field of the refined mask as values at the centres of the chip's pixels, with its walls there."""
+    """A field of the true mask as values at the centres of the chip's pixels, with its walls there."""
     rows, columns = np.indices(chip.mask.shape)
-    centres_um = np.stack((columns, rows), -1) * chip.um_per_px - origin_um(chip)
-    wall_px = at_centres(outline_px(true.mask) / REFINED)
+    centres_um = np.stack((columns, rows), -1) * chip.um_per_px - origin_um(true, chip)
+    wall_px = at_centres(outline_px(true.mask), chip) * (true.um_per_px / chip.um_per_px)
     velocity = np.where((wall_px > 0.0)[..., None], sample(field, centres_um), 0.0)
     return replace(
         field,
         um_per_px=chip.um_per_px,
         velocity_um_s=np.ascontiguousarray(velocity, np.float32),
-        pressure_pa=np.where(wall_px > 0.0, at_centres(field.pressure_pa), 0.0).astype(np.float32),
+        pressure_pa=np.where(wall_px > 0.0, at_centres(field.pressure_pa, chip), 0.0).astype(np.float32),
         wall_px=np.clip(wall_px, -_FARTHEST_PX, _FARTHEST_PX).astype(np.float32),
     )
 
 
-def at_centres(raster: NDArray[Any]) -> NDArray[np.float32]:
-    """A raster (2 h, 2 w) of the refined mask at the centres of the chip's pixels (h, w): the mean of the four."""
-    height, width = raster.shape
-    return np.asarray(raster.reshape(height // REFINED, REFINED, width // REFINED, REFINED).mean((1, 3)), np.float32)
+def at_centres(raster: NDArray[Any], chip: Chip) -> NDArray[np.float32]:
+    """A raster of the true mask at the centres of the chip's pixels (h, w): the mean of those within each."""
+    height, width = chip.mask.shape
+    cut = raster.shape[0] // height
+    return np.asarray(raster.reshape(height, cut, width, cut).mean((1, 3)), np.float32)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um, median_width_um
 from flowrec.chip.registration import Calibration
+from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField
 from flowrec.rigs.simulated.hindrance import Hindrance, walls_around
@@ -191,9 +192,9 @@ def world_of(
         if wall_error_px > 0.0 or blocked_share > 0.0:
             rng = drawn_from(simulated.seed, "walls")
             fine, words = true_walls(truth, wall_error_px, blocked_share, clear_um, rng)
-            field = on_pixels(solver.solve(fine), fine, chip)
-            mask, um_per_px, mask_origin_um = fine.mask, fine.um_per_px, origin_um(chip)
-            walls_um = at_centres(clearance_um(fine.mask, fine.um_per_px))
+            field = on_pixels(_solved(fine, solver), fine, chip)
+            mask, um_per_px, mask_origin_um = fine.mask, fine.um_per_px, origin_um(fine, chip)
+            walls_um = at_centres(clearance_um(fine.mask, fine.um_per_px), chip)
         else:
             field = solver.solve(truth)
         note = drawn_note(chip, truth, robot, simulated, words)
@@ -203,6 +204,14 @@ def world_of(
     share = simulated.value("hindrance")
     hindrance = Hindrance(share, walls_around(walls_um, chip.um_per_px)) if share > 0.0 else None
     return World(field, walls_um, mask, um_per_px, mask_origin_um, hindrance)
+
+
+def _solved(fine: Chip, solver: FlowSolver) -> FlowField:
+    """The flow between smooth walls; along the pixels where the smooth ones would cut an opening."""
+    try:
+        return solver.solve(fine)
+    except FlowError:
+        return solver.solve(replace(fine, walls="pixel"))
 
 
 def drawn_note(chip: Chip, truth: Chip, robot: Robot, simulated: Simulated, walls: str) -> str:
