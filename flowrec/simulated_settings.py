@@ -1,8 +1,8 @@
 """Settings of the simulated rig: how the simulated world differs from the assumed one; the table of named worlds.
 
 A setting that is None has the value of the preset that `simulated.world` names. Most of them bound an error that is
-drawn from the seed. Where a setting states the true value itself (`um_per_rev_share`, `depth_um`, `delay_s`,
-`step_out_share`, `um_per_px`, `angle_deg`, `centre_um`, `pulsation_hz`), None means that it is drawn.
+drawn from the seed. Where a setting states the true value itself, None means that it is drawn: `inlet_speed_share`,
+`depth_um`, `um_per_rev_share`, `delay_s`, `step_out_share`, `um_per_px`, `angle_deg`, `centre_um`, `pulsation_hz`.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class Simulated:
     # The flow.
     # each true inlet speed is the assumed one times 1 +- (a third of this to all)
     inlet_speed_error: _PartOf | None = None
+    inlet_speed_share: Annotated[float, Range(0.01, 10.0)] | None = None  # true over assumed, of all; None: drawn
     # each true outlet pressure differs by up to this fraction of the chip's pressure drop
     outlet_pressure_error: _Size | None = None
     viscosity_error: _PartOf | None = None  # the true viscosity is the assumed one times up to 1 +- this

@@ -14,10 +14,11 @@ from flowrec.chip.registration import Calibration
 from flowrec.config import config_from_toml, load_config, to_toml, with_sets
 from flowrec.flow import FlowSolver
 from flowrec.flow.sampling import relative_rmse, sample
-from flowrec.messages import Currents
+from flowrec.messages import Currents, FlowField
 from flowrec.pipeline import assemble
 from flowrec.ranges import faults
 from flowrec.resolve import derived, resolve
+from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
@@ -107,6 +108,9 @@ def test_a_stated_error_leaves_what_else_is_drawn_as_it_is():
     assert other.step_out_hz == 0.7 * ROBOT.step_out_hz
     exact = true_robot(ROBOT, replace(hard, um_per_rev_share=0.85, slip=0.1, delay_s=0.05))
     assert (exact.um_per_rev, exact.delay_s) == (pytest.approx(25.0 * 0.85 * 0.9), 0.05)
+    inlet = true_chip(CHIP, replace(hard, inlet_speed_share=1.1, outlet_pressure_error=0.0), FlowSolver())
+    assert inlet.boundary_values == pytest.approx(CHIP.boundary_values * 1.1)
+    assert inlet.viscosity_mpa_s == true_chip(CHIP, hard, FlowSolver()).viscosity_mpa_s
     shares = [true_robot(ROBOT, Simulated(world="moderate", seed=n)).um_per_rev / 25.0 for n in range(200)]
     assert min(shares) == pytest.approx(0.92, abs=0.004) and max(shares) == pytest.approx(1.08, abs=0.004)
     assert np.mean(shares) == pytest.approx(1.0, abs=0.01)
@@ -132,6 +136,18 @@ def test_the_depth_is_the_stated_one_but_for_its_error_and_a_chip_may_have_one_t
     )
     upper = np.hypot(*shallow.velocity_um_s[60].T).max() / np.hypot(*deep.velocity_um_s[60].T).max()
     assert upper > 1.1
+
+
+def test_the_brownian_motion_of_the_robot_is_stokes_and_einsteins_and_tiny():
+    still = Simulated(world="kind", position_noise_um=0.0, temperature_k=295.0, speed_noise=0.0)
+    shape = (80, 80)
+    field = FlowField(0, 0, "", 20.0, np.zeros((*shape, 2)), np.zeros(shape), None, np.zeros(0), 1.0, 1000.0, "")
+    ends = []
+    for seed in range(300):
+        body = Swimmer((800.0, 800.0), ROBOT, replace(still, seed=seed), field, np.full(shape, 800.0, np.float32), 20.0)
+        body.advance(1.0, 0.0, 0.0, 0.0)
+        ends.append(body.position_um - 800.0)
+    assert np.std(ends) == pytest.approx(0.0930, rel=0.08)  # sqrt(2 k T / (6 pi mu a) 1 s) of 50 um in water at 295 K
 
 
 def test_the_drift_of_a_pump_is_a_process_of_time_and_not_of_the_steps_that_it_is_asked_in():

@@ -64,9 +64,9 @@ def true_depth_um(chip: Chip, simulated: Simulated, radius_um: float = 0.0) -> f
 def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver, radius_um: float = 0.0) -> Chip:
     """The chip with the true boundary values, viscosity and depth, drawn from the seed.
 
-    Each inlet speed times 1 +- (a third of inlet_speed_error to all of it), the viscosity times 1 +-
-    viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across the chip;
-    all uniform. One outlet alone keeps its pressure: only differences drive a flow.
+    Each inlet speed times 1 +- (a third of inlet_speed_error to all of it) or times the stated share, the viscosity
+    times 1 +- viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across
+    the chip; all uniform. One outlet alone keeps its pressure: only differences drive a flow.
     """
     rng = np.random.default_rng([simulated.seed, 5])
     inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
@@ -74,7 +74,10 @@ def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver, radius_um: f
     viscosity = chip.viscosity_mpa_s * (1.0 + simulated.value("viscosity_error") * float(rng.uniform(-1.0, 1.0)))
     # At least a third of the error, because an almost correct assumption would leave nothing to refine.
     wrong = np.sign(draws) * (1.0 + 2.0 * np.abs(draws)) / 3.0
-    values = chip.boundary_values * np.where(inlet, 1.0 + simulated.value("inlet_speed_error") * wrong, 1.0)
+    share = 1.0 + simulated.value("inlet_speed_error") * wrong
+    if simulated.inlet_speed_share is not None:
+        share = np.full_like(share, simulated.inlet_speed_share)
+    values = chip.boundary_values * np.where(inlet, share, 1.0)
     chip = replace(chip, depth_um=true_depth_um(chip, simulated, radius_um))
     changed = chip.with_boundary(values, viscosity)
     outlet_error = simulated.value("outlet_pressure_error")
