@@ -145,7 +145,7 @@ def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:
         "notes": config.recording.notes,
     }
     if config.rig == SIMULATED:
-        facts["seed"] = str(config.simulated.seed)
+        facts |= {"seed": str(config.simulated.seed), "world": config.simulated.world}
     if config.refine.weights_sha256:
         facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
     pictures = _pictures(config)

@@ -25,7 +25,7 @@ _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16
 _REPEATED = ("reason", "duration")  # the second is a sentence of older files
-_STATED = ("seed", "operator", "sample", "notes")  # in the provenance
+_STATED = ("seed", "world", "operator", "sample", "notes")  # in the provenance
 _OF_SOURCE = ("source_", "times_", "coil_log_")  # of a movie; in the provenance
 _CLOCK_READINGS = ("wall_ns", "monotonic_ns")
 

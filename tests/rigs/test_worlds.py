@@ -187,9 +187,11 @@ def test_true_walls_are_off_by_up_to_what_was_asked_in_patches_and_keep_every_ch
 def test_the_mask_of_a_large_chip_keeps_its_pixel_size_and_every_one_of_its_channels():
     mask = np.zeros((240, 500), np.bool_)
     mask[20:110], mask[130:220] = True, True
+    mask[60:62, 100:400:50] = False  # posts of four pixels
     large = replace(CHIP, mask=mask, openings=CHIP.openings)
     true, _ = true_walls(large, 1.0, 0.0, np.zeros((0, 2)), np.random.default_rng(1))
     assert true.mask.shape == mask.shape and true.um_per_px == 20.0 and true.openings == large.openings
+    assert scipy.ndimage.label(~true.mask)[1] == 3 + 6
     assert scipy.ndimage.label(true.mask)[1] == 2 and 200 < (true.mask != mask).sum() < 3000
     assert at_centres(true.mask.astype(float), large).shape == mask.shape
 

@@ -26,7 +26,7 @@ _REFINED, _LARGEST_PX = 2, 40_000  # cells of the true mask per pixel side; flui
 _PATCH_WIDTHS = 1.0  # correlation length of the error of the walls, in median channel widths
 _BORDER_PX = 6.0  # from here to twice as far from the border the error grows to its full size
 _CORE = 0.6  # of the way from the middle of a channel to its wall that no error reaches, and so between channels
-_SPECK_PX = 30  # a smaller piece of a wall is none
+_SPECK_PX = 30  # a smaller piece is none, if it was part of a larger one
 _FROM_BORDER_WIDTHS = 1.5  # no branch is blocked nearer than this to the border
 _CLEAR_WIDTHS = 2.0  # nor to the start
 _WIDTHS = (0.6, 1.3)  # times the median, of a place to be blocked: wider ones are junctions
@@ -65,7 +65,7 @@ def true_walls(
         outline = outline + shift * np.clip(inwards_px / _BORDER_PX - 1.0, 0.0, 1.0)
         words.append(f"walls up to {wall_error_px:g} px off")
     fluid = ((outline > 0.0) | _core(coarse)) & ~_core(~coarse)
-    fluid = np.where(inwards_px < 1.0, coarse, _without_specks(fluid))  # openings keep their pixels
+    fluid = np.where(inwards_px < 1.0, coarse, _without_specks(fluid, coarse))  # openings keep their pixels
     true = replace(
         chip,
         um_per_px=chip.um_per_px / cut,
@@ -99,12 +99,25 @@ def _core(inside: Mask) -> Mask:
     return np.asarray(away <= _CORE * distance[rows, columns])
 
 
-def _without_specks(fluid: Mask) -> Mask:
-    """The same without pieces of a few pixels, of fluid or of walls, such as a corner that is cut off."""
-    solid, _ = scipy.ndimage.label(~fluid, np.ones((3, 3)))
-    fluid = fluid | (np.bincount(solid.ravel()) < _SPECK_PX)[solid]
-    pieces, _ = scipy.ndimage.label(fluid)
-    return np.asarray(fluid & (np.bincount(pieces.ravel()) >= _SPECK_PX)[pieces])
+def _without_specks(fluid: Mask, before: Mask) -> Mask:
+    """The same without pieces of a few pixels that were part of larger ones before, such as a corner that is cut off.
+
+    A piece of a wall becomes fluid, a piece of fluid a wall; a post that was small before stays.
+    """
+    corners = np.ones((3, 3))
+    fluid = fluid | _specks(~fluid, ~before, corners)
+    return fluid & ~_specks(fluid, before, None)
+
+
+def _specks(inside: Mask, before: Mask, neighbours: NDArray[np.float64] | None) -> Mask:
+    """The pixels of small pieces of `inside` whose pixels were in a piece of `before` of more than twice their size."""
+    pieces, count = scipy.ndimage.label(inside, neighbours)
+    whole, _ = scipy.ndimage.label(before, neighbours)
+    sizes, wholes = np.bincount(pieces.ravel(), minlength=count + 1), np.bincount(whole.ravel())
+    wholes[0] = 0
+    was = scipy.ndimage.maximum(wholes[whole], pieces, np.arange(1, count + 1))
+    small = np.concatenate(([False], (sizes[1:] < _SPECK_PX) & (2 * sizes[1:] < was)))
+    return np.asarray(small[pieces])
 
 
 def _obstacle(
