@@ -99,9 +99,10 @@ class FlowSolver:
             widest = max(opening.width_px for opening in chip.openings)
             fastest = float(np.abs(equations.linear(scales.drive)).max())
             reynolds = scales.inertia * self.k * widest * fastest
+            law = "a law of viscosity nearer to the Newtonian one, " if chip.law is not None else ""
             raise FlowError(
                 f"flow on chip '{chip.name}' did not converge (Re about {reynolds:.3g}, last step {failure.step:.1e} "
-                f"after {self.max_iterations} iterations): try a larger flow.k or flow.max_iterations, "
+                f"after {self.max_iterations} iterations): try {law}a larger flow.k or flow.max_iterations, "
                 "check units of speed and viscosity, or set flow.convection = false"
             ) from None
         return equations, scales, flux

@@ -6,8 +6,9 @@ of momentum.py, and b_k the same of the transposed gradient, -div (grad v)^T, th
 
     sum_k mu_k a_k + (mu_k - mu_f) b_k,   mu_f = mean of the four mu_k,
 
-so a constant viscosity gives the Newtonian operator to rounding: div (grad v)^T = 0, exactly in the fluxes of whole
-cells, where mu_f cancels and momentum is conserved, and to the order of the scheme at cut ones, where it does not.
+so a constant viscosity gives the Newtonian operator to rounding: div (grad v)^T = 0, exactly so in the fluxes of whole
+cells, where mu_f cancels and momentum is conserved. Faces that a wall cuts have no b_k: their differences would make
+the viscosity of neighbours amplify each other at sharp corners, and in a flow along the wall they are zero.
 
 The shear rate is that of the same gradients, gamma^2 = 4 u_x^2 + (u_y + v_x)^2. A corner in solid stands for the wall
 where it meets the grid lines through that corner. Only the normal derivative U' of the speed along the wall exists
@@ -134,14 +135,14 @@ def _component(
     across = tuple(matrix(columns, profiles.slope(row, end)) for end in (high, low))
     parts += [matrix(columns, -half[:, None] * (bend + sign * mean)) for sign in (1.0, -1.0)]
     kind = faces.kind[j, i]
-    whole = kind != OUTLET  # a half volume has no such identity
+    whole = (kind != OUTLET) & lines.simple  # half volumes and cut faces have no transposed part
     return _Component(
         me,
         kind != INLET,
         (along[0], along[1]),
         (across[0], across[1]),
         (parts[0], parts[1], parts[2], parts[3]),
-        (whole * -1.0 / np.maximum(lines.total, SHORTEST), whole * -half / length),
+        (whole * -1.0 / lines.total, whole * -half / length),
         lines.inner,
         (cell[j, np.minimum(i, w - 1)], cell[j, np.maximum(i - 1, 0)]),
         (corner[j + 1, i], corner[j, i]),

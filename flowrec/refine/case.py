@@ -1,7 +1,7 @@
 """One case without dimensions, on the pixels that the networks and Gauss-Newton work on.
 
 The image is cropped to the fluid and padded to sides that a U-Net can halve. Lengths are in pixels, velocities in
-units of a speed V, pressures in units of mu V / px.
+units of a speed V, pressures in units of mu V / px; mu is the viscosity at the shear rate V / px.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.openings import border
 from flowrec.messages import FlowField
+from flowrec.refine.local_viscosity import LocalViscosity, viscosity_scale
 from flowrec.refine.observation_operator import Floats, ObservationOperator
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 
@@ -86,6 +87,7 @@ class Case:
     reynolds: float  # rho V px / mu
     friction: float  # 12 px^2 / H^2, 0 without a depth
     crop: Crop
+    viscosity: LocalViscosity | None = None  # None: constant
 
     @classmethod
     def of(
@@ -112,8 +114,10 @@ class Case:
             along = slice(opening.first, opening.last + 1)
             border(inflow, opening.side)[along] = 1.0 if opening.kind == "inlet" else -1.0
             border(number, opening.side)[along] = index + 1
-        px_m, mu = chip.um_per_px * M_PER_UM, initial.viscosity_mpa_s * PA_S_PER_MPA_S
         speed = float(np.abs(initial.velocity_um_s).max()) if speed is None else speed
+        viscosity = LocalViscosity.of(chip, speed, chip.um_per_px)
+        px_m = chip.um_per_px * M_PER_UM
+        mu = initial.viscosity_mpa_s * PA_S_PER_MPA_S * viscosity_scale(viscosity)
         unit_pressure = mu * speed * M_PER_UM / px_m
         observed = crop.operator(operator)
         return cls(
@@ -134,6 +138,7 @@ class Case:
             initial.density_kg_m3 * speed * M_PER_UM * px_m / mu,
             0.0 if chip.depth_um is None else 12.0 * (chip.um_per_px / chip.depth_um) ** 2,
             crop,
+            viscosity,
         )
 
     def only(self, used: NDArray[np.bool_]) -> Case:

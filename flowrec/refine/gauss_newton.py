@@ -94,7 +94,7 @@ class _LeastSquares:
         distance = distance_transform_edt(np.pad(case.fluid, 1, mode="edge"))[1:-1, 1:-1]
         self.channel = np.maximum(2.0 * maximum_filter(distance, 9) * case.fluid, 2.0)
         fluid, inside = (_tensor(mask)[None] for mask in (case.fluid, case.inside))
-        self.physics = Physics.of(fluid, inside, case.reynolds, case.friction)
+        self.physics = Physics.of(fluid, inside, case.reynolds, case.friction, case.viscosity)
         self.speed = self._local_rms(case.velocity)
         self._truncation()
         self.operators, self.innovations = [], []  # H and observed minus initial velocity, along x and y

@@ -109,7 +109,7 @@ class FieldLoss:
             return torch.from_numpy(np.array(array, np.float32)).to(settings.device)
 
         self.correct, self.settings = correct, settings
-        self.physics = Physics.of(inputs.fluid, inputs.inside, case.reynolds, case.friction)
+        self.physics = Physics.of(inputs.fluid, inputs.inside, case.reynolds, case.friction, case.viscosity)
         self.truncation = self.physics.residuals(inputs.velocity, inputs.pressure)
         # Residuals are relative to the square of the initial field, so that weights mean the same in any case.
         size = float((inputs.velocity**2).sum() / inputs.fluid.sum()) or 1.0

@@ -68,9 +68,14 @@ class Pinn:
         Raises
         ------
         FlowError
-            If the device is not available, or the fit diverges.
+            If the device is not available, the fit diverges, or the viscosity depends on the shear rate.
         """
         assumed, operator, chip = problem.assumed, problem.operator, problem.chip
+        if chip.law is not None:
+            raise FlowError(
+                "the PINN knows constant viscosities only: use refine.method pi_unet or assimilate, or set "
+                "chip.viscosity.law = newtonian"
+            )
         speed = operator.rms_um_s
         if speed == 0.0:
             return replace(assumed, method="pinn", note="start kept: all observations say that the fluid stands still")

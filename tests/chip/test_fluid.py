@@ -115,7 +115,7 @@ def test_a_function_becomes_a_table_that_needs_it_no_more(tmp_path, monkeypatch)
         (ViscositySettings("power_law", time_s=1.0), "viscosity.time_s is not for the law power_law, it has exp"),
         (
             ViscositySettings(exponent=0.5),
-            "of the law newtonian, it has none; set chip.viscosity.law = power_law or carreau",
+            "for the law newtonian, it has none; set chip.viscosity.law = power_law or carreau",
         ),
         (ViscositySettings("carreau_yasuda", time_s=np.inf), "viscosity.time_s = inf"),
         (ViscositySettings("carreau_yasuda", infinite_share=np.nan), "viscosity.infinite_share = nan"),
