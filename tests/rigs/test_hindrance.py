@@ -107,18 +107,39 @@ def test_a_wall_slows_the_robot_down_along_it_and_more_so_towards_it():
         assert (vx, vy) == pytest.approx((0.0, 100.0 * math.sin(away)), abs=1e-3)
 
 
-def test_a_flow_carries_a_finite_sphere_by_faxens_law_and_less_beside_a_wall():
+def test_a_flow_carries_a_finite_sphere_by_faxens_law_and_a_wall_holds_it_back_by_the_shear():
     y = np.arange(40) * PX - 400.0
     velocity = np.zeros((40, 200, 2), np.float32)
     velocity[10:31, :, 0] = (300.0 * (1.0 - (y / 210.0) ** 2))[10:31, None]
-    for place, gaps in ((400.0, (3.2, 3.2)), (610.0 - 75.0, (0.5, 5.9))):
+    for place, gaps in ((400.0, (3.2, 3.2)), (610.0 - 75.0, (0.5, 5.9)), (190.0 + 60.0, (0.2, 6.2))):
         undisturbed = 300.0 * (1.0 - ((place - 400.0) / 210.0) ** 2)
         faxen = undisturbed - 300.0 / 3.0 * (RADIUS_UM / 210.0) ** 2
+        shear = 2.0 * 300.0 * abs(place - 400.0) / 210.0**2
+        near, far = (RADIUS_UM * (1.0 + gap) * (1.0 - carried(gap)) for gap in gaps)
         vx, vy = speed_of(swimmer((2000.0, place), 1.0, velocity), 0.0, 0.0)
-        assert vx == pytest.approx(faxen * carried(gaps[0]) * carried(gaps[1]), rel=2e-3)
+        assert vx == pytest.approx(faxen - shear * (near - far), rel=3e-3)
         assert vy == pytest.approx(0.0, abs=0.05)
         vx, _ = speed_of(swimmer((2000.0, place), 0.0, velocity), 0.0, 0.0)
         assert vx == pytest.approx(undisturbed, rel=1e-3)
+
+
+def test_a_sphere_in_a_shear_flow_along_one_wall_is_as_fast_as_goldman_says():
+    y = np.arange(200) * PX - 190.0
+    velocity = np.zeros((200, 60, 2), np.float32)
+    velocity[10:, :, 0] = y[10:, None]
+    mask = np.zeros((200, 60), np.bool_)
+    mask[10:] = True  # the other wall is far away
+    clearance = clearance_um(mask, PX)
+    field = FlowField(
+        0, 0, "made up", PX, velocity, np.zeros(mask.shape), None, np.zeros(0), 1.0, 1000.0, "",
+        np.clip(clearance / PX, -1.1, 1.1),
+    )  # fmt: skip
+    robot = Robot(radius_um=RADIUS_UM, max_speed_um_s=600.0, step_out_hz=30.0)
+    for distance, ratio in ((1.5431, 0.92185), (1.1276, 0.76692)):
+        place = 190.0 + distance * RADIUS_UM
+        walls = Hindrance(1.0, walls_around(clearance, PX))
+        body = Swimmer((600.0, place), robot, QUIET, field, clearance, PX, hindrance=walls)
+        assert speed_of(body, 0.0, 0.0)[0] == pytest.approx(ratio * distance * RADIUS_UM, rel=5e-3)
 
 
 def test_the_width_of_a_channel_is_found_from_either_side_and_from_its_middle():

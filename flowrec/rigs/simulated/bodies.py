@@ -19,7 +19,7 @@ from flowrec.flow.sampling import sample, walls_of
 from flowrec.flow.velocity_stencil import velocity_at
 from flowrec.interpolation import bilinear
 from flowrec.messages import FlowField
-from flowrec.rigs.simulated.hindrance import Hindrance, hindered
+from flowrec.rigs.simulated.hindrance import FAXEN, Hindrance, hindered
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.world import true_pump
 from flowrec.robot import Robot
@@ -30,7 +30,6 @@ from flowrec.units import UM_PER_M
 _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 4 um at 1000 um/s
 _CORRELATION_S = 1.0  # of the wander
 _BOLTZMANN_J_K = 1.380649e-23
-_FAXEN = math.sqrt(2.0 / 3.0)  # see hindrance.py
 _NO_WALLS = np.zeros((3, 0, 0), np.float32)
 
 
@@ -53,12 +52,13 @@ def _moves(
     if hindrance == 0.0:
         vx, vy = velocity_at(velocity, wall_px, x / um_per_px, y / um_per_px)
         return own_x + strength * vx, own_y + strength * vy
-    fx, fy, away = 0.0, 0.0, _FAXEN * radius
-    for dx, dy in ((away, 0.0), (-away, 0.0), (0.0, away), (0.0, -away)):
+    flow = np.empty((4, 2))
+    away = FAXEN * radius
+    for n, (dx, dy) in enumerate(((away, 0.0), (-away, 0.0), (0.0, away), (0.0, -away))):
         vx, vy = velocity_at(velocity, wall_px, (x + dx) / um_per_px, (y + dy) / um_per_px)
-        fx += 0.25 * strength * vx
-        fy += 0.25 * strength * vy
-    return hindered(x, y, own_x, own_y, fx, fy, hindrance, clearance, walls, um_per_px, radius)
+        flow[n, 0] = strength * vx
+        flow[n, 1] = strength * vy
+    return hindered(x, y, own_x, own_y, flow, hindrance, clearance, walls, um_per_px, radius)
 
 
 @compiled

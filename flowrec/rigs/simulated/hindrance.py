@@ -20,9 +20,12 @@ a gap of 2.7 % of its radius over the floor; so the floor's drag is 2.9. Revolut
 the field. Torque and step-out change by at most a fifth (Jeffery 1915: 1.202 at contact) and are left as they are.
 
 The flow carries a sphere of finite size with the mean over its surface, which is Faxen's law 1 + a^2 / 6 Laplacian; in
-a plane that is the mean over four points at sqrt(2/3) a. Beside a wall it lags behind the undisturbed flow, by Goldman,
-Cox and Brenner, Chem. Eng. Sci. 22 (1967) 653, table for a free sphere in a shear flow; for two walls the two factors
-are multiplied. The surface is not smooth: no gap is less than half a percent of the radius.
+a plane that is the mean over four points at sqrt(2/3) a. A wall holds it back in proportion to the shear rate S at its
+centre, by (1 - c) S l: c is the speed of a free sphere in a shear flow along a wall over that of the flow at its
+centre, Goldman, Cox and Brenner, Chem. Eng. Sci. 22 (1967) 653, with the exact values of their table, and
+1 - 5/16 (a / l)^3 far from the wall. The lags of two walls are added; in the middle of a channel there is no shear and
+no lag, as in Happel and Brenner (1973), section 7-4, up to terms of (a / l)^5: 3 % for a sphere of half the width. The
+surface is not smooth: no gap is less than half a percent of the radius.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ from flowrec.interpolation import bilinear
 from flowrec.system.numba_setup import compiled
 
 FLOOR_DRAG = 2.9  # of the roller over its floor, relative to Stokes' drag
+FAXEN = math.sqrt(2.0 / 3.0)  # radii from the centre to the four points
 _LEAST_GAP = 0.005  # roughness, in radii
 # Goldman, Cox and Brenner (1967, part II): speed of a free sphere over that of the shear flow at its centre, by ln gap.
 _LAG_AT = np.log(np.array([0.003202, 0.005004, 0.0453, 0.1276, 0.5431, 1.3524, 2.7622, 9.0677]))
@@ -83,35 +87,38 @@ def hindered(
     y: float,
     own_x: float,
     own_y: float,
-    flow_x: float,
-    flow_y: float,
+    flow: NDArray[np.float64],
     share: float,
     clearance: Rasters,
     walls: Rasters,
     um_per_px: float,
     radius: float,
 ) -> tuple[float, float]:
-    """Velocity of the robot at (x, y) um: own motion and flow (mean over its surface), with a share of the hindrance.
+    """Velocity of the robot at (x, y) um: own motion and flow, with a share of the hindrance.
 
-    `walls` as in `walls_around`; other arguments as in bodies.py.
+    `flow` (4, 2) is the flow FAXEN radii to the right, left, below and above; `walls` as in `walls_around`; other
+    arguments as in bodies.py.
     """
     i, j = x / um_per_px, y / um_per_px
     near = bilinear(clearance, i, j)
     far = max(bilinear(walls[0], i, j) - near, near)
     near_gap, far_gap = near / radius - 1.0, far / radius - 1.0
+    # The normal, away from the nearest wall, of its double angle.
+    angle = 0.5 * math.atan2(bilinear(walls[2], i, j), bilinear(walls[1], i, j))
+    nx, ny = math.cos(angle), math.sin(angle)
+    if bilinear(clearance, i + nx, j + ny) < bilinear(clearance, i - nx, j - ny):
+        nx, ny = -nx, -ny
     along = FLOOR_DRAG / (FLOOR_DRAG + drag_along(near_gap) + drag_along(far_gap) - 2.0)
     across = FLOOR_DRAG / (FLOOR_DRAG + drag_towards(near_gap) + drag_towards(far_gap) - 2.0)
-    lag = 1.0 - share * (1.0 - carried(near_gap) * carried(far_gap))
     along, across = 1.0 - share * (1.0 - along), 1.0 - share * (1.0 - across)
-    # own + (across - along) n n . own / |n|^2, with n n = (1 + (c, s; s, -c)) / 2.
-    c, s = bilinear(walls[1], i, j), bilinear(walls[2], i, j)
-    size = math.hypot(c, s)
-    if size > 1e-6:
-        c, s = c / size, s / size
-    half = 0.5 * (across - along)
+    to_wall = (across - along) * (own_x * nx + own_y * ny)
+    apart = 2.0 * FAXEN * radius
+    lag = share * ((1.0 - carried(near_gap)) * near - (1.0 - carried(far_gap)) * far)
+    shear_x = (nx * (flow[0, 0] - flow[1, 0]) + ny * (flow[2, 0] - flow[3, 0])) / apart
+    shear_y = (nx * (flow[0, 1] - flow[1, 1]) + ny * (flow[2, 1] - flow[3, 1])) / apart
     return (
-        along * own_x + half * (own_x + c * own_x + s * own_y) + lag * flow_x,
-        along * own_y + half * (own_y + s * own_x - c * own_y) + lag * flow_y,
+        along * own_x + to_wall * nx + flow[:, 0].mean() - lag * shear_x,
+        along * own_y + to_wall * ny + flow[:, 1].mean() - lag * shear_y,
     )
 
 
