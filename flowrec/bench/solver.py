@@ -11,13 +11,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.bench.complex_fluids import LAWS, law_bend_case, law_channel_case, law_oblique_case, law_speed_case
 from flowrec.bench.exact_flows import bend_case, oblique_case, straight_case
 from flowrec.bench.harness import Quick, Results, peak_mb, print_rows
 from flowrec.bench.published_flows import cavity_case, cylinder_case
 from flowrec.chip.chip import Chip, Walls
 from flowrec.chip.io import without_pockets
 from flowrec.chip.openings import find_openings, guess_inlets
-from flowrec.chip.synthetic import straight, vessels
+from flowrec.chip.synthetic import bifurcation, straight, vessels
 from flowrec.flow import FlowSolver
 from flowrec.flow.newton_solver import system
 
@@ -49,6 +50,19 @@ _TABLES = {
             "pressure_difference_pa_error_percent",
         ),
     ),
+    "law channel": (
+        "Channel along the pixels of a fluid whose viscosity depends on the shear rate, beside a fine quadrature",
+        ("law", "width_px", "k", "profile_error_percent", "resistance_error_percent"),
+    ),
+    "law oblique": (
+        "The same at an angle to the pixels, with exact walls",
+        ("law", "width_px", "k", "mean_profile_error_percent", "largest_profile_error_percent"),
+    ),
+    "law bend": ("The same around a bend between two circles", ("law", "k", "resistance_error_percent")),
+    "law speed": (
+        "CPU time of such a flow over that of a Newtonian one, nothing in the cache",
+        ("pattern", "law", "k", "cpu_s", "newtonian_cpu_s", "over_newtonian"),
+    ),
     "speed": ("Time and memory", ("pattern", "side_px", "k", "unknowns", "cold_s", "warm_s", "peak_memory_mb")),
 }
 
@@ -63,6 +77,9 @@ def measure(quick: Quick = False) -> Results:
     if not quick:
         masks += [("vessels", 128, 2), ("vessels", 128, 4), ("vessels", 512, 1), ("vessels", 1024, 1)]
         masks += [("posts", 512, 1), ("posts", 1024, 1)]
+    laws = ("power law 0.5",) if quick else tuple(LAWS)
+    channels = ((12, 1),) if quick else ((6, 1), (12, 1), (12, 2), (24, 1))
+    chips = (straight(),) if quick else (bifurcation(), vessels(1))
     walls: tuple[Walls, ...] = ("smooth", "pixel")
     cases: dict[str, Iterable[dict[str, Any]]] = {
         "channel": (straight_case(width, k) for width in widths for k in cuts),
@@ -70,6 +87,10 @@ def measure(quick: Quick = False) -> Results:
         "bend": (bend_case(k) for k in cuts),
         "cavity": (cavity_case(size, reynolds) for reynolds in numbers for size in cells),
         "cylinder": (cylinder_case(px, k, "smooth") for px, k in shapes),
+        "law channel": (law_channel_case(law, width, k) for law in laws for width, k in channels),
+        "law oblique": (law_oblique_case(law, 12.0, k, angles) for law in laws for k in cuts[:2]),
+        "law bend": (law_bend_case(law, k) for law in laws for k in cuts),
+        "law speed": (row for chip in chips for row in law_speed_case(chip.name, chip, 1, 1 if quick else 5)),
         "speed": (speed_case(*mask) for mask in masks),
     }
     rows = [{"case": case, **row} for case, found in cases.items() for row in found]
@@ -139,6 +160,10 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "channel_largest_error_percent": max(abs(row["resistance_error_percent"]) for row in of("channel")),
         "bend_order": order(bends[0], bends[-1]) / (len(bends) - 1),
         "cylinder_finest_drag_error_percent": of("cylinder")[-1]["drag_error_percent"],
+        "law_channel_largest_error_percent_at_12_px": max(
+            row["profile_error_percent"] for row in of("law channel") if (row["width_px"], row["k"]) == (12, 1)
+        ),
+        "law_largest_time_over_newtonian": max(row["over_newtonian"] for row in of("law speed")),
         "mass_lost_in_a_cell": max(row["mass_lost_in_a_cell"] for row in of("speed")),
     }
     for walls in ("smooth", "pixel"):
