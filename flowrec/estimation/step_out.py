@@ -7,7 +7,7 @@ first, therefore
 - after the frequency was lowered, a robot that had stepped out rolls faster, while one in a flow that differs from the
   map rolls slower in proportion. In the first case the limit stays for the rest of the run; in the second it is lifted.
 
-The limit follows from what was rolled: above its step-out frequency f_c a robot rolls, by Adler's equation, the fraction
+The limit follows from what was rolled: above its step-out frequency f_c a robot rolls, by Adler's equation, the part
 s = 1 - sqrt(1 - (f_c / f)^2) of what a field of frequency f asks for, so f_c = f sqrt(1 - (1 - s)^2).
 """
 
