@@ -165,7 +165,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     flow, route = tick.field, tick.route
     track, appearance = _seen(p, last, inputs)
     lap("track")
-    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow)
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
     robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
     # Sessions recorded before step-out was monitored replay without it.
@@ -202,7 +202,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         p.clearance_um,
         p.chip.um_per_px,
         _strength(p.coils, last),
-        p.observer.uses_map,
+        p.observer.uses_map(estimate),
     )
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO

@@ -109,7 +109,7 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
         applied = Applied(stamp, 0.0, 0.0, 1.0, np.zeros(3), np.array([turned.real, turned.imag]))
         estimate = observer.estimate(estimate, track, applied, robot, field)
         inputs = (mission, route, estimate, field, robot, None, _UM_PER_PX)
-        demand = controller.control(demand, *inputs, estimate_uses_map=observer.uses_map)
+        demand = controller.control(demand, *inputs, estimate_uses_map=observer.uses_map(estimate))
         flow = 1j * SPIN_PER_S * z
         miss = math.hypot(estimate.flow_um_s[0] - flow.real, estimate.flow_um_s[1] - flow.imag)
         reference_um, own_um_s = demand.reference_um - CENTRE_UM, demand.velocity_um_s

@@ -206,7 +206,7 @@ def recommend(path: Path) -> dict[str, Any]:
     config = session.config
     ticks = [tick for tick in session.ticks(with_frames=False) if tick.track is not None and tick.applied is not None]
     tracks, applied = [tick.track for tick in ticks], [tick.applied for tick in ticks]
-    fields = [tick.field for tick in ticks] if config.observer.uses_map else None
+    fields = [tick.field for tick in ticks] if "map" in OBSERVERS[config.observer.method].needs else None
     tuned = tune(tracks, applied, config.robot, config.observer.kalman, fields)  # type: ignore[arg-type]
     keys = ("sets", "position_noise_um", "rest_s", "agility", "nis", "nis_before")
     return {"path": str(path), "position_noise_from": tuned.source, **{key: getattr(tuned, key) for key in keys}}

@@ -1,8 +1,8 @@
 """`kalman` and `kalman_map`: position and flow from filterpy's Kalman filter.
 
 The state is that of process_model.py. `kalman` ignores the channel: it estimates the flow and its gradient.
-`kalman_map` uses a known map of the flow and estimates its error. The normalised innovation squared (NIS) has mean 2
-when all noise is stated correctly.
+`kalman_map` uses a known map of the flow and estimates its error. `kalman_auto` is one or the other, see observer.py.
+The normalised innovation squared (NIS) has mean 2 when all noise is stated correctly.
 
 The process noise is stated per displacement, not per time, because the flow is steady: over a displacement of one
 radius its variance is `flow_change` times the squared speed. The flow changes less in a wide vortex than in a vessel
@@ -245,6 +245,11 @@ def _filter_class() -> Any:
         return importlib.import_module("filterpy.kalman").KalmanFilter
     finally:
         del sys.modules[name]
+
+
+def corrects_map(estimate: Estimate) -> bool:
+    """Whether an estimate was made with a map: it states the map's gradient and has none in its state."""
+    return estimate.slopes_per_s.size > 0 and len(estimate.covariance) < 7
 
 
 def memory_s(covariance: Floats) -> float:

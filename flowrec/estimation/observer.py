@@ -9,17 +9,27 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.estimation.kalman import Kalman, memory_s
+from flowrec.enums import Alarm
+from flowrec.estimation.kalman import Kalman, corrects_map, memory_s
 from flowrec.estimation.luenberger import Luenberger
-from flowrec.messages import Applied, Estimate, FlowField, Track
+from flowrec.messages import Applied, Estimate, FlowField, Health, Track
 from flowrec.methods import Method, Methods
+from flowrec.ranges import Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
+_GIVEN_UP = 1.5  # times the deviation at which a map is taken up
 _KALMAN, _LUENBERGER = "flowrec.estimation.kalman:Kalman", "flowrec.estimation.luenberger:Luenberger"
 # The only option of a row is the section of its settings, an object of the class that implements it.
 OBSERVERS = Methods(
     "observer.method",
+    Method(
+        "kalman_auto",
+        _KALMAN,
+        "kalman_map while the map states a small error and the measured flow agrees with it, else kalman",
+        ("kalman",),
+        needs=("good map",),
+    ),
     Method("kalman", _KALMAN, "Kalman filter for position and flow", ("kalman",)),
     Method("kalman_map", _KALMAN, "the same with the best known flow field as its model", ("kalman",), needs=("map",)),
     Method("luenberger", _LUENBERGER, "disturbance observer of the paper", ("luenberger",)),
@@ -30,14 +40,16 @@ OBSERVERS = Methods(
 class Observer:
     """Settings of the observer stage; `method` selects a row of OBSERVERS."""
 
-    method: Annotated[str, OBSERVERS] = "kalman"
+    method: Annotated[str, OBSERVERS] = "kalman_auto"
     kalman: Kalman = field(default_factory=Kalman)
+    # kalman_auto: largest error that a map may state, and by which the measured flow may deviate from it, to be used
+    map_good_share: Share = 0.1
     luenberger: Luenberger = field(default_factory=Luenberger)
 
-    @property
-    def uses_map(self) -> bool:
-        """Whether the estimate corrects the flow field rather than ignoring it."""
-        return "map" in OBSERVERS[self.method].needs
+    def uses_map(self, estimate: Estimate) -> bool:
+        """Whether an estimate of this observer corrects the flow field rather than ignoring it."""
+        needs = OBSERVERS[self.method].needs
+        return "map" in needs or ("good map" in needs and corrects_map(estimate))
 
     def estimate(
         self,
@@ -46,20 +58,38 @@ class Observer:
         applied: Applied,
         robot: Robot,
         field: FlowField | None = None,
+        health: Health | None = None,
     ) -> Estimate:
         """The estimate after this frame. The robot's own displacement is um_per_rev times the turns really applied.
 
         Parameters
         ----------
         field : the best flow known; ignored by methods that do not use a map. Without one, kalman_map is kalman.
+        health : of the frame before, by which kalman_auto judges the map. None: not judged.
 
         Raises
         ------
         UsageError : `method` is not in the table.
         """
         settings = getattr(self, OBSERVERS[self.method].options[0])
-        estimate: Estimate = settings.estimate(previous, track, applied, robot, field if self.uses_map else None)
+        needs = OBSERVERS[self.method].needs
+        used = "map" in needs or ("good map" in needs and self._good(previous, field, health))
+        estimate: Estimate = settings.estimate(previous, track, applied, robot, field if used else None)
         return replace(estimate, rolled_um_s=_rolled_um_s(previous, estimate, applied, robot))
+
+    def _good(self, previous: Estimate | None, field: FlowField | None, health: Health | None) -> bool:
+        """Whether the map is good enough to be corrected instead of ignored.
+
+        It states an error within `map_good_share`; the innovations are consistent; and the flow that the monitor has
+        found on the way agrees with the map on the mean. A map that is in use is given up at one and a half times the
+        deviation at which it is taken up, so that the choice does not alternate.
+        """
+        if field is None or field.error_share is None or field.error_share > self.map_good_share:
+            return False
+        if health is None:
+            return True
+        most = self.map_good_share * (_GIVEN_UP if previous is not None and corrects_map(previous) else 1.0)
+        return Alarm.NIS not in health.alarm.split("; ") and abs(health.offset_share) <= most
 
 
 def _rolled_um_s(previous: Estimate | None, estimate: Estimate, applied: Applied, robot: Robot) -> NDArray[np.float64]:

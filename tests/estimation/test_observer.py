@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from flowrec.estimation import Kalman, Luenberger, Observer, Sampler
+from flowrec.estimation import HealthMonitor, Kalman, Luenberger, Observer, Sampler
 from flowrec.messages import Applied, Estimate, FlowField, Track
 from tests.estimation.lap import RATE_HZ, ROBOT, across, lemniscate, vortex
 
@@ -110,6 +111,29 @@ def test_with_a_map_what_it_misses_is_found(share: float, noise_um: float, limit
     _, mapless, tracks, inputs = swim(without, noise_um, 2.0)
     plain = Observer(kalman=kalman)
     assert mapless[-1].same_as(swim(plain, noise_um, 2.0)[1][-1])
+
+
+def test_by_default_the_map_is_used_while_it_states_a_small_error_and_the_measured_flow_agrees_with_it() -> None:
+    _, estimates, tracks, inputs = swim(Observer(), 1.0, 2.0, field=vortex(1.0))
+    consistent = HealthMonitor().watch(None, None, estimates[-1], None, ROBOT)
+
+    def after(before: Estimate, share: float | None = 0.03, method: str = "kalman_auto", **found: Any) -> Estimate:
+        field = replace(vortex(1.0), error_share=share)
+        health = replace(consistent, **found)
+        return Observer(method=method).estimate(before, tracks[-1], inputs[-1], ROBOT, field, health)
+
+    blind = estimates[-2]
+    good = after(blind)
+    assert good.same_as(after(blind, method="kalman_map")) and Observer().uses_map(good)
+    for untrusted in (
+        after(blind, share=None),
+        after(blind, share=0.2),
+        after(blind, alarm="nis; tracking"),
+        after(blind, offset_share=-0.12),
+    ):
+        assert untrusted.same_as(after(blind, method="kalman")) and not Observer().uses_map(untrusted)
+    assert Observer().uses_map(after(good, offset_share=-0.12)), "what is in use is not given up at once"
+    assert not Observer().uses_map(after(good, offset_share=-0.2))
 
 
 def test_another_map_does_not_make_the_estimate_jump() -> None:
