@@ -15,7 +15,6 @@ from flowrec.chip.clearance import opening_point_um
 from flowrec.chip.openings import named_opening
 from flowrec.chip.registration import Calibration
 from flowrec.config import Config, ResolvedConfig, check_config
-from flowrec.control import Coils
 from flowrec.control.mission import Place, PlacedMission, Point
 from flowrec.errors import UnreachableError, UsageError
 from flowrec.flow import FlowSolver
@@ -29,6 +28,7 @@ from flowrec.simulated_settings import Simulated
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _MAY_BE_NONE = ("camera.centre_um", "camera.residual_um")  # None is a value
 _ONLY_FOR_DRIVING = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s")
+_HOLD_START_S = 1.0  # the ramp of the coils and the first solution of the flow take less
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
 
@@ -58,13 +58,16 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     course_error = plan.swift.course_error(robot, robot.speed_limit_um_s)
     if config.mission.observes and config.rig != SIMULATED:  # which needs to know where the robot starts
         nowhere = 0.5 * chip.size_um[0], 0.5 * chip.size_um[1]
-        mission = _narrowed(PlacedMission, config.mission, start=nowhere, goal=nowhere)
+        mission = _narrowed(PlacedMission, config.mission, start=nowhere, goal=nowhere, hold_start_s=0.0)
     else:
+        hold_s = _hold_s(config, chip)
+        ramp_s = 0.0 if hold_s else config.coils.ramp_s
         mission = _narrowed(
             PlacedMission,
             config.mission,
-            start=_start(config.mission.start, chip, robot, course_error, config.flow, config.coils),
+            start=_start(config.mission.start, chip, robot, course_error, config.flow, ramp_s),
             goal=_point(chip, config.mission.goal, "goal", robot),
+            hold_start_s=hold_s,
         )
         _refuse_apart(chip, mission)
     tracker = replace(config.tracker, polarity=config.tracker.polarity or "auto")
@@ -150,13 +153,23 @@ def _timed(swift: FastFlowMargin, times: Mapping[str, float]) -> FastFlowMargin:
     return replace(swift, **{key: value for key, value in times.items() if getattr(swift, key) is None})
 
 
+def _hold_s(config: Config, chip: Chip) -> float:
+    """How long the robot is held at its start."""
+    start, stated = config.mission.start, config.mission.hold_start_s
+    if stated is not None:
+        return stated
+    held = isinstance(start, str) and not config.mission.observes and config.rig == SIMULATED
+    return _HOLD_START_S if held and named_opening(chip, str(start)).kind == "outlet" else 0.0
+
+
 def _start(
-    place: Place, chip: Chip, robot: Robot, course_error: CourseError, solver: FlowSolver, coils: Coils
+    place: Place, chip: Chip, robot: Robot, course_error: CourseError, solver: FlowSolver, ramp_s: float
 ) -> Point:
     """The start; for a named outlet the place nearest to it where the robot can be held.
 
-    That is five radii inside, as elsewhere, or farther if the assumed flow carries the robot out before the coils have
-    ramped up. Without such a place: the first one, which is refused with the reason before anything is driven.
+    That is five radii inside, as elsewhere, or farther if the assumed flow carries the robot out before the field is
+    up, which it is within `ramp_s`. Without such a place: the first one, which is refused with the reason before
+    anything is driven.
     """
     if not isinstance(place, str) or named_opening(chip, place).kind != "outlet":
         return _point(chip, place, "start", robot)
@@ -165,7 +178,7 @@ def _start(
         point = opening_point_um(chip, place, radii * robot.radius_um)
         start_um = np.array(point)
         if not (
-            swept_out(chip, field, start_um, course_error, coils.ramp_s)
+            swept_out(chip, field, start_um, course_error, ramp_s)
             or too_swift(chip, field, start_um, start_um, course_error)
         ):
             return point

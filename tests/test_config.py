@@ -188,9 +188,19 @@ def test_what_was_derived_is_said_and_kept_in_the_file(
     assert "robot.radius_um" not in said
 
 
+def test_a_robot_that_is_held_at_an_outlet_starts_there_whatever_time_the_coils_take():
+    ends = ["chip.name=straight", "chip.inlet_speed_um_s=3000", "mission.start=outlet", "mission.goal=inlet"]
+    config, chip, *_ = prepare(load_config(None, ends))
+    end_um = (chip.mask.shape[1] - 0.5) * chip.um_per_px
+    assert config.mission.hold_start_s == 1.0
+    assert end_um - config.mission.start[0] < 6.0 * config.robot.radius_um
+    assert prepare(load_config(None, [*ends[:2]]))[0].mission.hold_start_s == 0.0, "an inlet is no such place"
+
+
 def test_a_start_called_outlet_is_where_the_robot_can_be_held_while_the_field_comes_up():
     def start_of(*sets):
-        config, chip, *_ = prepare(load_config(None, ["mission.start=outlet", "mission.goal=inlet", *sets]))
+        ends = ["mission.start=outlet", "mission.goal=inlet", "mission.hold_start_s=0"]
+        config, chip, *_ = prepare(load_config(None, [*ends, *sets]))
         end_um = (chip.mask.shape[1] - 0.5) * chip.um_per_px
         return (end_um - config.mission.start[0]) / config.robot.radius_um
 

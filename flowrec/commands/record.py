@@ -167,7 +167,7 @@ def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
         reason = reason or too_swift(chip, field, start, goal, course_error)
         if reason:
             raise UnreachableError(f"unreachable: {reason}")
-    reason = swept_out(chip, field, start, course_error, config.coils.ramp_s)
+    reason = swept_out(chip, field, start, course_error, 0.0 if config.mission.hold_start_s else config.coils.ramp_s)
     if reason:
         raise UnreachableError(f"unreachable: {reason}")
 

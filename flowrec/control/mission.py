@@ -52,6 +52,9 @@ class MissionStateMachine:
     phases: tuple[PhaseName, ...] = PHASES
     start: Place = "inlet"
     goal: Place = "outlet"
+    # time from the first frame for which a pipette, a magnet or a pump that stands still holds the robot; the field is
+    # on and the flow solved before it is let go. None: 1 s in the simulated rig at an outlet that `start` names, else 0
+    hold_start_s: Annotated[float, Range(0.0, 3600.0)] | None = None
     goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
     survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0
     navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
@@ -256,6 +259,8 @@ class MissionStateMachine:
                 return self._next_phase(Phase.SURVEY, previous, now, f"no survey: {result.reason}")
             if not now.track.seen:
                 return replace(previous, stamp_ns=now.now_ns, wanted="") if previous.wanted else previous
+            if self.hold_start_s is not None and elapsed_s(previous, now) < self.hold_start_s:
+                return previous
             if Phase.SURVEY in self.phases:
                 return order(previous, now, Phase.START, WorkOrder.SURVEY_ROUTE)
             return self._next_phase(Phase.SURVEY, previous, now)
@@ -376,3 +381,4 @@ class PlacedMission(MissionStateMachine):
 
     start: Point
     goal: Point
+    hold_start_s: float

@@ -192,6 +192,15 @@ def test_a_robot_that_turns_out_slower_than_planned_gets_a_new_route_or_the_reas
     assert (refused.outcome, refused.note) == ("unreachable", "too narrow")
 
 
+def test_while_the_robot_is_held_at_its_start_the_flow_is_solved_and_nothing_else_begins() -> None:
+    world = World(phases=("navigate",), hold_start_s=2.5)
+    assert world.tick().wanted == "solve"
+    for _ in range(2):
+        held = world.tick(assumed=field(1))
+        assert (held.phase, held.request) == ("start", 1)
+    assert world.tick().wanted == "route"
+
+
 def test_a_robot_that_is_stuck_does_not_wait_for_ever() -> None:
     world = World(phases=("navigate",), patience=2.0)
     world.tick(assumed=field(0))

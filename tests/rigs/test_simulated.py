@@ -279,3 +279,19 @@ def test_the_true_step_out_may_lie_below_the_stated_one():
     far = {f: fly(rig_with(simulated=weak), {0: command(f)})[-1].truth.position_um[0] - 1000.0 for f in (12.0, 20.0)}
     assert far[12.0] == pytest.approx(25.0 * 12.0 * 0.96, rel=1e-3)
     assert far[20.0] == pytest.approx(25.0 * (20.0 - 16.0) * 0.96, rel=1e-3)
+
+
+def test_a_held_robot_stays_at_its_start_for_that_time_and_until_the_field_is_up():
+    def at(**commands):
+        rig = rig_with(flow=steady(100.0), hold_s=0.5, duration_s=2.0, coils=Coils())
+        return np.array([inputs.truth.position_um[0] for inputs in fly(rig, **commands)])
+
+    def let_go_s(places):
+        return (np.argmax(places > 1000.0) - 1) / CAMERA.rate_hz
+
+    assert (at() == 1000.0).all(), "without a field it is not let go"
+    soon = at(commands={0: command(1.0)})
+    assert let_go_s(soon) == pytest.approx(0.5, abs=2.0 / CAMERA.rate_hz)
+    assert soon[-1] - 1000.0 == pytest.approx(1.5 * (100.0 + 25.0), rel=0.05), "then it swims and drifts"
+    late = at(commands={k: command(1.0, amplitude_mt=0.1 * k) for k in range(41)})
+    assert 0.0 < let_go_s(late) - 41 / CAMERA.rate_hz < 0.4, "soon after it rises no more"

@@ -172,6 +172,10 @@ class Swimmer:
         x, y = self.position_um / self._um_per_px
         return float(bilinear(self._clearance, x, y)) - self._robot.radius_um
 
+    def wait(self, duration_s: float) -> None:
+        """Stay in place for a duration, held by something else than the field."""
+        self._time_s += duration_s
+
     def advance(self, duration_s: float, frequency_hz: float, heading_rad: float, strength: float) -> None:
         """Move for a duration under a constant field whose amplitude is `strength` times the full one.
 

@@ -36,6 +36,7 @@ from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _COILS = 3
 _SKEW_PPM = 50.0  # of a crystal, at most
+_STEADY_S = 0.1  # a field that has not risen for so long is up
 _STARTED_S = 3600.0  # ago, at most
 
 
@@ -73,6 +74,7 @@ class SimulatedRig:
         skipped.
     true_field : a flow to use instead of a drawn one, between the chip's own walls.
     coils : the relation of field and currents; None: always the full field, with the commanded currents.
+    hold_s : for how long, and until the field is up, the robot is held at the start, as by a pipette.
 
     Raises RigError, ChipError or UsageError for settings that do not describe a world.
     """
@@ -102,6 +104,7 @@ class SimulatedRig:
             realtime=realtime,
             true_field=true_field,
             coils=config.coils,
+            hold_s=config.mission.hold_start_s,
         )
 
     def __init__(
@@ -116,6 +119,7 @@ class SimulatedRig:
         realtime: bool = False,
         true_field: FlowField | None = None,
         coils: Coils | None = None,
+        hold_s: float = 0.0,
     ) -> None:
         check_ranges(camera, "camera")
         check_ranges(simulated, "simulated")
@@ -138,6 +142,8 @@ class SimulatedRig:
         self._delay_ns = nanoseconds(self._true_robot.delay_s)
         self._now_ns = 0
         self._coils = coils
+        # For how much longer the robot is held at its start, and the field's strength before; None: it is not held.
+        self._hold: tuple[float, float] | None = (hold_s, 0.0) if hold_s > 0.0 else None
         # The command in effect and the state of its field; commands on their way, as (stamp of their effect, command).
         self._acting: Currents | None = None
         self._rotation = FieldState()
@@ -247,7 +253,7 @@ class SimulatedRig:
             switch = self._coming[0][0] if self._coming else until_ns
             end = min(max(switch, now), until_ns)
             if end > now and self._acting is None:
-                swimmer.advance(seconds(end - now), 0.0, 0.0, 0.0)
+                self._move(swimmer, seconds(end - now), 0.0, 0.0, 0.0)
             elif end > now and self._acting is not None:
                 turns += self._turn(swimmer, self._acting, seconds(end - now))
             now = end
@@ -263,11 +269,24 @@ class SimulatedRig:
         full_mt = self._coils.amplitude_mt if self._coils is not None else 0.0
         strength = min(command.amplitude_mt / full_mt, 1.0) if full_mt > 0.0 else float(command.amplitude_mt > 0.0)
         for leg in way.segments(duration_s):
-            swimmer.advance(leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
+            self._move(swimmer, leg.duration_s, leg.frequency_hz, leg.heading_rad, strength)
             if strength > 0.0:
                 heading = np.array([math.cos(leg.heading_rad), math.sin(leg.heading_rad)])
                 turns += leg.frequency_hz * leg.duration_s * heading
         return turns
+
+    def _move(
+        self, swimmer: Swimmer, duration_s: float, frequency_hz: float, heading_rad: float, strength: float
+    ) -> None:
+        """Let the robot move, unless it is held."""
+        if self._hold is None:
+            swimmer.advance(duration_s, frequency_hz, heading_rad, strength)
+            return
+        swimmer.wait(duration_s)
+        left_s, before = self._hold
+        rises = strength > before or strength == 0.0
+        left_s = max(left_s, _STEADY_S) if rises else left_s - duration_s
+        self._hold = (left_s, strength) if left_s > 0.0 else None
 
     def _applied(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
         command, now = self._acting, self._rotation
