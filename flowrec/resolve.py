@@ -23,7 +23,6 @@ from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
 from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
-from flowrec.simulated_settings import Simulated
 
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _MAY_BE_NONE = ("camera.centre_um", "camera.residual_um")  # None is a value
@@ -110,8 +109,9 @@ def _refuse_simulated(config: Config) -> None:
     """A setting of the simulated rig has no effect on another one, which whoever sets it should know."""
     if config.rig == SIMULATED:
         return
-    keys = [f"simulated.{each.name}" for each in fields(Simulated)] + [f"camera.{name}" for name in OF_SIMULATED_CAMERA]
+    camera = [f"camera.{name}" for name in OF_SIMULATED_CAMERA]
     given, usual = _flat(asdict(config), ""), _flat(asdict(Config()), "")
+    keys = [key for key in usual if key.startswith("simulated.") or key in camera]
     changed = [key for key in keys if given[key] != usual[key]]
     if changed:
         raise UsageError(

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
+from flowrec.chip.fluid import ViscositySettings
 from flowrec.ranges import OneOf, Range, Seed, Share
 from flowrec.rig_settings import Angle, PointUm
 
@@ -41,6 +42,8 @@ class Simulated:
     # each true outlet pressure differs by up to this fraction of the chip's pressure drop
     outlet_pressure_error: _Size | None = None
     viscosity_error: _PartOf | None = None  # the true viscosity is the assumed one times up to 1 +- this
+    # the true law of viscosity; what it leaves out is as assumed
+    viscosity: ViscositySettings = field(default_factory=ViscositySettings)
     depth_error: _PartOf | None = None  # the true depth is the stated one times up to 1 +- this
     # mean of the true depth where the chip states none, in median channel widths; 0: two-dimensional, as assumed
     unstated_depth_widths: Annotated[float, Range(0.0, 100.0)] | None = None

@@ -83,7 +83,7 @@ def test_every_number_among_the_settings_has_a_range_that_is_kept(key: str) -> N
         default = (0.0, 0.0)
     if key == "tracker.box_px":
         default = (0.0, 0.0, 0.0, 0.0)
-    if key in ("chip.viscosity.rates_1_s", "chip.viscosity.ratios"):
+    if key.endswith((".rates_1_s", ".ratios")):
         default = (1.0,)
     whole = isinstance(valid.low, int)
     below = valid.low - 1 if whole else math.nextafter(valid.low, -math.inf)

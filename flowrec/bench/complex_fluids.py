@@ -63,7 +63,7 @@ def law_channel_case(name: str, width_px: int, k: int) -> dict[str, Any]:
     chip = Chip("channel", mask, _UM_PER_PX, openings, 1.0, 1000.0, walls="pixel", law=LAWS[name])
     field = FlowSolver(k).solve(chip)
     px = _UM_PER_PX * M_PER_UM
-    across = (np.arange(width_px) - 0.5 * (width_px - 1)) * px
+    across = np.asarray((np.arange(width_px) - 0.5 * (width_px - 1)) * px, np.float64)
     half = 0.5 * width_px * px
     exact, wall = channel_profile(LAWS[name], half, _SPEED_UM_S * M_PER_UM, across)
     # Downstream, where the profile of the inlet is forgotten.

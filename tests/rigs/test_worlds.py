@@ -10,6 +10,7 @@ import scipy
 
 from flowrec.chip import ChipSettings, clearance_um, load_chip
 from flowrec.chip.clearance import median_width_um
+from flowrec.chip.fluid import PowerLaw, ViscositySettings
 from flowrec.chip.registration import Calibration
 from flowrec.config import config_from_toml, load_config, to_toml, with_sets
 from flowrec.flow import FlowSolver
@@ -273,3 +274,12 @@ def test_oblique_light_is_another_profile_whose_centre_the_tracker_still_finds()
         pipeline = assemble(config, CHIP)
         track, _ = pipeline.tracker.follow(None, None, lit.frame, CHIP, pipeline.calibration, config.robot)
         assert track.seen and math.dist(track.position_um, lit.truth.position_um) < 0.25 * config.robot.radius_um
+
+
+def test_the_true_fluid_can_have_another_law_than_the_assumed_one():
+    chip = load_chip(ChipSettings("straight"))
+    assert true_chip(chip, Simulated(), FlowSolver()).law is None
+    thinning = Simulated(viscosity=ViscositySettings("power_law", exponent=0.6))
+    assert true_chip(chip, thinning, FlowSolver()).law == PowerLaw(0.6)
+    blunter = Simulated(viscosity=ViscositySettings(exponent=0.4))
+    assert true_chip(replace(chip, law=PowerLaw(0.6, 2.0)), blunter, FlowSolver()).law == PowerLaw(0.4, 2.0)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um, median_width_um
+from flowrec.chip.fluid import with_settings
 from flowrec.chip.registration import Calibration
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
@@ -62,7 +63,7 @@ def true_depth_um(chip: Chip, simulated: Simulated, radius_um: float = 0.0) -> f
 
 
 def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver, radius_um: float = 0.0) -> Chip:
-    """The chip with the true boundary values, viscosity and depth, drawn from the seed.
+    """The chip with the true boundary values, viscosity and its law, and depth, drawn from the seed.
 
     Each inlet speed times 1 +- (a third of inlet_speed_error to all of it) or times the stated share, the viscosity
     times 1 +- viscosity_error, each outlet's pressure plus up to +- outlet_pressure_error of the pressure drop across
@@ -78,7 +79,8 @@ def true_chip(chip: Chip, simulated: Simulated, solver: FlowSolver, radius_um: f
     if simulated.inlet_speed_share is not None:
         share = np.full_like(share, simulated.inlet_speed_share)
     values = chip.boundary_values * np.where(inlet, share, 1.0)
-    chip = replace(chip, depth_um=true_depth_um(chip, simulated, radius_um))
+    law = with_settings(chip.law, simulated.viscosity, "simulated")
+    chip = replace(chip, depth_um=true_depth_um(chip, simulated, radius_um), law=law)
     changed = chip.with_boundary(values, viscosity)
     outlet_error = simulated.value("outlet_pressure_error")
     if outlet_error == 0.0 or np.count_nonzero(~inlet) < 2:
