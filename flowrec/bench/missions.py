@@ -58,7 +58,7 @@ _DEFAULT_POLICIES = "policy,vector,paper,plain"
 # By direction and map. Upstream after a survey, the robot drifts down first and then swims back.
 TRIPS: dict[tuple[str, str], tuple[str, ...]] = {
     ("down", "surveyed"): (),
-    ("up", "surveyed"): ("survey.share=1.0", "mission.goal=inlet"),
+    ("up", "surveyed"): ("survey.method=downstream", "survey.share=1.0", "mission.goal=inlet"),
     ("down", "assumed"): ("mission.phases=plan,navigate",),
     ("up", "assumed"): ("mission.phases=plan,navigate", "mission.start=outlet", "mission.goal=inlet"),
 }

@@ -81,9 +81,14 @@ def random(task: Task) -> Seen:
 
 def prior(task: Task) -> Seen:
     """The places of the skeleton, one after the other, that lower the stated error of the map most."""
+    places = (np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px).astype(np.float64)
+    return Seen(_best(task, places))
+
+
+def _best(task: Task, places: Points) -> Points:
+    """Of places (n, 2) those, one after the other, that lower the stated error of the map most before any is seen."""
     uncertainty = task.config.refine.uncertainty(task.assumed, _none(), task.chip, task.config.flow)
     assert uncertainty is not None
-    places = (np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px).astype(np.float64)
     need, each = place_information(uncertainty, task.noise_um_s, task.chip, places)
     covariance, left, taken = uncertainty.covariance, list(range(len(places))), []
     for _ in range(min(task.count, len(places))):
@@ -91,11 +96,11 @@ def prior(task: Task) -> Seen:
         best = left.pop(int(np.argmin(errors)))
         covariance = covariance_after(covariance, each[best])
         taken.append(best)
-    return Seen(places[taken])
+    return places[taken]
 
 
-def survey(task: Task, planner: SurveyPlanner) -> Seen:
-    """Places evenly spread along the way of a survey until it has had enough."""
+def survey(task: Task, planner: SurveyPlanner, choose: bool = False) -> Seen:
+    """Places along the way of a survey until it has had enough: evenly spread, or chosen, a pixel apart."""
     config = task.config
     start = np.array(config.mission.start)
     sampling = Sampling(2.0 * task.spacing_um, 0.0, task.noise_um_s)
@@ -120,6 +125,8 @@ def survey(task: Task, planner: SurveyPlanner) -> Seen:
         return Seen(places, reason=new.reason)
     length = float(np.hypot(*np.diff(route.waypoints_um, axis=0).T).sum())
     places = _along(route, length / max(task.count - 1, 1) * (1.0 - 1e-9))
+    if choose:
+        places = _best(task, _along(route, task.chip.um_per_px))
     return Seen(places[: task.count], float(route.arrival_s[-1]), route.reason)
 
 
@@ -140,6 +147,7 @@ WAYS: dict[str, Callable[[Task], Seen]] = {
     "downstream": lambda task: survey(task, SurveyPlanner(method="downstream", share=1.0)),
     "random": random,
     "information": lambda task: survey(task, _EXPLORE),
+    "information:chosen": lambda task: survey(task, _EXPLORE, choose=True),
     "information:longer": lambda task: survey(task, replace(_EXPLORE, worth=0.5 * _EXPLORE.worth)),
     "prior": prior,
 }

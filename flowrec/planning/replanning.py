@@ -19,6 +19,7 @@ from flowrec.robot import Robot
 
 # Of the time that is left: two plans of the same way in the same map may differ by about as much.
 _NUMERICAL_SHARE = 0.01
+_STEP = 0.2  # standard deviations of the flow, for a derivative
 
 Points = NDArray[np.float64]
 
@@ -82,16 +83,15 @@ def _noise_s(
 ) -> float:
     """Standard deviation of a gain that follows from that of the flow, to first order; 0 where none is known.
 
-    A direction of the flow's error in which one of the ways becomes impossible tells nothing of their difference.
+    inf where a small change of the flow already makes one of the ways impossible.
     """
     if uncertainty is None:
         return 0.0
     count = len(uncertainty.columns_um_s)
     variance, axes = np.linalg.eigh(uncertainty.covariance[:count, :count])
-    changes = []
-    for deviation, axis in zip(np.sqrt(np.maximum(variance, 0.0)), axes.T, strict=True):
+    squares = 0.0
+    for deviation, axis in zip(_STEP * np.sqrt(np.maximum(variance, 0.0)), axes.T, strict=True):
         change = np.tensordot(deviation * axis, uncertainty.columns_um_s, axes=1).astype(np.float32)
-        changes.append(
-            gain_s(replace(field, velocity_um_s=field.velocity_um_s + fluid_image(chip.mask, change))) - gain
-        )
-    return float(np.linalg.norm([each for each in changes if math.isfinite(each)]))
+        changed = gain_s(replace(field, velocity_um_s=field.velocity_um_s + fluid_image(chip.mask, change)))
+        squares += ((changed - gain) / _STEP) ** 2
+    return math.sqrt(squares) if math.isfinite(squares) else math.inf

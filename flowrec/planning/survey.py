@@ -58,7 +58,7 @@ class SurveyMethod(Protocol):
 class SurveyPlanner:
     """Settings of all methods; a method reads those that its row in SURVEYS names."""
 
-    method: Annotated[str, SURVEYS] = "downstream"
+    method: Annotated[str, SURVEYS] = "information"
     # of `downstream`; None: `share` of the longest path downstream
     distance_um: Annotated[float, Range(1.0, 1e7)] | None = None
     share: PositiveShare | None = None  # None: 1/8; 1/2 where there are several inlets or outlets to tell apart

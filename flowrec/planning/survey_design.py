@@ -49,7 +49,7 @@ class SurveyOrder:
     ----------
     field : the best flow known.
     start_um : (2,) where the next stretch begins: the end of `present`, or the robot.
-    goal_um : (2,) that must stay within reach; None: the survey may end anywhere.
+    goal_um : (2,) that must stay within reach; None: only for methods that do not ask for it.
     uncertainty : of the flow after the observations so far; None: not known.
     observations : so far.
     present : the way that the robot is still on; None: it waits at the start.

@@ -2,8 +2,9 @@
 
 From the start of the stretch a search finds the fastest way, in the middle of the channels, to everywhere. Its ends in
 a number of places are compared, at several speeds, by the error that the flow would have after the observations on the
-way (survey_design.py), at first in the flow along the ways to the goal, then in the whole map. Only places are allowed
-from which the goal can still be reached, even in a flow that is worse than believed, and where the robot can wait.
+way (survey_design.py), in the flow along the ways to the goal and in the whole map. The seconds are those of the
+stretch, and those by which the way to the goal is longer from its end. Only places are allowed from which the goal can
+still be reached, even in a flow that is worse than believed, and where the robot can wait.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class _Stretch:
 
     path: Floats  # (n, 2) px
     speed_um_s: float
-    duration_s: float
+    cost_s: float  # its duration, and by how much longer the way to the goal is from its end
     error: float  # that the flow would have afterwards, relative
 
 
@@ -75,7 +76,7 @@ class Information:
 
     def plan(self, order: SurveyOrder) -> Route:
         """The survey so far and its next stretch; the survey so far alone when no stretch is worth its time."""
-        assert order.uncertainty is not None and order.sampling is not None, "the table says what the method needs"
+        assert order.uncertainty is not None and order.sampling is not None and order.goal_um is not None
         believed = replace(
             order.field,
             velocity_um_s=fluid_image(order.chip.mask, order.uncertainty.mean_um_s.astype(np.float32)),
@@ -111,7 +112,7 @@ class Information:
         best: _Stretch | None = None
         best_rate = self.worth / crossing_s
         for stretch in self._stretches(space, order, looks, covariance, need, start, reach):
-            rate = (now - stretch.error) / max(stretch.duration_s, order.least_s, _SHORTEST_SHARE * crossing_s)
+            rate = (now - stretch.error) / max(stretch.cost_s, order.least_s, _SHORTEST_SHARE * crossing_s)
             if rate > best_rate:
                 best, best_rate = stretch, rate
         if best is None:
@@ -143,21 +144,17 @@ class Information:
         deviation = fluid_image(order.chip.mask, uncertainty.std_um_s.max(axis=1)) / px
         limit = order.robot.speed_limit_um_s / px
         flow = np.hypot(space.vx, space.vy)
-        goal = None
-        if order.goal_um is not None:
-            goal = attach_goal(space, order.goal_um)
-            if goal.error:
-                return None
+        assert order.goal_um is not None
+        goal = attach_goal(space, order.goal_um)
+        if goal.error:
+            return None
+        speed = planning_speed_um_s(self.fast_share, order.robot) / px
         for deviations in dict.fromkeys((self.robust_deviations, 0.5 * self.robust_deviations, 0.0)):
             waiting = flow + deviations * deviation <= (1.0 - _KEPT_TO_WAIT) * limit
-            if goal is None:
-                togo = np.where(space.free.ravel(), 1.0, np.inf)
-            else:
-                speed = planning_speed_um_s(self.fast_share, order.robot) / px
-                # The way back in time: from the goal, against the flow.
-                rasters = space.cost_rasters(speed, deviations * deviation)
-                rasters = rasters._replace(clearance=space.clearance, vx=-space.vx, vy=-space.vy)
-                togo, _ = best_first(rasters, np.ones_like(flow), TRAVEL_TIME, directions(_REACH_PX), goal.node, -1)
+            # The way back in time: from the goal, against the flow.
+            rasters = space.cost_rasters(speed, deviations * deviation)
+            rasters = rasters._replace(clearance=space.clearance, vx=-space.vx, vy=-space.vy)
+            togo, _ = best_first(rasters, np.ones_like(flow), TRAVEL_TIME, directions(_REACH_PX), goal.node, -1)
             if np.isfinite(togo[start.node]):
                 fewer = deviations < self.robust_deviations
                 return _Reach(togo, waiting, f"{deviations:g} deviations of the flow to spare" if fewer else "")
@@ -174,7 +171,7 @@ class Information:
         """The error of the map, and of the flow along the ways to the goal."""
         mask = order.chip.mask
         whole = np.ones(len(uncertainty.mean_um_s))
-        if order.goal_um is None or self.route_share == 0.0:
+        if self.route_share == 0.0:
             return Need.of(uncertainty, (1.0, whole))
         speed = planning_speed_um_s(self.fast_share, order.robot) / space.um_per_px
         spent, _ = self._tree(space, speed, start, np.ones_like(space.clearance))
@@ -228,7 +225,8 @@ class Information:
                 if arrival[-1] > order.left_s:
                     continue
                 error = need.error(covariance_after(covariance, looks.information(path * px, arrival)))
-                yield _Stretch(path, speed_um_s, float(arrival[-1]), error)
+                farther_s = max(float(reach.togo_s[end] - reach.togo_s[start.node]), 0.0)
+                yield _Stretch(path, speed_um_s, float(arrival[-1]) + farther_s, error)
 
     def _timed(self, space: FreeSpace, believed: FlowField, stretch: _Stretch, start: Endpoint) -> Route:
         """The timed route of a stretch, off the pixels where that is possible."""

@@ -75,7 +75,7 @@ def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
     realtime_session: Path, tmp_path: Path
 ) -> None:
     recorded = verb.adoption_stamps(SessionReader(realtime_session))
-    assert len(recorded) == 4  # solved, surveyed, refined, planned
+    assert len(recorded) > 4  # solved, surveyed in several stretches, refined, planned
     out = tmp_path / "again.mcap"
     done = verb.replay(realtime_session, Change(refine="assimilate"), out=out)
     assert verb.adoption_stamps(SessionReader(out)) == recorded

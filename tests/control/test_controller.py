@@ -202,3 +202,22 @@ def test_a_swifter_robot_is_driven_with_quicker_gains_as_far_as_the_frames_allow
     assert pull_per_s(UNHURRIED, 10_000_000) == pytest.approx(3.0)
     assert pull_per_s(replace(UNHURRIED, max_speed_um_s=2400.0), 10_000_000) == pytest.approx(12.0)
     assert pull_per_s(replace(UNHURRIED, max_speed_um_s=24000.0), 10_000_000) == pytest.approx(30.0)
+
+
+def test_a_route_that_is_adopted_on_the_way_continues_the_reference_where_it_is():
+    first = straight(speed_um_s=300.0)
+    longer = replace(
+        first,
+        stamp_ns=2_000_000_000,
+        waypoints_um=np.concatenate([first.waypoints_um, first.waypoints_um[-1:] + [[0.0, 500.0]]]),
+        arrival_s=np.concatenate([first.arrival_s, first.arrival_s[-1:] + 2.0]),
+    )
+    way = np.array([np.interp(1.0, first.arrival_s, first.waypoints_um[:, c]) for c in (0, 1)])
+    under_way = Demand(1_000_000_000, np.zeros(2), way, 1.0, 0.0, False, np.zeros((0, 2)))
+    for held in (None, 1_500_000_000):
+        now = replace(mission("survey"), since_ns=0, held_since_ns=held)
+        demand = Controller().control(
+            under_way, now, longer, seen_at(way, 2_000_000_000), STILL, ROBOT, None, STILL.um_per_px
+        )
+        assert demand.progress_s == pytest.approx(1.0 if held else 2.0)
+        assert np.hypot(*(demand.reference_um - way)) == pytest.approx(0.0 if held else 300.0, abs=1.0)

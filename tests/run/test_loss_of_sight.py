@@ -95,7 +95,8 @@ def flown(
 
     monkeypatch.setattr("flowrec.rigs.simulated.rig.SimulatedRig", Made)
     try:
-        done: Recorded | RigError = record(load_config(None, [*SMALL, "duration_s=11", *sets]), path)
+        sets = ("survey.method=downstream", "duration_s=11", *sets)
+        done: Recorded | RigError = record(load_config(None, [*SMALL, *sets]), path)
     except RigError as error:
         done = error
     return done, rigs[0].log

@@ -49,7 +49,9 @@ class Scripted(RunControl):
 
 
 def flown(path: Path, *script: tuple[float, str, str], sets: tuple[str, ...] = ()):  # type: ignore[no-untyped-def]
-    recorded = verb.record(load_config(None, [*SMALL, *sets]), path, control=Unattended(Scripted(script)))
+    """A mission with one survey of known duration, so that the script meets the phases that it is meant for."""
+    asked = load_config(None, [*SMALL, "survey.method=downstream", *sets])
+    recorded = verb.record(asked, path, control=Unattended(Scripted(script)))
     return recorded, list(SessionReader(path).ticks(with_frames=False))
 
 
