@@ -2,9 +2,8 @@
 
 From the start of the stretch a search finds the fastest way, in the middle of the channels, to everywhere. Its ends in
 a number of places are compared, at several speeds, by the error that the flow would have after the observations on the
-way (survey_design.py), in the flow along the ways to the goal and in the whole map. The seconds are those of the
-stretch, and those by which the way to the goal is longer from its end. Only places are allowed from which the goal can
-still be reached, even in a flow that is worse than believed, and where the robot can wait.
+way (survey_design.py), in the flow along the ways to the goal and in the whole map. Only places are allowed from which
+the goal can still be reached, even in a flow that is worse than believed, and where the robot can wait.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ class _Stretch:
 
     path: Floats  # (n, 2) px
     speed_um_s: float
-    cost_s: float  # its duration, and by how much longer the way to the goal is from its end
+    duration_s: float
     error: float  # that the flow would have afterwards, relative
 
 
@@ -112,7 +111,7 @@ class Information:
         best: _Stretch | None = None
         best_rate = self.worth / crossing_s
         for stretch in self._stretches(space, order, looks, covariance, need, start, reach):
-            rate = (now - stretch.error) / max(stretch.cost_s, order.least_s, _SHORTEST_SHARE * crossing_s)
+            rate = (now - stretch.error) / max(stretch.duration_s, order.least_s, _SHORTEST_SHARE * crossing_s)
             if rate > best_rate:
                 best, best_rate = stretch, rate
         if best is None:
@@ -225,8 +224,7 @@ class Information:
                 if arrival[-1] > order.left_s:
                     continue
                 error = need.error(covariance_after(covariance, looks.information(path * px, arrival)))
-                farther_s = max(float(reach.togo_s[end] - reach.togo_s[start.node]), 0.0)
-                yield _Stretch(path, speed_um_s, float(arrival[-1]) + farther_s, error)
+                yield _Stretch(path, speed_um_s, float(arrival[-1]), error)
 
     def _timed(self, space: FreeSpace, believed: FlowField, stretch: _Stretch, start: Endpoint) -> Route:
         """The timed route of a stretch, off the pixels where that is possible."""

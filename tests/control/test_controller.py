@@ -209,7 +209,7 @@ def test_a_route_that_is_adopted_on_the_way_continues_the_reference_where_it_is(
     longer = replace(
         first,
         stamp_ns=2_000_000_000,
-        waypoints_um=np.concatenate([first.waypoints_um, first.waypoints_um[-1:] + [[0.0, 500.0]]]),
+        waypoints_um=np.vstack([first.waypoints_um, first.waypoints_um[-1] + np.array([0.0, 500.0])]),
         arrival_s=np.concatenate([first.arrival_s, first.arrival_s[-1:] + 2.0]),
     )
     way = np.array([np.interp(1.0, first.arrival_s, first.waypoints_um[:, c]) for c in (0, 1)])
