@@ -149,6 +149,7 @@ WAYS: dict[str, Callable[[Task], Seen]] = {
     "information": lambda task: survey(task, _EXPLORE),
     "information:chosen": lambda task: survey(task, _EXPLORE, choose=True),
     "information:longer": lambda task: survey(task, replace(_EXPLORE, worth=0.5 * _EXPLORE.worth)),
+    "information:unhurried": lambda task: survey(task, replace(_EXPLORE, worth=0.25 * _EXPLORE.worth), choose=True),
     "prior": prior,
 }
 
