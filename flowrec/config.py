@@ -377,6 +377,12 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"go, which plan.method = {config.plan.method!r} does not know; set plan.method = {able[0]!r}, or "
             "control.method = 'vector'"
         )
+    if config.control.needs and config.plan.cost != "time":
+        raise UsageError(
+            f"{origin('control.method', 'plan.cost')}: control.method = {config.control.method!r} needs the time to "
+            f"go, which a plan of least {config.plan.cost} does not hold; set plan.cost = 'time', or "
+            "control.method = 'vector'"
+        )
 
 
 def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, origin: Origin) -> None:

@@ -67,6 +67,10 @@ PLANNERS = Methods(
 )
 
 
+_UM_PER_REV = "um_per_rev_share"  # of FlowField.parameter_names: the true one over the stated one, less 1
+_SIGNIFICANT = 2.0  # standard deviations
+
+
 class PlanningMethod(Protocol):
     """What the target of a row is: a class whose fields are the row's options, with this verb."""
 
@@ -132,6 +136,7 @@ class Planner:
         FlowError
             If the field is not finite.
         """
+        robot = _as_found(robot, field)
         speed_um_s = planning_speed_um_s(self.speed_share, robot)
         method = self._method()
         start_at, goal_at = np.asarray(start_um, np.float64), np.asarray(goal_um, np.float64)
@@ -158,6 +163,22 @@ class Planner:
         check_ranges(self, "plan")
         method: PlanningMethod = row.load()(**{option: getattr(self, option) for option in row.options})
         return method
+
+
+def _as_found(robot: Robot, field: FlowField) -> Robot:
+    """The robot with the smaller um per revolution that the refinement of a field has found: it is that much slower.
+
+    A larger one is not counted on: the coils turn no faster than the stated one asks for.
+    """
+    names = field.parameter_names.split("; ")
+    if _UM_PER_REV not in names:
+        return robot
+    k = names.index(_UM_PER_REV)
+    change, std = float(field.parameters[k]), float(field.parameter_std[k])
+    if not -1.0 < change < -_SIGNIFICANT * std:
+        return robot
+    slower = 1.0 + change
+    return replace(robot, max_speed_um_s=slower * robot.max_speed_um_s, um_per_rev=slower * robot.um_per_rev)
 
 
 def warm_up() -> None:

@@ -158,6 +158,14 @@ def test_a_planner_that_does_not_know_the_time_to_go_is_refused_at_once():
     assert load_config(None, ["control.method=policy", "plan.method=time_field"]).control.method == "policy"
 
 
+def test_the_policy_is_refused_where_the_plan_is_one_of_least_energy():
+    with pytest.raises(
+        UsageError, match=r"needs the time to go.*set plan\.cost = 'time', or control\.method = 'vector'"
+    ):
+        load_config(None, ["control.method=policy", "plan.cost=energy"])
+    assert load_config(None, ["control.method=vector", "plan.cost=energy"]).plan.cost == "energy"
+
+
 def test_a_robot_out_of_sight_is_soon_asked_for_nothing_under_the_policy_too():
     route = homeward_route(zermelo_s(pixels_um(), np.zeros(2)).astype(np.float32))
     options = {"robot": SWIMMER, "clearance": (None, PX_UM), "blind": (0.5, 9.0)}

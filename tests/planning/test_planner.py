@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -154,3 +155,16 @@ def test_a_broken_field_a_foreign_field_and_a_robot_without_speed_are_errors():
         Planner().plan(field_of(open_water(10, 10), 0.0), START, GOAL, chip, robot())
     with pytest.raises(UsageError, match="no speed"):
         Planner(speed_share=0.0).plan(field, START, GOAL, chip, robot())
+
+
+def test_a_robot_that_was_found_to_roll_less_per_revolution_is_planned_with_as_the_slower_one_it_is():
+    mask = channel()
+    chip, field, ends = chip_of(mask), field_of(mask, 20.0), ((1100.0, 195.0), (100.0, 195.0))
+
+    def duration_s(change, std, speed_um_s=100.0):
+        found = replace(field, parameter_names="depth_um; um_per_rev_share", parameters=[90.0, change])
+        return Planner().plan(replace(found, parameter_std=[9.0, std]), *ends, chip, robot(speed_um_s)).arrival_s[-1]
+
+    usual = duration_s(0.0, 0.01)
+    assert duration_s(-0.2, 0.02) == pytest.approx(duration_s(0.0, 0.01, 80.0))
+    assert duration_s(-0.2, 0.15) == duration_s(0.2, 0.02) == usual
