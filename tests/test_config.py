@@ -6,17 +6,21 @@ import ast
 import json
 import re
 import sys
+import tomllib
 from dataclasses import asdict, fields, is_dataclass, replace
+from functools import reduce
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
+import tomli_w
 
 import flowrec
 from flowrec.chip import load_chip
 from flowrec.cli import main
 from flowrec.commands.record import prepare
 from flowrec.commands.run_summary import Recorded
-from flowrec.config import Config, config_from_toml, load_config, to_toml, with_sets
+from flowrec.config import _BEFORE, Config, config_from_toml, load_config, to_toml, with_sets
 from flowrec.errors import FlowrecError, UnreachableError, UsageError
 from flowrec.resolve import resolve
 from flowrec.rig_settings import RIGS
@@ -30,10 +34,15 @@ def test_a_configuration_survives_its_own_toml() -> None:
 
 def test_a_session_from_before_a_setting_has_the_value_with_which_it_replays_unchanged() -> None:
     config = resolve(load_config(None, []), load_chip(Config().chip))
-    older = "".join(line for line in to_toml(config).splitlines(keepends=True) if not line.startswith("policy_"))
-    plan = config_from_toml(older, "test").plan
-    assert (plan.policy_course_share, plan.policy_points_per_radius, plan.policy_points_per_px) == (1.0, 3.0, 4)
-    assert config_from_toml(to_toml(config), "test").plan.policy_points_per_px == config.plan.policy_points_per_px != 4
+    older = tomllib.loads(to_toml(config))
+    for key in _BEFORE:
+        *sections, name = key.split(".")
+        reduce(dict.__getitem__, sections, older).pop(name, None)
+    read = config_from_toml(tomli_w.dumps(older), "test")
+    assert {key: attrgetter(key)(read) for key in _BEFORE} == _BEFORE
+    stated = {"plan.policy_points_per_px": 4, "health.step_out.learned": False, "mission.replan_slower": 0.0}
+    assert stated.items() <= _BEFORE.items()
+    assert all(attrgetter(key)(config) != value for key, value in stated.items()), "new sessions have another one"
 
 
 def test_an_unknown_key_is_refused_with_the_nearest_known_one() -> None:

@@ -131,6 +131,23 @@ def test_in_a_narrow_channel_against_the_flow_the_time_to_go_is_that_of_a_much_f
     assert seconds_to_go(policy_points_per_radius=3.0) > 1.15 * finest
 
 
+def test_the_time_to_go_leads_around_pixels_that_touch_at_their_corners_where_the_robot_does_not_fit_between():
+    mask = np.zeros((44, 44), bool)
+    mask[2:14, 2:14] = mask[26:42, 26:42] = mask[3:9, 2:42] = mask[3:42, 34:41] = True  # two rooms, and the way around
+    mask[np.arange(12, 28)[:, None], np.arange(12, 28)[:, None] + [-1, 0, 1]] = True  # the oblique way
+    chip, still = chip_of(mask), field_of(mask, 0.0)
+
+    def seconds_to_go(radius_um):
+        planner = replace(FULL, clearance_margin_um=0.0)
+        route = planner.plan(still, (80.0, 80.0), (330.0, 330.0), chip, robot(radius_um=radius_um))
+        k = round(80.0 / route.time_to_go_um_per_px)
+        return route.time_to_go_s[k, k]
+
+    # On the oblique way 9.1 um are free at the centres of the pixels, and 7.1 um between them.
+    assert seconds_to_go(6.0) < 4.0 < seconds_to_go(10.0)
+    assert seconds_to_go(9.0) == pytest.approx(seconds_to_go(10.0), rel=0.01)
+
+
 def test_robust_deviations_lead_around_a_flow_at_the_edge_and_are_given_up_with_a_remark():
     chip, field = loop(fast=80.0, slow=20.0)
     std = np.zeros_like(field.velocity_um_s)
