@@ -38,7 +38,8 @@ REFINERS = Methods(
         "a U-Net corrects an initial field by physics and observations (the paper's method)",
         ("pi_unet", "assimilate"),
     ),
-    Method("fvm", "flowrec.refine.refiner:AssumedFlow", "no refinement: the assumed flow of the solver"),
+    Method("gain", "flowrec.refine.gain:Gain", "null model: the assumed flow times the factor that fits best"),
+    Method("fvm", "flowrec.refine.refiner:AssumedFlow", "null model: the assumed flow of the solver, not refined"),
     Method(
         "ni", "flowrec.refine.ni:Ni", "the paper's baseline: a U-Net without initial prediction, for one case", ("ni",)
     ),

@@ -1,0 +1,78 @@
+"""`gain`, the null model: the whole assumed field times the one factor that explains the observations best.
+
+The observations are c v_i + e_i, where v_i is the assumed flow there and e_i has the variance sigma_i^2 + (s |v_i|)^2
+per component: the stated noise, and a spread s of the flow around c v in proportion to the speed. c is the least
+squares solution, s the value at which the mean of chi squared is that of noise. Any method that states more about a
+flow than one number has to be better than this one, in its errors and in its error bars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowrec.messages import FlowField
+from flowrec.refine.method import Problem
+from flowrec.refine.observation_operator import Floats
+
+_FACTOR_STD = 1.0  # prior of the factor around 1: far wider than what any observation leaves
+_BISECTIONS = 40  # of ln s between 1e-4 and 1e4: to 1e-11 of their ratio
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """Has no options."""
+
+    def fit(self, problem: Problem) -> FlowField:
+        """The scaled field; its standard deviation is that of the factor and the spread of the observations."""
+        operator, assumed = problem.operator, problem.assumed
+        predicted = operator.predict(assumed.velocity_um_s.reshape(-1, 2))
+        variance = operator.std_um_s**2 + 1e-12 * max(float((predicted**2).max()), 1e-12)
+        spread = _spread(predicted, operator.flow_um_s, variance)
+        factor, factor_std = _factor(predicted, operator.flow_um_s, variance, spread)
+        speed = np.linalg.norm(assumed.velocity_um_s, axis=-1, keepdims=True)
+        std = np.hypot(factor_std * assumed.velocity_um_s, abs(factor) * spread * speed)
+        power = float((assumed.velocity_um_s.astype(np.float64) ** 2).sum())
+        return replace(
+            assumed,
+            method="gain",
+            velocity_um_s=(factor * assumed.velocity_um_s).astype(np.float32),
+            pressure_pa=(factor * assumed.pressure_pa).astype(np.float32),
+            std_um_s=std.astype(np.float32),
+            boundary_values=factor * assumed.boundary_values,
+            note=f"the assumed flow times {factor:.3f} +- {factor_std:.3f}; the observations scatter around it by "
+            f"{100.0 * spread:.0f} % of the speed",
+            error_share=float(np.sqrt((std.astype(np.float64) ** 2).sum() / max(factor**2 * power, 1e-300))),
+            parameter_names="flow_factor",
+            parameters=np.array([factor]),
+            parameter_std=np.array([factor_std]),
+        )
+
+
+def _factor(predicted: Floats, measured: Floats, variance: Floats, spread: float) -> tuple[float, float]:
+    """Least squares factor and its standard deviation, of flows (n, 2) with noise of variance (n,) and a spread."""
+    square = (predicted**2).sum(axis=1)
+    weight = 1.0 / (variance + spread**2 * square)
+    precision = float((weight * square).sum()) + 1.0 / _FACTOR_STD**2
+    factor = (float((weight * (predicted * measured).sum(axis=1)).sum()) + 1.0 / _FACTOR_STD**2) / precision
+    return factor, 1.0 / np.sqrt(precision)
+
+
+def _spread(predicted: Floats, measured: Floats, variance: Floats) -> float:
+    """The spread (of the speed, per component) at which chi squared is its number of degrees of freedom; 0 or more."""
+    square = (predicted**2).sum(axis=1)
+    freedom = 2.0 * len(square) - 1.0
+
+    def excess(spread: float) -> float:
+        factor, _ = _factor(predicted, measured, variance, spread)
+        left = ((measured - factor * predicted) ** 2).sum(axis=1)
+        return float((left / (variance + spread**2 * square)).sum()) - freedom
+
+    low, high = np.log(1e-4), np.log(1e4)
+    if excess(0.0) <= 0.0:
+        return 0.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if excess(float(np.exp(middle))) > 0.0 else (low, middle)
+    return float(np.exp(0.5 * (low + high)))
