@@ -1,43 +1,73 @@
-"""Assimilation: the boundary values that explain the observations best, and the uncertainty of the resulting field.
+"""Assimilation: what differs from the assumed world, found from the observations, and the uncertainty of the flow.
 
-The parameters are the boundary values and the fluid's viscosity and density, with a Gaussian prior around the assumed
-ones. Without inertia the field is linear in inlet speeds and p_out / mu; with inertia a few steps of the full equations
-with frozen factors add the nonlinear remainder. The curvature of the posterior gives the covariance. Where the
-observations contradict the walls, masks a pixel off are compared by their evidence.
+Unknown are the boundary values and the fluid (prior.py), errors of the map along the channels (channel_cells.py), what
+the robot, the pump and the registration add to the observations (causes.py), and the sizes of all these effects
+(evidence.py). Without inertia the field is linear in inlet speeds and p_out / mu; with inertia a few steps of the full
+equations with frozen factors add the nonlinear remainder. The depth of a chip that states none is taken from a small
+grid, and masks a pixel off are tried where the observations contradict the walls; the field is the mean over these
+hypotheses, weighted by their evidence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
-import scipy  # its ndimage loads at first use, not at start-up
 
 from flowrec.chip.chip import Chip
-from flowrec.chip.openings import border, run_around
+from flowrec.chip.clearance import median_width_um
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
-from flowrec.flow.linear_solver import cached, cell_count, chip_key
 from flowrec.flow.sampling import fluid_image
-from flowrec.flow.sensitivities import Remainder, Sensitivities
 from flowrec.messages import FlowField
 from flowrec.ranges import Range
+from flowrec.refine.causes import RESISTANCE, SECTION, Observed
 from flowrec.refine.discretisation_error import ModelError
+from flowrec.refine.findings import findings
+from flowrec.refine.flow_model import FlowModel, flow_model
+from flowrec.refine.hypothesis import NOISE, Fitted, Robust, State, Steps, begin, complete, robust_noise
+from flowrec.refine.mask_variants import mask_variants
 from flowrec.refine.method import Problem
-from flowrec.refine.mixture_regression import Model, Regression
 from flowrec.refine.observation_operator import Floats, ObservationOperator
-from flowrec.refine.prior import Prior, PriorSettings
+from flowrec.refine.prior import PriorSettings
 from flowrec.refine.report import report
 
-SURPRISE = 1.5  # standard deviations of chi squared above which other walls are tried
 LEAST_GAIN = 4.0  # in ln evidence, before other walls than the chip's are taken
-OUTLIER_SCALE = 3.0  # size of an outlier's components over the typical component of the observations
-LARGEST_PX = 30_000  # fluid pixels of a chip for which other walls are tried: each variant is a geometry of its own
-LEAST_STD = 1e-3  # of the typical observed speed: no observation is more accurate
-CLUSTER_PX = 4  # observations in a square of this size share the model's error
+LARGEST_PX = 30_000  # fluid pixels of a chip for which depths and walls are tried: each is a geometry of its own
+DEPTHS_WIDTHS = (0.4, 0.8, 1.6, 3.2)  # grid of depths of a chip that states none, in median channel widths
+DEPTH_STD_SHARE = 0.3  # standard deviation around each of them: half of their spacing in ln depth
+UNSTATED_SHARE = 0.75  # prior probability that the depth of such a chip does not matter
+LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
+STRUCTURE_DOUBTED = 2.0  # size of the errors along the channels over the usual one, above which other walls are tried
+NOISE_DOUBTED = 1.2  # the same of the noise over the stated one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """The flows of the plausible hypotheses on the same fluid pixels, and their probabilities.
+
+    The first is the chip as it is stated, and it stands until another hypothesis is likelier after the observations
+    than before: the mean gives others the weight by which their evidence exceeds that of the first. The variance around
+    it counts all by their probabilities, so that what the observations can not tell is within the error bars.
+    """
+
+    found: list[Fitted]
+    weights: Floats  # probabilities
+    shares: Floats  # of the mean
+    robust: Robust
+    wrong_mask: str  # how the chip's mask is wrong, in words; '' where it is not
+
+    @property
+    def best(self) -> Fitted:
+        """The most probable one."""
+        return self.found[int(np.argmax(self.shares))]
+
+    @property
+    def flow(self) -> Floats:
+        """(n, 2) the mean."""
+        return np.asarray(np.tensordot(self.shares, np.stack([one.flow for one in self.found]), axes=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,101 +76,144 @@ class Assimilate(PriorSettings):
 
     model: ModelError = field(default_factory=ModelError)
     doubt_walls: bool = True  # try walls a pixel off where the observations contradict the chip's
+    doubt_depth: bool = True  # try depths where the chip states none
     max_steps: Annotated[int, Range(1, 1_000)] = 8  # of the full equations with frozen factors
     tolerance: Annotated[float, Range(1e-12, 1.0)] = 2e-3  # last such step over the fastest speed
 
     def fit(self, problem: Problem) -> FlowField:
-        """Posterior mean field with its standard deviation, boundary values and viscosity.
+        """Posterior mean field with its standard deviation, boundary values, viscosity and what else was found.
 
         Raises
         ------
         FlowError
             If the flow of the fitted parameters can not be computed.
         """
-        operator, chip, solver = problem.operator, problem.chip, problem.solver
-        best = self._posterior(operator, chip, solver)
-        wrong = ""
-        if self.doubt_walls and best.surprise > SURPRISE and np.count_nonzero(chip.mask) <= LARGEST_PX:
-            wrong, other = self._better_mask(operator, chip, replace(solver, k=1))
-            if wrong:
-                # The coarse grid proposes, the fine one decides.
-                moved = self._posterior(operator, other, solver)
-                if moved.adequate and moved.evidence > best.evidence + LEAST_GAIN:
-                    best = moved
-                else:
-                    wrong = ""
-        return self._field(best, wrong, problem)
+        return self._field(self.hypotheses(problem.operator, problem.chip, problem.solver), problem)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
         """The assumed field with the standard deviation of the prior, or without one where there is no prior."""
         try:
-            model = self._linear_model(chip, solver)
+            model = flow_model(self, self.model, chip, solver)
         except FlowError:
             return assumed
-        std = np.sqrt((model.columns**2).sum(axis=0) + model.error_std**2)
-        return replace(assumed, std_um_s=fluid_image(chip.mask, std.astype(np.float32)))
+        columns, covariance = prior_of(model)
+        variance = (np.diag(covariance)[:, None, None] * columns**2).sum(axis=0) + model.error_std[:, None] ** 2
+        std = fluid_image(chip.mask, np.sqrt(variance).astype(np.float32))
+        return replace(assumed, std_um_s=std, error_share=_error_share(model.base, variance))
 
-    def _better_mask(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> tuple[str, Chip]:
-        """What is wrong with the mask, and the chip with a mask of far higher evidence; '' where there is none."""
-        own = self._posterior(operator, chip, solver).evidence
+    def hypotheses(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> Hypotheses:
+        """The flows of the plausible hypotheses.
+
+        Raises
+        ------
+        FlowError
+            If the chip's own flow can not be computed, or is at rest.
+        """
+        steps = Steps(self.max_steps, self.tolerance)
+        small = np.count_nonzero(chip.mask) <= LARGEST_PX
+        chips, prior = [chip], [1.0]
+        if self.doubt_depth and chip.depth_um is None and small:
+            width = median_width_um(chip)
+            chips += [replace(chip, depth_um=share * width) for share in DEPTHS_WIDTHS]
+            prior = [UNSTATED_SHARE, *[(1.0 - UNSTATED_SHARE) / len(DEPTHS_WIDTHS)] * len(DEPTHS_WIDTHS)]
+        own = self._observed(chip, chip, operator, solver)
+        robust = robust_noise(own)
+        begun = []
+        for other, share in zip(chips, prior, strict=True):
+            with suppress(FlowError):  # a depth whose flow can not be computed
+                observed = self._observed(other, chip, operator, solver)
+                begun.append((observed, begin(observed, robust, steps), np.log(share)))
+        ln_weight = np.array([state.sizes.evidence + ln_prior for _, state, ln_prior in begun])
+        best = begun[int(np.argmax(ln_weight))]
+        if self.doubt_walls and small and _doubtful(best[1]):
+            wrong, moved = self._better_mask(operator, best[0].model.chip, chip, solver, robust, best[1])
+            if moved is not None:
+                return Hypotheses([moved], np.ones(1), np.ones(1), robust, wrong)
+        least = ln_weight.max() + np.log(LEAST_WEIGHT)
+        found = [
+            (complete(observed, robust, state, steps), ln_prior)
+            for (observed, state, ln_prior), ln in zip(begun, ln_weight, strict=True)
+            if ln > least
+        ]
+        ln_weight = np.array([one.posterior.evidence + ln_prior for one, ln_prior in found])
+        weights = np.exp(ln_weight - ln_weight.max())
+        shares = weights.copy()
+        if found[0][0].observed.model.chip.depth_um == chip.depth_um:
+            # weight - prior x evidence of the first: of what is not likelier than the first, nothing is left.
+            first = found[0][0].posterior.evidence
+            shares[1:] *= [-np.expm1(min(first - one.posterior.evidence, 0.0)) for one, _ in found[1:]]
+        return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), robust, "")
+
+    def _observed(self, chip: Chip, stated: Chip, operator: ObservationOperator, solver: FlowSolver) -> Observed:
+        """The observations in the model of a chip. A depth that is not stated is known to the spacing of the grid."""
+        settings = replace(self, depth_std_share=DEPTH_STD_SHARE) if chip.depth_um != stated.depth_um else self
+        return Observed.of(flow_model(settings, self.model, chip, solver), operator)
+
+    def _better_mask(
+        self,
+        operator: ObservationOperator,
+        chip: Chip,
+        stated: Chip,
+        solver: FlowSolver,
+        robust: Robust,
+        own: State,
+    ) -> tuple[str, Fitted | None]:
+        """What is wrong with the mask, and the flow in a mask of far higher evidence; '' and None where there is none.
+
+        `own` is the state of the chip, whose depth stays; `stated` is the chip as it is assumed.
+        """
+        steps = Steps(self.max_steps, self.tolerance)
+        coarse = replace(solver, k=1)
+        before = own if solver.k == 1 else begin(self._observed(chip, stated, operator, coarse), robust, steps)
         gains = []
         for words, other in mask_variants(chip):
             with suppress(FlowError):  # a variant that carries no flow is left out
-                gains.append((self._posterior(operator, other, solver).evidence - own, words, other))
+                state = begin(self._observed(other, stated, operator, coarse), robust, steps)
+                gains.append((state.sizes.evidence - before.sizes.evidence, words, other))
         gain, words, other = max(gains, key=lambda entry: entry[0], default=(0.0, "", chip))
-        return (words, other) if gain > LEAST_GAIN else ("", chip)
+        if gain <= LEAST_GAIN:
+            return "", None
+        # The coarse grid proposes, the fine one decides.
+        observed = self._observed(other, stated, operator, solver)
+        state = begin(observed, robust, steps)
+        if state.sizes.evidence <= own.sizes.evidence + LEAST_GAIN:
+            return "", None
+        return words, complete(observed, robust, state, steps)
 
-    def _posterior(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> _Posterior:
-        """The most probable flow of a chip. Observations in its solid are predicted to be at rest."""
-        model = self._linear_model(chip, solver)
-        expansion, prior = model.expansion, model.prior
-        here = operator.with_walls(expansion.wall_px).on_fluid(chip.mask)
-        design = here.predict(model.columns)
-        misfit = operator.flow_um_s - here.predict(model.base)
-        variance = _variance(operator, here.predict(model.error_std)[:, 0])
-        remainder, nonlinear = expansion.start(), np.zeros_like(model.base)
-        # The same for all walls, so that their evidence can be compared.
-        outlier_variance = (
-            OUTLIER_SCALE**2 * 0.5 * float(np.median((operator.flow_um_s**2).sum(axis=1)))
-            + float(operator.std_um_s.max()) ** 2
-            + 1e-9
+    def _field(self, every: Hypotheses, problem: Problem) -> FlowField:
+        """The mean over the hypotheses as a field on the chip's own mask."""
+        chip, best = problem.chip, every.best
+        mask = best.observed.model.chip.mask
+        mean = every.flow
+        variance = sum(
+            (
+                weight * (field_variance(one) + (one.flow - mean) ** 2)
+                for one, weight in zip(every.found, every.weights, strict=True)
+            ),
+            np.zeros_like(mean),
         )
-        linear = Model(design, misfit, variance, outlier_variance)
-        found, moved = linear.fit(), False
-        for _ in range(self.max_steps):
-            remainder = expansion.approach(prior.offset(found.mean), remainder)
-            nonlinear = expansion.pixels(remainder.flux)
-            linear = replace(linear, misfit=misfit - here.predict(nonlinear))
-            if remainder.step <= self.tolerance:
-                break
-            # The inlier probabilities are found again at the end only.
-            found, moved = linear.refit(found), True
-        found = linear.fit() if moved else found
-        residual = linear.residual(found.mean)
-        return _Posterior(chip, model, found, remainder, nonlinear, (residual**2).sum(axis=1) / variance)
-
-    def _field(self, best: _Posterior, wrong_mask: str, problem: Problem) -> FlowField:
-        """The posterior as a field on the chip's own mask."""
-        model, found, chip = best.model, best.found, problem.chip
-        velocity = model.base + np.tensordot(found.mean, model.columns, axes=1) + best.nonlinear
-        root = np.linalg.cholesky(found.covariance)
-        std = np.sqrt((np.tensordot(root.T, model.columns, axes=1) ** 2).sum(axis=0) + model.error_std**2)
-        fitted = model.prior.chip(best.chip, found.mean)
-        pressure = model.expansion.pressure(model.prior.offset(found.mean), best.remainder)
+        model = best.observed.model
+        z = best.posterior.mean
+        fitted = model.prior.chip(model.chip, z)
+        pressure = model.expansion.pressure(model.prior.offset(z), best.remainder)
         pressure = pressure * fitted.viscosity_mpa_s / chip.viscosity_mpa_s
         velocity_um_s, std_um_s, pressure_pa = (
             np.where(
                 chip.mask.reshape(chip.mask.shape + (1,) * (values.ndim - 1)),
-                fluid_image(best.chip.mask, values.astype(np.float32)),
+                fluid_image(mask, values.astype(np.float32)),
                 np.float32(0.0),
             )
-            for values in (velocity, std, pressure)
+            for values in (mean, np.sqrt(variance), pressure)
         )
         # The mean speed is that through the opening as the chip has it, at the same flow rate.
         widths = [
             (other.width_px / opening.width_px if opening.kind == "inlet" else 1.0)
-            for other, opening in zip(best.chip.openings, chip.openings, strict=True)
+            for other, opening in zip(model.chip.openings, chip.openings, strict=True)
         ]
+        also = findings(every.found, every.weights)
+        wrong = [f"the mask seems wrong: {every.wrong_mask}"] if every.wrong_mask else []
+        robust = every.robust
+        note = report(chip, problem.operator, best, robust.inlier, robust.factor, [*wrong, *also.words])
         return replace(
             problem.assumed,
             method="assimilate",
@@ -151,117 +224,46 @@ class Assimilate(PriorSettings):
             boundary_values=fitted.boundary_values * widths,
             viscosity_mpa_s=fitted.viscosity_mpa_s,
             density_kg_m3=fitted.density_kg_m3,
-            note=report(chip, problem.operator, found, model.prior, wrong_mask),
-        )
-
-    def _linear_model(self, chip: Chip, solver: FlowSolver) -> _LinearModel:
-        """All that does not depend on the observations, from the cache if possible."""
-
-        def compute() -> _LinearModel:
-            expansion = solver.sensitivities(chip, self.depth_std_share > 0.0, self.inlet_shape_std > 0.0)
-            pressure = expansion.pressure(np.zeros(len(expansion.modes)), expansion.start())
-            prior = Prior.of(self, chip, float(np.ptp(pressure)))
-            grid = self.model.of(chip, solver, expansion)
-            modes = expansion.modes.copy()
-            modes[: len(grid.modes)] += grid.fraction * grid.modes
-            # Per prior standard deviation of each unknown; the last unknown is the fraction of the grid's error.
-            columns = np.concatenate([np.tensordot(prior.effect, modes, axes=1), grid.fraction_std * grid.base[None]])
-            base = expansion.base + grid.fraction * grid.base
-            # Above rounding errors, also where an observation has a std of 0.
-            std = np.maximum(grid.local_std, 1e-3 * grid.local_std.max() + 1e-9)
-            return _LinearModel(expansion, prior, columns, base, np.repeat(std[:, None], 2, axis=1))
-
-        model: _LinearModel = cached((self, solver, chip_key(chip)), cell_count(chip, solver.k) // 10, compute)
-        return model
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _LinearModel:
-    """The linear model of a chip: velocity = base + z columns, and its error; compact (..., n, 2) um/s."""
-
-    expansion: Sensitivities
-    prior: Prior
-    columns: Floats  # (unknowns + 1, n, 2)
-    base: Floats  # (n, 2)
-    error_std: Floats  # (n, 2)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Posterior:
-    """A chip's most probable flow."""
-
-    chip: Chip
-    model: _LinearModel
-    found: Regression
-    remainder: Remainder
-    nonlinear: Floats  # (n, 2) um/s what inertia adds to the linear model
-    chi2: Floats  # (observations,) squared residuals over their variance
-
-    @property
-    def evidence(self) -> float:
-        """Logarithm of the evidence of the observations (Laplace approximation), up to a constant."""
-        return 0.5 * float(np.linalg.slogdet(self.found.covariance)[1]) - self.found.energy
-
-    @property
-    def surprise(self) -> float:
-        """By how many of its standard deviations chi squared of the observations is too large."""
-        free = max(2.0 * len(self.chi2) - float((1.0 - np.diag(self.found.covariance)).sum()), 1.0)
-        return (float(self.chi2.sum()) - free) / float(np.sqrt(2.0 * free))
-
-    @property
-    def adequate(self) -> bool:
-        """Whether the flow explains most observations, with boundary values that are plausible beforehand."""
-        return (
-            self.found.noise_factor < 1.5
-            and float(self.found.inlier.mean()) > 0.6
-            and float(np.abs(self.found.mean[: len(self.chip.openings)]).max()) < 3.0
+            note=note,
+            error_share=_error_share(mean, variance),
+            parameter_names="; ".join(also.names),
+            parameters=also.values,
+            parameter_std=also.stds,
         )
 
 
-def _variance(operator: ObservationOperator, error_std: Floats) -> Floats:
-    """(n,) variance of each component: noise of the observation, and the model's error there.
-
-    Neighbours share the model's error, so their mean is not more accurate. An observation that was given several times
-    counts once.
-    """
-    cell = np.floor(operator.points.T).astype(np.int64) // CLUSTER_PX
-    _, cluster, neighbours = np.unique(cell, axis=1, return_inverse=True, return_counts=True)
-    identity = np.concatenate([operator.points, operator.flow_um_s], axis=1)
-    _, copy, copies = np.unique(identity, axis=0, return_inverse=True, return_counts=True)
-    # A std of 0 in solid would be a contradiction that no noise explains.
-    least = (LEAST_STD**2) * float(np.median((operator.flow_um_s**2).sum(axis=1))) + 1e-12
-    noise = copies[copy.ravel()] * operator.std_um_s**2
-    return np.asarray(noise + neighbours[cluster.ravel()] * error_std**2 + least)
+def field_columns(found: Fitted) -> Floats:
+    """(p, n, 2) um/s per unit of each of the first p unknowns, which are those of the flow."""
+    model = found.observed.model
+    sections = model.cells.toarray()[:, :, None] * found.in_use
+    return np.concatenate([model.known, model.resistance, sections])
 
 
-def mask_variants(chip: Chip) -> Iterator[tuple[str, Chip]]:
-    """What would be wrong with the mask, in words, and the chip with the mask corrected and its openings moved.
+def field_variance(found: Fitted) -> Floats:
+    """(n, 2) posterior variance of each component of the flow of a hypothesis."""
+    columns = field_columns(found)
+    values, vectors = np.linalg.eigh(found.posterior.covariance[: len(columns), : len(columns)])
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    spread = np.tensordot(root.T, columns, axes=1)
+    return np.asarray((spread**2).sum(axis=0) + found.observed.model.error_std[:, None] ** 2)
 
-    A variant in which an opening vanishes or meets another is left out.
-    """
-    mask = chip.mask
-    edge = np.pad(mask, 1, mode="edge")
-    variants = (
-        (
-            "its channels are drawn a pixel too wide on each side",
-            scipy.ndimage.binary_erosion(mask, border_value=1),
-            (0, 0),
-        ),
-        ("its channels are drawn a pixel too narrow on each side", scipy.ndimage.binary_dilation(mask), (0, 0)),
-        ("it lies a pixel too far left", edge[1:-1, :-2], (1, 0)),
-        ("it lies a pixel too far right", edge[1:-1, 2:], (-1, 0)),
-        ("it lies a pixel too high", edge[:-2, 1:-1], (0, 1)),
-        ("it lies a pixel too low", edge[2:, 1:-1], (0, -1)),
-    )
-    for words, other, (right, down) in variants:
-        runs = [
-            run_around(
-                border(other, o.side), (o.first + o.last) // 2 + (down if o.side in ("left", "right") else right)
-            )
-            for o in chip.openings
-        ]
-        openings = tuple(
-            replace(o, first=run[0], last=run[1]) for o, run in zip(chip.openings, runs, strict=True) if run
-        )
-        if len({(o.side, o.first) for o in openings}) == len(runs):
-            yield words, replace(chip, mask=np.ascontiguousarray(other), openings=openings)
+
+def prior_of(model: FlowModel) -> tuple[Floats, Floats]:
+    """Columns (p, n, 2) of the unknowns of the flow, and their covariance (p, p) before any observation."""
+    sections = model.cells.toarray()[:, :, None] * model.base
+    sizes = np.repeat([1.0, RESISTANCE[0], SECTION[0]], [len(model.known), len(model.resistance), len(sections)])
+    return np.concatenate([model.known, model.resistance, sections]), np.diag(sizes**2)
+
+
+def _doubtful(state: State) -> bool:
+    """Whether errors of the map along the channels, or the noise, are larger than usual."""
+    sizes = dict(zip([effect.name for effect in state.evidence.effects], np.exp(state.sizes.mode), strict=True))
+    usual = {"section": SECTION[0], "resistance": RESISTANCE[0]}
+    structure = any(sizes[name] > STRUCTURE_DOUBTED * size for name, size in usual.items())
+    return structure or sizes[NOISE[0]] > NOISE_DOUBTED
+
+
+def _error_share(flow: Floats, variance: Floats) -> float:
+    """Expected relative RMSE of a mean flow (n, 2) whose components have a variance (n, 2)."""
+    total = float(variance.sum())
+    return float(np.sqrt(total / max(float((flow**2).sum()) + total, 1e-300)))

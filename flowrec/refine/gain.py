@@ -32,7 +32,7 @@ class Gain:
         spread = _spread(predicted, operator.flow_um_s, variance)
         factor, factor_std = _factor(predicted, operator.flow_um_s, variance, spread)
         speed = np.linalg.norm(assumed.velocity_um_s, axis=-1, keepdims=True)
-        std = np.hypot(factor_std * assumed.velocity_um_s, abs(factor) * spread * speed)
+        std = np.hypot(factor_std * assumed.velocity_um_s, spread * speed)
         power = float((assumed.velocity_um_s.astype(np.float64) ** 2).sum())
         return replace(
             assumed,
@@ -42,7 +42,7 @@ class Gain:
             std_um_s=std.astype(np.float32),
             boundary_values=factor * assumed.boundary_values,
             note=f"the assumed flow times {factor:.3f} +- {factor_std:.3f}; the observations scatter around it by "
-            f"{100.0 * spread:.0f} % of the speed",
+            f"{100.0 * spread / max(abs(factor), 1e-9):.0f} % of the speed",
             error_share=float(np.sqrt((std.astype(np.float64) ** 2).sum() / max(factor**2 * power, 1e-300))),
             parameter_names="flow_factor",
             parameters=np.array([factor]),

@@ -28,6 +28,8 @@ class ObservationOperator:
     flow_um_s: Floats  # (n, 2)
     std_um_s: Floats  # (n,)
     ignored: str = ""  # number of unusable observations and why; for people
+    rolled_um_s: Floats | None = None  # (n, 2) the robot's own motion; None: not stated, see Observations
+    time_s: Floats | None = None  # (n,)
 
     @property
     def count(self) -> int:
@@ -91,6 +93,8 @@ def observation_operator(
         & np.isfinite(observations.std_um_s)
         & (observations.std_um_s >= 0.0)
     )
+    for more in (observations.rolled_um_s, observations.time_s):
+        finite &= True if more is None else np.isfinite(more.reshape(len(finite), -1)).all(axis=1)
     usable = finite & cells_at(points, mask.shape).inside
     usable[usable] = mask[nearest_pixels(points[usable], mask.shape)]
     pixels, weights = _stencils(points[usable], mask.shape, wall_px)
@@ -103,6 +107,8 @@ def observation_operator(
         observations.flow_um_s[usable],
         observations.std_um_s[usable],
         " and ".join(f"{which.sum()} {why}" for which, why in unusable if which.any()),
+        None if observations.rolled_um_s is None else observations.rolled_um_s[usable],
+        None if observations.time_s is None else observations.time_s[usable],
     )
 
 

@@ -38,6 +38,8 @@ class Prior:
     effect: Floats  # (unknowns, P): offset = z effect
     viscosity_std: float  # of ln mu
     density_std: float  # of ln rho
+    depth_index: int | None = None  # of the unknown that is the depth; None: it is none
+    depth_std: float = 0.0  # of ln depth
 
     @classmethod
     def of(cls, settings: PriorSettings, chip: Chip, drop_pa: float) -> Prior:
@@ -67,8 +69,9 @@ class Prior:
         # The flow depends on p / mu: a pressure is as uncertain as the viscosity.
         viscosity[:count] = np.where(inlet, 0.0, -values * settings.viscosity_std_share)
         rows += [viscosity, density]
+        depth_index = len(rows) if with_depth else None
         if with_depth:
-            depth[count + 1] = 2.0 * settings.depth_std_share  # friction is proportional to 1 / depth^2
+            depth[count + 1] = -2.0 * settings.depth_std_share  # friction is proportional to 1 / depth^2
             rows.append(depth)
         if shapes:
             widths = np.repeat(settings.inlet_shape_std * speed[inlet], 2)
@@ -76,7 +79,8 @@ class Prior:
         if settings.pump_std_share > 0.0:
             pump[:count] = np.where(inlet, values, 0.0) * settings.pump_std_share
             rows.append(pump)
-        return cls(np.stack(rows), settings.viscosity_std_share, settings.density_std_share)
+        stds = (settings.viscosity_std_share, settings.density_std_share)
+        return cls(np.stack(rows), *stds, depth_index, settings.depth_std_share)
 
     def offset(self, z: Floats) -> Floats:
         """(P,) change of the parameters of Sensitivities."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from flowrec.chip.chip import Chip
-from flowrec.refine.mixture_regression import Regression
+from flowrec.refine.hypothesis import Fitted
 from flowrec.refine.observation_operator import Floats, ObservationOperator
 from flowrec.refine.prior import Prior
 
@@ -14,35 +16,37 @@ WEAK = 0.6  # ratio above which it is tested whether openings are observed toget
 OBSERVED_TOGETHER = 0.4  # ratio of their sum below which they are
 FAR = 3.0  # prior standard deviations from the assumed value
 OUTLIER = 0.5  # inlier probability below which an observation counts as an outlier
-CORRELATED = 3.0  # correlation length of the residuals above which the model is doubted, in observations
 NOISIER = 1.3  # times the stated noise
+LEAST_GAIN = 1.0  # in ln evidence over the assumed flow
 
 
-def report(chip: Chip, operator: ObservationOperator, found: Regression, prior: Prior, wrong_mask: str) -> str:
-    """One line; `wrong_mask` says how the mask seems to be wrong, '' where it does not."""
-    used = operator.count - int((found.inlier < OUTLIER).sum())
+def report(
+    chip: Chip, operator: ObservationOperator, best: Fitted, inlier: Floats, noise_factor: float, causes: Sequence[str]
+) -> str:
+    """One line on the most probable hypothesis; `causes` are what it found besides the boundary values, in words."""
+    used = operator.count - int((inlier < OUTLIER).sum())
     parts = [f"assimilated {used} observations" if used != 1 else "assimilated 1 observation"]
     if operator.count > used:
         parts.append(f"{operator.count - used} more distrusted as outliers")
     if operator.ignored:
         parts.append(f"ignored {operator.ignored}")
-    if wrong_mask:
-        parts.append(f"the mask seems wrong: {wrong_mask}")
-    if found.noise_factor > NOISIER:
-        parts.append(f"they scatter {found.noise_factor:.1f} times more than their std says, error bars widened")
-    if found.correlation_length > CORRELATED:
-        parts.append("neighbours miss alike: something here is not in the model")
+    parts += causes
+    if noise_factor > NOISIER:
+        parts.append(f"they scatter {noise_factor:.1f} times more than their std says, error bars widened")
+    mean, covariance = best.unknowns("boundary")
     far = [
-        f"{_name(chip, index)} ({abs(found.mean[index]):.0f} prior std off)"
+        f"{_name(chip, index)} ({abs(mean[index]):.0f} prior std off)"
         for index in range(len(chip.openings))
-        if abs(found.mean[index]) > FAR
+        if abs(mean[index]) > FAR
     ]
     if far:
         parts.append(f"far from what was assumed: {', '.join(far)}")
-    return "; ".join([*parts, *_unobserved(chip, found, prior)])
+    if best.gain < LEAST_GAIN:
+        parts.append("they do not ask for another flow than the assumed one")
+    return "; ".join([*parts, *_unobserved(chip, covariance, best.observed.model.prior)])
 
 
-def _unobserved(chip: Chip, found: Regression, prior: Prior) -> list[str]:
+def _unobserved(chip: Chip, posterior: Floats, prior: Prior) -> list[str]:
     """Which openings the observations did not determine, alone or only together."""
     parts, hidden = [], []
     for kind, quantity in (("inlet", "flow"), ("outlet", "pressure")):
@@ -56,7 +60,7 @@ def _unobserved(chip: Chip, found: Regression, prior: Prior) -> list[str]:
         else:
             # Only pressure differences drive a flow: each pressure relative to the mean of all.
             directions = np.diag(std) @ (np.eye(count) - 1.0 / count)
-        covariance = found.covariance[np.ix_(group, group)]
+        covariance = posterior[np.ix_(group, group)]
         ratio = _std_ratio(directions, covariance)
         weak = np.flatnonzero(ratio > WEAK)
         together = directions[:, weak].sum(axis=1, keepdims=True)

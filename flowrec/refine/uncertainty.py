@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,8 +10,11 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.uncertainty import FlowUncertainty
-from flowrec.refine.assimilate import Assimilate
-from flowrec.refine.observation_operator import ObservationOperator
+from flowrec.refine.assimilate import Assimilate, Hypotheses, field_columns, prior_of
+from flowrec.refine.causes import GAIN
+from flowrec.refine.flow_model import flow_model
+from flowrec.refine.hypothesis import NOISE
+from flowrec.refine.observation_operator import Floats, ObservationOperator
 
 
 def flow_uncertainty(
@@ -19,18 +22,58 @@ def flow_uncertainty(
 ) -> FlowUncertainty | None:
     """The posterior of the assimilation, on the chip's own walls; the prior without an observation.
 
-    None where there is no prior: the chip is assumed to stand still, or its flow can not be computed.
+    The constant of the robot is the relative error of um per revolution. Hypotheses that differ (the depth of the chip)
+    are unknowns, too: the column of each is its difference from the mean. None where there is no prior: the chip is
+    assumed to stand still, or its flow can not be computed.
     """
     try:
         if operator.count == 0:
-            model = settings._linear_model(chip, solver)  # noqa: SLF001
-            covariance, mean, factor = np.eye(len(model.columns)), model.base, 1.0
-        else:
-            found = settings._posterior(operator, chip, solver)  # noqa: SLF001
-            model, covariance = found.model, found.found.covariance
-            factor = found.found.noise_factor * math.sqrt(found.found.correlation_length)
-            mean = model.base + np.tensordot(found.found.mean, model.columns, axes=1) + found.nonlinear
+            model = flow_model(settings, settings.model, chip, solver)
+            columns, covariance = prior_of(model)
+            rolled = np.ones((1, len(model.base)))
+            return FlowUncertainty(
+                model.base, columns, rolled, _joined(covariance, np.diag([GAIN[0] ** 2])), model.error_std
+            )
+        # The pixels of a chip with other walls are not those of the chip.
+        every = replace(settings, doubt_walls=False).hypotheses(operator, chip, solver)
     except FlowError:
         return None
-    error = np.sqrt((model.error_std**2).mean(axis=1))
-    return FlowUncertainty(mean, model.columns, np.zeros((0, len(mean))), covariance, error, factor)
+    return _of(every)
+
+
+def _of(every: Hypotheses) -> FlowUncertainty:
+    best = every.best
+    columns, mean = field_columns(best), every.flow
+    count = len(columns)
+    gain = _gain_index(every)
+    index = [*range(count), *([] if gain is None else [gain])]
+    covariance = best.posterior.covariance[np.ix_(index, index)]
+    apart = [np.sqrt(weight) * (one.flow - mean) for one, weight in zip(every.found, every.weights, strict=True)]
+    if len(apart) > 1:
+        columns = np.concatenate([columns, np.stack(apart)])
+        moved = np.zeros((len(covariance) + len(apart),) * 2)
+        old = np.r_[0:count, count + len(apart) : len(moved)]
+        moved[np.ix_(old, old)] = covariance
+        new = np.arange(count, count + len(apart))
+        moved[new, new] = 1.0
+        covariance = moved
+    rolled = np.ones((0 if gain is None else 1, len(mean)))
+    factor = every.robust.factor * best.size(NOISE[0])
+    return FlowUncertainty(mean, columns, rolled, covariance, best.observed.model.error_std, factor)
+
+
+def _gain_index(every: Hypotheses) -> int | None:
+    """Place of the unknown that is the error of um per revolution; None where the robot's motion is not stated."""
+    first = 0
+    for effect in every.best.effects:
+        if effect.name == "gain":
+            return first
+        first += len(effect.columns)
+    return None
+
+
+def _joined(one: Floats, two: Floats) -> Floats:
+    """The block-diagonal matrix of two."""
+    joined = np.zeros((len(one) + len(two),) * 2)
+    joined[: len(one), : len(one)], joined[len(one) :, len(one) :] = one, two
+    return joined

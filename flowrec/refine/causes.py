@@ -1,0 +1,164 @@
+"""What makes observations differ from the assumed flow, besides boundary values and fluid: effects with their sizes.
+
+With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, and the flow v:
+
+    y_i = v(x_i) + dv/dx (offset + scale (x_i - c) + angle J (x_i - c)) + (scale + angle J) v + scale r_i
+          + (gain - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
+          - carry b_i v + v (g(x_i) + p(t_i)) + noise
+
+J turns from +x to +y, c is the mean of the places, b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the
+wall, d is the least one that was observed (the robot's radius is not part of a refinement, and it can not have been
+nearer), b is its mean: the gain is that of the robot where it was observed, and hindrance what differs nearer to or
+farther from a wall. g is an error of the cross-sections along the channels, p a change of the whole flow in time: slow
+wander, and a spectral line. Each effect is linear in its unknowns around the flow in use, so the assimilation repeats
+with the flow that it found.
+
+The median of a size is what is usual in a laboratory, the ln_std says how far that may be off: by a factor of 3 to 5,
+so that the observations decide (evidence.py), and an effect that nothing asks for stays small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowrec.refine.evidence import Effect
+from flowrec.refine.flow_model import FlowModel
+from flowrec.refine.observation_operator import Floats, ObservationOperator
+
+# Median and ln_std of the size of each effect.
+BOUNDARY = (1.0, 0.3)  # in the prior standard deviations of the settings
+FLUID = (1.0, 0.02)  # viscosity, density, depth, shapes of the inlets, fraction of the grid's error: as stated
+RESISTANCE = (0.05, 1.0)  # of a cell: a channel 3 % narrower than drawn has 9 % more
+SECTION = (0.01, 1.0)  # of the speed in a cell: a wall half a pixel off in a channel 20 px wide is 2.5 %
+GAIN = (0.08, 1.3)  # um per revolution is known to a few per cent where it was calibrated, else to 15 %
+HEADING = (0.01, 0.8)  # rad: coils and camera are aligned to half a degree
+HINDRANCE = (0.05, 1.3)  # of the own motion, between the least distance to a wall and far from one
+CARRY = (0.02, 1.0)  # of the flow, likewise: a sphere lags by little until it nearly touches the wall
+OFFSET_PX = (0.3, 1.0)  # registration to a fraction of a pixel of the mask
+SCALE = (0.006, 1.0)  # um per pixel of a camera
+ANGLE = (0.004, 0.8)  # rad
+WANDER = (0.02, 1.2)  # of the flow, over `WANDER_S`: a pump on a bench
+WANDER_S = (2.0, 20.0)  # correlation times: one effect each
+ROLLING = (0.02, 0.7)  # of the own motion: a roller's course and speed vary by that much, over `ROLLING_S`
+ROLLING_S = 1.0
+LINE = (0.04, 1.3)  # amplitude of a spectral line
+NEIGHBOURHOOD_PX = 6.0  # over which the correlation of the model's local error falls to 1 / e
+SLOWEST_HZ = 0.05  # of a line
+LINE_STEP = 0.2  # of the frequencies that are tried, over the time that was observed: finer than its resolution
+MOST_LINES = 400
+LEAST_PERIODS = 0.5  # of a line in the time that was observed: less is a wander
+FEWEST_FOR_LINE = 12  # observations: amplitude, phase and frequency on top of the flow
+LINE_NAME = "line"
+NEAR_SHARE = 0.5  # of the least distance: over which hindrance falls to 1 / e
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """The usable observations in the walls of one model, and what the effects need of each."""
+
+    model: FlowModel
+    operator: ObservationOperator  # on the fluid pixels of the model
+    shifted: tuple[ObservationOperator, ...]  # half a pixel to the right, left, down, up
+    cells: Floats  # (cells, n) weights of the cells there
+    near: Floats  # (n,) b_i: 1 at the least distance to a wall
+    um_per_px: float
+
+    @classmethod
+    def of(cls, model: FlowModel, operator: ObservationOperator) -> Observed:
+        """The observations of an operator. Those in solid are predicted to be at rest."""
+        mask, wall_px = model.chip.mask, model.expansion.wall_px
+        here = operator.with_walls(wall_px)
+        steps = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        last = np.array(mask.shape[::-1]) - 1.0
+        shifted = tuple(
+            replace(operator, points=np.clip(operator.points + step, 0.0, last)).with_walls(wall_px).on_fluid(mask)
+            for step in steps
+        )
+        here = here.on_fluid(mask)
+        column, row = operator.points.T.round().astype(np.intp)
+        distance = np.maximum(wall_px[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)], 0.0)
+        least = max(float(distance.min()), 0.5)
+        near = np.exp(-np.maximum(distance - least, 0.0) / (NEAR_SHARE * least))
+        return cls(model, here, shifted, model.cells[:, here.pixels[:, 0]].toarray(), near, model.chip.um_per_px)
+
+    def effects(self, flow: Floats, line_hz: float | None) -> list[Effect]:
+        """All effects around a flow (n, 2) of the model's pixels, with columns for the observations, x and y of each.
+
+        The first four have unknowns that belong to the field: boundary values, fluid, resistances, sections.
+        """
+        here, model = self.operator, self.model
+        v = here.predict(flow)
+        right, left, down, up = (one.predict(flow) for one in self.shifted)
+        gradient = np.stack([right - left, down - up])  # (2, n, 2) um/s per px
+        rolled, time_s = here.rolled_um_s, here.time_s
+        own = np.zeros_like(v) if rolled is None else rolled
+        away = here.points - here.points.mean(axis=0)
+        turned = _turned(away)
+        stretch = v + own - np.einsum("an,anc->nc", away.T, gradient)
+        turn = _turned(v) - np.einsum("an,anc->nc", turned.T, gradient)
+        known, openings = here.predict(model.known), len(model.chip.openings)
+        found = [
+            _effect("boundary", BOUNDARY, known[:openings]),
+            _effect("fluid", FLUID, known[openings:]),
+            _effect("resistance", RESISTANCE, here.predict(model.resistance)),
+            _effect("section", SECTION, self.cells[:, :, None] * v),
+            _effect("offset", OFFSET_PX, gradient),
+            _effect("scale", SCALE, stretch[None]),
+            _effect("angle", ANGLE, turn[None]),
+            _effect("carry", CARRY, -(self.near[:, None] * v)[None]),
+        ]
+        if rolled is not None:
+            found += [
+                _effect("gain", GAIN, own[None]),
+                _effect("heading", HEADING, _turned(own)[None]),
+                _effect("hindrance", HINDRANCE, -((self.near - self.near.mean())[:, None] * own)[None]),
+            ]
+        if time_s is not None:
+            along = v.ravel()[:, None] * v.ravel()
+            apart = np.abs(np.repeat(time_s, 2)[:, None] - np.repeat(time_s, 2))
+            none = np.zeros((0, v.size))
+            found += [
+                Effect(f"wander {length:g} s", *WANDER, none, along * np.exp(-apart / length)) for length in WANDER_S
+            ]
+            if rolled is not None:
+                pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, _turned(own))]
+                found.append(Effect("rolling", *ROLLING, none, sum(pushed) * np.exp(-apart / ROLLING_S)))
+            if line_hz is not None:
+                found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
+        return found
+
+    def local_error(self) -> Floats:
+        """(2 n, 2 n) covariance of the model's own error: neighbours share it."""
+        here = self.operator
+        std = here.predict(np.repeat(self.model.error_std[:, None], 2, axis=1))[:, 0]
+        apart = np.linalg.norm(here.points[:, None] - here.points, axis=-1)
+        covariance = std[:, None] * std * np.exp(-apart / NEIGHBOURHOOD_PX)
+        return np.kron(covariance, np.eye(2))
+
+
+def waves(hz: float, time_s: Floats) -> Floats:
+    """(2, n) cosine and sine of a line."""
+    phase = 2.0 * np.pi * hz * time_s
+    return np.stack([np.cos(phase), np.sin(phase)])
+
+
+def lines_hz(time_s: Floats | None) -> Floats:
+    """(k,) frequencies that observations at times (n,) could show: enough periods, and two observations in each."""
+    if time_s is None or len(time_s) < FEWEST_FOR_LINE:
+        return np.zeros(0)
+    span = float(np.ptp(time_s))
+    slowest, fastest = max(SLOWEST_HZ, LEAST_PERIODS / max(span, 1e-9)), 0.5 * (len(time_s) - 1) / max(span, 1e-9)
+    if fastest <= slowest:
+        return np.zeros(0)
+    return np.arange(slowest, fastest, LINE_STEP / span)[:MOST_LINES]
+
+
+def _effect(name: str, size: tuple[float, float], columns: Floats) -> Effect:
+    return Effect(name, *size, np.ascontiguousarray(columns.reshape(len(columns), -1)))
+
+
+def _turned(vectors: Floats) -> Floats:
+    """(n, 2) vectors turned by 90 degrees from +x to +y."""
+    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

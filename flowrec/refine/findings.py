@@ -1,0 +1,144 @@
+"""What an assimilation found besides the boundary values: names, values, standard deviations, and plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowrec.refine.causes import LINE_NAME, WANDER_S
+from flowrec.refine.hypothesis import Fitted
+from flowrec.refine.observation_operator import Floats
+
+SURE = 2.5  # standard deviations from zero above which a cause is named
+PROBABLE = 0.9  # probability of a depth, or of none, above which it is said
+# Least value of a cause that is worth a word, and the words for a negative and a positive one.
+WORDS = {
+    "um_per_rev_share": (0.02, "the robot moves {:.0f} +- {:.0f} % less per revolution than stated", "more"),
+    "hindrance_share": (0.03, "near walls the robot rolls by {:.0f} +- {:.0f} % faster than elsewhere", "slower"),
+    "um_per_px_share": (0.005, "the image scale is {:.1f} +- {:.1f} % smaller than stated", "larger"),
+}
+UNSURE = 0.04  # of um per revolution: a larger standard deviation is worth a word
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """Named values with their standard deviations, means over the hypotheses; the rest is for the note."""
+
+    names: tuple[str, ...]
+    values: Floats
+    stds: Floats
+    words: tuple[str, ...]
+
+    def of(self, name: str) -> tuple[float, float]:
+        """Value and standard deviation of a name.
+
+        Raises
+        ------
+        ValueError
+            If there is no such name.
+        """
+        index = self.names.index(name)
+        return float(self.values[index]), float(self.stds[index])
+
+
+def findings(found: Sequence[Fitted], weights: Floats) -> Findings:
+    """What the hypotheses say together."""
+    parts = [_values(one) for one in found]
+    names = list(dict.fromkeys(name for part in parts for name in part))
+    values, stds = {}, {}
+    for name in names:
+        # A hypothesis that does not know an effect says that it is zero.
+        pairs = np.array([part.get(name, (0.0, 0.0)) for part in parts])
+        mean = float(weights @ pairs[:, 0])
+        values[name] = mean
+        stds[name] = float(np.sqrt(weights @ (pairs[:, 1] ** 2 + (pairs[:, 0] - mean) ** 2)))
+    depth_words = []
+    shallow = [index for index, one in enumerate(found) if one.observed.model.prior.depth_index is not None]
+    share = float(weights[shallow].sum()) if shallow else 0.0
+    if shallow:
+        depths = np.array([found[index].depth_um for index in shallow])
+        part = weights[shallow] / share
+        ln_mean = float(part @ np.log(depths[:, 0]))
+        ln_std = float(np.sqrt(part @ ((depths[:, 1] / depths[:, 0]) ** 2 + (np.log(depths[:, 0]) - ln_mean) ** 2)))
+        depth, std = float(np.exp(ln_mean)), float(np.exp(ln_mean) * ln_std)
+        if share > PROBABLE:
+            names.append("depth_um")
+            values["depth_um"], stds["depth_um"] = depth, std
+            depth_words.append(f"chip depth {depth:.0f} +- {std:.0f} um")
+        elif share > 1.0 - PROBABLE:
+            depth_words.append(
+                f"whether the chip is shallow they do not tell ({share:.0%}: {depth:.0f} +- {std:.0f} um)"
+            )
+    words = (*_words(values, stds, found[0].observed.um_per_px), *depth_words)
+    return Findings(tuple(names), np.array([values[n] for n in names]), np.array([stds[n] for n in names]), words)
+
+
+def _values(one: Fitted) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation by name, of one hypothesis."""
+    px = one.observed.um_per_px
+    singles = {
+        "um_per_rev_share": ("gain", 1.0),
+        "hindrance_share": ("hindrance", 1.0),
+        "heading_deg": ("heading", 180.0 / np.pi),
+        "um_per_px_share": ("scale", 1.0),
+        "angle_deg": ("angle", 180.0 / np.pi),
+        "carry_share": ("carry", 1.0),
+    }
+    result: dict[str, tuple[float, float]] = {}
+    for name, (effect, factor) in singles.items():
+        mean, covariance = one.unknowns(effect)
+        if len(mean):
+            result[name] = (factor * float(mean[0]), factor * float(np.sqrt(covariance[0, 0])))
+    mean, covariance = one.unknowns("offset")
+    for axis, index in (("x", 0), ("y", 1)):
+        result[f"offset_{axis}_um"] = (px * float(mean[index]), px * float(np.sqrt(covariance[index, index])))
+    mean, covariance = one.unknowns(LINE_NAME)
+    if len(mean) and one.line_hz is not None:
+        amplitude = float(np.hypot(*mean))
+        std = float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
+        result[f"pump_{one.line_hz:.2f}_hz_share"] = (amplitude, std)
+    names = [effect.name for effect in one.effects]
+    sizes = {"structural_share": ["section"], "resistance_share": ["resistance"]}
+    sizes["wander_share"] = [f"wander {length:g} s" for length in WANDER_S]
+    for name, effects in sizes.items():
+        chosen = [names.index(effect) for effect in effects if effect in names]
+        if chosen:
+            size = one.posterior.sizes[chosen]
+            total = float(np.sqrt((size**2).sum()))
+            std = float(np.sqrt(((size**2 * one.posterior.ln_size_std[chosen]) ** 2).sum())) / max(total, 1e-12)
+            result[name] = (total, std)
+    return result
+
+
+def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float) -> list[str]:
+    """Causes that are certain, and those that the observations could not tell apart."""
+    words = []
+    for name, (least, less, more) in WORDS.items():
+        value, std = values.get(name, 0.0), stds.get(name, 0.0)
+        if abs(value) > max(SURE * std, least):
+            opposite = {"more": "less", "slower": "faster", "larger": "smaller"}[more]
+            words.append(
+                (less if value < 0.0 else less.replace(opposite, more)).format(100.0 * abs(value), 100.0 * std)
+            )
+    if stds.get("um_per_rev_share", 0.0) > UNSURE:
+        words.append(
+            f"um per revolution they tell to {100.0 * stds['um_per_rev_share']:.0f} % only: a survey with other "
+            "headings tells more"
+        )
+    offset = np.array([values["offset_x_um"], values["offset_y_um"]])
+    spread = np.array([stds["offset_x_um"], stds["offset_y_um"]])
+    size = float(np.hypot(*offset))
+    along = float(np.hypot(*(offset * spread))) / max(size, 1e-12)
+    if size > max(SURE * along, 0.25 * um_per_px):
+        words.append(f"the chip lies {size:.0f} +- {along:.0f} um from where the registration puts it")
+    for name in values:
+        if name.startswith("pump_"):
+            hz = name.split("_")[1]
+            words.append(f"the pump pulsates by {100.0 * values[name]:.0f} +- {100.0 * stds[name]:.0f} % at {hz} Hz")
+    if values.get("wander_share", 0.0) > 0.06:
+        words.append(f"the flow wanders in time by {100.0 * values['wander_share']:.0f} %")
+    if values["structural_share"] > 0.04:
+        words.append(f"the map differs along the channels by {100.0 * values['structural_share']:.0f} % of the speed")
+    return words

@@ -1,0 +1,250 @@
+"""One hypothesis about a chip (its walls, its depth): the most probable flow, its uncertainty and its evidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowrec.flow.sensitivities import Remainder
+from flowrec.refine.causes import Observed, lines_hz
+from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes
+from flowrec.refine.mixture_regression import Model
+from flowrec.refine.observation_operator import Floats, ObservationOperator
+
+MOST_OBSERVATIONS = 120  # of which the evidence is computed: more are first averaged along the way
+LEAST_STD = 1e-3  # of the typical observed speed: no observation is more accurate
+LEAST_INLIER = 1e-6  # probability: the noise of an observation is divided by it
+OUTLIER_SCALE = 3.0  # size of an outlier's components over the typical component of the observations
+NOISE = ("noise", 0.7, 0.6)  # size of the stated noise: name, median, ln_std; a filter states what is safe
+WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
+LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
+FIELD_EFFECTS = (
+    "boundary",
+    "fluid",
+    "resistance",
+    "section",
+)  # the first ones, in the order of the columns of the flow
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Robust:
+    """Noise of the observations without their outliers."""
+
+    variance: Floats  # (n,) of each component, stated
+    inlier: Floats  # (n,) probability
+    factor: float  # actual over stated standard deviation
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """The flow of a hypothesis. Its unknowns are those of the effects, in order."""
+
+    observed: Observed
+    effects: list[Effect]
+    sizes: Sizes
+    posterior: Posterior
+    flow: Floats  # (n, 2) mean
+    in_use: Floats  # (n, 2) the flow around which the effects are linear
+    remainder: Remainder
+    line_hz: float | None
+
+    gain: float  # in ln evidence over the assumed flow
+
+    def unknowns(self, *names: str) -> tuple[Floats, Floats]:
+        """Mean (k,) and covariance (k, k) of the unknowns of effects; what there is not is left out."""
+        first, chosen = 0, []
+        for effect in self.effects:
+            if effect.name in names:
+                chosen.append(np.arange(first, first + len(effect.columns)))
+            first += len(effect.columns)
+        which = np.concatenate([np.zeros(0, np.intp), *chosen])
+        return self.posterior.mean[which], self.posterior.covariance[np.ix_(which, which)]
+
+    def size(self, name: str) -> float:
+        """Size of an effect."""
+        return float(self.posterior.sizes[[effect.name for effect in self.effects].index(name)])
+
+    @property
+    def depth_um(self) -> tuple[float, float]:
+        """Depth of the chip and its standard deviation; 0 where the depth is no unknown."""
+        prior, stated = self.observed.model.prior, self.observed.model.chip.depth_um
+        if prior.depth_index is None or stated is None:
+            return 0.0, 0.0
+        mean, covariance = self.unknowns("boundary", "fluid")
+        index = prior.depth_index
+        depth = stated * float(np.exp(prior.depth_std * mean[index]))
+        return depth, depth * prior.depth_std * float(np.sqrt(covariance[index, index]))
+
+
+def robust_noise(observed: Observed) -> Robust:
+    """Outliers and a common factor of the noise, by a mixture model in which every effect has its usual size."""
+    here = observed.operator
+    effects = observed.effects(observed.model.base, None)
+    design = np.concatenate([2.0 * effect.median * effect.columns for effect in effects if len(effect.columns)])
+    variance = noise_variance(here)
+    power = (here.flow_um_s**2).sum(axis=1)
+    wide = OUTLIER_SCALE**2 * 0.5 * float(np.median(power)) + float(here.std_um_s.max()) ** 2 + 1e-9
+    misfit = here.flow_um_s - here.predict(observed.model.base)
+    local = np.diag(observed.local_error())[::2]
+    # A change of the flow in time is no noise, but no column either.
+    local = local + sum(
+        (effect.median**2 * np.diag(effect.matrix)[::2] for effect in effects if effect.kernel is not None), 0.0
+    )
+    found = Model(design.reshape(len(design), -1, 2), misfit, variance + local, wide).fit()
+    return Robust(variance, np.maximum(found.inlier, LEAST_INLIER), found.noise_factor)
+
+
+def noise_variance(operator: ObservationOperator) -> Floats:
+    """(n,) variance of each component. An observation that was given several times counts once."""
+    identity = np.concatenate([operator.points, operator.flow_um_s], axis=1)
+    _, copy, copies = np.unique(identity, axis=0, return_inverse=True, return_counts=True)
+    # A std of 0 in solid would be a contradiction that no noise explains.
+    least = LEAST_STD**2 * float(np.median((operator.flow_um_s**2).sum(axis=1))) + 1e-12
+    return np.asarray(copies[copy.ravel()] * operator.std_um_s**2 + least)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps:
+    """How far the nonlinear remainder is followed: settings of the assimilation."""
+
+    most: int
+    tolerance: float  # last step over the fastest speed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """The most probable flow of a hypothesis so far, with the most probable sizes."""
+
+    sizes: Sizes
+    evidence: Evidence
+    line_hz: float | None
+    flow: Floats  # (n, 2)
+    in_use: Floats  # (n, 2) the flow around which the effects were linear
+    nonlinear: Floats  # (n, 2) what inertia, or a large change of the depth, add to the linear model
+    remainder: Remainder
+
+
+def begin(observed: Observed, robust: Robust, steps: Steps) -> State:
+    """The most probable flow, with the effects around the assumed flow; a spectral line where the evidence asks."""
+    model = observed.model
+    nothing = np.zeros_like(model.base)
+    evidence = _evidence(observed, robust, nothing, model.base, None)
+    sizes, line_hz = evidence.sizes(), None
+    hz = _line_hz(observed, robust, evidence, sizes)
+    if hz is not None:
+        pulsating = _evidence(observed, robust, nothing, model.base, hz)
+        found = pulsating.sizes()
+        if found.evidence > sizes.evidence + WORTH_A_LINE:
+            line_hz, evidence, sizes = hz, pulsating, found
+    return _followed(
+        observed,
+        robust,
+        State(sizes, evidence, line_hz, model.base, model.base, nothing, model.expansion.start()),
+        steps,
+    )
+
+
+def complete(observed: Observed, robust: Robust, state: State, steps: Steps) -> Fitted:
+    """The same with the effects around the flow that was found, and averaged over the sizes."""
+    evidence = _evidence(observed, robust, state.nonlinear, state.flow, state.line_hz)
+    sizes = evidence.sizes(state.sizes.mode)
+    state = replace(state, evidence=evidence, sizes=sizes, in_use=state.flow)
+    state = _followed(observed, robust, state, steps)
+    posterior = state.evidence.posterior(sizes)
+    flow = _flow(observed, posterior.mean, state.in_use, state.nonlinear)
+    effects = list(state.evidence.effects)
+    gain = sizes.evidence - _assumed(observed, robust, state.line_hz)
+    return Fitted(observed, effects, sizes, posterior, flow, state.in_use, state.remainder, state.line_hz, gain)
+
+
+def _assumed(observed: Observed, robust: Robust, line_hz: float | None) -> float:
+    """Ln evidence of the assumed flow: robot, registration and pump may explain the observations, the field may not."""
+    base = observed.model.base
+    full = _evidence(observed, robust, np.zeros_like(base), base, line_hz)
+    return (
+        replace(full, effects=[effect for effect in full.effects if effect.name not in FIELD_EFFECTS]).sizes().evidence
+    )
+
+
+def _followed(observed: Observed, robust: Robust, state: State, steps: Steps) -> State:
+    """The state with the nonlinear remainder of its most probable unknowns."""
+    model = observed.model
+    for _ in range(steps.most):
+        z = state.evidence.most_probable(state.sizes)
+        remainder = model.expansion.approach(model.prior.offset(z[: len(model.known)]), state.remainder)
+        nonlinear = model.expansion.pixels(remainder.flux)
+        shift = _averages(robust, observed.operator) @ observed.operator.predict(nonlinear - state.nonlinear).ravel()
+        evidence = replace(state.evidence, y=state.evidence.y - shift)
+        state = replace(state, evidence=evidence, remainder=remainder, nonlinear=nonlinear)
+        if remainder.step <= steps.tolerance:
+            break
+    z = state.evidence.most_probable(state.sizes)
+    return replace(state, flow=_flow(observed, z, state.in_use, state.nonlinear))
+
+
+def _flow(observed: Observed, z: Floats, in_use: Floats, nonlinear: Floats) -> Floats:
+    """(n, 2) flow of unknowns z, those of the field first."""
+    model = observed.model
+    known, cells = len(model.known), len(model.resistance)
+    flow = model.base + nonlinear + np.tensordot(z[:known], model.known, axes=1)
+    flow = flow + np.tensordot(z[known : known + cells], model.resistance, axes=1)
+    return np.asarray(flow + (z[known + cells : known + 2 * cells] @ model.cells)[:, None] * in_use)
+
+
+def _evidence(observed: Observed, robust: Robust, nonlinear: Floats, in_use: Floats, line_hz: float | None) -> Evidence:
+    """The observations, averaged, and the effects on them."""
+    here = observed.operator
+    average = _averages(robust, here)
+    misfit = here.flow_um_s - here.predict(observed.model.base + nonlinear)
+    noise = np.repeat(robust.factor**2 * robust.variance / robust.inlier, 2)
+    effects = [
+        replace(
+            effect,
+            columns=effect.columns @ average.T,
+            kernel=None if effect.kernel is None else average @ effect.kernel @ average.T,
+        )
+        for effect in observed.effects(in_use, line_hz)
+    ]
+    stated = (average * noise) @ average.T
+    effects.append(Effect(*NOISE, np.zeros((0, len(average))), stated))
+    local = average @ observed.local_error() @ average.T
+    return Evidence(
+        average @ misfit.ravel(), local + 1e-9 * float(np.trace(stated)) / len(stated) * np.eye(len(stated)), effects
+    )
+
+
+def _averages(robust: Robust, operator: ObservationOperator) -> Floats:
+    """(m, 2 n) weighted means of neighbours along the way, x and y of each in turn; the identity for few."""
+    count = operator.count
+    group = np.arange(count) * min(MOST_OBSERVATIONS, count) // count
+    weight = robust.inlier / robust.variance
+    matrix = np.zeros((group[-1] + 1, count))
+    matrix[group, np.arange(count)] = weight
+    return np.kron(matrix / matrix.sum(axis=1, keepdims=True), np.eye(2))
+
+
+def _line_hz(observed: Observed, robust: Robust, evidence: Evidence, sizes: Sizes) -> float | None:
+    """The frequency at which a spectral line of the assumed flow explains most; None where none could be seen."""
+    time_s = observed.operator.time_s
+    frequencies = lines_hz(time_s)
+    if time_s is None or not len(frequencies):
+        return None
+    base = np.array(evidence.noise)
+    for effect, ln_size in zip(evidence.effects, sizes.mode, strict=True):
+        # A line must not be taken for a wander.
+        wander = effect.name.startswith("wander")
+        base += (effect.median**2 if wander else np.exp(2.0 * ln_size)) * effect.matrix
+    average = _averages(robust, observed.operator)
+    weighted = average * observed.operator.predict(observed.model.base).ravel()  # (m, 2 n): times a wave, its column
+    phase = np.repeat(2.0 * np.pi * frequencies[:, None] * time_s, 2, axis=1)
+    columns = np.stack([np.cos(phase), np.sin(phase)], axis=1) @ weighted.T  # (k, 2, m)
+    inverse = np.linalg.inv(base)
+    precision = columns @ inverse @ columns.transpose(0, 2, 1)
+    score = columns @ (inverse @ evidence.y)
+    gains = []
+    for amplitude in LINE_TRIALS:
+        inner = np.eye(2) + amplitude**2 * precision
+        explained = (score * np.linalg.solve(inner, score[..., None])[..., 0]).sum(axis=1)
+        gains.append(0.5 * amplitude**2 * explained - 0.5 * np.linalg.slogdet(inner)[1])
+    return float(frequencies[int(np.argmax(np.logaddexp.reduce(gains, axis=0)))])

@@ -1,0 +1,108 @@
+"""What robot, pump, depth and registration add to observations is found, or said to be unknown, with its sign."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from flowrec.flow import sample
+from flowrec.messages import Observations
+from flowrec.refine import Assimilate, Refiner
+
+SETTINGS = Refiner(assimilate=Assimilate(doubt_walls=False, doubt_depth=False))
+
+
+def flown(case, headings="varied", seed=0, gain=0.0, pump=0.0, hz=0.5, noise=3.0, offset=(0.0, 0.0), count=80):
+    """A survey in a true flow, by a robot that rolls along headings that vary, or always in proportion to the flow."""
+    rng = np.random.default_rng(seed)
+    corners = np.array([[20, 240], [240, 240], [240, 120], [555, 120], [555, 240], [760, 240]], float)
+    pieces = [np.linspace(a, b, int(np.abs(b - a).max() / 5), endpoint=False) for a, b in pairwise(corners)]
+    way = np.concatenate(pieces)
+    points = way[np.linspace(0, len(way) - 1, count).astype(int)]
+    if headings == "varied":
+        angle = rng.uniform(0.0, 2.0 * np.pi, count)
+        rolled = 150.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    else:
+        rolled = 0.8 * sample(case.assumed, points)
+    time_s = 0.25 * np.arange(count)
+    truth = sample(case.true, points + np.array(offset))
+    flow = truth * (1.0 + pump * np.sin(2.0 * np.pi * hz * time_s + 1.0))[:, None]
+    flow = flow + gain * rolled + noise * rng.standard_normal(flow.shape)
+    return Observations(0, points, flow, np.full(count, noise), rolled, time_s)
+
+
+def found(refined, name):
+    """Value and standard deviation."""
+    index = refined.parameter_names.split("; ").index(name)
+    return float(refined.parameters[index]), float(refined.parameter_std[index])
+
+
+@pytest.mark.parametrize("gain", [-0.14, 0.12])
+def test_um_per_revolution_is_found_where_the_headings_vary_and_the_note_says_so(twin, gain):
+    case = twin()
+    refined = SETTINGS.refine(case.assumed, flown(case, gain=gain), case.chip, case.solver)
+    value, std = found(refined, "um_per_rev_share")
+    assert value == pytest.approx(gain, abs=0.04) and std < 0.04
+    assert f"% {'less' if gain < 0 else 'more'} per revolution than stated" in refined.note
+    assert case.error(refined) < 0.04
+
+
+def test_where_the_headings_never_vary_the_note_says_that_it_is_unknown_and_the_error_bars_contain_it(twin):
+    case = twin(truth=(120.0, 0.0, 0.0))
+    scores = []
+    for gain in (-0.14, 0.0, 0.14):
+        observed = flown(case, headings="along", gain=gain)
+        refined = SETTINGS.refine(case.assumed, observed, case.chip, case.solver)
+        value, std = found(refined, "um_per_rev_share")
+        assert abs(value - gain) < 3.0 * std and std > 0.04
+        assert "um per revolution they tell to" in refined.note
+        fast = np.linalg.norm(case.true.velocity_um_s, axis=-1) > 20.0
+        scores.append((refined.velocity_um_s - case.true.velocity_um_s)[fast] / refined.std_um_s[fast])
+    assert np.mean(np.abs(np.concatenate(scores)) < 2.0) > 0.9
+
+
+@pytest.mark.parametrize("hz", [0.1, 0.7])
+def test_a_planted_line_of_the_pump_is_found_at_its_frequency_and_the_flow_is_that_without_it(twin, hz):
+    case = twin()
+    refined = SETTINGS.refine(case.assumed, flown(case, pump=0.25, hz=hz), case.chip, case.solver)
+    line = next(name for name in refined.parameter_names.split("; ") if name.startswith("pump_"))
+    assert float(line.split("_")[1]) == pytest.approx(hz, abs=0.02)
+    assert found(refined, line)[0] == pytest.approx(0.25, abs=0.05)
+    assert case.error(refined) < 0.06
+    assert "the pump pulsates by" in refined.note
+
+
+def test_a_steady_flow_has_no_line_and_no_cause_beyond_doubt(twin):
+    case = twin()
+    refined = SETTINGS.refine(case.assumed, flown(case), case.chip, case.solver)
+    assert "pump_" not in refined.parameter_names
+    assert not any(word in refined.note for word in ("pulsates", "per revolution than", "registration", "wanders"))
+
+
+def test_an_offset_of_the_registration_is_found_in_its_direction(twin):
+    case = twin()
+    observed = flown(case, offset=(4.0, -8.0), noise=1.0)
+    refined = SETTINGS.refine(case.assumed, observed, case.chip, case.solver)
+    for name, true in (("offset_x_um", 4.0), ("offset_y_um", -8.0)):
+        value, std = found(refined, name)
+        assert abs(value - true) < 3.0 * std and std < 4.0
+    assert "from where the registration puts it" in refined.note
+
+
+def test_observations_without_motion_and_time_are_assimilated_as_those_of_older_sessions(twin):
+    case = twin()
+    observed = replace(flown(case), rolled_um_s=None, time_s=None)
+    refined = SETTINGS.refine(case.assumed, observed, case.chip, case.solver)
+    assert "um_per_rev_share" not in refined.parameter_names and "wander" not in refined.parameter_names
+    assert case.error(refined) < 0.04
+
+
+def test_the_expected_error_is_as_large_as_the_error_over_several_surveys(twin):
+    case = twin()
+    errors, expected = [], []
+    for seed in range(4):
+        refined = SETTINGS.refine(case.assumed, flown(case, seed=seed, noise=8.0), case.chip, case.solver)
+        errors.append(case.error(refined))
+        expected.append(refined.error_share)
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) / np.mean(expected) < 1.5
