@@ -147,9 +147,13 @@ def begin(observed: Observed, robust: Robust, steps: Steps) -> State:
 
 def complete(observed: Observed, robust: Robust, state: State, steps: Steps) -> Fitted:
     """The same with the effects around the flow that was found, and averaged over the sizes."""
-    evidence = _evidence(observed, robust, state.nonlinear, state.flow, state.line_hz)
+    # That of the boundary values alone: a flow that follows the observations everywhere would explain them by itself.
+    known = observed.model.known
+    z = state.evidence.most_probable(state.sizes)[: len(known)]
+    in_use = observed.model.base + state.nonlinear + np.tensordot(z, known, axes=1)
+    evidence = _evidence(observed, robust, state.nonlinear, in_use, state.line_hz)
     sizes = evidence.sizes(state.sizes.mode)
-    state = replace(state, evidence=evidence, sizes=sizes, in_use=state.flow)
+    state = replace(state, evidence=evidence, sizes=sizes, in_use=in_use)
     state = _followed(observed, robust, state, steps)
     posterior = state.evidence.posterior(sizes)
     flow = _flow(observed, posterior.mean, state.in_use, state.nonlinear)
