@@ -88,6 +88,7 @@ class Assimilate(PriorSettings):
         FlowError
             If the flow of the fitted parameters can not be computed.
         """
+        problem = replace(problem, operator=problem.operator.distinct())
         return self._field(self.hypotheses(problem.operator, problem.chip, problem.solver), problem)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:

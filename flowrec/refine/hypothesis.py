@@ -96,12 +96,10 @@ def robust_noise(observed: Observed) -> Robust:
 
 
 def noise_variance(operator: ObservationOperator) -> Floats:
-    """(n,) variance of each component. An observation that was given several times counts once."""
-    identity = np.concatenate([operator.points, operator.flow_um_s], axis=1)
-    _, copy, copies = np.unique(identity, axis=0, return_inverse=True, return_counts=True)
+    """(n,) stated variance of each component."""
     # A std of 0 in solid would be a contradiction that no noise explains.
     least = LEAST_STD**2 * float(np.median((operator.flow_um_s**2).sum(axis=1))) + 1e-12
-    return np.asarray(copies[copy.ravel()] * operator.std_um_s**2 + least)
+    return np.asarray(operator.std_um_s**2 + least)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

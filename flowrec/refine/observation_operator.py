@@ -56,6 +56,21 @@ class ObservationOperator:
         number[mask] = np.arange(np.count_nonzero(mask))
         return self.renumbered(number)
 
+    def distinct(self) -> ObservationOperator:
+        """The operator without copies: an observation that was given several times counts once."""
+        identity = np.concatenate([self.points, self.flow_um_s], axis=1)
+        first = np.sort(np.unique(identity, axis=0, return_index=True)[1])
+        return replace(
+            self,
+            points=self.points[first],
+            pixels=self.pixels[first],
+            weights=self.weights[first],
+            flow_um_s=self.flow_um_s[first],
+            std_um_s=self.std_um_s[first],
+            rolled_um_s=None if self.rolled_um_s is None else self.rolled_um_s[first],
+            time_s=None if self.time_s is None else self.time_s[first],
+        )
+
     def with_walls(self, wall_px: NDArray[np.float32]) -> ObservationOperator:
         """The operator in a field with the walls of a raster (h, w), see FlowField."""
         pixels, weights = _stencils(self.points, wall_px.shape, wall_px)

@@ -69,9 +69,6 @@ def test_a_closed_branch_is_found_by_the_assimilation_and_pi_unet_does_not_make_
     assert assimilated.error_share == pytest.approx(case.error(assimilated), rel=0.6)
     assert case.error(refined) <= 1.02 * case.error(assimilated)
     assert (refined.std_um_s >= assimilated.std_um_s).all()
-    unet = Refiner("pi_unet", pi_unet=PiUnet(start="fvm"))
-    alone = unet.refine(case.assumed, case.observations, case.chip, case.solver)
-    assert case.error(alone) < 0.9 * case.error(case.assumed)
 
 
 @pytest.mark.parametrize("settings", [{"observations": "hard"}, {"near_wall": "hard"}, {"near_wall": "free"}])
