@@ -120,6 +120,7 @@ class Flight:
     drift : the flow during the survey over the steady one, by the drift of the pump.
     order : messages of the last work order before the navigation that asked for a refinement; {} if there was none.
     refined : scores by method.
+    code : version and commit that flew it.
     """
 
     world: str
@@ -134,6 +135,7 @@ class Flight:
     drift: float = 1.0
     order: dict[str, Any] = field(default_factory=dict)
     refined: dict[str, dict[str, Any]] = field(default_factory=dict)
+    code: str = ""
 
     @classmethod
     def of(cls, line: Mapping[str, Any]) -> Flight:

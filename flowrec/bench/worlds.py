@@ -24,6 +24,7 @@ import typer
 from flowrec.bench.harness import Results, Sets, chosen, mean_with_interval, paired, print_rows
 from flowrec.bench.world_flights import WORLDS, Case, Flight, as_line, fly, refine
 from flowrec.errors import UsageError
+from flowrec.provenance import provenance
 from flowrec.refine.refiner import REFINERS
 from flowrec.terminal import progress, say
 
@@ -62,6 +63,9 @@ def measure(
         for chip in chips.split(",")
     ]
     flights = {} if rows is None else {flight.key(): flight for flight in kept(rows)}
+    code = _code()
+    if others := {flight.code for flight in flights.values()} - {code}:
+        say(f"{rows}: flown by {', '.join(sorted(others))}, this is {code}; another file has only flights of one")
     left = [case for case in cases if _is_left(flights.get(case.key()), wanted, again=again)]
     if rows is not None and len(left) < len(cases):
         say(f"{rows}: {len(cases) - len(left)} of {len(cases)} flights are there")
@@ -70,12 +74,20 @@ def measure(
         done = stack.enter_context(progress("flying", len(left)))
         file = stack.enter_context(_appended(rows)) if rows is not None else None
         for count, flight in enumerate(_each(work, [(case, flights.get(case.key())) for case in left], jobs), 1):
+            flight.code = flight.code or code
             flights[flight.key()] = flight
             if file is not None:
                 file.write(json.dumps(as_line(flight)) + "\n")
                 file.flush()
             done(count)
     return results_of([flights[case.key()] for case in cases], names, wanted)
+
+
+def _code() -> str:
+    """The version and the commit of this flowrec."""
+    facts = provenance(anonymous=True)
+    changed = " with local changes" if facts.get("git_changed") == "True" else ""
+    return f"flowrec {facts['flowrec']} {facts.get('git_commit', '')[:10]}{changed}"
 
 
 def kept(path: Path) -> Iterator[Flight]:

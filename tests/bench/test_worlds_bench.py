@@ -47,6 +47,8 @@ def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(f
     assert found["flights"][0]["refined"] == flown.refined
     worlds.measure(methods="assimilate", again=True, **options)
     assert len(list(worlds.kept(file))) == 2
+    assert {"slip"} == {one.world for one in worlds.kept(file)} and list(worlds.kept(file))[-1].code
+    assert "flown by" in capsys.readouterr().err  # the fixture's flight states no code
     json.dumps(found)
     worlds.show(found)
     assert "slip" in capsys.readouterr().out
