@@ -64,7 +64,7 @@ def measure(
     ]
     flights = {} if rows is None else {flight.key(): flight for flight in kept(rows)}
     code = _code()
-    if others := {flight.code for flight in flights.values()} - {code}:
+    if others := {flight.code or "another one" for flight in flights.values()} - {code}:
         say(f"{rows}: flown by {', '.join(sorted(others))}, this is {code}; another file has only flights of one")
     left = [case for case in cases if _is_left(flights.get(case.key()), wanted, again=again)]
     if rows is not None and len(left) < len(cases):
