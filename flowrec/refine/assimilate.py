@@ -97,10 +97,17 @@ class Assimilate(PriorSettings):
             model = flow_model(self, self.model, chip, solver)
         except FlowError:
             return assumed
-        columns, covariance = prior_of(model)
-        variance = (np.diag(covariance)[:, None, None] * columns**2).sum(axis=0) + model.error_std[:, None] ** 2
+        variance = _prior_variance(model)
         std = fluid_image(chip.mask, np.sqrt(variance).astype(np.float32))
         return replace(assumed, std_um_s=std, error_share=_error_share(model.base, variance))
+
+    def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:
+        """Expected relative RMSE of the assumed flow; None where there is no prior."""
+        try:
+            model = flow_model(self, self.model, chip, solver)
+        except FlowError:
+            return None
+        return _error_share(model.base, _prior_variance(model))
 
     def hypotheses(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> Hypotheses:
         """The flows of the plausible hypotheses.
@@ -254,6 +261,13 @@ def prior_of(model: FlowModel) -> tuple[Floats, Floats]:
     sections = model.cells.toarray()[:, :, None] * model.base
     sizes = np.repeat([1.0, RESISTANCE[0], SECTION[0]], [len(model.known), len(model.resistance), len(sections)])
     return np.concatenate([model.known, model.resistance, sections]), np.diag(sizes**2)
+
+
+def _prior_variance(model: FlowModel) -> Floats:
+    """(n, 2) variance of each component of the flow before any observation."""
+    columns, covariance = prior_of(model)
+    variance = (np.diag(covariance)[:, None, None] * columns**2).sum(axis=0)
+    return np.asarray(variance + model.error_std[:, None] ** 2)
 
 
 def _doubtful(state: State) -> bool:

@@ -114,6 +114,10 @@ class Refiner:
             return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
         return method.fit(problem)
 
+    def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:
+        """Expected relative RMSE of the chip's assumed flow; None where nothing says how wrong it may be."""
+        return self.assimilate.prior_error_share(chip, solver)
+
     def uncertainty(
         self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver
     ) -> FlowUncertainty | None:

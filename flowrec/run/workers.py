@@ -33,7 +33,9 @@ def work(pipeline: Pipeline, order: Tick) -> Result:
     mission, _ = ordered(order)
     result: Result
     if mission.wanted == WorkOrder.SOLVE:
-        result = pipeline.solver.solve(pipeline.chip)
+        solved = pipeline.solver.solve(pipeline.chip)
+        share = pipeline.refiner.prior_error_share(pipeline.chip, pipeline.solver)
+        result = replace(solved, error_share=share)
     elif mission.wanted == WorkOrder.REFINE:
         result = _refined(pipeline, order, mission)
     elif mission.wanted == WorkOrder.SURVEY_ROUTE:
