@@ -290,7 +290,7 @@ class MissionStateMachine:
             return self._next_phase(Phase.SURVEY, previous, now, "survey cut short by its time limit")
         near_end = left_s(now, route) <= self.lead_s
         if route.more:
-            if not (near_end or at_end(now, route)):
+            if not near_end:
                 return previous
             return order(
                 *(previous, now, Phase.SURVEY, WorkOrder.SURVEY_ROUTE),

@@ -337,6 +337,11 @@ def test_a_survey_that_has_enough_ends_at_its_end_and_not_where_its_way_passes_t
     assert world.tick(at=(500.0, 500.0), progress=17.6, route=enough).phase == "survey"
     assert world.tick(at=(600.0, 500.0), progress=18.0).wanted == "", "nothing more is ordered"
     assert world.tick(at=(690.0, 500.0), progress=19.0).wanted == "refine"
+    world = surveying(lead_s=2.0)
+    world.tick(at=(900.0, 500.0), progress=9.0)
+    world.tick(at=(950.0, 500.0), progress=9.5, route=stretch(3, 1000.0, 400.0, 700.0, more=False))
+    assert world.tick(at=(700.0, 500.0), progress=13.0).phase == "survey", "its end, passed on the way"
+    assert world.tick(at=(690.0, 500.0), progress=19.0).wanted == "refine"
 
 
 def test_an_older_survey_of_one_stretch_orders_nothing_more() -> None:
