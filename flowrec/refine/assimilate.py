@@ -18,6 +18,7 @@ import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import median_width_um
+from flowrec.chip.fluid import law_text
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.sampling import fluid_image
@@ -237,6 +238,7 @@ class Assimilate(PriorSettings):
             parameter_names="; ".join(also.names),
             parameters=also.values,
             parameter_std=also.stds,
+            viscosity_law=law_text(fitted.law),
         )
 
 

@@ -86,7 +86,7 @@ def _values(one: Fitted) -> dict[str, tuple[float, float]]:
         "angle_deg": ("angle", 180.0 / np.pi),
         "carry_share": ("carry", 1.0),
     }
-    result: dict[str, tuple[float, float]] = {}
+    result: dict[str, tuple[float, float]] = dict(one.law)
     for name, (effect, factor) in singles.items():
         mean, covariance = one.unknowns(effect)
         if len(mean):
@@ -134,6 +134,8 @@ def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: fl
     if size > max(SURE * along, 0.25 * um_per_px):
         words.append(f"the chip lies {size:.0f} +- {along:.0f} um from where the registration puts it")
     for name in values:
+        if name.startswith("viscosity_"):
+            words.append(f"{name.replace('_', ' ')} {values[name]:.3g} +- {stds[name]:.2g}")
         if name.startswith("pump_"):
             hz = name.split("_")[1]
             words.append(f"the pump pulsates by {100.0 * values[name]:.0f} +- {100.0 * stds[name]:.0f} % at {hz} Hz")

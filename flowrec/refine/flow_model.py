@@ -18,7 +18,7 @@ from flowrec.flow.sensitivities import Sensitivities
 from flowrec.refine.channel_cells import channel_cells, resistance_modes
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.observation_operator import Floats
-from flowrec.refine.prior import Prior, PriorSettings
+from flowrec.refine.prior import Prior, PriorSettings, law_widths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,8 @@ def flow_model(settings: PriorSettings, error: ModelError, chip: Chip, solver: F
     """
 
     def compute() -> FlowModel:
-        expansion = solver.sensitivities(chip, settings.depth_std_share > 0.0, settings.inlet_shape_std > 0.0)
+        law = bool(law_widths(settings, chip))
+        expansion = solver.sensitivities(chip, settings.depth_std_share > 0.0, settings.inlet_shape_std > 0.0, law)
         pressure = expansion.pressure(np.zeros(len(expansion.modes)), expansion.start())
         prior = Prior.of(settings, chip, float(np.ptp(pressure)))
         grid = error.of(chip, solver, expansion)

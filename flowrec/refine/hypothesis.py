@@ -76,6 +76,23 @@ class Fitted:
         depth = stated * float(np.exp(prior.depth_std * mean[index]))
         return depth, depth * prior.depth_std * float(np.sqrt(covariance[index, index]))
 
+    @property
+    def law(self) -> dict[str, tuple[float, float]]:
+        """Unknowns of the chip's law of viscosity by name, each with its standard deviation."""
+        prior, law = self.observed.model.prior, self.observed.model.chip.law
+        mean, covariance = self.unknowns("boundary", "fluid")
+        result = {}
+        for number, std in enumerate(prior.law_stds):
+            assert law is not None
+            index = prior.law_index + number
+            name = law.unknowns[number].removeprefix("ln ")
+            change, error = std * float(mean[index]), std * float(np.sqrt(covariance[index, index]))
+            value = float(getattr(law, name))
+            if name != law.unknowns[number]:
+                change, error = value * float(np.expm1(change)), value * float(np.exp(change)) * error
+            result[f"viscosity_{name}"] = value + change, error
+        return result
+
 
 def robust_noise(observed: Observed) -> Robust:
     """Outliers and a common factor of the noise, by a mixture model in which every effect has its usual size."""

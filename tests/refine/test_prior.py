@@ -1,9 +1,15 @@
 """The prior against the solver: the flow of a chip whose fluid and boundary values are those of a draw."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from flowrec.chip.chip import Chip, Opening
+from flowrec.chip.fluid import PowerLaw
 from flowrec.flow import FlowSolver
+from flowrec.messages import Observations
+from flowrec.refine import Refiner
 from flowrec.refine.prior import Prior, PriorSettings
 
 SETTINGS = PriorSettings()
@@ -58,3 +64,27 @@ def test_a_change_of_the_viscosity_alone_leaves_the_pressures_as_they_are(driven
     drawn = prior.chip(driven, z)
     # The product of two changes is left, of second order.
     np.testing.assert_allclose(drawn.boundary_values, driven.boundary_values, rtol=2.0 * (0.30 * 0.01) ** 2)
+
+
+def test_the_law_of_viscosity_is_found_where_the_flow_tells_it_and_left_open_where_not():
+    def exponent(depth_um, length=64):
+        mask = np.zeros((28, length), bool)
+        mask[2:-2] = True
+        openings = (Opening("left", 2, 25, "inlet", 120.0), Opening("right", 2, 25, "outlet", 0.0))
+        chip = Chip("wide", mask, 20.0, openings, 1.0, 1000.0, depth_um, "pixel", law=PowerLaw(0.8))
+        truth = FlowSolver().solve(replace(chip, law=PowerLaw(0.5)))
+        rows, columns = np.arange(6, 22), np.arange(length)  # not beside the walls
+        row, column = np.nonzero(np.add.outer(3 * rows, columns) % 11 == 0) + np.array([[6], [0]])
+        flow = truth.velocity_um_s[row, column] + np.random.default_rng(3).normal(0.0, 4.0, (len(row), 2))
+        places = np.stack([column, row], axis=1) * 20.0
+        seen = Observations(0, places, flow, np.full(len(row), 4.0))
+        found = Refiner("assimilate").refine(FlowSolver().solve(chip), seen, chip, FlowSolver())
+        index = found.parameter_names.split("; ").index("viscosity_exponent")
+        assert "viscosity exponent" in found.note
+        return found.parameters[index], found.parameter_std[index]
+
+    value, std = exponent(None)
+    assert abs(value - 0.5) < 3.0 * std < 0.2
+    # In a shallow channel every fluid has the same plug.
+    value, std = exponent(20.0)
+    assert std > 0.1
