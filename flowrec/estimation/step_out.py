@@ -33,6 +33,8 @@ _SETTLED = 0.6  # fraction of the window's weight that must be present
 _IMPROVEMENT = -0.5
 _FREE_RADII = 1.3  # from a wall: nearer to it the robot may touch it or be slowed by it
 _HIGH = 0.5  # fraction of the frequency limit below which step-out is not looked for
+_NOMINAL_RADII_PER_S = 12.0  # top speed of the robot that `window_s` is meant for, as in control/tracking_laws.py
+_FEWEST_FRAMES = 8  # in a window
 _FULL = 0.8  # the same for a single frame whose motion enters the mean that the step-out frequency is found from
 _LEAST_STEP = 0.95  # a learned limit falls at least to this fraction of the one before
 
@@ -41,13 +43,20 @@ _LEAST_STEP = 0.95  # a learned limit falls at least to this fraction of the one
 class StepOut:
     """Settings of the detection."""
 
-    window_s: Annotated[float, Range(0.05, 60.0)] = 0.5  # of the means
+    window_s: Annotated[float, Range(0.05, 60.0)] = 0.5  # of the means, for a robot of up to 12 radii per second
     map_error: Share | None = None  # relative error of the map's flow; None: from the map
     missing_share: Share = 0.3  # fraction of the commanded motion that must be missing besides; 1: never limit
     learned: bool = True  # the limit is step_out_margin times what Adler's equation gives; False: lowered in steps
     lower_to: PositiveShare = 0.8  # factor on the frequency in one such step
     floor_share: PositiveShare = 0.3  # lowest limit, as a fraction of the robot's own
     wait_s: Annotated[float, Range(0.0, 1e6)] = 10.0  # before another step after one that did not help
+
+    def _window_s(self, robot: Robot, dt: float) -> float:
+        """`window_s`, shorter for a robot that is faster than it is meant for: it is carried away sooner."""
+        if not self.learned:
+            return self.window_s
+        ratio = max(robot.max_speed_um_s / robot.radius_um / _NOMINAL_RADII_PER_S, 1.0)
+        return min(max(self.window_s / ratio, _FEWEST_FRAMES * dt), self.window_s)
 
     def watch(
         self,
@@ -89,11 +98,12 @@ class StepOut:
         carried = dt * sample(field, 0.5 * (before.measured_um + estimate.measured_um))
         rolled_um = float((estimate.measured_um - before.measured_um - carried) @ heading)
         newest = np.array([rolled_um, robot.um_per_rev * turns, math.hypot(carried[0], carried[1]), dt])
-        sums = newest + math.exp(-dt / self.window_s) * (previous.rolled_sums if previous.rolled_sums.size else 0.0)
+        window_s = self._window_s(robot, dt)
+        sums = newest + math.exp(-dt / window_s) * (previous.rolled_sums if previous.rolled_sums.size else 0.0)
         now = replace(now, rolled_sums=sums)
         time_s = float(sums[3])
         rolled, expected, carried_um_s = (sums[:3] / time_s).tolist()
-        if time_s < _SETTLED * self.window_s or expected < _HIGH * limit_hz * robot.um_per_rev:
+        if time_s < _SETTLED * window_s or expected < _HIGH * limit_hz * robot.um_per_rev:
             return now
         if rolled_before.size:
             if rolled - rolled_before[0] < _IMPROVEMENT * (rolled_before[1] - expected):

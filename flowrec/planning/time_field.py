@@ -107,7 +107,9 @@ class TimeField:
         speed = planning_speed_um_s(self.policy_share, problem.robot) / px
         fine = space.cost_rasters(speed, deviations * self._deviation(problem)).finer(finer)
         clearance = finer * interpolated(space.clearance, finer)
+        h, w = clearance.shape
         column, row = np.rint(finer * route.waypoints_um[0] / px).astype(int)
+        column, row = min(max(column, 0), w - 1), min(max(row, 0), h - 1)  # half a pixel lies outside of the points
         # Two free pixels that touch at their corners are joined, but between them the robot may not fit: the wall
         # barrier would stop it there. Such a way is used only if there is no other.
         fits = fine.free & (clearance >= finer * space.radius)

@@ -148,6 +148,13 @@ def test_the_time_to_go_leads_around_pixels_that_touch_at_their_corners_where_th
     assert seconds_to_go(9.0) == pytest.approx(seconds_to_go(10.0), rel=0.01)
 
 
+def test_a_start_on_the_outer_half_of_the_last_pixel_has_a_time_to_go():
+    mask = open_water()
+    edge_um = (mask.shape[1] - 0.6) * 10.0
+    route = FULL.plan(field_of(mask, 0.0), (edge_um, 300.0), (400.0, 300.0), chip_of(mask), robot())
+    assert route.reachable and route.time_to_go_s is not None
+
+
 def test_robust_deviations_lead_around_a_flow_at_the_edge_and_are_given_up_with_a_remark():
     chip, field = loop(fast=80.0, slow=20.0)
     std = np.zeros_like(field.velocity_um_s)
