@@ -36,8 +36,11 @@ from flowrec.units import seconds
 _KEPT = ("mission", "estimate", "health", "observations")
 _IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compared
 
-# Clauses of a note that are no warning: what was used, and what was not seen.
-_NO_WARNING = re.compile(r"assimilated|\d+ more distrusted|ignored|they say nothing|of (in|out)let|not refined|$")
+# Clauses of a note that are no warning: what was used, what was not seen, what could not be told, the null model.
+_NO_WARNING = re.compile(
+    r"assimilated|\d+ more distrusted|ignored|they say nothing|of (in|out)let|whether|they do not ask|not refined"
+    r"|the assumed flow times|the observations scatter around it|residual|$"
+)
 
 
 @dataclass(frozen=True, slots=True)

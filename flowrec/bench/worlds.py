@@ -180,12 +180,13 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
     """Means over flights with bootstrap 95 % intervals; errors and CRPS relative to the rms speed.
 
     worse : flights in which the refined error is larger than the assumed one; unsaid : those of them whose note does
-    not warn. over_null : error over that of `gain`, paired. within_2_sigma is pooled: every flight has the weight of
-    its pixels.
+    not warn. expected : the error that the fields state (error_share). over_null : error over that of `gain`, paired.
+    within_2_sigma : share of the components, all flights pooled with the same weight.
     """
     rows = [one.refined for one in flights if method in one.refined and "failed" not in one.refined[method]]
     mine = [row[method] for row in rows]
     worse = [row[method] for row in rows if row[method]["error"] > _WORSE * row["assumed"]["error"] + 1e-9]
+    expected = [one["expected"] for one in mine if one["expected"] is not None]
     stated = [one["within_2_sigma"] for one in mine if one["within_2_sigma"] is not None]
     pairs = [row[method]["error"] / row[NULL]["error"] for row in rows if "error" in row.get(NULL, {})]
     return {
@@ -194,6 +195,7 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
         "assumed": mean_with_interval([row["assumed"]["error"] for row in rows]),
         "error": mean_with_interval([one["error"] for one in mine]),
         "worst": max((one["error"] for one in mine), default=None),
+        "expected": mean_with_interval(expected),
         "crps": mean_with_interval([one["crps"] for one in mine]),
         "within_2_sigma": float(np.mean(stated)) if stated else None,
         "worse": len(worse),

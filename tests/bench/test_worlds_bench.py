@@ -96,6 +96,7 @@ def test_a_summary_counts_worse_maps_and_those_of_which_nothing_was_said(flown):
     assert not warned(
         "assimilated 8 observations; 1 more distrusted as outliers; they say nothing about outlet 1 (right)"
     )
+    assert not warned("the assumed flow times 0.8 +- 0.1; the observations scatter around it by 9 % of the speed")
     assert warned("assimilated 8 observations; neighbours miss alike: something here is not in the model")
 
     def made(assumed, refined, note):
