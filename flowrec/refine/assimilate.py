@@ -127,6 +127,9 @@ class Assimilate(PriorSettings):
             prior = [UNSTATED_SHARE, *[(1.0 - UNSTATED_SHARE) / len(DEPTHS_WIDTHS)] * len(DEPTHS_WIDTHS)]
         own = self._observed(chip, chip, operator, solver)
         robust = robust_noise(own)
+        if solver.k > 1 and len(chips) > 1:
+            # The coarse grid proposes: most depths are out of the question, and a factorisation is dear.
+            chips, prior = self._plausible(chips, prior, operator, replace(solver, k=1), robust, steps)
         begun = []
         for other, share in zip(chips, prior, strict=True):
             with suppress(FlowError):  # a depth whose flow can not be computed
@@ -152,6 +155,26 @@ class Assimilate(PriorSettings):
             first = found[0][0].posterior.evidence
             shares[1:] *= [-np.expm1(min(first - one.posterior.evidence, 0.0)) for one, _ in found[1:]]
         return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), robust, "")
+
+    def _plausible(
+        self,
+        chips: list[Chip],
+        prior: list[float],
+        operator: ObservationOperator,
+        solver: FlowSolver,
+        robust: Robust,
+        steps: Steps,
+    ) -> tuple[list[Chip], list[float]]:
+        """The first chip, and those that are not far less likely than the likeliest."""
+        ln_weight = np.full(len(chips), -np.inf)
+        for index, (other, share) in enumerate(zip(chips, prior, strict=True)):
+            with suppress(FlowError):
+                state = begin(self._observed(other, chips[0], operator, solver), robust, steps)
+                ln_weight[index] = state.sizes.evidence + np.log(share)
+        kept = ln_weight > ln_weight.max() + np.log(LEAST_WEIGHT)
+        kept[0] = True
+        which = np.flatnonzero(kept)
+        return [chips[index] for index in which], [prior[index] for index in which]
 
     def _observed(self, chip: Chip, stated: Chip, operator: ObservationOperator, solver: FlowSolver) -> Observed:
         """The observations in the model of a chip. A depth that is not stated is known to the spacing of the grid."""

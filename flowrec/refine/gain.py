@@ -51,12 +51,16 @@ class Gain:
 
 
 def _factor(predicted: Floats, measured: Floats, variance: Floats, spread: float) -> tuple[float, float]:
-    """Least squares factor and its standard deviation, of flows (n, 2) with noise of variance (n,) and a spread."""
+    """Least squares factor and its standard deviation, of flows (n, 2) with noise of variance (n,) and a spread.
+
+    The weights are those of the noise alone: with the spread in them, places that are nearly at rest would decide.
+    """
     square = (predicted**2).sum(axis=1)
-    weight = 1.0 / (variance + spread**2 * square)
+    weight = 1.0 / variance
     precision = float((weight * square).sum()) + 1.0 / _FACTOR_STD**2
     factor = (float((weight * (predicted * measured).sum(axis=1)).sum()) + 1.0 / _FACTOR_STD**2) / precision
-    return factor, 1.0 / np.sqrt(precision)
+    scatter = float((weight**2 * square * (variance + spread**2 * square)).sum()) + 1.0 / _FACTOR_STD**2
+    return factor, float(np.sqrt(scatter)) / precision
 
 
 def _spread(predicted: Floats, measured: Floats, variance: Floats) -> float:
