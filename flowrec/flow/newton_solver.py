@@ -218,8 +218,12 @@ def _made(chip: Chip, k: int) -> System:
     """The same without the cache. Friction of single pixels changes nothing but the resistance of a chip without it."""
     if chip.friction_per_um2 is None:
         return assembled(chip, k)
-    bare = system(replace(chip, friction_per_um2=None), k)
-    friction = local_friction(chip.friction_per_um2, chip.um_per_px, bare.grid)
+    return with_friction(system(replace(chip, friction_per_um2=None), k), chip.friction_per_um2, chip.um_per_px)
+
+
+def with_friction(bare: System, friction_per_um2: Floats, um_per_px: float) -> System:
+    """The equations of a chip whose pixels (h, w) have more friction than those of `bare`."""
+    friction = local_friction(friction_per_um2, um_per_px, bare.grid)
     resistance = sp.csr_array(bare.resistance + sp.diags_array(friction * bare.momentum.volume))
     return replace(bare, resistance=resistance, stokes=factorise(bare.stream.curl.T @ resistance @ bare.stream.curl))
 

@@ -26,12 +26,13 @@ from flowrec.messages import FlowField
 from flowrec.ranges import Range
 from flowrec.refine.causes import RESISTANCE, SECTION, Observed
 from flowrec.refine.discretisation_error import ModelError
-from flowrec.refine.findings import findings
+from flowrec.refine.findings import PROBABLE, findings
 from flowrec.refine.flow_model import FlowModel, flow_model
 from flowrec.refine.hypothesis import NOISE, Fitted, Robust, State, Steps, begin, complete, robust_noise
 from flowrec.refine.mask_variants import mask_variants
 from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import Floats, ObservationOperator
+from flowrec.refine.obstacles import PLACES, Obstacle, likely_obstacles
 from flowrec.refine.prior import PriorSettings
 from flowrec.refine.report import report
 
@@ -40,6 +41,7 @@ LARGEST_PX = 30_000  # fluid pixels of a chip for which depths and walls are tri
 DEPTHS_WIDTHS = (0.4, 0.8, 1.6, 3.2)  # grid of depths of a chip that states none, in median channel widths
 DEPTH_STD_SHARE = 0.3  # standard deviation around each of them: half of their spacing in ln depth
 UNSTATED_SHARE = 0.75  # prior probability that the depth of such a chip does not matter
+OBSTACLE_SHARE = 0.2  # prior probability that some channel is partly blocked, at any one of the tried places
 LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
 STRUCTURE_DOUBTED = 2.0  # size of the errors along the channels over the usual one, above which other walls are tried
 NOISE_DOUBTED = 1.2  # the same of the noise over the stated one
@@ -59,6 +61,15 @@ class Hypotheses:
     shares: Floats  # of the mean
     robust: Robust
     wrong_mask: str  # how the chip's mask is wrong, in words; '' where it is not
+    obstacles: tuple[Obstacle, ...] = ()  # of the last hypotheses, one each
+
+    @property
+    def obstacle(self) -> tuple[Obstacle, float] | None:
+        """The likeliest obstacle, and the probability that there is one; None where none was tried."""
+        if not self.obstacles:
+            return None
+        weights = self.weights[-len(self.obstacles) :]
+        return self.obstacles[int(np.argmax(weights))], float(weights.sum())
 
     @property
     def best(self) -> Fitted:
@@ -81,8 +92,10 @@ class Assimilate(PriorSettings):
     max_steps: Annotated[int, Range(1, 1_000)] = 8  # of the full equations with frozen factors
     tolerance: Annotated[float, Range(1e-12, 1.0)] = 2e-3  # last such step over the fastest speed
 
-    def fit(self, problem: Problem) -> FlowField:
+    def fit(self, problem: Problem, obstacles: bool = False) -> FlowField:
         """Posterior mean field with its standard deviation, boundary values, viscosity and what else was found.
+
+        `obstacles`: channels that are partly blocked are tried as well.
 
         Raises
         ------
@@ -90,7 +103,16 @@ class Assimilate(PriorSettings):
             If the flow of the fitted parameters can not be computed.
         """
         problem = replace(problem, operator=problem.operator.distinct())
-        return self._field(self.hypotheses(problem.operator, problem.chip, problem.solver), problem)
+        every = self.hypotheses(problem.operator, problem.chip, problem.solver)
+        if obstacles and problem.chip.law is None and np.count_nonzero(problem.chip.mask) <= LARGEST_PX:
+            drawn = every
+            if every.wrong_mask:
+                drawn = replace(self, doubt_walls=False).hypotheses(problem.operator, problem.chip, problem.solver)
+            blocked = self._with_obstacles(drawn, problem)
+            # Walls that are wrong everywhere and a single obstacle can look alike.
+            if not every.wrong_mask or blocked.best.posterior.evidence > every.best.posterior.evidence:
+                every = blocked
+        return self._field(every, problem)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
         """The assumed field with the standard deviation of the prior, or without one where there is no prior."""
@@ -176,6 +198,37 @@ class Assimilate(PriorSettings):
         which = np.flatnonzero(kept)
         return [chips[index] for index in which], [prior[index] for index in which]
 
+    def _with_obstacles(self, every: Hypotheses, problem: Problem) -> Hypotheses:
+        """The same and the chip of the most probable one with each likely obstacle."""
+        best = every.best
+        chip, solver = best.observed.model.chip, problem.solver
+        steps, tried = Steps(self.max_steps, self.tolerance), []
+        for obstacle in likely_obstacles(best.observed, every.robust, solver):
+            with suppress(FlowError):  # a channel that is closed
+                observed = self._observed(obstacle.on(chip), problem.chip, problem.operator, solver)
+                robust = robust_noise(observed)  # what was an outlier may be explained now
+                tried.append((obstacle, observed, robust, begin(observed, robust, steps)))
+        ln_odds = float(np.log(OBSTACLE_SHARE / (1.0 - OBSTACLE_SHARE) / PLACES))
+        least = begin(best.observed, every.robust, steps).sizes.evidence + np.log(LEAST_WEIGHT) - ln_odds
+        tried = [entry for entry in tried if entry[3].sizes.evidence > least]
+        if not tried:
+            return every
+        found = [complete(observed, robust, state, steps) for _, observed, robust, state in tried]
+        ln_ratio = np.array([one.posterior.evidence - best.posterior.evidence for one in found])
+        weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds, 500.0))
+        weights = np.concatenate([every.weights, weight])
+        # As for depths: of what is not likelier than the chip without it, nothing is left.
+        shares = np.concatenate([every.shares, weight * -np.expm1(np.minimum(-ln_ratio, 0.0))])
+        robust = tried[int(np.argmax(weight))][2] if weight.max() > every.weights.max() else every.robust
+        return Hypotheses(
+            every.found + found,
+            weights / weights.sum(),
+            shares / shares.sum(),
+            robust,
+            "",
+            tuple(obstacle for obstacle, *_ in tried),
+        )
+
     def _observed(self, chip: Chip, stated: Chip, operator: ObservationOperator, solver: FlowSolver) -> Observed:
         """The observations in the model of a chip. A depth that is not stated is known to the spacing of the grid."""
         settings = replace(self, depth_std_share=DEPTH_STD_SHARE) if chip.depth_um != stated.depth_um else self
@@ -245,6 +298,14 @@ class Assimilate(PriorSettings):
         also = findings(every.found, every.weights)
         wrong = [f"the mask seems wrong: {every.wrong_mask}"] if every.wrong_mask else []
         robust = every.robust
+        names, values, stds = list(also.names), also.values, also.stds
+        if every.obstacle is not None and every.obstacle[1] > PROBABLE:
+            obstacle = every.obstacle[0]
+            x_um, y_um = obstacle.column * chip.um_per_px, obstacle.row * chip.um_per_px
+            wrong.append(f"a channel is partly blocked at ({x_um:.0f}, {y_um:.0f}) um")
+            names += ["obstacle_x_um", "obstacle_y_um"]
+            values = np.append(values, [x_um, y_um])
+            stds = np.append(stds, 2 * [obstacle.half_width_px * chip.um_per_px])
         note = report(chip, problem.operator, best, robust.inlier, robust.factor, [*wrong, *also.words])
         return replace(
             problem.assumed,
@@ -258,9 +319,9 @@ class Assimilate(PriorSettings):
             density_kg_m3=fitted.density_kg_m3,
             note=note,
             error_share=_error_share(mean, variance),
-            parameter_names="; ".join(also.names),
-            parameters=also.values,
-            parameter_std=also.stds,
+            parameter_names="; ".join(names),
+            parameters=values,
+            parameter_std=stds,
             viscosity_law=law_text(fitted.law),
         )
 

@@ -20,7 +20,8 @@ class Problem:
     operator: ObservationOperator  # with at least one observation
     chip: Chip  # with the assumed parameters
     solver: FlowSolver
-    assimilated: Callable[[], FlowField]  # computes the result of the assimilation, for methods that start from it
+    # Computes the result of the assimilation, for methods that start from it; True: with channels partly blocked.
+    assimilated: Callable[[bool], FlowField]
 
 
 class Refinement(Protocol):

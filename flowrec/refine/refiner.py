@@ -104,8 +104,8 @@ class Refiner:
             )
         operator = observation_operator(observations, chip.mask, chip.um_per_px, assumed.wall_px)
 
-        def assimilated() -> FlowField:
-            return self.assimilate.fit(problem)
+        def assimilated(obstacles: bool) -> FlowField:
+            return self.assimilate.fit(problem, obstacles)
 
         problem = Problem(assumed, operator, chip, solver, assimilated)
         if operator.count == 0 and not isinstance(method, AssumedFlow):

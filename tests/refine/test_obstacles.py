@@ -1,0 +1,82 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.chip.openings import find_openings, guess_inlets
+from flowrec.chip.synthetic import bifurcation
+from flowrec.flow import FlowSolver
+from flowrec.flow.sampling import relative_rmse, sample
+from flowrec.messages import Observations
+from flowrec.refine import PiUnet, Refiner
+from flowrec.refine.obstacles import Obstacle
+
+SOLVER = FlowSolver()
+# One step of the network leaves the field of the best hypothesis.
+PLAIN, CORRECTED = Refiner("assimilate"), Refiner("pi_unet", pi_unet=PiUnet(iterations=1))
+AT_UM = (3200.0, 3400.0)  # in the middle of the lower branch
+
+
+def blocked(chip):
+    """The lower half of the lower branch is solid over 0.4 mm."""
+    y, x = np.indices(chip.mask.shape) * chip.um_per_px
+    return replace(chip, mask=chip.mask & ~((np.abs(x - AT_UM[0]) < 200.0) & (y > AT_UM[1]) & (y < AT_UM[1] + 400.0)))
+
+
+def observed(truth, chip, noise=0.03):
+    """Along the upper half of the lower branch, and where inlet and outlet are."""
+    rng = np.random.default_rng(3)
+    x = np.concatenate([np.linspace(200.0, 900.0, 8), np.linspace(2400.0, 4000.0, 30), np.linspace(5500.0, 6200.0, 8)])
+    points = np.stack([x, np.where((x > 2000.0) & (x < 4500.0), AT_UM[1] - 70.0, 2700.0)], axis=1)
+    flow = np.array([sample(truth, point) for point in points])
+    std = noise * float(np.sqrt((flow**2).sum(axis=1).mean()))
+    flow = flow + rng.normal(0.0, std, flow.shape)
+    return Observations(0, points, flow, np.full(len(points), std))
+
+
+@pytest.fixture(scope="module")
+def chip():
+    """The bifurcation with pixels of 40 um."""
+    fine = bifurcation()
+    mask = fine.mask[::2, ::2]
+    return replace(fine, mask=mask, um_per_px=2.0 * fine.um_per_px, openings=guess_inlets(find_openings(mask), 220.0))
+
+
+@pytest.fixture(scope="module")
+def assumed(chip):
+    return SOLVER.solve(chip)
+
+
+def test_a_branch_that_is_half_blocked_is_found_and_the_map_is_right_beside_it(chip, assumed):
+    truth = SOLVER.solve(blocked(chip))
+    observations = observed(truth, chip)
+    plain, corrected = (method.refine(assumed, observations, chip, SOLVER) for method in (PLAIN, CORRECTED))
+    before, after = (relative_rmse(field, truth, chip.mask).v for field in (plain, corrected))
+    assert after < 0.8 * before
+    found = dict(zip(corrected.parameter_names.split("; "), corrected.parameters, strict=True))
+    assert (found["obstacle_x_um"], found["obstacle_y_um"]) == pytest.approx(AT_UM, abs=300.0)
+    assert "a channel is partly blocked" in corrected.note
+    true = truth.velocity_um_s[chip.mask]
+    within = np.abs(corrected.velocity_um_s[chip.mask] - true) < 2.0 * corrected.std_um_s[chip.mask]
+    assert within.mean() > 0.9
+
+
+def test_where_nothing_is_blocked_the_map_is_that_of_the_assimilation(chip, assumed):
+    values = chip.boundary_values * np.array([1.2, 1.0])
+    truth = SOLVER.solve(chip.with_boundary(values))
+    observations = observed(truth, chip)
+    plain, corrected = (method.refine(assumed, observations, chip, SOLVER) for method in (PLAIN, CORRECTED))
+    assert relative_rmse(corrected, truth, chip.mask).v == pytest.approx(
+        relative_rmse(plain, truth, chip.mask).v, abs=0.002
+    )
+    assert "blocked" not in corrected.note
+
+
+def test_an_obstacle_closes_the_side_of_the_flow_that_it_names(chip):
+    left = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, -1, 0.0, 1.5, 100.0).friction_per_um2(chip)
+    whole = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, 0, 0.0, 1.5, 100.0).friction_per_um2(chip)
+    rows, columns = np.nonzero(left)
+    assert rows.max() == 85  # image rows grow downwards: left of a flow to the right is above
+    assert (columns.min(), columns.max()) == (74, 86)
+    assert np.count_nonzero(whole) > 1.5 * np.count_nonzero(left)
+    assert not whole[~chip.mask].any()
