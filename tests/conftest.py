@@ -23,7 +23,14 @@ settings.register_profile("flowrec", deadline=None)
 settings.load_profile("flowrec")
 
 HANG_S = 120.0  # a wait as long as this one hangs; no test asserts how quick something is
-SMALL = ["camera.width_px=320", "camera.height_px=256", "simulated.seed=1", "simulated.world=kind"]
+# A short survey: most tests are about something else.
+SMALL = [
+    "camera.width_px=320",
+    "camera.height_px=256",
+    "simulated.seed=1",
+    "simulated.world=kind",
+    "survey.method=downstream",
+]
 
 # For tests of what happens in real time: other tests beside them would be the cause of their failures.
 needs_quiet = pytest.mark.skipif(
@@ -63,5 +70,5 @@ def realtime_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     A replay that does not know when each was adopted would wait for 100 s.
     """
     path = tmp_path_factory.mktemp("realtime") / "realtime.mcap"
-    sets = [*SMALL, "mission.phases=survey,refine,plan", "worker.adopt_after_s=100"]
+    sets = [*SMALL, "survey.method=information", "mission.phases=survey,refine,plan", "worker.adopt_after_s=100"]
     return record(load_config(None, sets), path, realtime=True).path

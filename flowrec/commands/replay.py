@@ -279,7 +279,7 @@ class WithoutFrames:
 def _order_under_way(reader: SessionReader, start: Tick) -> Tick | None:
     """The tick of a work order whose result is not yet adopted at the start; None if there is no such order.
 
-    If a part of a run begins after that tick, it is the keyframe, in which only later observations differ.
+    If a part of a run begins after that tick, it is the keyframe, which holds later messages of the stages.
     """
     mission = start.mission
     if mission is None or not mission.wanted:

@@ -9,9 +9,9 @@ from typing import Any
 
 from flowrec.commands.compare import Comparison
 from flowrec.config import ResolvedConfig
-from flowrec.enums import WorkOrder
+from flowrec.enums import Phase, WorkOrder
 from flowrec.errors import printable
-from flowrec.messages import Demand, FlowField, Route, Tick
+from flowrec.messages import Demand, FlowField, Mission, Route, Tick
 from flowrec.pipeline import Pipeline
 from flowrec.run.loop import RunReport
 from flowrec.run.workers import work
@@ -47,11 +47,10 @@ class WorkerCheck:
         self.results: list[str] = []
         if order is None or order.mission is None:
             return
-        mission, seen = order.mission, order.observations
-        if mission.wanted == WorkOrder.REFINE and seen is not None and seen.stamp_ns > mission.requested_ns:
-            # Ordered before this part of a run begins, from fewer observations than its keyframe holds.
+        mission = order.mission
+        if _knows_more(pipeline, order, mission):
             self._unknown.add(mission.request)
-            path = BY_FIELD[ANSWERED_BY[WorkOrder.REFINE]].path
+            path = BY_FIELD[ANSWERED_BY[WorkOrder(mission.wanted)]].path
             self.results.append(f"{path}: ordered in the part before, taken as recorded")
         else:
             self._computed[mission.request] = work(pipeline, order)
@@ -75,6 +74,17 @@ class WorkerCheck:
             self._ordered = mission.request
             self._computed[mission.request] = work(self._pipeline, tick)
         self._last = tick
+
+
+def _knows_more(pipeline: Pipeline, order: Tick, mission: Mission) -> bool:
+    """Whether a part of a run begins after an order, and its keyframe holds later messages that the work reads."""
+    if order.stamp_ns <= mission.requested_ns:
+        return False
+    if mission.wanted == WorkOrder.REFINE:
+        return order.observations is not None and order.observations.stamp_ns > mission.requested_ns
+    if mission.wanted == WorkOrder.SURVEY_ROUTE:  # where the robot is and what it has seen, unless it goes downstream
+        return pipeline.survey.method != "downstream"
+    return mission.wanted == WorkOrder.ROUTE and mission.phase == Phase.NAVIGATE  # the present route and its progress
 
 
 def digest_lines(path: Path) -> tuple[bool, list[str]]:

@@ -115,12 +115,12 @@ class Information:
             if rate > best_rate:
                 best, best_rate = stretch, rate
         if best is None:
-            said = f"{ENOUGH}: the flow is known to {now:.1%}, and no further stretch is worth its time"
+            said = f"{ENOUGH}: the flow is known to {100.0 * now:.1f} %, and no further stretch is worth its time"
             return no_route(METHOD, said) if order.present is None else _so_far(order.present, said)
         route = self._timed(space, believed, best, start)
         if not route.reachable:
             return route
-        said = f"from {now:.1%} to {best.error:.1%} of the flow in {route.arrival_s[-1]:.1f} s"
+        said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.arrival_s[-1]:.1f} s"
         remarks = filter(None, (start.remark, reach.remark, said))
         return replace(_joined(order.present, route), reason="; ".join(remarks), more=True)
 

@@ -78,7 +78,7 @@ def test_observe_needs_neither_start_nor_goal_nor_what_only_matters_for_driving(
     ):
         resolve(load_config(None, ["rig=movie", "mission.phases=observe"]), chip)
     other = load_config(None, ["rig=lab", "mission.phases=observe", "simulated.seed=3", "camera.debris=0", *measured])
-    with pytest.raises(UsageError, match=r"simulated\.seed, camera\.debris is of the simulated rig only"):
+    with pytest.raises(UsageError, match=r"camera\.debris, simulated\.seed is of the simulated rig only"):
         resolve(other, chip)
     with pytest.raises(UsageError, match=r"mission\.phases = observe, plan: observe drives no robot"):
         load_config(None, ["mission.phases=observe,plan"])

@@ -88,9 +88,9 @@ class Forgetful(Observer):
 
     calls: tuple[list[int], ...] = ([0],)
 
-    def estimate(self, previous, track, applied, robot, field=None) -> Estimate:  # type: ignore[no-untyped-def]
+    def estimate(self, *known) -> Estimate:  # type: ignore[no-untyped-def]
         self.calls[0][0] += 1
-        honest = Observer.estimate(self, previous, track, applied, robot, field)
+        honest = Observer.estimate(self, *known)
         return replace(honest, flow_um_s=honest.flow_um_s + 1e-3 * self.calls[0][0])
 
 

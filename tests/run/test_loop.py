@@ -24,10 +24,10 @@ BREAKS_NS = NS_PER_S // 2
 class Breaking(Observer):
     """Fails at a certain frame."""
 
-    def estimate(self, previous, track, applied, robot, field=None) -> Estimate:  # type: ignore[no-untyped-def]
+    def estimate(self, previous, track, *known) -> Estimate:  # type: ignore[no-untyped-def]
         if track.stamp_ns >= BREAKS_NS:
             raise ValueError("the observer is broken")
-        return Observer.estimate(self, previous, track, applied, robot, field)
+        return Observer.estimate(self, previous, track, *known)
 
 
 def test_a_stage_that_fails_leaves_the_inputs_that_broke_it_as_the_last_tick_and_nothing_made_of_them(

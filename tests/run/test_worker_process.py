@@ -29,6 +29,7 @@ from tests.conftest import HANG_S, SMALL, until
 HURDLES = """
     import sys, threading, time
     from dataclasses import dataclass
+    from flowrec.errors import FlowError
 
     def explode():
         raise RuntimeError("this can not be read back")
@@ -46,6 +47,7 @@ HURDLES = """
     class Unreadable:
         stamp_ns: int = 0
         request: int = 0
+        error_share: float | None = None
         def __reduce__(self):
             return explode, ()
 
@@ -66,6 +68,8 @@ HURDLES = """
             if how == "exits":
                 sys.exit(7)
             return Unreadable()
+        def sensitivities(self, *_):
+            raise FlowError("of a field without a flow")
 """
 
 

@@ -190,7 +190,7 @@ def test_a_file_made_before_a_field_with_a_default_existed_is_read(tmp_path, mon
     slot = channels.SLOTS["/robot/estimate"]
     files = descriptor_pb2.FileDescriptorSet.FromString(slot.schema.data)
     estimate = files.file[-1].message_type[0]
-    assert estimate.name == "Estimate" and estimate.field[-1].name == "um_per_rev"
+    assert estimate.name == "Estimate" and estimate.field[-1].name == "rolled_um_s"
     del estimate.field[-1]
     other = replace(slot, schema=replace(slot.schema, data=files.SerializeToString()))
     monkeypatch.setitem(channels.SLOTS, "/robot/estimate", other)
