@@ -136,7 +136,7 @@ def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: fl
     for name in values:
         if name.startswith("viscosity_"):
             words.append(f"{name.replace('_', ' ')} {values[name]:.3g} +- {stds[name]:.2g}")
-        if name.startswith("pump_"):
+        if name.startswith("pump_") and values[name] > SURE * stds[name]:
             hz = name.split("_")[1]
             words.append(f"the pump pulsates by {100.0 * values[name]:.0f} +- {100.0 * stds[name]:.0f} % at {hz} Hz")
     if values.get("wander_share", 0.0) > 0.06:

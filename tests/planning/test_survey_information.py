@@ -57,7 +57,7 @@ def planner(**settings):
 
 def promised(route):
     """The error of the flow in %, now and after the stretch, as the reason states them."""
-    return [float(number) for number in re.findall(r"([0-9.]+)%", route.reason)]
+    return [float(number) for number in re.findall(r"([0-9.]+) %", route.reason)]
 
 
 def branch_of(route):
