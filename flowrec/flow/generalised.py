@@ -32,7 +32,7 @@ from flowrec.flow.momentum import Momentum
 from flowrec.flow.newton_solver import (
     PATIENCE,
     RUNAWAY,
-    NotConvergedError,
+    Continuation,
     System,
     depth_friction,
     geometry_key,
@@ -57,9 +57,8 @@ KEEPING, DEPTH = 0.8, 4
 SMALL = 1e-5  # change of an unknown of the law for the derivative of its slit factor
 # Convection whose largest force is less than this fraction of the largest viscous one is left out of the matrix.
 NEGLIGIBLE = 0.01
-# How continuation proceeds from the Newtonian flow to that of the law.
-INTERMEDIATE_TOLERANCE = 1e-2
-SMALLEST_STRIDE = 0.02
+# From the Newtonian flow to that of the law.
+BY_STRENGTH = Continuation(1e-2, 0.02, longer=1.5, shorter=0.4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,22 +210,12 @@ class GeneralisedSystem:
         flux = self.linear(drive, push)
         if not flux.any():
             return flux
-        left, tolerance = max_iterations, max(tolerance, ENOUGH)
-        reached, stride = 0.0, 1.0
-        while True:
-            goal = min(reached + stride, 1.0)
-            equations = replace(self, strength=self.strength * goal)
-            near = tolerance if goal == 1.0 else max(tolerance, INTERMEDIATE_TOLERANCE)
-            result, used, step = equations.newton(flux, drive, push, goal * inertia, left, near)
-            left -= used
-            if result is not None:
-                if goal == 1.0:
-                    return result
-                flux, reached, stride = result, goal, 1.5 * stride
-            else:
-                stride = 0.4 * (goal - reached)
-            if left <= 0 or stride < SMALLEST_STRIDE:
-                raise NotConvergedError(step)
+        return BY_STRENGTH.follow(
+            lambda begin, goal, left, near: replace(self, strength=self.strength * goal).newton(
+                begin, drive, push, goal * inertia, left, near
+            ),
+            *(flux, 1.0, max_iterations, max(tolerance, ENOUGH)),
+        )
 
     def newton(
         self,

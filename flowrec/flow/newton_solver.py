@@ -6,7 +6,7 @@ factorisation serves all of them.
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -29,11 +29,9 @@ from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
 # Factors are reused as long as each step is at most this fraction of the last one.
 WORTH_KEEPING = 0.3
 
-# When Newton's method has diverged, and how continuation in inertia proceeds.
+# When Newton's method has diverged.
 RUNAWAY = 20.0  # step over the speed of the flow it started from
 PATIENCE = 2  # number of steps that may be longer than the one before
-INTERMEDIATE_TOLERANCE = 1e-3  # relative step that is enough for an intermediate flow
-SMALLEST_STRIDE = 1e-3  # of the inertia
 
 
 class NotConvergedError(Exception):
@@ -42,6 +40,46 @@ class NotConvergedError(Exception):
     def __init__(self, step: float) -> None:
         super().__init__(step)
         self.step = step
+
+
+# Of a flow to begin with, a parameter, iterations and a tolerance: the flow or None, iterations used, last step.
+Solve = Callable[[Floats, float, int, float], tuple[Floats | None, int, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Continuation:
+    """How a parameter grows from 0 where Newton's method does not converge at once."""
+
+    intermediate_tolerance: float  # relative step that is enough for an intermediate flow
+    smallest_stride: float  # of the end
+    longer: float  # factor on the stride after a success
+    shorter: float  # of a stride that failed
+
+    def follow(self, solve: Solve, flux: Floats, end: float, max_iterations: int, tolerance: float) -> Floats:
+        """Flow (faces,) of the parameter `end`, from that of 0.
+
+        Raises
+        ------
+        NotConvergedError
+            If there is no flow of `end` after all iterations.
+        """
+        left, reached, stride = max_iterations, 0.0, end
+        while True:
+            goal = min(reached + stride, end)
+            near = tolerance if goal == end else max(tolerance, self.intermediate_tolerance)
+            result, used, step = solve(flux, goal, left, near)
+            left -= used
+            if result is not None:
+                if goal == end:
+                    return result
+                flux, reached, stride = result, goal, self.longer * stride
+            else:
+                stride = self.shorter * (goal - reached)
+            if left <= 0 or stride < self.smallest_stride * end:
+                raise NotConvergedError(step)
+
+
+BY_INERTIA = Continuation(1e-3, 1e-3, longer=2.0, shorter=0.25)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,21 +162,10 @@ class System:
         flux = self.linear(drive, push)
         if inertia == 0.0 or not flux.any():
             return flux
-        left = max_iterations
-        reached, stride = 0.0, inertia
-        while True:
-            goal = min(reached + stride, inertia)
-            near = tolerance if goal == inertia else max(tolerance, INTERMEDIATE_TOLERANCE)
-            result, used, step = self._newton(flux, drive, push, goal, left, near)
-            left -= used
-            if result is not None:
-                if goal == inertia:
-                    return result
-                flux, reached, stride = result, goal, 2.0 * stride
-            else:
-                stride = 0.25 * (goal - reached)
-            if left <= 0 or stride < SMALLEST_STRIDE * inertia:
-                raise NotConvergedError(step)
+        return BY_INERTIA.follow(
+            lambda begin, goal, left, near: self._newton(begin, drive, push, goal, left, near),
+            *(flux, inertia, max_iterations, tolerance),
+        )
 
     def _newton(
         self,

@@ -208,6 +208,8 @@ class Assimilate(PriorSettings):
                 observed = self._observed(obstacle.on(chip), problem.chip, problem.operator, solver)
                 robust = robust_noise(observed)  # what was an outlier may be explained now
                 tried.append((obstacle, observed, robust, begin(observed, robust, steps)))
+        if not tried:
+            return every
         ln_odds = float(np.log(OBSTACLE_SHARE / (1.0 - OBSTACLE_SHARE) / PLACES))
         least = begin(best.observed, every.robust, steps).sizes.evidence + np.log(LEAST_WEIGHT) - ln_odds
         tried = [entry for entry in tried if entry[3].sizes.evidence > least]

@@ -61,16 +61,27 @@ class Obstacle:
     def friction_per_um2(self, chip: Chip) -> Floats:
         """(h, w) see Chip."""
         r = self.half_width_px
-        box = _box(self.row, self.column, max(self.reach, 1.6) * r + 2.0, chip.mask.shape)
-        y, x = np.ogrid[box]
-        x, y = x - self.column, y - self.row
-        along, across = x * self.along[0] + y * self.along[1], y * self.along[0] - x * self.along[1]
+        box, along, across = self.around(max(self.reach, 1.6) * r + 2.0, chip.mask.shape)
         inside = chip.mask[box] & (np.abs(along) <= self.reach * r) & (np.abs(across) <= 1.6 * r + 1.0)
         if self.side:
             inside &= self.side * across >= -self.depth * r
         friction = np.zeros(chip.mask.shape)
         friction[box][inside] = (self.ratio - 1.0) * PLANE_CHANNEL / (2.0 * r * chip.um_per_px) ** 2
         return friction
+
+    def around(self, reach_px: float, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], Floats, Floats]:
+        """The part of an image of a shape within a distance along both axes, and its pixels along and across the flow.
+
+        From the centre, in pixels; across is positive to the right of the flow.
+        """
+        rows, columns = (
+            slice(max(int(at - reach_px), 0), min(int(np.ceil(at + reach_px)) + 1, size))
+            for at, size in zip((self.row, self.column), shape, strict=True)
+        )
+        y, x = np.ogrid[rows, columns]
+        x, y = x - self.column, y - self.row
+        ux, uy = self.along
+        return (rows, columns), x * ux + y * uy, y * ux - x * uy
 
     def on(self, chip: Chip) -> Chip:
         """The chip with this obstacle."""
@@ -186,24 +197,13 @@ def _pieces(chip: Chip, flow: Floats) -> list[Obstacle]:
                 continue
             u = u / size
             piece = Obstacle(row, column, (float(u[0]), float(u[1])), radius, 0, 0.0, 1.5 * spacing, 2.0)
-            box = _box(row, column, 2.0 * radius + 2.0, mask.shape)
-            y, x = np.ogrid[box]
-            along, across = (x - column) * u[0] + (y - row) * u[1], (y - row) * u[0] - (x - column) * u[1]
+            box, along, across = piece.around(2.0 * radius + 2.0, mask.shape)
             free[box] &= ~((np.abs(along) <= spacing * radius) & (np.abs(across) <= 1.3 * radius + 1.0))
             if radius >= 1.5:
                 found.append(piece)
         if len(found) <= MOST_PIECES:
             return found
         spacing *= 1.3
-
-
-def _box(row: float, column: float, reach: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """The part of an image of a shape within a distance of a point along both axes."""
-    rows, columns = (
-        slice(max(int(at - reach), 0), min(int(np.ceil(at + reach)) + 1, size))
-        for at, size in zip((row, column), shape, strict=True)
-    )
-    return rows, columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,6 +16,7 @@ from flowrec.commands import replay as verb
 from flowrec.commands.check import check
 from flowrec.commands.compare import compare
 from flowrec.commands.info import info, list_sessions
+from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config
 from flowrec.errors import SessionError
@@ -30,6 +31,7 @@ from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import Part
 from flowrec.store.writer import SessionWriter
 from flowrec.topics import BY_FIELD
+from tests.conftest import SMALL
 from tests.store.made_up import ticks_of
 
 CONFIG = load_config(None, ["camera.rate_hz=60"])
@@ -293,6 +295,23 @@ def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut
     done = verb.replay(files[-1], Change(refine="assimilate"), out=tmp_path / "again.mcap")
     assert done.replayed.refined is not None
     assert SessionReader(tmp_path / "again.mcap").header.parent["sha256"] == session_sha256([files[-1]])
+
+
+def test_a_stretch_of_a_survey_that_was_ordered_before_a_part_begins_is_taken_as_recorded(tmp_path):
+    sets = [*SMALL, "survey.method=information", "mission.phases=survey"]
+    with SessionReader(record(load_config(None, sets), tmp_path / "survey.mcap").path) as reader:
+        ticks, header = list(reader.ticks()), reader.header
+    (cut,) = [
+        i + 2
+        for i, tick in enumerate(ticks)
+        if tick.mission.wanted == "survey_route"
+        and tick.mission.phase == "survey"
+        and tick.mission.stamp_ns == tick.stamp_ns
+    ][-1:]
+    _, part = in_parts(tmp_path / "x.mcap", {cut}, ticks, header)
+    done = verb.replay(part, Change(), verify=True)
+    assert done.comparison.identical, done.lines()
+    assert "/plan/route: ordered in the part before, taken as recorded" in done.lines()
 
 
 def test_recover_and_export_answer_in_json(run, rrd_only_begun):
