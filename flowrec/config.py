@@ -6,12 +6,10 @@ makes a ResolvedConfig of it, on a chip; a session carries that one, so a replay
 
 from __future__ import annotations
 
-import difflib
-import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar
 
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
@@ -20,14 +18,24 @@ from flowrec.chip import ChipSettings
 from flowrec.chip.chip import Chip
 from flowrec.chip.io import CHIP_KEYS
 from flowrec.chip.registration import Calibration
+from flowrec.config_tree import (
+    IMAGE_SIZE,
+    REGISTRATION,
+    Origin,
+    apply_sets,
+    key_of,
+    refuse_unknown,
+    take_registration,
+    type_error,
+    without_none,
+)
 from flowrec.control import Coils, Controller
 from flowrec.control.mission import MissionStateMachine, PlacedMission
 from flowrec.errors import UsageError
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
-from flowrec.methods import Methods
 from flowrec.planning import PLANNERS, Planner, SurveyPlanner
-from flowrec.ranges import Fault, Range, faults, hints, range_of
+from flowrec.ranges import Fault, Range, faults, hints
 from flowrec.refine import Refiner
 from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Lab, Movie, Safety
 from flowrec.robot import Robot, RobotSettings
@@ -124,8 +132,6 @@ class ResolvedConfig(Config):
     mission: PlacedMission
 
 
-REGISTRATION = "camera.registration"
-_IMAGE_SIZE = ("width_px", "height_px")
 # Settings that a session from before them does not hold, with the values with which it replays unchanged.
 _BEFORE: dict[str, Any] = {
     "simulated.world": FIRST_WORLD,
@@ -142,22 +148,6 @@ _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Origin of settings, for errors: the typed flag or the file."""
-
-    file: str
-    flags: Mapping[str, str] = field(default_factory=dict)  # by key
-
-    def __call__(self, *keys: str) -> str:
-        """The flag that set a key, a part of it or its section; the file if none did."""
-        for key in keys:
-            for typed, flag in self.flags.items():
-                if f"{typed}.".startswith(f"{key}.") or f"{key}.".startswith(f"{typed}."):
-                    return flag
-        return self.file
-
-
 def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mapping[str, str] | None = None) -> Config:
     """Defaults, then the TOML file, then each `key=value` of `sets` (value as in TOML, or a bare word).
 
@@ -168,8 +158,8 @@ def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mappi
     UsageError : one line that names the flag or the file, the key, its range and the nearest valid value.
     """
     tree, sets = _read_config(path) if path is not None else {}, list(sets)
-    _take_registration(tree, sets)
-    origin = Origin(str(path) if path is not None else "--set", _apply_sets(tree, sets) | dict(flags or {}))
+    take_registration(tree, sets)
+    origin = Origin(str(path) if path is not None else "--set", apply_sets(tree, sets) | dict(flags or {}))
     config = _config_from(Config, tree, origin)
     check_config(config, origin)
     return config
@@ -203,7 +193,7 @@ def config_from_toml(text: str, where: str) -> ResolvedConfig:
 
 def to_toml(config: Config) -> str:
     """The configuration as TOML, without the settings that are None."""
-    return tomli_w.dumps(_without_none(asdict(config)))
+    return tomli_w.dumps(without_none(asdict(config)))
 
 
 def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] | None = None) -> _AnyConfig:
@@ -211,14 +201,14 @@ def with_sets(config: _AnyConfig, sets: Iterable[str], flags: Mapping[str, str] 
 
     A recorded configuration may hold settings outside of their ranges; only the changed settings are checked.
     """
-    tree, sets = _without_none(asdict(config)), list(sets)
-    if any(_key(text) == REGISTRATION for text in sets):
-        tree["camera"] = {k: v for k, v in tree["camera"].items() if k not in _IMAGE_SIZE}  # that of the file
-        _take_registration(tree, sets)
-    if any(_key(text) == "simulated.world" for text in sets):  # what the other world's preset has stated goes with it
+    tree, sets = without_none(asdict(config)), list(sets)
+    if any(key_of(text) == REGISTRATION for text in sets):
+        tree["camera"] = {k: v for k, v in tree["camera"].items() if k not in IMAGE_SIZE}  # that of the file
+        take_registration(tree, sets)
+    if any(key_of(text) == "simulated.world" for text in sets):  # what the other world's preset has stated goes with it
         preset = WORLDS[config.simulated.world]
         tree["simulated"] = {key: value for key, value in tree["simulated"].items() if value != preset.get(key)}
-    origin = Origin("configuration", _apply_sets(tree, sets) | dict(flags or {}))
+    origin = Origin("configuration", apply_sets(tree, sets) | dict(flags or {}))
     changed = _config_from(type(config), tree, origin)
     check_config(changed, origin, frozenset(faults(config)))
     return changed
@@ -245,66 +235,12 @@ def _read_config(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _value(text: str) -> Any:
-    """A value in TOML syntax; a bare word is a string, so that shells need no double quoting."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def _apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> dict[str, str]:
-    """Put each `key=value` into the tree; returns the flag by key."""
-    flags = {}
-    for text in sets:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise UsageError(f"--set {text!r}: expected key=value, as in --set control.method=ff_fb")
-        _put(tree, key.strip().split("."), _value(value.strip()))
-        flags[key.strip()] = "--set"
-    return flags
-
-
-def _key(text: str) -> str:
-    return text.partition("=")[0].strip()
-
-
-def _take_registration(tree: dict[str, Any], sets: Iterable[str]) -> None:
-    """Put the settings of a registration file, which the tree or one of `sets` names, before those of the tree."""
-    camera = tree.get("camera", {})
-    named = [_value(text.partition("=")[2].strip()) for text in sets if _key(text) == REGISTRATION]
-    path = named[-1] if named else camera.get("registration") if isinstance(camera, dict) else None
-    if not isinstance(path, str) or not path or not isinstance(camera, dict):
-        return
-    stated = read_toml(Path(path)).get("camera")
-    if not isinstance(stated, dict) or not {"um_per_px", "angle_deg", "width_px", "height_px"} <= stated.keys():
-        raise UsageError(f"{path}: is no registration; flowrec calibrate image PICTURE -o {path} makes one")
-    for key in _IMAGE_SIZE:
-        given = [_value(text.partition("=")[2].strip()) for text in sets if _key(text) == f"camera.{key}"]
-        value = given[-1] if given else camera.get(key, stated[key])
-        if value != stated[key]:
-            raise UsageError(
-                f"{path}: is of images {stated['width_px']} x {stated['height_px']}, and camera.{key} = {value}; take "
-                "a picture with the size and region of the run, and register it"
-            )
-    tree["camera"] = camera | stated
-
-
-def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
-    for key in keys[:-1]:
-        inner = tree.setdefault(key, {})
-        if not isinstance(inner, dict):
-            raise UsageError(f"--set {'.'.join(keys)}: {key!r} is a value, not a section")
-        tree = inner
-    tree[keys[-1]] = value
-
-
 def _config_from(kind: type[_AnyConfig], tree: dict[str, Any], origin: Origin) -> _AnyConfig:
     """The configuration of a tree; types are checked, ranges are not."""
     phases = tree.get("mission", {}).get("phases") if isinstance(tree.get("mission", {}), dict) else None
     if isinstance(phases, str):
         tree["mission"]["phases"] = [phase.strip() for phase in phases.split(",") if phase.strip()]
-    _refuse_unknown(tree, Config, "", origin)
+    refuse_unknown(tree, Config, origin)
     if kind not in _ADAPTERS:
         _ADAPTERS[kind] = TypeAdapter(kind)
     try:
@@ -314,34 +250,8 @@ def _config_from(kind: type[_AnyConfig], tree: dict[str, Any], origin: Origin) -
         key = ".".join(part for part in map(str, first["loc"]) if not part.startswith(("tuple", "str", "function")))
         if first["type"] == "missing":
             raise UsageError(f"{origin(key)}: {key} is missing; a session states it") from error
-        raise UsageError(f"{origin(key)}: {_type_error(key, first['input'], first['msg'].lower())}") from error
+        raise UsageError(f"{origin(key)}: {type_error(Config, key, first['input'], first['msg'].lower())}") from error
     return config
-
-
-def _type_error(key: str, value: Any, complaint: str) -> str:
-    """The error text for a value of the wrong type, with the nearest valid value."""
-    known = dict(_all_hints(Config, ""))
-    while key not in known and "." in key:  # a place in a tuple
-        key = key.rpartition(".")[0]
-    hint = known.get(key)
-    names, valid = _names_of(hint), range_of(hint)
-    if names:
-        near = difflib.get_close_matches(str(value), names, 1, 0.0)[0]
-        return f"{key} = {value!r}: must be one of {', '.join(names)}; the nearest is {near}"
-    if valid is not None and isinstance(value, (int, float)):
-        if value in valid:
-            return f"{key} = {value!r}: must be a whole number {valid}; the nearest is {round(value)}"
-        return str(Fault(key, value, valid))
-    return f"{key} = {value!r}: {complaint}" + (f"; a number {valid} is wanted" if valid is not None else "")
-
-
-def _names_of(hint: Any) -> list[str]:
-    """The names that a setting can take; empty if it takes other values."""
-    if get_origin(hint) is Literal:
-        return list(map(str, get_args(hint)))
-    if isinstance(hint, Methods):
-        return list(hint)
-    return [name for part in get_args(hint) for name in _names_of(part)]
 
 
 def check_config(config: Config, origin: Origin | None = None, known: frozenset[Fault] = frozenset()) -> None:
@@ -383,34 +293,3 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
             f"go, which a plan of least {config.plan.cost} does not hold; set plan.cost = 'time', or "
             "control.method = 'vector'"
         )
-
-
-def _refuse_unknown(tree: Mapping[str, Any], section: type, prefix: str, origin: Origin) -> None:
-    known = hints(section)
-    for key, value in tree.items():
-        if key not in known:
-            near = difflib.get_close_matches(prefix + key, [key for key, _ in _all_hints(Config, "")], n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(prefix + name for name in known)}"
-            raise UsageError(f"{origin(prefix + key)}: unknown key {prefix + key}; {hint}")
-        inner = known[key]
-        if is_dataclass(inner) and isinstance(inner, type):
-            if not isinstance(value, dict):
-                where = origin(prefix + key)
-                raise UsageError(f"{where}: {prefix + key} is a section, not a value; set one of its keys")
-            _refuse_unknown(value, inner, f"{prefix}{key}.", origin)
-
-
-def _all_hints(section: type, prefix: str) -> Iterable[tuple[str, Any]]:
-    """Every key of the configuration with its type, sections included."""
-    for key, inner in hints(section).items():
-        yield prefix + key, inner
-        if is_dataclass(inner) and isinstance(inner, type):
-            yield from _all_hints(inner, f"{prefix}{key}.")
-
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
-    if isinstance(value, (list, tuple)):
-        return [_without_none(inner) for inner in value]
-    return value

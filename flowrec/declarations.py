@@ -1,7 +1,7 @@
 """Annotations of message fields and of the fields of `Tick`: shape, finiteness, topic, source, tolerances.
 
-messages.py declares every record with these. The wire format (store/schema.py), the checks of what was read from a
-file and the table of topics (topics.py) are derived from them.
+messages.py and diagnostics.py declare every record with these, topics.py the fields of `Tick`. The wire format
+(store/schema.py), the checks of what was read from a file and the table of topics (topics.py) are derived from them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Every record that flowrec keeps: frozen, read-only, with units in the field names.
+"""The records that rigs, stages and the operator make: frozen, read-only, with units in the field names.
 
 What a stage carries from one frame to the next is one of these, and each of them is recorded, so a session can be
 replayed from any tick. Annotations (declarations.py) state the shape of each array and the topic of each field of
@@ -23,14 +23,10 @@ from flowrec.declarations import (
     NanFloat,
     Raster,
     Shape,
-    SlowStage,
-    Source,
-    Topic,
     Vector,
     Vector2,
     Vector3,
 )
-from flowrec.enums import WorkOrder
 from flowrec.errors import RigError
 
 PIXEL_BITS = (8, 10, 12, 14, 16)
@@ -376,74 +372,6 @@ class Event(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Timing(Message):
-    """Wall time of each part of this tick. Diagnostic: never compared."""
-
-    stamp_ns: int
-    track_ms: float
-    observe_ms: float
-    control_ms: float
-    sinks_ms: float
-    total_ms: float
-    queue_mb: float  # data that waits for the disk
-    dropped_frames: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Drops(Message):
-    """Losses of a topic so far, written when they begin, change and end. Diagnostic."""
-
-    stamp_ns: int
-    topic: str
-    by_backlog: int  # not written because disk or processor was slower than the camera
-    by_camera: int  # never delivered by the camera: gaps in the frame index
-    kept_every: int  # from now on every n-th frame is written; 1: all
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Clocks(Message):
-    """Wall clock and camera clock, about once a second and after each step or fault of one. Diagnostic."""
-
-    stamp_ns: int
-    monotonic_ns: int  # monotonic clock of the host, read together with wall_ns
-    wall_ns: int  # time of day since 1970, UTC
-    wall_set_s: float  # sum of all steps of the wall clock since the run began
-    wall_jumps: int  # number of these steps
-    passed_over: int  # frames rejected because their stamp did not increase
-    device: int  # raw count of the camera's clock at its latest frame
-    arrival_ns: int  # of that frame on the session clock
-    fitted_ns: int  # predicted earliest arrival (lower envelope of the arrival times)
-    rate: float  # ns of the session clock per count: the fit is fitted_ns + rate (counts - device); 0: no clock
-    known: bool  # whether the rate has been measured
-    late_s: float  # mean of arrival - fit since the previous message
-    latest_s: float  # maximum of arrival - fit since the previous message
-    duplicates: int  # frames delivered twice, so far
-    disordered: int  # frames older than their predecessor, so far
-    wraps: int  # overflows of the counter, so far
-    resets: int  # backward steps of the camera's clock, each followed by a new fit, so far
-    jumps: int  # forward steps or stops of it, each followed by a new fit, so far
-    unit: float  # apparent length of a count in ns if it differs from the declared one; else 0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraLosses(Message):
-    """Blocks (images) that a camera has counted so far, and what became of them. Diagnostic.
-
-    ids = frames + link + incomplete + driver + backlog.
-    """
-
-    stamp_ns: int
-    ids: int  # by the camera's own block ids, unwrapped
-    frames: int  # handed on to the loop
-    link: int  # gaps of the ids: lost in the camera or on the link
-    incomplete: int  # arrived with parts missing, or marked as bad by the camera
-    driver: int  # thrown away by the driver, whose buffers were full
-    backlog: int  # thrown away by the queue before the loop, because the loop was slower than the camera
-    triggers: int  # triggers that no block has answered; not among the ids
-    reconnections: int  # the camera was absent and came back; blocks of the time between are not known
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Truth(Message):
     """Ground truth of a simulated rig. Recorded for evaluation; no stage reads it."""
 
@@ -452,55 +380,3 @@ class Truth(Message):
     flow_um_s: Vector2  # true flow at the robot
     clearance_um: NanFloat  # from the robot's surface to the nearest wall
     contacts: int  # wall contacts so far
-
-
-_ASSUMED = {"velocity_um_s": 1e-4, "std_um_s": 1e-4, "pressure_pa": 1e-7}
-_REFINED = {"velocity_um_s": 1e-3, "std_um_s": 1e-3, "pressure_pa": 1e-6}
-_ROUTE = {"waypoints_um": 1e-4, "arrival_s": 1e-6, "time_to_go_s": 1e-6}
-_SOLVE = SlowStage((WorkOrder.SOLVE,), reads=(), settings=("flow",))
-_REFINE = SlowStage(
-    (WorkOrder.REFINE,),
-    reads=("assumed", "refined", "observations"),
-    settings=("tracker", "observer", "sampler", "refine", "mission"),
-)
-_PLAN = SlowStage(
-    (WorkOrder.SURVEY_ROUTE, WorkOrder.ROUTE),
-    reads=("assumed", "refined", "health", "route", "estimate", "observations", "demand"),
-    settings=("robot", "survey", "plan"),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """All that is known after one frame: the latest message of each topic, None before the first.
-
-    Replay adopts a result of the worker at the tick that adopted it; `replay --verify` computes its value again.
-    """
-
-    stamp_ns: int = -1
-    frame: Annotated[Frame | None, Topic("/camera/frame", Source.CAMERA)] = None
-    applied: Annotated[Applied | None, Topic("/coils/applied", Source.RIG)] = None
-    operator: Annotated[OperatorEvent | None, Topic("/operator/events", Source.OPERATOR)] = None
-    assumed: Annotated[FlowField | None, Topic("/flow/assumed", Source.WORKER, 1e-5, _ASSUMED, _SOLVE)] = None
-    refined: Annotated[FlowField | None, Topic("/flow/refined", Source.WORKER, 1e-4, _REFINED, _REFINE)] = None
-    route: Annotated[Route | None, Topic("/plan/route", Source.WORKER, 1e-5, _ROUTE, _PLAN)] = None
-    track: Annotated[Track | None, Topic("/robot/track", Source.STAGE, 1e-6)] = None
-    estimate: Annotated[Estimate | None, Topic("/robot/estimate", Source.STAGE, 1e-6, {"covariance": 1e-6})] = None
-    health: Annotated[Health | None, Topic("/run/health", Source.STAGE, 1e-6)] = None
-    observations: Annotated[Observations | None, Topic("/flow/observations", Source.STAGE, 1e-6)] = None
-    mission: Annotated[Mission | None, Topic("/run/mission", Source.STAGE, 1e-6)] = None
-    demand: Annotated[Demand | None, Topic("/control/demand", Source.STAGE, 1e-6)] = None
-    currents: Annotated[Currents | None, Topic("/coils/command", Source.STAGE, 1e-6)] = None
-    event: Annotated[Event | None, Topic("/run/events", Source.STAGE)] = None
-    timing: Annotated[Timing | None, Topic("/run/timing", Source.LOOP)] = None
-    drops: Annotated[Drops | None, Topic("/run/drops", Source.LOOP)] = None
-    truth: Annotated[Truth | None, Topic("/truth/robot", Source.SIMULATOR)] = None
-    true_field: Annotated[FlowField | None, Topic("/truth/flow", Source.SIMULATOR)] = None
-    appearance: Annotated[Appearance | None, Topic("/robot/appearance", Source.STAGE, 1e-4, {"views": 1e-3})] = None
-    clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
-    losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
-
-    @property
-    def field(self) -> FlowField | None:
-        """The best flow known: refined where there is one, else assumed."""
-        return self.refined if self.refined is not None else self.assumed

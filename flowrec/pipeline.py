@@ -20,27 +20,16 @@ from flowrec.control import Coils, Controller
 from flowrec.control.events import event_of
 from flowrec.control.mission import MissionStateMachine
 from flowrec.declarations import Role, Source
+from flowrec.diagnostics import CameraLosses
 from flowrec.enums import Action
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
-from flowrec.messages import (
-    Appearance,
-    Applied,
-    CameraLosses,
-    FlowField,
-    Frame,
-    Observations,
-    OperatorEvent,
-    Route,
-    Tick,
-    Track,
-    Truth,
-)
+from flowrec.messages import Appearance, Applied, FlowField, Frame, Observations, OperatorEvent, Route, Track, Truth
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
-from flowrec.topics import BY_FIELD, TOPICS
+from flowrec.topics import BY_FIELD, TOPICS, Tick
 from flowrec.vision import Tracker, unseen
 
 

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from flowrec.chip.chip import Chip
     from flowrec.chip.registration import Calibration
     from flowrec.config import ResolvedConfig
-    from flowrec.messages import Event, FlowField, Frame, Tick
+    from flowrec.messages import Event, FlowField, Frame
     from flowrec.store.reader import SessionReader
+    from flowrec.topics import Tick
 
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
@@ -263,8 +264,7 @@ def input_blamed(session: Session, config: ResolvedConfig, done: str) -> Iterato
 
 def _absurd_numbers(session: Session) -> Iterator[str]:
     from flowrec.declarations import invalid_numbers
-    from flowrec.messages import Tick
-    from flowrec.topics import TOPICS
+    from flowrec.topics import TOPICS, Tick
 
     before = Tick()
     for tick in session.ticks(with_frames=False):

@@ -1,13 +1,87 @@
-"""Table of topics, derived from the annotations of `Tick`. Writer, reader, viewer, compare and replay iterate it."""
+"""Tick: the latest message of each topic; and the table of topics, derived from the annotations of its fields.
+
+Writer, reader, viewer, compare and replay iterate the table.
+"""
+
+from __future__ import annotations
 
 import dataclasses
 import types
 from collections.abc import Iterable
-from typing import get_args, get_type_hints
+from dataclasses import dataclass
+from typing import Annotated, get_args, get_type_hints
 
-from flowrec.declarations import Message, Source, Topic, message_fields
+from flowrec.declarations import Message, SlowStage, Source, Topic, message_fields
+from flowrec.diagnostics import CameraLosses, Clocks, Drops, Timing
 from flowrec.enums import WorkOrder
-from flowrec.messages import FlowField, Tick
+from flowrec.messages import (
+    Appearance,
+    Applied,
+    Currents,
+    Demand,
+    Estimate,
+    Event,
+    FlowField,
+    Frame,
+    Health,
+    Mission,
+    Observations,
+    OperatorEvent,
+    Route,
+    Track,
+    Truth,
+)
+
+_ASSUMED = {"velocity_um_s": 1e-4, "std_um_s": 1e-4, "pressure_pa": 1e-7}
+_REFINED = {"velocity_um_s": 1e-3, "std_um_s": 1e-3, "pressure_pa": 1e-6}
+_ROUTE = {"waypoints_um": 1e-4, "arrival_s": 1e-6, "time_to_go_s": 1e-6}
+_SOLVE = SlowStage((WorkOrder.SOLVE,), reads=(), settings=("flow",))
+_REFINE = SlowStage(
+    (WorkOrder.REFINE,),
+    reads=("assumed", "refined", "observations"),
+    settings=("tracker", "observer", "sampler", "refine", "mission"),
+)
+_PLAN = SlowStage(
+    (WorkOrder.SURVEY_ROUTE, WorkOrder.ROUTE),
+    reads=("assumed", "refined", "health", "route", "estimate", "observations", "demand"),
+    settings=("robot", "survey", "plan"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """All that is known after one frame: the latest message of each topic, None before the first.
+
+    Replay adopts a result of the worker at the tick that adopted it; `replay --verify` computes its value again.
+    """
+
+    stamp_ns: int = -1
+    frame: Annotated[Frame | None, Topic("/camera/frame", Source.CAMERA)] = None
+    applied: Annotated[Applied | None, Topic("/coils/applied", Source.RIG)] = None
+    operator: Annotated[OperatorEvent | None, Topic("/operator/events", Source.OPERATOR)] = None
+    assumed: Annotated[FlowField | None, Topic("/flow/assumed", Source.WORKER, 1e-5, _ASSUMED, _SOLVE)] = None
+    refined: Annotated[FlowField | None, Topic("/flow/refined", Source.WORKER, 1e-4, _REFINED, _REFINE)] = None
+    route: Annotated[Route | None, Topic("/plan/route", Source.WORKER, 1e-5, _ROUTE, _PLAN)] = None
+    track: Annotated[Track | None, Topic("/robot/track", Source.STAGE, 1e-6)] = None
+    estimate: Annotated[Estimate | None, Topic("/robot/estimate", Source.STAGE, 1e-6, {"covariance": 1e-6})] = None
+    health: Annotated[Health | None, Topic("/run/health", Source.STAGE, 1e-6)] = None
+    observations: Annotated[Observations | None, Topic("/flow/observations", Source.STAGE, 1e-6)] = None
+    mission: Annotated[Mission | None, Topic("/run/mission", Source.STAGE, 1e-6)] = None
+    demand: Annotated[Demand | None, Topic("/control/demand", Source.STAGE, 1e-6)] = None
+    currents: Annotated[Currents | None, Topic("/coils/command", Source.STAGE, 1e-6)] = None
+    event: Annotated[Event | None, Topic("/run/events", Source.STAGE)] = None
+    timing: Annotated[Timing | None, Topic("/run/timing", Source.LOOP)] = None
+    drops: Annotated[Drops | None, Topic("/run/drops", Source.LOOP)] = None
+    truth: Annotated[Truth | None, Topic("/truth/robot", Source.SIMULATOR)] = None
+    true_field: Annotated[FlowField | None, Topic("/truth/flow", Source.SIMULATOR)] = None
+    appearance: Annotated[Appearance | None, Topic("/robot/appearance", Source.STAGE, 1e-4, {"views": 1e-3})] = None
+    clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
+    losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
+
+    @property
+    def field(self) -> FlowField | None:
+        """The best flow known: refined where there is one, else assumed."""
+        return self.refined if self.refined is not None else self.assumed
 
 
 def topics_of(tick_type: type) -> tuple[Topic, ...]:

@@ -14,7 +14,7 @@ import pytest
 
 import flowrec
 from flowrec.errors import SessionError, UsageError
-from flowrec.messages import Tick
+from flowrec.topics import Tick
 from tests.conftest import HANG_S, SMALL, until
 
 ROOT = Path(__file__).parents[1]

@@ -10,8 +10,8 @@ import pytest
 from flowrec.config import Config
 from flowrec.declarations import Message, Role, SlowStage, Source, Topic, Vector
 from flowrec.enums import WorkOrder
-from flowrec.messages import Tick, Track
-from flowrec.topics import BY_FIELD, WORKER_FIELDS, stale_results, topics_of
+from flowrec.messages import Track
+from flowrec.topics import BY_FIELD, WORKER_FIELDS, Tick, stale_results, topics_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,7 +22,8 @@ from flowrec.commands.export_rrd import scene_of
 from flowrec.commands.record import prepare
 from flowrec.commands.replay import Change, replay
 from flowrec.config import ResolvedConfig, load_config
-from flowrec.messages import Currents, Tick, Timing
+from flowrec.diagnostics import Timing
+from flowrec.messages import Currents
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import Sink, run
@@ -31,6 +32,7 @@ from flowrec.session_writer import session_header
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.terminal import progress, table
+from flowrec.topics import Tick
 from flowrec.view.live import LiveView
 
 RATE_HZ = 60.0

@@ -29,7 +29,7 @@ from flowrec.config import ResolvedConfig, load_config
 from flowrec.control.controller import CONTROLLERS
 from flowrec.errors import FlowrecError
 from flowrec.flow import FlowSolver
-from flowrec.messages import FlowField, Route, Tick
+from flowrec.messages import FlowField, Route
 from flowrec.pipeline import assemble
 from flowrec.planning import Planner
 from flowrec.resolve import resolve
@@ -39,6 +39,7 @@ from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
 from flowrec.terminal import progress, say
+from flowrec.topics import Tick
 from flowrec.units import seconds
 
 # The settings of a policy. `plain` is the null model: the shortest path, planned without the flow.

@@ -23,13 +23,13 @@ from flowrec.config import ResolvedConfig, calibration_of, load_config
 from flowrec.declarations import message_fields
 from flowrec.enums import Phase, WorkOrder
 from flowrec.errors import FlowrecError
-from flowrec.messages import FlowField, Tick
+from flowrec.messages import FlowField
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.resolve import resolve
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker, work
-from flowrec.topics import BY_FIELD
+from flowrec.topics import BY_FIELD, Tick
 from flowrec.units import seconds
 
 # Messages of a work order that are kept; the assumed flow is solved again.

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from flowrec.clocks.device_clock import Fit
-from flowrec.messages import Clocks
+from flowrec.diagnostics import Clocks
 from flowrec.units import nanoseconds, seconds
 
 _SET_S = 0.01  # a larger change of the wall clock relative to the monotonic one means that it was set

@@ -10,7 +10,8 @@ from collections import Counter
 
 from flowrec.commands.verdict import Gap
 from flowrec.declarations import Message, invalid_numbers
-from flowrec.messages import Applied, CameraLosses, Clocks, Frame, Timing
+from flowrec.diagnostics import CameraLosses, Clocks, Timing
+from flowrec.messages import Applied, Frame
 from flowrec.store.audit import Audit
 from flowrec.topics import BY_FIELD
 from flowrec.units import seconds

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from flowrec.declarations import Message, Role, Topic
 from flowrec.errors import printable
-from flowrec.messages import Tick
 from flowrec.session import Session
 from flowrec.store.channels import is_left_out
-from flowrec.topics import BY_FIELD, TOPICS
+from flowrec.topics import BY_FIELD, TOPICS, Tick
 from flowrec.units import seconds
 from flowrec.version import NUMERICS_VERSION
 

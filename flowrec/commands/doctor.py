@@ -22,8 +22,8 @@ from flowrec.commands.record import refuse_adrift
 from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.control import Coils
 from flowrec.declarations import Image
+from flowrec.diagnostics import CameraLosses
 from flowrec.errors import FlowrecError, RigError
-from flowrec.messages import CameraLosses
 from flowrec.resolve import resolve
 from flowrec.rig_settings import AMPLIFIERS, LAB
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian

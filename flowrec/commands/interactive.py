@@ -16,12 +16,13 @@ from rich.text import Text
 
 from flowrec.enums import Level, Phase
 from flowrec.errors import printable
-from flowrec.messages import Event, Tick
+from flowrec.messages import Event
 from flowrec.run.control import RunControl
 from flowrec.run.disk_monitor import DiskMonitor
 from flowrec.run.watchdog import Watchdog
 from flowrec.store.writer import SessionWriter
 from flowrec.terminal import console, outlet, progress, say
+from flowrec.topics import Tick
 from flowrec.units import seconds
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.enums import Outcome, Phase
 from flowrec.errors import MovieError, SessionError, UnreachableError, UsageError
 from flowrec.estimation.sampler import SAMPLERS
-from flowrec.messages import FlowField, Tick
+from flowrec.messages import FlowField
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.feasibility import no_room, swept_out, too_swift
 from flowrec.resolve import derived, resolve
@@ -44,6 +44,7 @@ from flowrec.summary import as_text, finite
 from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.system.processes import realtime_priority
 from flowrec.terminal import say, warn
+from flowrec.topics import Tick
 
 if TYPE_CHECKING:
     from flowrec.view.live import LiveView

@@ -23,7 +23,7 @@ from flowrec.errors import SessionError, UsageError
 from flowrec.estimation.observer import OBSERVERS
 from flowrec.estimation.sampler import SAMPLERS
 from flowrec.estimation.smoother import observe, smooth
-from flowrec.messages import Applied, Mission, Observations, Tick, Track
+from flowrec.messages import Applied, Mission, Observations, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.planner import PLANNERS
 from flowrec.rigs.recorded import RecordedRig
@@ -36,7 +36,7 @@ from flowrec.store.writer import SessionWriter
 from flowrec.summary import Figures, as_text
 from flowrec.system.outputs import MCAP, Output
 from flowrec.terminal import warn
-from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
+from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from flowrec.units import seconds
 
 # Sections that a replay can not change.

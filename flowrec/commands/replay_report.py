@@ -19,7 +19,7 @@ from flowrec.enums import Phase
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
 from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import FlowField, Observations, Route, Tick
+from flowrec.messages import FlowField, Observations, Route
 from flowrec.pipeline import assemble
 from flowrec.planning import travel_time
 from flowrec.rigs.simulated.rig import SimulatedRig
@@ -31,7 +31,7 @@ from flowrec.session_writer import session_writer
 from flowrec.summary import Row, Value, finite
 from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.terminal import say
-from flowrec.topics import FLOW_FIELDS
+from flowrec.topics import FLOW_FIELDS, Tick
 from flowrec.units import seconds
 
 _SAME_MAP = 1e-3  # of the largest speed: smaller changes are not visible in any table

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from flowrec.commands.compare import Comparison
 from flowrec.config import ResolvedConfig
-from flowrec.enums import Phase, WorkOrder
+from flowrec.enums import WorkOrder
 from flowrec.errors import printable
-from flowrec.messages import Demand, FlowField, Mission, Route, Tick
+from flowrec.messages import Demand, FlowField, Mission, Route
 from flowrec.pipeline import Pipeline
 from flowrec.run.loop import RunReport
 from flowrec.run.workers import work
 from flowrec.session import Session
 from flowrec.store.audit import digest_faults
-from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS
+from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS, Tick
 
 _SAME_COMMAND_UM_S = 1.0  # smaller differences of the demanded velocity are not visible
 
@@ -48,9 +49,10 @@ class WorkerCheck:
         if order is None or order.mission is None:
             return
         mission = order.mission
-        if _knows_more(pipeline, order, mission):
+        answer = ANSWERED_BY[WorkOrder(mission.wanted)]
+        if _knows_more(order, mission, WORKER_FIELDS[answer].reads):
             self._unknown.add(mission.request)
-            path = BY_FIELD[ANSWERED_BY[WorkOrder(mission.wanted)]].path
+            path = BY_FIELD[answer].path
             self.results.append(f"{path}: ordered in the part before, taken as recorded")
         else:
             self._computed[mission.request] = work(pipeline, order)
@@ -76,15 +78,10 @@ class WorkerCheck:
         self._last = tick
 
 
-def _knows_more(pipeline: Pipeline, order: Tick, mission: Mission) -> bool:
+def _knows_more(order: Tick, mission: Mission, reads: Iterable[str]) -> bool:
     """Whether a part of a run begins after an order, and its keyframe holds later messages that the work reads."""
-    if order.stamp_ns <= mission.requested_ns:
-        return False
-    if mission.wanted == WorkOrder.REFINE:
-        return order.observations is not None and order.observations.stamp_ns > mission.requested_ns
-    if mission.wanted == WorkOrder.SURVEY_ROUTE:  # where the robot is and what it has seen, unless it goes downstream
-        return pipeline.survey.method != "downstream"
-    return mission.wanted == WorkOrder.ROUTE and mission.phase == Phase.NAVIGATE  # the present route and its progress
+    read = [getattr(order, name) for name in reads]
+    return any(message is not None and message.stamp_ns > mission.requested_ns for message in read)
 
 
 def digest_lines(path: Path) -> tuple[bool, list[str]]:

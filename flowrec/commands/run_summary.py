@@ -12,12 +12,12 @@ import numpy as np
 from flowrec.chip.chip import Chip
 from flowrec.enums import Outcome, Phase
 from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import Demand, FlowField, Route, Tick
+from flowrec.messages import Demand, FlowField, Route
 from flowrec.run.loop import RunReport
 from flowrec.store.run_files import is_snapshot
 from flowrec.summary import Figures, finite, rows_for_people
 from flowrec.terminal import say, table
-from flowrec.topics import FLOW_FIELDS
+from flowrec.topics import FLOW_FIELDS, Tick
 from flowrec.units import seconds
 
 # The mission was completed, or was ended on purpose.

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from flowrec.enums import Action, Alarm, Level, Outcome, Phase
-from flowrec.messages import Event, Health, Tick
+from flowrec.messages import Event, Health
+from flowrec.topics import Tick
 from flowrec.units import seconds
 
 Line = tuple[str, Level | None]  # text and level; None leaves the level as it is

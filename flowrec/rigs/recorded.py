@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from flowrec.messages import Currents, Tick
+from flowrec.messages import Currents
 from flowrec.pipeline import ARRIVING, Inputs
 from flowrec.store.reader import SessionReader
+from flowrec.topics import Tick
 
 
 class RecordedRig:

@@ -13,13 +13,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from flowrec.clocks import ClockMonitor
+from flowrec.diagnostics import Timing
 from flowrec.enums import Action, Outcome, Phase
-from flowrec.messages import Applied, OperatorEvent, Tick, Timing
+from flowrec.messages import Applied, OperatorEvent
 from flowrec.pipeline import Inputs, Pipeline, step, with_inputs
 from flowrec.rigs.rig import Rig, checked_images, increasing_stamps
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.workers import Results, Worker
+from flowrec.topics import Tick
 from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 SWITCH_S = 1e-4

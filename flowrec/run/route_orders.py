@@ -9,10 +9,11 @@ import numpy as np
 from flowrec.enums import Phase
 from flowrec.estimation.kalman import memory_s
 from flowrec.flow.uncertainty import FlowUncertainty
-from flowrec.messages import Mission, Observations, Route, Tick
+from flowrec.messages import Mission, Observations, Route
 from flowrec.pipeline import Pipeline
 from flowrec.planning.replanning import better_route
 from flowrec.planning.survey_design import Sampling, SurveyOrder
+from flowrec.topics import Tick
 from flowrec.units import seconds
 
 _RECENT = 20  # observations, of which the noise of the next ones is expected

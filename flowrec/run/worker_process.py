@@ -22,12 +22,11 @@ from dataclasses import replace
 from typing import Any, BinaryIO
 
 from flowrec.errors import FlowrecError
-from flowrec.messages import Tick
 from flowrec.pipeline import Pipeline
 from flowrec.planning import warm_up
 from flowrec.run.workers import Result, Results, ordered, work
 from flowrec.system.processes import child_command, child_environment
-from flowrec.topics import WORKER_FIELDS
+from flowrec.topics import WORKER_FIELDS, Tick
 
 _NAME = "the process that solves and plans"
 _LOG_BYTES = 65_536  # the last part of what the process printed

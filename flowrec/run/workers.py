@@ -12,10 +12,10 @@ from typing import Protocol
 
 from flowrec.enums import Phase, WorkOrder
 from flowrec.errors import FlowError
-from flowrec.messages import FlowField, Mission, Route, Tick
+from flowrec.messages import FlowField, Mission, Route
 from flowrec.pipeline import Pipeline
 from flowrec.run.route_orders import observations_of, route, survey_route
-from flowrec.topics import ANSWERED_BY, WORKER_FIELDS
+from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from flowrec.units import nanoseconds
 
 Result = FlowField | Route

@@ -10,13 +10,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from flowrec.errors import SessionError
-from flowrec.messages import Tick
 from flowrec.store.channels import SessionContents
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.roi import Region
 from flowrec.store.run_files import Run, RunFile
 from flowrec.store.session_metadata import SessionHeader
-from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
+from flowrec.topics import BY_FIELD, BY_PATH, TOPICS, Tick
 from flowrec.units import seconds
 
 _OPEN_FILES = 4

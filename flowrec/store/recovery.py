@@ -11,7 +11,6 @@ from pathlib import Path
 
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
-from flowrec.messages import Tick
 from flowrec.store.channels import SessionContents
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_reader import DamageError, McapReader
@@ -38,7 +37,7 @@ from flowrec.store.session_metadata import (
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import held
 from flowrec.system.outputs import MCAP, Output, OutputError, put_in_place
-from flowrec.topics import BY_PATH
+from flowrec.topics import BY_PATH, Tick
 from flowrec.units import seconds
 
 _POLL_S = 1e-3

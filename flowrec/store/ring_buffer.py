@@ -13,8 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from flowrec.diagnostics import Drops
 from flowrec.enums import Action, Level, Outcome
-from flowrec.messages import Drops, Event, OperatorEvent
+from flowrec.messages import Event, OperatorEvent
 from flowrec.store.channels import FRAMES
 from flowrec.store.chunk import ChunkEncoder, SealedChunk, Sink, detached
 from flowrec.store.run_files import partial_path, snapshot_path

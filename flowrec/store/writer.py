@@ -17,9 +17,10 @@ from typing import Any, Self
 import numpy as np
 
 from flowrec.declarations import Message, array_fields
+from flowrec.diagnostics import Drops
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
-from flowrec.messages import Drops, Frame, Tick, Track
+from flowrec.messages import Frame, Track
 from flowrec.store.channels import FRAME_PATH
 from flowrec.store.ring_buffer import RingBuffer
 from flowrec.store.roi import Window, WindowSelector
@@ -29,7 +30,7 @@ from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, NewMessages, WriteQueue
 from flowrec.system.locks import remove_idle
-from flowrec.topics import TOPICS
+from flowrec.topics import TOPICS, Tick
 from flowrec.units import NS_PER_S, nanoseconds
 
 _NICE = 5  # where there are too few cores for all, the control loop goes first

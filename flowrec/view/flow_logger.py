@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from flowrec.messages import FlowField, Route, Tick
+from flowrec.messages import FlowField, Route
+from flowrec.topics import Tick
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label

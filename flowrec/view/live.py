@@ -27,8 +27,9 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from flowrec.messages import Frame, Tick
+from flowrec.messages import Frame
 from flowrec.system.processes import child_command, child_environment
+from flowrec.topics import Tick
 from flowrec.view import viewer
 from flowrec.view.scene import Scene
 

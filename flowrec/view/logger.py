@@ -13,23 +13,12 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from flowrec.declarations import Image
+from flowrec.diagnostics import Timing
 from flowrec.enums import Level, Phase
 from flowrec.flow import sample
-from flowrec.messages import (
-    Currents,
-    Demand,
-    Estimate,
-    Event,
-    Frame,
-    Health,
-    Mission,
-    OperatorEvent,
-    Route,
-    Tick,
-    Timing,
-    Track,
-)
+from flowrec.messages import Currents, Demand, Estimate, Event, Frame, Health, Mission, OperatorEvent, Route, Track
 from flowrec.store.roi import nonzero_window
+from flowrec.topics import Tick
 from flowrec.units import NS_PER_S
 from flowrec.view import colours, maps
 from flowrec.view import entities as e

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from flowrec.messages import Tick
 from flowrec.system.outputs import Output
+from flowrec.topics import Tick
 from flowrec.units import seconds
 from flowrec.view.blueprint import blueprint
 from flowrec.view.logger import TickLogger

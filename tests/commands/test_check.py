@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from flowrec.cli import app
 from flowrec.commands.check import check
+from flowrec.diagnostics import CameraLosses
 from flowrec.errors import SessionError
-from flowrec.messages import CameraLosses
 from flowrec.store.channels import SLOTS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover

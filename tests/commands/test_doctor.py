@@ -17,7 +17,7 @@ from flowrec.cli import app
 from flowrec.commands import doctor
 from flowrec.commands.doctor import FAILURE, OK, WARNING, diagnose
 from flowrec.config import Config, load_config
-from flowrec.messages import CameraLosses
+from flowrec.diagnostics import CameraLosses
 from flowrec.rigs.lab.cameras import probe as camera
 from flowrec.rigs.lab.cameras.camera import CameraInfo
 from tests.chip.looks import LOOKS, picture

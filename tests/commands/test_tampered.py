@@ -18,12 +18,13 @@ from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.config import load_config
 from flowrec.declarations import Role
-from flowrec.messages import Appearance, CameraLosses, Clocks, Drops, Health, Tick
+from flowrec.diagnostics import CameraLosses, Clocks, Drops
+from flowrec.messages import Appearance, Health
 from flowrec.session_writer import session_header
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import TOPICS
+from flowrec.topics import TOPICS, Tick
 from tests.conftest import SMALL
 from tests.rewritten import leaves_of, parser_of, rewrite
 from tests.store.made_up import ticks_of

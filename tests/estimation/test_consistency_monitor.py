@@ -10,7 +10,8 @@ import pytest
 
 from flowrec.control.events import event_of
 from flowrec.estimation import HealthMonitor, Kalman, Observer
-from flowrec.messages import Estimate, Health, Tick
+from flowrec.messages import Estimate, Health
+from flowrec.topics import Tick
 from tests.estimation.lap import ROBOT, driven, vortex
 from tests.store.made_up import encode
 

@@ -14,11 +14,12 @@ from flowrec.commands.record import record
 from flowrec.config import Config, load_config
 from flowrec.control.events import event_of
 from flowrec.estimation import HealthMonitor
-from flowrec.messages import Applied, Estimate, FlowField, Health, Tick
+from flowrec.messages import Applied, Estimate, FlowField, Health
 from flowrec.pipeline import Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.robot import Robot
 from flowrec.store.reader import SessionReader
+from flowrec.topics import Tick
 from tests.conftest import SMALL
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.8)

@@ -18,13 +18,14 @@ import numpy as np
 
 from flowrec.declarations import Image
 from flowrec.errors import SessionError
-from flowrec.messages import OperatorEvent, Tick
+from flowrec.messages import OperatorEvent
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.run_files import PARTIAL_SUFFIX, run_files
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.terminal import progress, table
+from flowrec.topics import Tick
 from flowrec.units import seconds
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 

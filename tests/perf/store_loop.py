@@ -22,12 +22,13 @@ from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.declarations import Image
-from flowrec.messages import Frame, OperatorEvent, Tick
+from flowrec.messages import Frame, OperatorEvent
 from flowrec.run.loop import Sink
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.system.processes import realtime_priority
 from flowrec.terminal import progress
+from flowrec.topics import Tick
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _WIDTH, _HEIGHT = 2448, 2048

@@ -14,7 +14,7 @@ from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from mcap.writer import CompressionType, Writer
 
 from flowrec.declarations import Image, Message
-from flowrec.messages import Applied, Estimate, Frame, Tick, Track
+from flowrec.messages import Applied, Estimate, Frame, Track
 from flowrec.store.channels import SLOTS, declarations, message_codec
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
@@ -22,7 +22,7 @@ from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import BY_FIELD
+from flowrec.topics import BY_FIELD, Tick
 from flowrec.units import nanoseconds
 from tests.store.made_up import encode
 

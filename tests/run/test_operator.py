@@ -20,11 +20,12 @@ from flowrec.commands.interactive import Unattended
 from flowrec.config import load_config
 from flowrec.enums import Action
 from flowrec.errors import SessionError
-from flowrec.messages import OperatorEvent, Tick
+from flowrec.messages import OperatorEvent
 from flowrec.run.control import RunControl
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.keyboard import Keyboard
 from flowrec.store.reader import SessionReader
+from flowrec.topics import Tick
 from flowrec.units import seconds
 from tests.conftest import HANG_S, SMALL
 

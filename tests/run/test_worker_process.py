@@ -19,10 +19,11 @@ import pytest
 from flowrec.commands.record import prepare
 from flowrec.config import load_config
 from flowrec.errors import FlowrecError
-from flowrec.messages import Mission, Tick
+from flowrec.messages import Mission
 from flowrec.pipeline import Pipeline
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import work
+from flowrec.topics import Tick
 from tests.conftest import HANG_S, SMALL, until
 
 # Found by this process and by its child: stages that fail in every way in which an answer can fail.

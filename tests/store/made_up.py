@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from flowrec.diagnostics import Timing
 from flowrec.messages import (
     Applied,
     Currents,
@@ -17,14 +18,13 @@ from flowrec.messages import (
     Observations,
     OperatorEvent,
     Route,
-    Tick,
-    Timing,
     Track,
     Truth,
 )
 from flowrec.store import codec
 from flowrec.store.channels import message_codec
 from flowrec.store.session_metadata import SessionHeader
+from flowrec.topics import Tick
 
 
 def encode(message, schema=""):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from flowrec.errors import SessionError
-from flowrec.messages import Frame, Tick
+from flowrec.messages import Frame
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
@@ -26,6 +26,7 @@ from flowrec.store.scan import scan
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from flowrec.store.writer import SessionWriter
+from flowrec.topics import Tick
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 

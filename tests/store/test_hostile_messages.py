@@ -19,12 +19,12 @@ from flowrec.commands.export import export
 from flowrec.config import config_from_toml
 from flowrec.declarations import Message, invalid_numbers, message_fields, shape_error
 from flowrec.errors import SessionError, UsageError, printable
-from flowrec.messages import Estimate, FlowField, Frame, Tick
+from flowrec.messages import Estimate, FlowField, Frame
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import BY_FIELD, TOPICS
+from flowrec.topics import BY_FIELD, TOPICS, Tick
 from tests.store.drafts import (
     ATTACHMENT,
     CHANNEL,

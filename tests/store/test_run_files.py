@@ -20,7 +20,6 @@ from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config
 from flowrec.errors import SessionError
-from flowrec.messages import Tick
 from flowrec.resolve import resolve
 from flowrec.session import Session, session_sha256
 from flowrec.session_writer import session_header
@@ -30,7 +29,7 @@ from flowrec.store.run_files import part_path, partial_path, parts, run_files, r
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import Part
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import BY_FIELD
+from flowrec.topics import BY_FIELD, Tick
 from tests.conftest import SMALL
 from tests.store.made_up import ticks_of
 

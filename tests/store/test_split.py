@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
-from flowrec.messages import OperatorEvent, Tick
+from flowrec.messages import OperatorEvent
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
@@ -32,6 +32,7 @@ from flowrec.store.split import Parts
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
 from flowrec.store.writer import SessionWriter
+from flowrec.topics import Tick
 from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in

@@ -19,11 +19,12 @@ from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 
 from flowrec.errors import SessionError
-from flowrec.messages import Frame, Tick
+from flowrec.messages import Frame
 from flowrec.store.reader import SessionReader
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
+from flowrec.topics import Tick
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
 TICKS = list(ticks_of(150))

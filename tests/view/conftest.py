@@ -12,7 +12,9 @@ import pytest
 from flowrec import messages as m
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
+from flowrec.diagnostics import Timing
 from flowrec.robot import Robot
+from flowrec.topics import Tick
 from flowrec.view.scene import Scene
 
 H, W, UM_PER_PX = 256, 320, 4.0
@@ -64,7 +66,7 @@ def scene() -> Scene:
     return Scene(chip, Calibration(CAMERA_UM_PER_PX, (0.0, 0.0)), robot, "a made-up mission", {"operator": "nobody"})
 
 
-def mission(ticks: int = 120, seed: int = 0, share: float = 0.65) -> Iterator[m.Tick]:
+def mission(ticks: int = 120, seed: int = 0, share: float = 0.65) -> Iterator[Tick]:
     """Ticks at 60 Hz: survey, refine at 30 %, navigate into the upper branch; lost for a few frames at 60 %."""
     noise = np.random.default_rng(seed)
     fluid = cv2.resize(mask().astype(np.uint8), (640, 512), interpolation=cv2.INTER_LINEAR)
@@ -76,7 +78,7 @@ def mission(ticks: int = 120, seed: int = 0, share: float = 0.65) -> Iterator[m.
     steps = np.r_[0, np.cumsum(np.hypot(*np.diff(way, axis=0).T))]
     fine = np.linspace(0, steps[-1], 120)
     waypoints = np.stack([np.interp(fine, steps, way[:, c]) for c in (0, 1)], 1)
-    tick = m.Tick()
+    tick = Tick()
     for i in range(ticks):
         now, done = round(i * 1e9 / 60), i / ticks
         at = np.array([np.interp(done * steps[-1] * 0.95, steps, way[:, c]) for c in (0, 1)])
@@ -100,7 +102,7 @@ def mission(ticks: int = 120, seed: int = 0, share: float = 0.65) -> Iterator[m.
             "currents": m.Currents(
                 now, 9 + 3 * np.sin(i / 20), heading, 5.0, i * 0.9, 1.5 * np.cos([i * 0.9, i * 0.9 + 2, i]), False
             ),
-            "timing": m.Timing(now, 2.1, 0.2, 0.4, 0.3, 3.4, 0.0, 0),
+            "timing": Timing(now, 2.1, 0.2, 0.4, 0.3, 3.4, 0.0, 0),
             "truth": m.Truth(now, at, flow, 20.0, 0),
         }
         if tick.mission is None or tick.mission.phase != phase:
@@ -111,7 +113,7 @@ def mission(ticks: int = 120, seed: int = 0, share: float = 0.65) -> Iterator[m.
         if tick.refined is None and done >= 0.3:
             new["refined"] = refined
             new["route"] = m.Route(now, 2, "astar", True, "", waypoints, np.linspace(0, 20, 120))
-        tick = m.Tick(**{name: new.get(name, getattr(tick, name)) for name in m.Tick.__dataclass_fields__})
+        tick = Tick(**{name: new.get(name, getattr(tick, name)) for name in Tick.__dataclass_fields__})
         yield tick
 
 
@@ -122,10 +124,10 @@ def field_at(flow: m.FlowField, at_um: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def ticks() -> list[m.Tick]:
+def ticks() -> list[Tick]:
     return list(mission())
 
 
 @pytest.fixture(scope="session")
-def made_up() -> Callable[..., Iterator[m.Tick]]:
+def made_up() -> Callable[..., Iterator[Tick]]:
     return mission

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from flowrec.messages import Frame, Tick
+from flowrec.messages import Frame
+from flowrec.topics import Tick
 from flowrec.view import viewer
 from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene

@@ -12,7 +12,8 @@ import rerun as rr
 
 from flowrec.chip.registration import Calibration
 from flowrec.flow import sample
-from flowrec.messages import FlowField, Tick
+from flowrec.messages import FlowField
+from flowrec.topics import Tick
 from flowrec.view import colours, maps
 from flowrec.view.colours import Scale
 from flowrec.view.logger import TickLogger

@@ -12,8 +12,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 from flowrec.errors import SessionError
-from flowrec.messages import Tick
 from flowrec.system.outputs import RRD, Output
+from flowrec.topics import Tick
 from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene
 

@@ -9,8 +9,8 @@ import cv2
 import pytest
 
 from flowrec.errors import FlowrecError
-from flowrec.messages import Tick
 from flowrec.system.outputs import RRD, Output
+from flowrec.topics import Tick
 from flowrec.view import viewer
 from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene

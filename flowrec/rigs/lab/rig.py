@@ -21,8 +21,9 @@ import numpy as np
 
 from flowrec.clocks import Fit
 from flowrec.config import ResolvedConfig
+from flowrec.diagnostics import CameraLosses
 from flowrec.errors import RigError, UsageError
-from flowrec.messages import Applied, CameraLosses, Currents, Frame
+from flowrec.messages import Applied, Currents, Frame
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rig_settings import CAMERAS
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of

@@ -19,8 +19,8 @@ from types import TracebackType
 from typing import Self, TypeVar
 
 from flowrec.clocks import DeviceClock, Fit
+from flowrec.diagnostics import CameraLosses
 from flowrec.errors import RigError
-from flowrec.messages import CameraLosses
 from flowrec.rigs.lab.cameras.block_ids import BlockIds
 from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Image, Wanted
 from flowrec.system.processes import realtime_priority

@@ -9,8 +9,8 @@ from functools import partial
 
 from flowrec.clocks.device_clock import envelope
 from flowrec.declarations import Image
+from flowrec.diagnostics import CameraLosses
 from flowrec.errors import RigError
-from flowrec.messages import CameraLosses
 from flowrec.rig_settings import CAMERAS, CameraSettings, Lab
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber

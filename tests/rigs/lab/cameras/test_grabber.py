@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flowrec.diagnostics import CameraLosses
 from flowrec.errors import RigError
-from flowrec.messages import CameraLosses
 from flowrec.rigs.lab.cameras.camera import Wanted
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from tests.rigs.lab.cameras.scripted import GONE, INFO, WANTED, Scripted, Step, block
