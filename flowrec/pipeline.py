@@ -164,7 +164,12 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
         health = p.health.watch(health, last.estimate, estimate, flow, p.robot, looked, wall_um)
     robot = robot.limited_to(health.limit_hz)
-    observations = p.sampler.collect(last.observations, last.estimate, estimate, p.robot)
+    mapless, measured = last.mapless, estimate
+    if p.sampler.without_map:
+        mapless = p.observer.without_map(last.mapless, last.estimate, estimate, track, inputs.applied, p.robot)
+        measured = p.observer.measured(mapless, estimate)
+    before = None if last.estimate is None else p.observer.measured(last.mapless, last.estimate)
+    observations = p.sampler.collect(last.observations, before, measured, p.robot)
     lap("observe")
     mission = p.mission.update(
         last.mission,
@@ -205,6 +210,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         estimate=estimate,
         health=health,
         observations=observations,
+        mapless=mapless,
         mission=mission,
         demand=demand,
         currents=currents,

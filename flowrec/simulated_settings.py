@@ -76,6 +76,8 @@ class Simulated:
     delay_s: Annotated[float, Range(0.0, 10.0)] | None = None  # None: drawn
     step_out_error: _PartOf | None = None  # the true step-out frequency is the assumed one times up to 1 +- this
     step_out_share: Annotated[float, Range(0.01, 10.0)] | None = None  # true over assumed; None: drawn
+    # each coil's true field per ampere differs by up to this fraction of itself, in each of the three directions
+    coil_error: _PartOf | None = None
     # The camera.
     # Its true registration: shifted by half of to all of offset_px (camera pixels) in any direction, turned by up to
     # angle_error_deg and scaled by up to 1 +- scale_error from that of [camera].
@@ -147,6 +149,7 @@ WORLDS: Mapping[str, Mapping[str, Any]] = {
         "speed_noise": 0.02,
         "delay_error": 0.0,
         "step_out_error": 0.0,
+        "coil_error": 0.0,
         "offset_px": 0.0,
         "angle_error_deg": 0.0,
         "scale_error": 0.0,
@@ -175,6 +178,7 @@ WORLDS: Mapping[str, Mapping[str, Any]] = {
         "speed_noise": 0.02,  # [9]
         "delay_error": 0.1,  # [10]
         "step_out_error": 0.1,  # [11]
+        "coil_error": 0.0,
         "offset_px": 1.0,  # [12] 10 um in the default view
         "angle_error_deg": 0.2,  # [12]
         "scale_error": 0.003,  # [12]
@@ -203,6 +207,7 @@ WORLDS: Mapping[str, Mapping[str, Any]] = {
         "speed_noise": 0.03,  # [9]
         "delay_error": 0.3,  # [10]
         "step_out_error": 0.2,  # [11]
+        "coil_error": 0.0,
         "offset_px": 2.0,  # [12]
         "angle_error_deg": 0.5,  # [12]
         "scale_error": 0.01,  # [12]

@@ -75,6 +75,10 @@ class Tick:
     truth: Annotated[Truth | None, Topic("/truth/robot", Source.SIMULATOR)] = None
     true_field: Annotated[FlowField | None, Topic("/truth/flow", Source.SIMULATOR)] = None
     appearance: Annotated[Appearance | None, Topic("/robot/appearance", Source.STAGE, 1e-4, {"views": 1e-3})] = None
+    # The estimate of a filter that knows no map, while `estimate` corrects one: what observations are taken from.
+    mapless: Annotated[
+        Estimate | None, Topic("/robot/estimate_without_map", Source.STAGE, 1e-6, {"covariance": 1e-6})
+    ] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -172,14 +173,18 @@ def draw_track(
 
 
 def draw_missions(path: Path, results: dict[str, Any]) -> None:
-    """Arrival time over the least time by policy, a panel per map; trips joined, failures and contacts counted."""
-    rows, policies = results["rows"], list(results["summary"])
+    """Arrival time over the least time by policy, a row of panels per world, one per map; trips are joined.
+
+    Failures and contacts are counted.
+    """
+    rows, worlds = results["rows"], list(results["summary"])
+    policies = list(results["summary"][worlds[0]])
     maps = list(dict.fromkeys(row["map"] for row in rows))
-    figure = new_figure(1.5 + 1.35 * len(policies) * len(maps), 4.4)
-    axes = figure.subplots(1, len(maps), sharey=True, squeeze=False)[0]
-    for ax, known in zip(axes, maps, strict=True):
+    figure = new_figure(1.5 + 1.35 * len(policies) * len(maps), 0.9 + 3.5 * len(worlds))
+    axes = figure.subplots(len(worlds), len(maps), sharey=True, squeeze=False)
+    for ax, (world, known) in zip(axes.flat, product(worlds, maps), strict=True):
         for way, label, colour, shift in _WAYS:
-            mine = [row for row in rows if row["map"] == known and row["way"] == way]
+            mine = [row for row in rows if (row["world"], row["map"], row["way"]) == (world, known, way)]
             for seed in sorted({row["seed"] for row in mine}):
                 ratio = {row["policy"]: row["ratio"] for row in mine if row["seed"] == seed}
                 places = [at + shift for at, name in enumerate(policies) if ratio.get(name) is not None]
@@ -199,12 +204,13 @@ def draw_missions(path: Path, results: dict[str, Any]) -> None:
                 ax.annotate(note, place, ha="center", va="top", fontsize=8, color=colour)
         ax.axhline(1.0, color=INK, lw=0.8)
         ax.axhline(1.1, color=QUIET, lw=0.8, ls=":")
-        style(ax, f"on the {known} map", grid=False)
+        style(ax, f"{world}, on the {known} map", grid=False)
         ax.set_xticks(range(len(policies)), policies, fontsize=9, color=INK)
         ax.set_xlim(-0.5, len(policies) - 0.5)
         ax.set_ylim(0.9, _LARGEST_RATIO)
-    axes[0].set_ylabel("arrival time / least time in the true flow", fontsize=9, color=INK)
-    axes[0].legend(fontsize=8, frameon=False, loc="upper left")
-    text = f"{results['seeds']} worlds, inlet flows {100 * results['world']['flow_error']:g} % off; bars: medians, "
+    for ax in axes[:, 0]:
+        ax.set_ylabel("arrival time / least time in the true flow", fontsize=9, color=INK)
+    axes[0, 0].legend(fontsize=8, frameon=False, loc="upper left")
+    text = f"{results['seeds']} seeds, coils {results['coils']}; bars: medians, "
     figure.suptitle(f"{text}lines: one trip; × failed, ▮ touched a wall", fontsize=8.5, color=INK, x=0.01, ha="left")
     figure.savefig(path)

@@ -1,8 +1,11 @@
 """`flowrec bench missions`: whole missions in the simulated rig, several policies in the same worlds.
 
-A seed determines a world: the chip, the error of the assumed flow, the noise. Every policy flies every trip in it, with
-the flow and against it, after a survey and on the assumed map alone. Only the bench reads the truth; the stages get
-camera images.
+A world and a seed determine the chip, what truly differs from the assumptions, and the noise. Every policy flies every
+trip in it, with the flow and against it, after a survey and on the assumed map alone. Only the bench reads the truth;
+the stages get camera images.
+
+Coils take part: the demand becomes currents within the limits of amplifiers and coils, and the field that these
+currents truly make moves the robot. Each command is held against the limits that a lab's amplifier enforces.
 """
 
 from __future__ import annotations
@@ -22,22 +25,24 @@ from numpy.typing import NDArray
 
 from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, print_rows, vessel_cases, wilson
+from flowrec.bench.world_flights import WORLDS as FAULTS
+from flowrec.bench.world_flights import Given, in_world
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
-from flowrec.commands.record import refuse_adrift
-from flowrec.config import ResolvedConfig, load_config
+from flowrec.config import load_config
 from flowrec.control.controller import CONTROLLERS
-from flowrec.errors import FlowrecError
-from flowrec.flow import FlowSolver
-from flowrec.messages import FlowField, Route
+from flowrec.errors import FlowrecError, RigError, UsageError
+from flowrec.messages import Currents, FlowField, Route
 from flowrec.pipeline import assemble
 from flowrec.planning import Planner
-from flowrec.resolve import resolve
+from flowrec.rig_settings import OutputLimits
+from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.rigs.simulated.world import true_chip
+from flowrec.rigs.simulated.world import true_robot
 from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
+from flowrec.simulated_settings import Simulated
 from flowrec.terminal import progress, say
 from flowrec.topics import Tick
 from flowrec.units import seconds
@@ -55,7 +60,19 @@ POLICIES |= {
     for name in CONTROLLERS
     if not any(f"control.method={name}" in sets for sets in POLICIES.values())
 }
-_DEFAULT_POLICIES = "policy,vector,paper,plain"
+_DEFAULT_POLICIES = "policy,vector,paper,plain,ff_fb_no_flow"
+# Those of `bench worlds`, and the world of the first missions: inlet flows a tenth off, all else nearly as assumed.
+WORLDS: dict[str, Callable[[Given], Sequence[str]]] = {
+    **FAULTS,
+    "inlet": lambda given: (f"inlet_speed_share={given.either(0.1)}", "outlet_pressure_error=0.0"),
+}
+_DEFAULT_WORLDS = "kind,moderate,hard"
+# Coils as configured, which can do all that is asked of them; and coils with resistance and inductance behind voltage
+# amplifiers, in the earth's field, calibrated with a Hall probe to a few percent (an assumption).
+COILS: dict[str, tuple[str, ...]] = {
+    "ample": (),
+    "real": ("coils.amplifier.kind=voltage", "coils.bias_mt=[0.0, 0.02, 0.045]", "simulated.coil_error=0.03"),
+}
 # By direction and map. Upstream after a survey, the robot drifts down first and then swims back.
 TRIPS: dict[tuple[str, str], tuple[str, ...]] = {
     ("down", "surveyed"): (),
@@ -69,11 +86,10 @@ _BEST = Planner(method="time_field", clearance_margin_um=0.0, speed_share=1.0)  
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """Errors of the assumptions; noise and latency are those of any simulated run."""
+    """What truly differs from the assumptions."""
 
-    flow_error: float = 0.1  # relative error of each true inlet flow; the seed chooses its sign
-    outlet_error: float = 0.0  # simulated.outlet_pressure_error
-    latency_s: float | None = None  # of the robot, known to it; None: the default
+    name: str = "kind"  # of WORLDS
+    coils: str = "ample"  # of COILS
     sets: tuple[str, ...] = ()  # further settings of all policies
 
 
@@ -81,6 +97,7 @@ class World:
 class Row:
     """One mission. None or NaN if it was refused, or if there is no such value."""
 
+    world: str
     seed: int
     chip: str
     way: str  # down, up
@@ -96,15 +113,23 @@ class Row:
     planned_s: float | None = None
     rms_um: float | None = None  # distance to the reference while navigating
     replans: int = 0
+    beyond: int = 0  # commands to the coils that a lab's amplifier would have changed or refused
     latency_ms: float = math.nan
     radius_um: float = math.nan
     speed_limit_um_s: float = math.nan
 
 
 class MissionLog:
-    """A sink that collects the data of a row."""
+    """A sink that collects the data of a row.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    limits : what the coils can do.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.beyond = 0
+        self._limits = limits
         self.began: tuple[int, NDArray[np.float64], Route] | None = None  # stamp, true position, route
         self.contacts = {"survey": 0, "navigate": 0}
         self.replans = 0
@@ -121,21 +146,33 @@ class MissionLog:
         self.contacts["survey" if self.began is None else "navigate"] += touched
         if self.began is not None and mission.wanted == "route" and before.mission is not None:
             self.replans += mission.request != before.mission.request
+        if tick.currents is not None and tick.currents is not before.currents:
+            self.beyond += self._is_beyond(tick.currents, (tick.stamp_ns - before.stamp_ns) if before.track else 0)
         demand = tick.demand
         if mission.phase == "navigate" and demand is not None and math.isfinite(demand.error_um):
             self.squared_um2.append(demand.error_um**2)
         self._last = tick
+
+    def _is_beyond(self, currents: Currents, frame_ns: int) -> bool:
+        """Whether a command, or an output sample of the frame that it lasts, is beyond a limit."""
+        coils = self._limits.coils
+        state, command = coils.state_and_command(currents)
+        admitted = self._limits.admit(currents, currents.stamp_ns)
+        samples = coils.output_samples(state, command, math.ceil(seconds(frame_ns) * coils.amplifier.output_hz) + 1)
+        try:
+            self._limits.check_samples(*samples)
+        except RigError:
+            return True
+        return (admitted.frequency_hz, admitted.amplitude_mt) != (command.frequency_hz, command.amplitude_mt)
 
 
 def measure(
     seeds: Annotated[int, typer.Option(min=1, help="Worlds; every policy flies all of them, both ways.")] = 40,
     cases: Annotated[Path | None, typer.Option(metavar="DIR", help="Vessel cases besides the built-in chips.")] = None,
     policies: Annotated[str, typer.Option(metavar="A,B", help=f"Of {', '.join(POLICIES)}.")] = _DEFAULT_POLICIES,
-    flow_error: Annotated[float, typer.Option(help="Relative error of each inlet flow.")] = 0.1,
-    outlet_error: Annotated[float, typer.Option(help="Same of outlet pressures, of the drop across the chip.")] = 0.0,
-    latency: Annotated[
-        float | None, typer.Option(metavar="S", help="From command to motion; 0.04, less in fast channels.")
-    ] = None,
+    worlds: Annotated[str, typer.Option(metavar="A,B", help=f"Of {', '.join(WORLDS)}.")] = _DEFAULT_WORLDS,
+    coils: Annotated[str, typer.Option(metavar="NAME", help=f"One of {', '.join(COILS)}.")] = "real",
+    first_seed: Annotated[int, typer.Option(min=1, help="Seed of the first world.")] = 1,
     sets: Sets = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     figure: FigureFile = None,
@@ -148,14 +185,17 @@ def measure(
     Raises
     ------
     UsageError
-        If there is no such policy, or no case in `cases`.
+        If there is no such policy, world or kind of coils, or no case in `cases`.
     """
     names = chosen("bench missions: no policy", policies, POLICIES)
-    world = World(flow_error, outlet_error, latency, tuple(sets or ()))
+    known_worlds = chosen("bench missions: no world", worlds, WORLDS)
+    if coils not in COILS:
+        raise UsageError(f"bench missions: no coils {coils!r}; there are {', '.join(COILS)}")
     paths = [] if cases is None else vessel_cases(cases)
     missions = [
-        (seed, chip_of(seed, paths), way, known, policy, world)
-        for seed in range(1, seeds + 1)
+        (seed, chip_of(seed, paths), way, known, policy, World(world, coils, tuple(sets or ())))
+        for seed in range(first_seed, first_seed + seeds)
+        for world in known_worlds
         for way, known in TRIPS
         if known in maps
         for policy in names
@@ -169,16 +209,29 @@ def measure(
         for row in workers.map(fly, *columns, chunksize=4) if jobs > 1 else map(fly, *columns):
             rows.append(row)
             done(len(rows))
-    results = {
-        "world": asdict(world),
-        "seeds": seeds,
-        "rows": [asdict(row) for row in rows],
-        "summary": {policy: summary([row for row in rows if row.policy == policy]) for policy in names},
-        "pairs": {f"{a} / {b}": compared(rows, a, b) for a, b in combinations(names, 2)},
-    }
+    results = results_of(rows, known_worlds, names) | {"coils": coils, "seeds": seeds}
     if figure is not None:
         draw_missions(figure, results)
     return results
+
+
+def results_of(rows: Sequence[Row], worlds: Sequence[str], policies: Sequence[str]) -> Results:
+    """The rows, and by world a summary of each policy and their pairs; `fault_count`: commands beyond the limits."""
+    by_world = {world: [row for row in rows if row.world == world] for world in worlds}
+    return {
+        "rows": [asdict(row) for row in rows],
+        "summary": {
+            world: {
+                policy: summary(mine) for policy in policies if (mine := [row for row in some if row.policy == policy])
+            }
+            for world, some in by_world.items()
+        },
+        "pairs": {
+            world: {f"{a} / {b}": compared(some, a, b) for a, b in combinations(policies, 2)}
+            for world, some in by_world.items()
+        },
+        "fault_count": sum(row.beyond for row in rows),
+    }
 
 
 def chip_of(seed: int, paths: Sequence[Path]) -> tuple[str, ...]:
@@ -220,28 +273,19 @@ def fly(
     watch: Callable[[Tick], None] | None = None,
 ) -> Row:
     """One mission; `known` is the map, surveyed or assumed. `watch` gets every tick."""
-    sets = [
-        *chip_sets,
-        f"simulated.seed={seed}",
-        f"simulated.outlet_pressure_error={world.outlet_error}",
-        *([] if world.latency_s is None else [f"robot.delay_s={world.latency_s}"]),
-        *TRIPS[way, known],
-        *POLICIES[policy],
-        *world.sets,
-    ]
+    sets = [*chip_sets, f"simulated.seed={seed}", *COILS[world.coils], *TRIPS[way, known], *POLICIES[policy]]
+    sets += world.sets
     asked = load_config(None, sets)
     name = Path(asked.chip.path).stem or asked.chip.name
     name += " slowed" if asked.chip.path and asked.chip.inlet_speed_um_s is not None else ""
     try:
-        chip = load_chip(asked.chip)
-        config = resolve(asked, chip)
-        refuse_adrift(config, chip)
-        truth = true_field(chip, config, world)
+        config, chip = in_world(WORLDS[world.name], list(WORLDS).index(world.name), seed, sets)
+        pipeline = assemble(config, chip)
+        rig = SimulatedRig.of(pipeline, config)
+        truth = rig.true_world().field
     except FlowrecError as error:  # before anything is switched on
-        return Row(seed, name, way, known, policy, "refused", str(error))
-    pipeline = assemble(config, chip)
-    rig = SimulatedRig.of(pipeline, config, true_field=truth)
-    log = MissionLog()
+        return Row(world.name, seed, name, way, known, policy, "refused", str(error))
+    log = MissionLog(Limits(config.coils, config.robot, OutputLimits()))
     report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], on_tick=watch)
     mission, outcome = report.last.mission, report.outcome
     assert mission is not None
@@ -250,13 +294,14 @@ def fly(
         began_ns, start_um, route = log.began
         planned_s = float(route.arrival_s[-1])
         tolerance_um = config.mission.goal_tolerance_um or config.robot.radius_um
-        best_s = optimum_s(truth, start_um, mission.goal_um, tolerance_um, chip, config.robot)
+        able = able_robot(config.robot, config.simulated)
+        best_s = optimum_s(truth, start_um, mission.goal_um, tolerance_um, chip, able)
         if outcome == "reached":
             taken_s = seconds(mission.since_ns - began_ns)
         elif outcome == "unreachable":
             outcome = "unreachable too late"
     return Row(
-        *(seed, name, way, known, policy, outcome, report.note),
+        *(world.name, seed, name, way, known, policy, outcome, report.note),
         survey_contacts=log.contacts["survey"],
         contacts=log.contacts["navigate"],
         seconds=taken_s,
@@ -265,22 +310,17 @@ def fly(
         planned_s=planned_s,
         rms_um=math.sqrt(float(np.mean(log.squared_um2))) if log.squared_um2 else None,
         replans=log.replans,
+        beyond=log.beyond,
         latency_ms=1e3 * config.robot.delay_s,
         radius_um=config.robot.radius_um,
         speed_limit_um_s=config.robot.speed_limit_um_s,
     )
 
 
-def true_field(chip: Chip, config: ResolvedConfig, world: World) -> FlowField:
-    """The true flow: inlets off by exactly the flow error of the world, outlets and viscosity as drawn by the rig."""
-    solver = FlowSolver(k=config.simulated.value("k"))
-    drawn = true_chip(chip, config.simulated, solver)
-    rng = np.random.default_rng([config.simulated.seed, 0xF10])
-    signs = np.where(rng.random(len(chip.openings)) < 0.5, -1.0, 1.0)
-    inlet = np.array([opening.kind == "inlet" for opening in chip.openings])
-    values = np.where(inlet, chip.boundary_values * (1.0 + world.flow_error * signs), drawn.boundary_values)
-    field = solver.solve(chip.with_boundary(values, drawn.viscosity_mpa_s))
-    return replace(field, method="truth", note=f"inlets off by {100 * world.flow_error:g} %")
+def able_robot(robot: Robot, simulated: Simulated) -> Robot:
+    """The robot with the speed that it truly has."""
+    true = true_robot(robot, simulated)
+    return replace(true, max_speed_um_s=robot.max_speed_um_s * true.um_per_rev / robot.um_per_rev)
 
 
 def optimum_s(
@@ -351,16 +391,20 @@ def compared(rows: Sequence[Row], a: str, b: str) -> dict[str, Any]:
 
 
 def show(results: Results) -> None:
-    """Print the summary by policy and the comparisons."""
-    counts = {"reached": "reached", "predicted": "honest"}
+    """Print the summary by world and policy, and the comparisons."""
+    counts = {"reached": "reached", "refused": "unreachable", "either": "honest"}
     counts |= {"no contact": "without_contact", "survey": "survey_without_contact"}
     ratios = {name: f"{{ratio[{name}]:.2f}}" for name in ("median", "mean", "worst")}
     print_rows(
-        f"Missions over {results['seeds']} worlds, inlet flows {100 * results['world']['flow_error']:g} % off, Wilson "
-        "95 % intervals in brackets; predicted: reached, or refused in advance",
-        [{"policy": name, **line} for name, line in results["summary"].items()],
+        f"Missions with {results['seeds']} seeds, coils {results['coils']}; Wilson 95 % intervals in brackets; "
+        "refused: in advance; time over the least time",
+        [
+            {"world": world if index == 0 else "", "policy": name, **line}
+            for world, lines in results["summary"].items()
+            for index, (name, line) in enumerate(lines.items())
+        ],
         {
-            **{"policy": "{policy}", "n": "{missions}"},
+            **{"world": "{world}", "policy": "{policy}", "n": "{missions}"},
             **{
                 head: f"{{{key}[count]}} ({{{key}[wilson_95][0]:.0%}}-{{{key}[wilson_95][1]:.0%}})"
                 for head, key in counts.items()
@@ -369,15 +413,24 @@ def show(results: Results) -> None:
             "< 1.1": "{ratio[within_10_percent][share]:.0%}",
         },
     )
-    for name, line in results["summary"].items():
-        for failure in line["failed"]:
-            say(f"{name}: {failure}")
-    if results["pairs"]:
+    for world, lines in results["summary"].items():
+        for name, line in lines.items():
+            for failure in line["failed"]:
+                say(f"{world}, {name}: {failure}")
+    if results["fault_count"]:
+        say(f"{results['fault_count']} commands were beyond the limits of the coils")
+    pairs = [
+        {"world": world, "policies": name, **pair}
+        for world, found in results["pairs"].items()
+        for name, pair in found.items()
+        if pair["count"]
+    ]
+    if pairs:
         print_rows(
             "Time of one over time of the other on the same trips",
-            [{"policies": name, **pair} for name, pair in results["pairs"].items() if pair["count"]],
+            pairs,
             {
-                **{"policies": "{policies}", "n": "{count}", "faster": "{less} of {count}"},
+                **{"world": "{world}", "policies": "{policies}", "n": "{count}", "faster": "{less} of {count}"},
                 "mean ratio (95 %)": "{mean:.3f} ({interval_95[0]:.3f} to {interval_95[1]:.3f})",
                 **{"sign test p": "{sign_p:.1g}", "Wilcoxon p": "{wilcoxon_p:.1g}"},
             },

@@ -164,11 +164,25 @@ def prepared(case: Case) -> tuple[ResolvedConfig, Chip]:
     Raises FlowrecError where the mission can not be flown.
     """
     sets = [*chip_sets(case.chip), f"refine.method={_IN_FLIGHT}", f"simulated.seed={case.seed}", *case.sets]
+    return in_world(WORLDS[case.world], list(WORLDS).index(case.world), case.seed, sets)
+
+
+def in_world(
+    faults: Callable[[Given], Sequence[str]], number: int, seed: int, sets: Sequence[str]
+) -> tuple[ResolvedConfig, Chip]:
+    """The configuration of a seed in a world, and its chip.
+
+    Parameters
+    ----------
+    number : of the world, which has random numbers of its own.
+    sets : settings, which those of the world do not replace.
+
+    Raises FlowrecError where the mission can not be flown.
+    """
     asked = load_config(None, ["simulated.world=kind", *sets])
     chip = load_chip(asked.chip)
-    rng = np.random.default_rng([case.seed, _FAULT_STREAM, list(WORLDS).index(case.world)])
-    faults = WORLDS[case.world](Given(rng, resolve(asked, chip), chip))
-    asked = load_config(None, ["simulated.world=kind", *(f"simulated.{fault}" for fault in faults), *sets])
+    given = Given(np.random.default_rng([seed, _FAULT_STREAM, number]), resolve(asked, chip), chip)
+    asked = load_config(None, ["simulated.world=kind", *(f"simulated.{fault}" for fault in faults(given)), *sets])
     config = resolve(asked, chip)
     refuse_adrift(config, chip)
     return config, chip

@@ -77,6 +77,37 @@ class Observer:
         estimate: Estimate = settings.estimate(previous, track, applied, robot, field if used else None)
         return replace(estimate, rolled_um_s=_rolled_um_s(previous, estimate, applied, robot))
 
+    def without_map(
+        self,
+        previous: Estimate | None,
+        before: Estimate | None,
+        estimate: Estimate,
+        track: Track,
+        applied: Applied,
+        robot: Robot,
+    ) -> Estimate | None:
+        """The estimate of the same filter without a map, while `estimate` corrects one; else `previous` itself.
+
+        An estimate that corrects a map contains it: a refinement of that map would take what it has found before for
+        another measurement.
+
+        Parameters
+        ----------
+        previous : what this method returned last.
+        before : the estimate of the frame before, from which the filter continues where that did not use a map.
+        """
+        if not corrects_map(estimate):
+            return previous
+        if before is not None:
+            before = self.measured(previous, before)
+        now = self.kalman.estimate(before, track, applied, robot)
+        return replace(now, rolled_um_s=_rolled_um_s(before, now, applied, robot))
+
+    @staticmethod
+    def measured(mapless: Estimate | None, estimate: Estimate) -> Estimate:
+        """What was measured of the flow on a frame: the estimate without a map if there is one of that frame."""
+        return mapless if mapless is not None and mapless.stamp_ns == estimate.stamp_ns else estimate
+
     def _good(self, previous: Estimate | None, field: FlowField | None, health: Health | None) -> bool:
         """Whether the map is good enough to be corrected instead of ignored.
 

@@ -97,6 +97,8 @@ class Sampler:
     floor_um_s: Annotated[float, Range(1e-3, 1e4)] = 2.0  # least sigma of an observation
     # one sigma of the robot rolling off its course, which appears as flow; fraction of its own speed
     rolling_share: Share = 0.02
+    # take them from a filter that knows no map (`Observer.without_map`): a map is no measurement
+    without_map: bool = True
     capacity: Annotated[int, Range(1, 100_000)] = 2000  # the oldest are dropped first
     method: Annotated[str, SAMPLERS] = "filter"  # what a refinement is given
     trimmed: Trimmed = field(default_factory=Trimmed)

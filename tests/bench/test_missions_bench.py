@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +10,15 @@ import pytest
 from flowrec.bench import missions
 from flowrec.bench.figures import draw_missions
 from flowrec.bench.harness import paired, wilson
-from flowrec.bench.missions import World, chip_of, compared, fly, optimum_s, summary
+from flowrec.bench.missions import MissionLog, World, chip_of, compared, fly, optimum_s, results_of, summary
 from flowrec.chip import load_chip
 from flowrec.chip.chip import ChipSettings
+from flowrec.control.amplifier import Amplifier
+from flowrec.control.coils import Coils
 from flowrec.errors import UsageError
+from flowrec.rig_settings import OutputLimits
+from flowrec.rigs.lab.amplifiers.limits import Limits
+from tests.estimation.lap import ROBOT
 from tests.planning.worlds import channel, field_of, open_water, robot
 from tests.planning.worlds import chip_of as made_up
 
@@ -56,7 +61,7 @@ def test_there_is_no_optimum_against_a_flow_that_is_too_fast():
 @pytest.fixture(scope="module")
 def flown():
     ticks = []
-    row = fly(3, TINY, "down", "assumed", "vector", World(sets=("plan.method=astar_time",)), ticks.append)
+    row = fly(3, TINY, "down", "assumed", "vector", World("inlet", "real", ("plan.method=astar_time",)), ticks.append)
     return row, ticks
 
 
@@ -65,6 +70,7 @@ def test_a_row_says_what_the_ticks_say(flown):
     going = [tick for tick in ticks if tick.mission.phase == "navigate"]
     done = next(tick for tick in ticks if tick.mission.finished)
     assert (row.outcome, row.contacts, row.survey_contacts, row.replans) == ("reached", 0, 0, 0)
+    assert row.beyond == 0 and max(tick.currents.amplitude_mt for tick in ticks) > 3.0
     assert ticks[-1].truth.contacts == 0
     assert row.seconds == pytest.approx((done.stamp_ns - going[0].stamp_ns) * 1e-9)
     assert row.ratio == row.seconds / row.optimum_s and 0.97 < row.ratio < 1.6
@@ -85,10 +91,34 @@ def test_the_true_flow_is_wrong_by_what_was_asked(flown):
     assert abs(share - 1.0) == pytest.approx(0.1)
 
 
+def test_the_world_flies_as_it_is_with_its_walls_its_robot_and_its_coils(flown):
+    ticks = []
+    row = fly(
+        3, (*TINY, "mission.navigate_limit_s=0.1"), "down", "assumed", "vector", World("hard", "real"), ticks.append
+    )
+    note = ticks[0].true_field.note
+    for drawn in ("world hard", "depth", "um per revolution", "step-out", "walls", "coils up to 3 % off"):
+        assert drawn in note, drawn
+    assert row.world == "hard" and "world" not in flown[1][0].true_field.note
+
+
+def test_a_command_that_an_amplifier_would_change_or_an_output_beyond_its_limit_is_counted(flown):
+    _, ticks = flown
+    coils = Coils(amplifier=Amplifier(kind="voltage"))
+    tick = next(tick for tick in ticks if tick.currents.amplitude_mt == 4.0 and tick.currents.frequency_hz > 5.0)
+    fine, weak = (MissionLog(Limits(c, ROBOT, OutputLimits())) for c in (coils, replace(coils, max_current_a=1.0)))
+    for log in (fine, weak):
+        log.write(tick)
+    assert (fine.beyond, weak.beyond) == (0, 1)
+    fine.write(replace(tick, currents=replace(tick.currents, frequency_hz=1e3)))
+    assert fine.beyond == 1
+
+
 def test_a_flow_too_swift_is_refused_before_the_robot_is_let_in():
     swift = (*TINY, "chip.inlet_speed_um_s=60000")
     ticks = []
     row = fly(3, swift, "down", "assumed", "vector", World(sets=("plan.method=astar_time",)), ticks.append)
+    assert row.world == "kind"
     assert row.outcome == "refused" and "too swift to be steered" in row.note
     assert not ticks
 
@@ -108,11 +138,15 @@ def test_a_summary_counts_and_pairs_what_arrived(flown, tmp_path, capsys):
     assert ours["ratio"]["median"] == row.ratio and theirs["failed"] == ["straight 4 down assumed: timeout"]
     pair = compared(rows, "vector", "paper")
     assert pair["count"] == 1 and pair["mean"] == pytest.approx(0.5)
-    figures = {"seeds": 2, "world": asdict(World()), "rows": [asdict(made) for made in rows], "pairs": {"v / p": pair}}
-    figures["summary"] = {"vector": ours, "paper": theirs}
+    hard = replace(row, world="hard", outcome="left the chip", seconds=None, ratio=None, beyond=2)
+    figures = results_of([*rows, hard], ["inlet", "hard"], ["vector", "paper"]) | {"seeds": 2, "coils": "real"}
+    assert figures["summary"]["inlet"] == {"vector": ours, "paper": theirs}
+    assert figures["pairs"]["inlet"] == {"vector / paper": pair} and figures["fault_count"] == 2
+    assert list(figures["summary"]["hard"]) == ["vector"]
     json.dumps(figures)
     missions.show(figures)
-    assert "vector" in capsys.readouterr().out
+    said = capsys.readouterr().err
+    assert "hard, vector: straight 3 down assumed: left the chip" in said and "2 commands were beyond" in said
     draw_missions(tmp_path / "a.png", figures)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
@@ -123,5 +157,9 @@ def test_seeds_take_chips_in_turn_and_wrong_requests_are_said_at_once(tmp_path):
     ]
     with pytest.raises(UsageError, match="no policy 'luck'"):
         missions.measure(1, None, "luck")
+    with pytest.raises(UsageError, match="no world 'mild'"):
+        missions.measure(1, None, "vector", "mild")
+    with pytest.raises(UsageError, match="no coils 'none'; there are ample, real"):
+        missions.measure(1, None, "vector", "hard", "none")
     with pytest.raises(UsageError, match="no vessel case"):
         missions.measure(1, tmp_path, "vector")

@@ -136,6 +136,26 @@ def test_by_default_the_map_is_used_while_it_states_a_small_error_and_the_measur
     assert not Observer().uses_map(after(good, offset_share=-0.2))
 
 
+def test_what_observations_are_taken_from_does_not_know_the_map_that_the_estimate_corrects() -> None:
+    _, plain, tracks, inputs = swim(Observer(method="kalman"), 3.0, 8.0)
+    wrong, observer, sampler = vortex(1.6), Observer(method="kalman_map"), Sampler()
+    before = mapless = taken = taken_plain = None
+    for index, (seen, done) in enumerate(zip(tracks, inputs, strict=True)):
+        field = wrong if index >= 60 else None  # a map that is adopted on the way
+        now = observer.estimate(before, seen, done, ROBOT, field)
+        mapless_now = observer.without_map(mapless, before, now, seen, done, ROBOT)
+        assert (mapless_now is None) == (index < 60)
+        if before is not None:
+            assert Observer.measured(mapless_now, now).same_as(plain[index])
+            taken = sampler.collect(
+                taken, Observer.measured(mapless, before), Observer.measured(mapless_now, now), ROBOT
+            )
+            taken_plain = sampler.collect(taken_plain, plain[index - 1], plain[index], ROBOT)
+        before, mapless = now, mapless_now
+    assert taken is not None and len(taken.std_um_s) > 8 and taken.same_as(taken_plain)
+    assert before is not None and math.dist(before.flow_um_s, plain[-1].flow_um_s) > 1.0, "the estimate itself does"
+
+
 def test_another_map_does_not_make_the_estimate_jump() -> None:
     observer = Observer(method="kalman_map")
     _, estimates, tracks, inputs = swim(observer, 1.0, 4.0, field=vortex(1.2))

@@ -29,6 +29,7 @@ from flowrec.ranges import check_ranges
 from flowrec.rig_settings import Camera
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
+from flowrec.rigs.simulated.true_coils import TrueCoils
 from flowrec.rigs.simulated.world import Shake, World, misregistered, true_pump, true_robot, world_of
 from flowrec.robot import Robot
 from flowrec.simulated_settings import Simulated
@@ -142,6 +143,7 @@ class SimulatedRig:
         self._delay_ns = nanoseconds(self._true_robot.delay_s)
         self._now_ns = 0
         self._coils = coils
+        self._true_coils = TrueCoils.of(coils, simulated)
         # For how much longer the robot is held at its start, and the field's strength before; None: it is not held.
         self._hold: tuple[float, float] | None = (hold_s, 0.0) if hold_s > 0.0 else None
         # The command in effect and the state of its field; commands on their way, as (stamp of their effect, command).
@@ -280,6 +282,9 @@ class SimulatedRig:
     ) -> None:
         """Let the robot move, unless it is held."""
         if self._hold is None:
+            if self._true_coils is not None:
+                heading_rad, part = self._true_coils.motion(heading_rad)
+                strength *= part
             swimmer.advance(duration_s, frequency_hz, heading_rad, strength)
             return
         swimmer.wait(duration_s)

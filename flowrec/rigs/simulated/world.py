@@ -29,7 +29,7 @@ _STREAM = 7  # of the seed; bodies, microscope, chip and clock have 1 to 6 and 8
 # In the order of their random numbers; new ones at the end.
 _DRAWN = (
     *("depth", "walls", "drift", "pulsation_hz", "pulsation_phase"),
-    *("um_per_rev", "delay", "step_out", "offset", "angle", "scale", "shake"),
+    *("um_per_rev", "delay", "step_out", "offset", "angle", "scale", "shake", "coils"),
 )
 _PULSATION_HZ = (0.05, 2.0)  # of syringe and peristaltic pumps
 _LEAST_DEPTH_RADII = 2.2  # the robot fits in
@@ -233,6 +233,8 @@ def drawn_note(chip: Chip, truth: Chip, robot: Robot, simulated: Simulated, wall
         parts.append(f"step-out {real.step_out_hz:.1f} Hz")
     if real.delay_s != robot.delay_s:
         parts.append(f"delay {1e3 * real.delay_s:.0f} ms")
+    if simulated.value("coil_error") > 0.0:
+        parts.append(f"field of the coils up to {100.0 * simulated.value('coil_error'):g} % off")
     if walls:
         parts.append(walls)
     return "; ".join(parts)
