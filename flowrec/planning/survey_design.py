@@ -112,6 +112,7 @@ class Looks:
     ----------
     patch_px : side of a patch.
     share : of the speed of the flow, one standard deviation of the error that looks at a patch share.
+    pixel : (h, w) index of each fluid pixel among those of the uncertainty.
     sums : (patches, q, 2) sum of w A so far.
     weights : (patches,) sum of w so far.
     """
@@ -121,6 +122,7 @@ class Looks:
     chip: Chip
     patch_px: float
     share: float
+    pixel: NDArray[np.intp]
     sums: Floats
     weights: Floats
 
@@ -129,7 +131,8 @@ class Looks:
         """No look so far."""
         patches = int(np.prod(np.ceil(np.array(chip.mask.shape) / patch_px)))
         sums = np.zeros((patches, len(uncertainty.covariance), 2))
-        return cls(uncertainty, sampling, chip, patch_px, share, sums, np.zeros(patches))
+        pixel = np.cumsum(chip.mask.ravel()).reshape(chip.mask.shape) - 1
+        return cls(uncertainty, sampling, chip, patch_px, share, pixel, sums, np.zeros(patches))
 
     def after_places(self, places_um: Floats, own_um_s: Floats) -> Looks:
         """And one look each at places (m, 2), where the robot's own velocity was (m, 2)."""
@@ -151,8 +154,9 @@ class Looks:
         patches, index = np.unique(which, return_inverse=True)
         least = 1.0 / np.maximum(np.bincount(index, weight * error**2), 1e-300) * np.bincount(index, weight)
         before, weights = self.sums[patches], self.weights[patches]
-        added = np.zeros_like(before)
-        np.add.at(added, index, np.moveaxis(effect * weight[:, None], 0, 1))
+        order = np.argsort(index, kind="stable")
+        first = np.searchsorted(index[order], np.arange(len(patches)))
+        added = np.add.reduceat(np.moveaxis(effect * weight[:, None], 0, 1)[order], first, axis=0)
         weights_after = weights + np.bincount(index, weight)
         shared = [
             (sums / np.sqrt(least + total)[:, None, None]).transpose(1, 0, 2).reshape(unknowns, -1)
@@ -182,7 +186,7 @@ class Looks:
         rows, columns = nearest_pixels(places_um.reshape(-1, 2) / self.chip.um_per_px, shape)
         fluid = self.chip.mask[rows, columns]
         rows, columns, count, velocity = rows[fluid], columns[fluid], count[fluid], velocity_um_s[fluid]
-        pixel = (np.cumsum(self.chip.mask.ravel()) - 1)[rows * shape[1] + columns]
+        pixel = self.pixel[rows, columns]
         own = velocity - mean[pixel] if over_ground else velocity
         across = math.ceil(shape[1] / self.patch_px)
         patch = (rows // self.patch_px).astype(np.intp) * across + (columns // self.patch_px).astype(np.intp)

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um, median_width_um
+from flowrec.flow.linear_solver import cached, cell_count
 from flowrec.flow.sensitivities import Sensitivities
 from flowrec.refine.observation_operator import Floats
 
@@ -28,6 +29,12 @@ LONGER = 1.3  # factor on the length while there are too many
 
 def channel_cells(chip: Chip) -> Any:
     """(cells, n) sparse weights of each cell on the fluid pixels in raster order; their sum is 1 on each pixel."""
+    # All depths and laws of a chip have the same cells.
+    key = ("channel cells", chip.mask.shape, chip.mask.tobytes(), median_width_um(chip) / chip.um_per_px)
+    return cached(key, cell_count(chip, 1) // 5, lambda: _channel_cells(chip))
+
+
+def _channel_cells(chip: Chip) -> Any:
     graph, clearance = _pixel_graph(chip.mask), clearance_um(chip.mask, 1.0)[chip.mask]
     reach = LENGTH_WIDTHS * median_width_um(chip) / chip.um_per_px
     order = np.argsort(-clearance, kind="stable")

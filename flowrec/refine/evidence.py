@@ -76,7 +76,7 @@ class Evidence:
 
     def sizes(self, start: Floats | None = None) -> Sizes:
         """The most probable sizes and their uncertainty."""
-        matrices = [effect.matrix for effect in self.effects]
+        matrices = self._matrices()
         medians = np.log([effect.median for effect in self.effects])
         stds = np.array([effect.ln_std for effect in self.effects])
 
@@ -92,12 +92,10 @@ class Evidence:
         )
         mode = np.asarray(found.x, np.float64)
         inverse = np.linalg.inv(self._covariance(matrices, mode))
-        scaled = [2.0 * np.exp(2.0 * ln) * (inverse @ matrix) for ln, matrix in zip(mode, matrices, strict=True)]
-        information = np.diag(1.0 / stds**2)
-        for i, one in enumerate(scaled):
-            for j, two in enumerate(scaled[: i + 1]):
-                information[i, j] += 0.5 * float((one * two.T).sum())
-                information[j, i] = information[i, j]
+        scaled = 2.0 * np.exp(2.0 * mode)[:, None, None] * (inverse @ matrices)
+        # Half of the traces of the products of each two.
+        products = scaled.reshape(len(mode), -1) @ scaled.transpose(0, 2, 1).reshape(len(mode), -1).T
+        information = np.diag(1.0 / stds**2) + 0.25 * (products + products.T)
         covariance = np.asarray(np.linalg.inv(information), np.float64)
         # Laplace: the hyperprior's density is normalised, its constant is in the determinants.
         evidence = -float(found.fun) + 0.5 * float(np.linalg.slogdet(covariance)[1]) - float(np.log(stds).sum())
@@ -105,7 +103,7 @@ class Evidence:
 
     def posterior(self, sizes: Sizes) -> Posterior:
         """The unknowns, averaged over the sizes."""
-        matrices = [effect.matrix for effect in self.effects]
+        matrices = self._matrices()
         columns = np.concatenate([effect.columns for effect in self.effects])
         owner = np.repeat(np.arange(len(self.effects)), [len(effect.columns) for effect in self.effects])
         medians = np.log([effect.median for effect in self.effects])
@@ -146,7 +144,7 @@ class Evidence:
 
     def most_probable(self, sizes: Sizes) -> Floats:
         """(unknowns,) at the most probable sizes."""
-        _, solved = self._solved([effect.matrix for effect in self.effects], sizes.mode)
+        _, solved = self._solved(self._matrices(), sizes.mode)
         return np.concatenate(
             [
                 np.exp(2.0 * ln_size) * (effect.columns @ solved)
@@ -154,27 +152,27 @@ class Evidence:
             ]
         )
 
-    def _covariance(self, matrices: Sequence[Floats], ln_sizes: Floats) -> Floats:
-        total = self.noise.copy()
-        for matrix, ln_size in zip(matrices, ln_sizes, strict=True):
-            total += np.exp(2.0 * ln_size) * matrix
-        return total
+    def _matrices(self) -> Floats:
+        """(effects, m, m) what each effect adds to the covariance at size 1."""
+        return np.stack([effect.matrix for effect in self.effects])
 
-    def _solved(self, matrices: Sequence[Floats], ln_sizes: Floats) -> tuple[Floats, Floats]:
+    def _covariance(self, matrices: Floats, ln_sizes: Floats) -> Floats:
+        sum_of_effects = np.exp(2.0 * ln_sizes) @ matrices.reshape(len(matrices), -1)
+        return np.asarray(self.noise + sum_of_effects.reshape(self.noise.shape))
+
+    def _solved(self, matrices: Floats, ln_sizes: Floats) -> tuple[Floats, Floats]:
         """Cholesky factor (m, m) of the covariance, and the covariance's inverse times y."""
         factor = scipy.linalg.cholesky(self._covariance(matrices, ln_sizes), lower=True, check_finite=False)
         return factor, scipy.linalg.cho_solve((factor, True), self.y, check_finite=False)
 
-    def _likelihood(self, matrices: Sequence[Floats], ln_sizes: Floats) -> tuple[float, Floats]:
+    def _likelihood(self, matrices: Floats, ln_sizes: Floats) -> tuple[float, Floats]:
         """Ln N(y; 0, C) and its gradient (effects,) by ln size."""
         factor, solved = self._solved(matrices, ln_sizes)
         inverse = scipy.linalg.cho_solve((factor, True), np.eye(len(self.y)), check_finite=False)
         value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
-        gradient = np.array(
-            [
-                np.exp(2.0 * ln_size) * (float(solved @ (matrix @ solved)) - float((inverse * matrix).sum()))
-                for matrix, ln_size in zip(matrices, ln_sizes, strict=True)
-            ]
+        # s^2 (u^T G u - trace(C^-1 G)) with u = C^-1 y, of all effects at once.
+        gradient = np.exp(2.0 * ln_sizes) * (
+            matrices.reshape(len(matrices), -1) @ (np.outer(solved, solved) - inverse).ravel()
         )
         return value - 0.5 * len(self.y) * np.log(2.0 * np.pi), gradient
 

@@ -48,8 +48,11 @@ class Fitted:
     in_use: Floats  # (n, 2) the flow around which the effects are linear
     remainder: Remainder
     line_hz: float | None
+    robust: Robust
 
-    gain: float  # in ln evidence over the assumed flow
+    def gain(self) -> float:
+        """Ln evidence over the assumed flow."""
+        return self.sizes.evidence - _assumed(self.observed, self.robust, self.line_hz)
 
     def unknowns(self, *names: str) -> tuple[Floats, Floats]:
         """Mean (k,) and covariance (k, k) of the unknowns of effects; what there is not is left out."""
@@ -173,8 +176,7 @@ def complete(observed: Observed, robust: Robust, state: State, steps: Steps) -> 
     posterior = state.evidence.posterior(sizes)
     flow = _flow(observed, posterior.mean, state.in_use, state.nonlinear)
     effects = list(state.evidence.effects)
-    gain = sizes.evidence - _assumed(observed, robust, state.line_hz)
-    return Fitted(observed, effects, sizes, posterior, flow, state.in_use, state.remainder, state.line_hz, gain)
+    return Fitted(observed, effects, sizes, posterior, flow, state.in_use, state.remainder, state.line_hz, robust)
 
 
 def _assumed(observed: Observed, robust: Robust, line_hz: float | None) -> float:

@@ -41,7 +41,7 @@ def report(
     ]
     if far:
         parts.append(f"far from what was assumed: {', '.join(far)}")
-    if best.gain < LEAST_GAIN:
+    if best.gain() < LEAST_GAIN:
         parts.append("they do not ask for another flow than the assumed one")
     return "; ".join([*parts, *_unobserved(chip, covariance, best.observed.model.prior)])
 

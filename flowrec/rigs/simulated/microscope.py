@@ -13,6 +13,7 @@ whole film holds no more than a million different values. Same seed and frames, 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -137,7 +138,7 @@ class Microscope:
 
     def add_still(self, point_um: NDArray[np.float64], radius_um: float, darkness: float) -> None:
         """Put a particle that never moves into the background."""
-        self._particle(self._empty, point_um, radius_um, darkness, np.zeros(2))
+        self._particle(self._empty, self._calibration.to_px(point_um).tolist(), radius_um, darkness)
         self._scene[:] = self._empty
 
     def image(
@@ -154,7 +155,6 @@ class Microscope:
 
         `stage_um` (2,) is how far the stage, and all that is on it, has moved; None: not at all.
         """
-        still = np.zeros(2)
         if stage_um is not None:
             shift = self._calibration.vectors_to_px(stage_um)
             move = np.column_stack((np.eye(2), shift))
@@ -163,14 +163,18 @@ class Microscope:
             debris_um = debris_um + stage_um
             robot_um = None if robot_um is None else robot_um + stage_um
         windows = [
-            self._particle(self._scene, point, radius, darkness, still)
-            for point, radius, darkness in zip(
-                debris_um, debris_radii_um.tolist(), debris_darkness.tolist(), strict=True
+            self._particle(self._scene, place, radius, darkness)
+            for place, radius, darkness in zip(
+                self._calibration.to_px(debris_um).tolist(),
+                debris_radii_um.tolist(),
+                debris_darkness.tolist(),
+                strict=True,
             )
         ]
         if robot_um is not None:
-            smear = self._calibration.vectors_to_px(robot_velocity_um_s * self._camera.exposure_s)
-            windows.append(self._particle(self._scene, robot_um, robot_radius_um, 0.8, smear))
+            place = self._calibration.to_px(robot_um).tolist()
+            smear = self._calibration.vectors_to_px(robot_velocity_um_s * self._camera.exposure_s).tolist()
+            windows.append(self._particle(self._scene, place, robot_radius_um, 0.8, smear))
         height, width = self._scene.shape
         camera = self._camera
         image = np.empty((height, width), pixel_type(camera.bits))
@@ -184,15 +188,14 @@ class Microscope:
     def _particle(
         self,
         scene: NDArray[np.float32],
-        point_um: NDArray[np.float64],
+        place_px: Sequence[float],
         radius_um: float,
         darkness: float,
-        smear_px: NDArray[np.float64],
+        smear_px: Sequence[float] = (0.0, 0.0),
     ) -> tuple[int, int, int, int]:
-        column, row = self._calibration.to_px(point_um)
         radius = radius_um / self._calibration.um_per_px
         edge = math.hypot(max(self._camera.blur_px, 0.3), 0.05 * radius)
-        smear_x, smear_y = (float(way) for way in smear_px)
+        (column, row), (smear_x, smear_y) = place_px, smear_px
         return _draw(scene, column, row, radius, edge, darkness, 0.35 * darkness, smear_x, smear_y, *self._lit)
 
 
