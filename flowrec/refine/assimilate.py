@@ -28,7 +28,7 @@ from flowrec.refine.causes import RESISTANCE, SECTION, Observed
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.findings import PROBABLE, findings
 from flowrec.refine.flow_model import FlowModel, flow_model
-from flowrec.refine.hypothesis import NOISE, Fitted, Robust, State, Steps, begin, complete, robust_noise
+from flowrec.refine.hypothesis import NOISE, Fitted, Robust, State, Steps, begin, complete, of_the_field, robust_noise
 from flowrec.refine.mask_variants import mask_variants
 from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -92,8 +92,18 @@ class Assimilate(PriorSettings):
     max_steps: Annotated[int, Range(1, 1_000)] = 8  # of the full equations with frozen factors
     tolerance: Annotated[float, Range(1e-12, 1.0)] = 2e-3  # last such step over the fastest speed
 
-    def fit(self, problem: Problem, obstacles: bool = False) -> FlowField:
+    def fit(self, problem: Problem) -> FlowField:
         """Posterior mean field with its standard deviation, boundary values, viscosity and what else was found.
+
+        Raises
+        ------
+        FlowError
+            If the flow of the fitted parameters can not be computed.
+        """
+        return self.fit_with_observations(problem)[0]
+
+    def fit_with_observations(self, problem: Problem, obstacles: bool = False) -> tuple[FlowField, ObservationOperator]:
+        """The same, and the observations less what robot, registration and pump explain of them.
 
         `obstacles`: channels that are partly blocked are tried as well.
 
@@ -112,7 +122,8 @@ class Assimilate(PriorSettings):
             # Walls that are wrong everywhere and a single obstacle can look alike.
             if not every.wrong_mask or blocked.best.posterior.evidence > every.best.posterior.evidence:
                 every = blocked
-        return self._field(every, problem)
+        flow_um_s, std_um_s = of_the_field(every.best, every.robust)
+        return self._field(every, problem), replace(problem.operator, flow_um_s=flow_um_s, std_um_s=std_um_s)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
         """The assumed field with the standard deviation of the prior, or without one where there is no prior."""

@@ -97,6 +97,27 @@ class Fitted:
         return result
 
 
+def of_the_field(found: Fitted, robust: Robust) -> tuple[Floats, Floats]:
+    """The observations (n, 2) less what robot, registration and pump explain of them, and their noise (n,) in um/s.
+
+    What changes in time and follows from no unknown (wander, rolling) counts as noise.
+    """
+    own, first = found.observed.operator.flow_um_s.copy(), 0
+    variance = robust.factor**2 * robust.variance / robust.inlier
+    for effect in found.observed.effects(found.in_use, found.line_hz):
+        count = len(effect.columns)
+        if effect.name not in FIELD_EFFECTS:
+            z = slice(first, first + count)
+            columns = effect.columns.reshape(count, len(own), 2)
+            own -= np.tensordot(found.posterior.mean[z], columns, axes=1)
+            spread = np.einsum("inc,ij,jnc->n", columns, found.posterior.covariance[z, z], columns)
+            if effect.kernel is not None:
+                spread = spread + found.size(effect.name) ** 2 * np.diag(effect.kernel).reshape(-1, 2).sum(axis=1)
+            variance = variance + 0.5 * spread
+        first += count
+    return own, np.sqrt(variance)
+
+
 def robust_noise(observed: Observed) -> Robust:
     """Outliers and a common factor of the noise, by a mixture model in which every effect has its usual size."""
     here = observed.operator

@@ -20,8 +20,9 @@ class Problem:
     operator: ObservationOperator  # with at least one observation
     chip: Chip  # with the assumed parameters
     solver: FlowSolver
-    # Computes the result of the assimilation, for methods that start from it; True: with channels partly blocked.
-    assimilated: Callable[[bool], FlowField]
+    # Computes the result of the assimilation, for methods that start from it, and the observations less what it finds
+    # that robot, registration and pump do to them. True: with channels partly blocked.
+    assimilated: Callable[[bool], tuple[FlowField, ObservationOperator]]
 
 
 class Refinement(Protocol):

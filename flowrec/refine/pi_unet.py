@@ -59,18 +59,20 @@ class PiUnet(NetworkSettings):
 
         A correction is first computed without every fourth observation and must predict those better than the initial
         field does; from the unrefined start it is then computed again with all. A start with error bars has used the
-        observations already: it is kept when they lie within their noise around it.
+        observations already: it is kept when they lie within their noise around it, and a correction follows what the
+        start does not explain by robot, registration or pump.
 
         Raises
         ------
         FlowError
             If the device is not available, or the weights can not be read.
         """
-        initial = problem.assimilated(self.obstacles) if self.start == "assimilate" else problem.assumed
+        initial, operator = problem.assumed, problem.operator
+        if self.start == "assimilate":
+            initial, operator = problem.assimilated(self.obstacles)
         assimilated = initial.std_um_s is not None
         if not initial.velocity_um_s.any():
             return _kept(initial, "the initial field stands still")
-        operator = problem.operator
         before = operator.misfit(initial.velocity_um_s)
         chi2 = float(before.mean()) / 2.0
         # Two standard deviations of chi2.

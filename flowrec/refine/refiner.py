@@ -18,7 +18,7 @@ from flowrec.methods import Method, Methods
 from flowrec.refine.assimilate import Assimilate
 from flowrec.refine.method import Problem, Refinement
 from flowrec.refine.ni import Ni
-from flowrec.refine.observation_operator import observation_operator
+from flowrec.refine.observation_operator import ObservationOperator, observation_operator
 from flowrec.refine.pi_unet import PiUnet
 from flowrec.refine.pinn import Pinn
 from flowrec.refine.uncertainty import flow_uncertainty
@@ -104,8 +104,8 @@ class Refiner:
             )
         operator = observation_operator(observations, chip.mask, chip.um_per_px, assumed.wall_px)
 
-        def assimilated(obstacles: bool) -> FlowField:
-            return self.assimilate.fit(problem, obstacles)
+        def assimilated(obstacles: bool) -> tuple[FlowField, ObservationOperator]:
+            return self.assimilate.fit_with_observations(problem, obstacles)
 
         problem = Problem(assumed, operator, chip, solver, assimilated)
         if operator.count == 0 and not isinstance(method, AssumedFlow):

@@ -71,6 +71,21 @@ def test_a_closed_branch_is_found_by_the_assimilation_and_pi_unet_does_not_make_
     assert (refined.std_um_s >= assimilated.std_um_s).all()
 
 
+def test_a_robot_that_slips_is_not_taken_for_an_error_of_the_field(twin):
+    case = twin(noise=0.02)
+    points = case.observations.position_um
+    heading = np.gradient(points, axis=0)
+    rolled = 400.0 * heading / np.linalg.norm(heading, axis=1, keepdims=True)
+    slipping = case.observations.flow_um_s - 0.3 * rolled
+    observations = replace(
+        case.observations, flow_um_s=slipping, rolled_um_s=rolled, time_s=0.2 * np.arange(len(points))
+    )
+    assimilated = Refiner().refine(case.assumed, observations, case.chip, case.solver)
+    refined = Refiner("pi_unet").refine(case.assumed, observations, case.chip, case.solver)
+    assert "less per revolution" in assimilated.note
+    assert np.array_equal(refined.velocity_um_s, assimilated.velocity_um_s), refined.note
+
+
 @pytest.mark.parametrize("settings", [{"observations": "hard"}, {"near_wall": "hard"}, {"near_wall": "free"}])
 def test_the_printed_variants_run_and_give_the_same_bytes_twice(twin, settings):
     case = twin(noise=0.0)
