@@ -33,7 +33,7 @@ class Simulated:
     are.
     """
 
-    world: Literal["kind", "moderate", "hard"] = "kind"  # preset of the settings that are None: WORLDS
+    world: Literal["kind", "moderate", "hard"] = "moderate"  # preset of the settings that are None: WORLDS
     seed: Seed = 0
     # The flow.
     # each true inlet speed is the assumed one times 1 +- (a third of this to all)
