@@ -1,19 +1,28 @@
-"""What several test files use: missions that are flown once, waiting, and the profile of hypothesis."""
+"""What several test files use: missions and kernels that are made once for all workers, waiting, hypothesis."""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import pickle
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import settings
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.dispatcher import Dispatcher
 
 from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import load_config
+from flowrec.system.numba_setup import _cache_folder
+
+Made = TypeVar("Made")
 
 # A shell that starts the tests in the background has SIGINT ignored, and so would all that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -43,11 +52,60 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
+@contextmanager
+def alone(lock: Path) -> Iterator[None]:
+    """One process at a time."""
+    with lock.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Made]) -> Made:
+    """What `make` returns, and writes into a folder: made by the first worker that asks, taken over by the others."""
+    shared = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = shared.parent  # of all workers
+    with alone(shared / f"{name}.lock"):
+        kept, folder = shared / f"{name}.pickle", shared / name
+        if not kept.exists():
+            folder.mkdir()
+            kept.write_bytes(pickle.dumps(make(folder)))
+        made: Made = pickle.loads(kept.read_bytes())
+    return made
+
+
+_compile = Dispatcher.compile
+_compiling: set[str] = set()
+
+
+def _compile_in_turn(kernel: Any, signature: Any) -> Any:
+    """Compile a kernel of flowrec unless another worker does: then take that one's from the cache.
+
+    All kernels take half a minute, which each worker would spend at its first mission in a new installation.
+    """
+    name = f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+    if not name.startswith("flowrec.") or not _cache_folder():
+        return _compile(kernel, signature)
+    with global_compiler_lock:  # threads of this process first, so that none waits for a lock of another's
+        if name in _compiling:
+            return _compile(kernel, signature)
+        _compiling.add(name)
+        try:
+            with alone(Path(_cache_folder()) / f"{name}.lock"):
+                return _compile(kernel, signature)
+        finally:
+            _compiling.remove(name)
+
+
+Dispatcher.compile = _compile_in_turn
+
+
 @pytest.fixture(scope="session")
 def mission(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """A whole mission on the bifurcation, seen by a small camera."""
-    path = tmp_path_factory.mktemp("mission") / "mission.mcap"
-    return record(load_config(None, SMALL), path)
+    return made_once(
+        tmp_path_factory, "mission", lambda folder: record(load_config(None, SMALL), folder / "mission.mcap")
+    )
 
 
 @pytest.fixture(scope="session")
@@ -69,6 +127,9 @@ def realtime_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     A replay that does not know when each was adopted would wait for 100 s.
     """
-    path = tmp_path_factory.mktemp("realtime") / "realtime.mcap"
     sets = [*SMALL, "survey.method=information", "mission.phases=survey,refine,plan", "worker.adopt_after_s=100"]
-    return record(load_config(None, sets), path, realtime=True).path
+    return made_once(
+        tmp_path_factory,
+        "realtime",
+        lambda folder: record(load_config(None, sets), folder / "realtime.mcap", realtime=True).path,
+    )

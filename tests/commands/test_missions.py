@@ -15,7 +15,7 @@ from flowrec.commands.run_summary import GOOD_ENDS, Recorded
 from flowrec.config import load_config
 from flowrec.store.reader import SessionReader
 from flowrec.system.outputs import MCAP, Output
-from tests.conftest import SMALL
+from tests.conftest import SMALL, made_once
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
 # The island between the branches of the bifurcation: above it runs the long slow branch, below it the short fast one.
@@ -41,8 +41,8 @@ def test_downstream_the_robot_takes_the_short_fast_branch(mission: Recorded) -> 
 
 @pytest.fixture(scope="module")
 def upstream(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    path = tmp_path_factory.mktemp("upstream") / "upstream.mcap"
-    return record(load_config(SESSIONS / "upstream.toml", SMALL), path)
+    asked = load_config(SESSIONS / "upstream.toml", SMALL)
+    return made_once(tmp_path_factory, "upstream", lambda folder: record(asked, folder / "upstream.mcap"))
 
 
 def test_upstream_it_takes_the_long_slow_branch_and_arrives(upstream: Recorded) -> None:
