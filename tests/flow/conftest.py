@@ -26,8 +26,7 @@ def straight():
     return make
 
 
-@pytest.fixture
-def crossing():
+def crossing_chip(bottom_pa=0.02):
     """Two inlets, two outlets on four sides, an island and a pond that no opening reaches."""
     mask = np.zeros((40, 48), bool)
     mask[14:26] = True
@@ -38,9 +37,14 @@ def crossing():
         Opening("left", 14, 25, "inlet", 150.0),
         Opening("top", 18, 29, "inlet", 60.0),
         Opening("right", 14, 25, "outlet", 0.0),
-        Opening("bottom", 18, 29, "outlet", 0.02),
+        Opening("bottom", 18, 29, "outlet", bottom_pa),
     )
     return Chip("crossing", mask, 10.0, openings, 1.0, 1000.0, walls="pixel")
+
+
+@pytest.fixture
+def crossing():
+    return crossing_chip()
 
 
 @pytest.fixture

@@ -141,6 +141,24 @@ def test_where_um_per_rev_is_in_doubt_the_stretches_vary_the_own_motion():
     assert along.max() - along.min() > 0.5 * SPEED_UM_S
 
 
+@pytest.mark.parametrize(("rolled", "drifts"), [(None, False), (1.0, True)])
+def test_a_stretch_drifts_where_um_per_rev_is_in_doubt_and_no_change_of_heading_tells_it_from_the_flow(rolled, drifts):
+    # In a straight channel the robot's own motion, all along the flow, looks like a part of it; a drift has little.
+    mask = np.zeros((20, 120), bool)
+    mask[6:15] = True
+    chip, field = chip_of(mask), field_of(mask, np.where(mask, 20.0, 0.0))
+    velocity = field.velocity_um_s[mask].astype(float)
+    deviations = [0.1, *([] if rolled is None else [rolled])]
+    constants = np.ones((len(deviations) - 1, len(velocity)))
+    doubt = FlowUncertainty(
+        velocity, velocity[None], constants, np.diag(np.square(deviations)), np.zeros(len(velocity))
+    )
+    route = planner().plan(ordered(chip, field, doubt, start=(300.0, 100.0), goal=(1100.0, 100.0)))
+    ground = np.diff(route.waypoints_um, axis=0) / np.diff(route.arrival_s)[:, None]
+    own = np.hypot(*(ground - [20.0, 0.0]).T)
+    assert np.median(own) == pytest.approx((0.15 if drifts else 0.85) * SPEED_UM_S, rel=0.02)
+
+
 def test_a_stretch_from_which_the_goal_can_not_be_reached_is_never_chosen():
     # The lower branch flows faster than the robot: whoever enters it is carried out.
     chip, field = junction(lower=75.0)

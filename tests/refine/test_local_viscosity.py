@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from flowrec.chip.chip import Chip, Opening
 from flowrec.chip.fluid import CarreauYasuda, PowerLaw
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
@@ -19,21 +18,14 @@ from flowrec.refine.local_viscosity import LocalViscosity
 from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.residuals import Physics
+from tests.flow.conftest import crossing_chip
 
 
 @pytest.fixture(scope="module")
 def flows():
     """Two crossing channels of a thinning fluid: chip, assumed flow, true flow, and what is seen upstream."""
-    mask = np.zeros((40, 48), bool)
-    mask[14:26] = mask[:, 18:30] = True
-    mask[17:23, 21:27] = False
-    openings = (
-        Opening("left", 14, 25, "inlet", 150.0),
-        Opening("top", 18, 29, "inlet", 60.0),
-        Opening("right", 14, 25, "outlet", 0.0),
-        Opening("bottom", 18, 29, "outlet", 0.01),
-    )
-    chip = Chip("crossing", mask, 10.0, openings, 1.0, 1000.0, law=PowerLaw(0.5))
+    chip = replace(crossing_chip(bottom_pa=0.01), walls="smooth", law=PowerLaw(0.5))
+    mask = chip.mask
     truth = FlowSolver().solve(chip.with_boundary(chip.boundary_values * [0.6, 1.6, 1.0, 1.0]))
     seen = mask & (np.add.outer(np.arange(40), 3 * np.arange(48)) % 5 == 0)
     seen[:, 30:] = seen[26:] = False
