@@ -52,6 +52,11 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest tests first: at the end of a run a worker would wait for them."""
+    items.sort(key=lambda item: item.path.name not in ("test_contributing.py", "test_notebooks.py"))
+
+
 @contextmanager
 def alone(lock: Path) -> Iterator[None]:
     """One process at a time."""

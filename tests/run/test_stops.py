@@ -10,6 +10,8 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -17,8 +19,11 @@ from flowrec.commands import record as verb
 from flowrec.commands.replay import Change, replay
 from flowrec.config import load_config
 from flowrec.messages import OperatorEvent
+from flowrec.run.control import RunControl
+from flowrec.run.signals import Signals
+from flowrec.run.watchdog import Watchdog
 from flowrec.store.reader import SessionReader
-from tests.conftest import SMALL
+from tests.conftest import SMALL, until
 from tests.perf.stop_trial import LoggedRig
 from tests.perf.stops import KINDS, Ended, Kind, stop
 
@@ -47,7 +52,7 @@ def events(done: Ended) -> list[tuple[str, str]]:
     return [(event.action, event.text) for event in found if isinstance(event, OperatorEvent)]
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_takes_the_field_down_its_ramp_and_the_file_is_whole(name: str, tmp_path: Path) -> None:
     done = ended(name, tmp_path, PATIENT)
     sent = [amplitude_mt for event, amplitude_mt in done.after_cause() if event == "apply"]
@@ -59,9 +64,32 @@ def test_a_signal_takes_the_field_down_its_ramp_and_the_file_is_whole(name: str,
     assert [action for action, _ in events(done)] == ["stop"]
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2"])
+def test_each_signal_ends_the_run_by_its_ramp_or_takes_the_field_away_at_once(name: str) -> None:
+    """The others than those that are sent to processes below differ from them by their row in a table only."""
+    told: list[str] = []
+    number, ends = getattr(signal, name), name in ("SIGINT", "SIGTERM", "SIGHUP")
+    control = SimpleNamespace(
+        stop=lambda reason: told.append(f"ramp: {reason}"),
+        skip_ramp=lambda: told.append("no ramp"),
+        must_interrupt=False,
+        stuck=False,
+    )
+    watchdog = SimpleNamespace(trip=lambda reason: told.append(f"off: {reason}"), timeout_s=None)
+    before = signal.signal(number, lambda *_: None)  # nohup ignores SIGHUP
+    try:
+        with Signals(cast(RunControl, control), cast(Watchdog, watchdog)).handled():
+            signal.raise_signal(number)
+            until(lambda: len(told) == (1 if ends else 2))
+    finally:
+        signal.signal(number, before)
+    assert told[0].startswith("ramp: stopped by" if ends else "off: operator: zero field") and name in told[0]
+    assert told[1:] == ([] if ends else ["no ramp"])
+
+
 @pytest.mark.parametrize(
     ("name", "says"),
-    [("SIGQUIT", "SIGQUIT"), ("SIGUSR1", "SIGUSR1"), ("SIGUSR2", "SIGUSR2"), ("SIGTERM twice", "SIGTERM again")],
+    [("SIGQUIT", "SIGQUIT"), ("SIGTERM twice", "SIGTERM again")],
 )
 def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run(
     name: str, says: str, tmp_path: Path
