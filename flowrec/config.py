@@ -138,6 +138,7 @@ _BEFORE: dict[str, Any] = {
     "survey.method": "downstream",
     "mission.reassimilate_observations": 0,
     "mission.replan_slower": 0.0,
+    "mission.survey_stuck_s": 0.0,
     "mission.hold_start_s": 0.0,
     "plan.policy_course_share": 1.0,
     "plan.policy_points_per_radius": 3.0,

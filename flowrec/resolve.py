@@ -21,6 +21,7 @@ from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
 from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
+from flowrec.planning.survey import SURVEYS
 from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
 
@@ -50,6 +51,7 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     check_config(config)
     _refuse_simulated(config)
     _refuse_unmeasured(config)
+    _refuse_survey_share(config)
     robot, camera = _fitted(config, chip)
     swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
     plan = replace(config.plan, swift=_timed(config.plan.swift, swift))
@@ -117,6 +119,16 @@ def _refuse_simulated(config: Config) -> None:
         raise UsageError(
             f"rig = {config.rig!r}: {', '.join(changed)} is of the simulated rig only and has no effect here; leave it "
             "out"
+        )
+
+
+def _refuse_survey_share(config: Config) -> None:
+    """A limit that the method of the survey does not read would have no effect, which whoever sets it should know."""
+    method = SURVEYS[config.survey.method]
+    if config.survey.share is not None and "share" not in method.options:
+        raise UsageError(
+            f"survey.share = {config.survey.share:g} has no effect on survey.method = {method.name!r}: limit it by "
+            "survey.distance_um or mission.survey_limit_s, or set survey.method = 'downstream'"
         )
 
 

@@ -181,6 +181,15 @@ def test_a_rig_that_is_not_simulated_needs_its_robot_and_camera_measured() -> No
     assert asdict(resolve(replace(config, robot=robot, camera=camera), chip).robot) == asdict(robot)
 
 
+def test_a_limit_that_the_method_of_the_survey_does_not_read_is_refused_with_those_it_reads() -> None:
+    config = load_config(None, ["survey.share=0.5"])
+    with pytest.raises(
+        UsageError, match=r"survey\.share = 0\.5 has no effect on survey\.method = 'information'.*distance"
+    ):
+        resolve(config, load_chip(config.chip))
+    resolve(with_sets(config, ["survey.method=downstream"]), load_chip(config.chip))
+
+
 def test_what_was_derived_is_said_and_kept_in_the_file(
     mission: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

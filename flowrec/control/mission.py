@@ -36,6 +36,7 @@ Point = tuple[Coordinate, Coordinate]
 Place = Point | str
 _IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
 _ON_THE_WAY = (Phase.SURVEY, Phase.NAVIGATE)  # the robot goes on while an order is under way
+_SLOWER = 0.3  # of the planned time: a robot that steps out at 0.7 of its limit is later by about so much
 _EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
 
 
@@ -57,6 +58,9 @@ class MissionStateMachine:
     hold_start_s: Annotated[float, Range(0.0, 3600.0)] | None = None
     goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
     survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0
+    # time by which a survey may be late, on top of what is usual, before it counts as stuck and ends; 0: never. As long
+    # as a robot at its speed limit needs for a few widths of a channel.
+    survey_stuck_s: Annotated[float, Range(0.0, 1e6)] = 5.0
     navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
     # no route is followed for longer than this factor times its planned duration, plus 5 s
     patience: Annotated[float, Range(0.1, 1e3)] = 3.0
@@ -288,6 +292,8 @@ class MissionStateMachine:
             return previous
         if elapsed_s(previous, now) > self._time_limit_s(self.survey_limit_s, route):
             return self._next_phase(Phase.SURVEY, previous, now, "survey cut short by its time limit")
+        if self._stuck(previous, now):
+            return self._next_phase(Phase.SURVEY, previous, now, "survey cut short: something is in the way")
         near_end = left_s(now, route) <= self.lead_s
         if route.more:
             if not near_end:
@@ -301,6 +307,16 @@ class MissionStateMachine:
         if at_end(now, route) and (near_end or not previous.routine_orders):
             return self._next_phase(Phase.SURVEY, previous, now)
         return previous
+
+    def _stuck(self, previous: Mission, now: Frame) -> bool:
+        """Whether the robot of a survey does not follow its reference, and both are late.
+
+        What may block a channel is not on the map. The reference waits for the robot.
+        """
+        if not self.survey_stuck_s or now.demand is None or now.demand.error_um <= now.robot.radius_um:
+            return False
+        late_s = elapsed_s(previous, now) - now.demand.progress_s
+        return late_s > self.survey_stuck_s + _SLOWER * now.demand.progress_s
 
     def _time_limit_s(self, limit_s: float, route: Route) -> float:
         """How long a route may be followed: for a robot that is stuck, waiting does not help."""

@@ -5,12 +5,31 @@ It is not a message: it follows from the recorded observations and is computed a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Doubts:
+    """What may be wrong in one place: k changes of the flow that exclude each other.
+
+    Attributes
+    ----------
+    changes_um_s : (k, n, 2) of the flow.
+    probability : (k,) of each; what is left to 1 is that of no change.
+    """
+
+    changes_um_s: NDArray[np.floating]
+    probability: Floats
+
+    @classmethod
+    def none(cls, pixels: int) -> Doubts:
+        """Nothing is doubted."""
+        return cls(np.zeros((0, pixels, 2)), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +48,7 @@ class FlowUncertainty:
     covariance : (p + r, p + r) of all unknowns.
     error_um_s : (n,) standard deviation of a component that no unknown explains.
     noise_factor : by which the noise of observations was wider than stated, neighbours that err alike included.
+    doubts : what may be wrong in one place; neither `std_um_s` nor `error_share` contains it.
     """
 
     mean_um_s: Floats
@@ -37,6 +57,7 @@ class FlowUncertainty:
     covariance: Floats
     error_um_s: Floats
     noise_factor: float = 1.0
+    doubts: Doubts = field(default_factory=lambda: Doubts.none(0))
 
     @property
     def std_um_s(self) -> Floats:
@@ -57,9 +78,12 @@ class FlowUncertainty:
         return replace(self, covariance=covariance)
 
     def effect(self, pixels: NDArray[np.intp], own_um_s: Floats) -> Floats:
-        """(p + r, m, 2) what a unit of each unknown adds to the flow observed in m fluid pixels.
+        """(p + r + k, m, 2) what a unit of each unknown, and each doubt, adds to the flow observed in m fluid pixels.
 
         `own_um_s` (m, 2) is the velocity of the robot through the fluid there.
         """
         rolled = self.rolled[:, pixels, None] * own_um_s
-        return np.concatenate([self.columns_um_s[:, pixels], rolled])
+        parts = [self.columns_um_s[:, pixels], rolled]
+        if len(self.doubts.probability):
+            parts.append(self.doubts.changes_um_s[:, pixels].astype(np.float64))
+        return np.concatenate(parts)

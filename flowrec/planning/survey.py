@@ -22,6 +22,7 @@ SURVEYS = Methods(
         "stretch by stretch to where observations lower the error of the flow most per second, while it is worth it",
         (
             *_ALL,
+            "distance_um",
             "fast_share",
             "drift_share",
             "route_share",
@@ -59,9 +60,10 @@ class SurveyPlanner:
     """Settings of all methods; a method reads those that its row in SURVEYS names."""
 
     method: Annotated[str, SURVEYS] = "information"
-    # of `downstream`; None: `share` of the longest path downstream
+    # length of the survey at most; None: `share` of the longest path downstream, or no limit of `information`
     distance_um: Annotated[float, Range(1.0, 1e7)] | None = None
-    share: PositiveShare | None = None  # None: 1/8; 1/2 where there are several inlets or outlets to tell apart
+    # of `downstream`; None: 1/8; 1/2 where there are several inlets or outlets to tell apart
+    share: PositiveShare | None = None
     # ratio to the robot's speed limit: slower than usual, to observe more on the way
     speed_share: PositiveShare = 0.5
     clearance_margin_um: Annotated[float, Range(0.0, 1e4)] | None = None  # None: half of the robot's radius
@@ -84,7 +86,8 @@ class SurveyPlanner:
     model_share: Annotated[float, Range(0.0, 10.0)] = 0.05
     places: Annotated[int, Range(1, 10_000)] = 120  # at most so many ends of a stretch are compared, per speed
     # The survey ends when a crossing's time of it would lower the relative error of the flow by less than this.
-    worth: Annotated[float, Range(0.0, 10.0)] = 0.02
+    # `flowrec bench survey`: mean error .0218 with 0.02, .0189 with 0.01.
+    worth: Annotated[float, Range(0.0, 10.0)] = 0.01
 
     def plan(self, order: SurveyOrder) -> Route:
         """The route (stamp and request 0) of the survey as far as it is decided, or no route with the reason.

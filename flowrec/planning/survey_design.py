@@ -4,6 +4,14 @@ The covariance of the unknowns after an observation does not depend on what is o
 before it is travelled: with the information H = sum of A^T A / variance of its observations, the covariance C becomes
 (C^-1 + H)^-1, and the squared error of the flow where it is needed is the trace of C with a matrix. This is the
 A-optimal design of Bayesian experiments (Chaloner and Verdinelli, 1995), weighted by the need.
+
+What may be wrong in one place are hypotheses j with probabilities w_j and changes D_j of the flow, of which one is
+true. The squared error that they add is the sum over pairs of w_j w_k |D_j - D_k|^2. The density of observations y is
+at least twice the geometric mean of two of its parts. So where d_jk standard deviations part two hypotheses, y leaves
+
+    E[w_j w_k | y] <= min(w_j w_k, sqrt(w_j w_k) exp(-d_jk^2 / 8) / 2)
+
+(the bound of Bhattacharyya on the error of a decision; Kailath, 1967).
 """
 
 from __future__ import annotations
@@ -15,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
-from flowrec.flow.uncertainty import FlowUncertainty
+from flowrec.flow.uncertainty import Doubts, FlowUncertainty
 from flowrec.interpolation import nearest_pixels
 from flowrec.messages import FlowField, Observations, Route
 from flowrec.robot import Robot
@@ -78,22 +86,47 @@ class Need:
 
     matrix: Floats  # (q, q), of which the trace with the covariance is the error that observations can remove
     rest: float  # what no unknown explains
+    apart: Floats  # (k + 1, k + 1) squared difference of the flow between doubts; the last is that nothing is wrong
+    pairs: Floats  # (k + 1, k + 1) half of the product of their probabilities
 
     @classmethod
     def of(cls, uncertainty: FlowUncertainty, *weights: tuple[float, Floats]) -> Need:
         """The sum of shares of relative errors, each with its weights (n,) of the fluid pixels."""
         columns, unknowns = uncertainty.columns_um_s, len(uncertainty.covariance)
         matrix, rest = np.zeros((unknowns, unknowns)), 0.0
+        doubts = uncertainty.doubts
+        gram = np.zeros((len(doubts.probability) + 1,) * 2)
         for share, weight in weights:
             size = share / max(float((weight * (uncertainty.mean_um_s**2).sum(axis=1)).sum()), 1e-300)
             flat = (columns * np.sqrt(size * weight)[:, None]).reshape(len(columns), -1)
             matrix[: len(columns), : len(columns)] += flat @ flat.T
             rest += size * float((2.0 * weight * uncertainty.error_um_s**2).sum())
-        return cls(matrix, rest)
+            if len(gram) > 1:
+                flat = (doubts.changes_um_s * np.sqrt(size * weight)[:, None]).reshape(len(gram) - 1, -1)
+                gram[:-1, :-1] += np.asarray(flat @ flat.T, np.float64)
+        probability = np.append(doubts.probability, max(1.0 - float(doubts.probability.sum()), 0.0))
+        return cls(matrix, rest, _distances(gram), 0.5 * np.outer(probability, probability))
 
-    def error(self, covariance: Floats) -> float:
-        """The relative error that a covariance (q, q) states."""
-        return math.sqrt(max(float((covariance * self.matrix).sum()), 0.0) + self.rest)
+    def error(self, covariance: Floats, information: Floats | None = None) -> float:
+        """The relative error that a covariance (q, q) states.
+
+        With `information` (q + k, q + k), see `Looks.information`: after observations that have led to the covariance.
+        """
+        left = self.pairs
+        if information is not None and len(left) > 1:
+            known = len(covariance)
+            across = information[:known, known:]
+            gram = np.zeros_like(left)
+            gram[:-1, :-1] = information[known:, known:] - across.T @ covariance @ across
+            left = np.minimum(left, np.sqrt(left / 8.0) * np.exp(-_distances(gram) / 8.0))
+        square = float((covariance * self.matrix).sum()) + float((left * self.apart).sum())
+        return math.sqrt(max(square, 0.0) + self.rest)
+
+
+def _distances(gram: Floats) -> Floats:
+    """(k, k) squared distances of vectors whose inner products are (k, k)."""
+    square = np.diag(gram)
+    return np.maximum(square[:, None] + square - 2.0 * gram, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +146,7 @@ class Looks:
     patch_px : side of a patch.
     share : of the speed of the flow, one standard deviation of the error that looks at a patch share.
     pixel : (h, w) index of each fluid pixel among those of the uncertainty.
-    sums : (patches, q, 2) sum of w A so far.
+    sums : (patches, q + k, 2) sum of w A so far.
     weights : (patches,) sum of w so far.
     """
 
@@ -130,7 +163,8 @@ class Looks:
     def none(cls, uncertainty: FlowUncertainty, sampling: Sampling, chip: Chip, patch_px: float, share: float) -> Looks:
         """No look so far."""
         patches = int(np.prod(np.ceil(np.array(chip.mask.shape) / patch_px)))
-        sums = np.zeros((patches, len(uncertainty.covariance), 2))
+        unknowns = len(uncertainty.covariance) + len(uncertainty.doubts.probability)
+        sums = np.zeros((patches, unknowns, 2))
         pixel = np.cumsum(chip.mask.ravel()).reshape(chip.mask.shape) - 1
         return cls(uncertainty, sampling, chip, patch_px, share, pixel, sums, np.zeros(patches))
 
@@ -144,7 +178,7 @@ class Looks:
         return self._after(*self._on_way(waypoints_um, arrival_s)[:3])
 
     def information(self, waypoints_um: Floats, arrival_s: Floats) -> Floats:
-        """(q, q) what the looks on a way add.
+        """(q + k, q + k) what the looks on a way add, about the unknowns and then the doubts.
 
         Each part of the way has as many looks, also less than one, as its length and its duration allow.
         """
@@ -198,7 +232,8 @@ class Looks:
 
 
 def covariance_after(covariance: Floats, information: Floats) -> Floats:
-    """(q, q) covariance after observations of an information (q, q)."""
+    """(q, q) covariance after observations of an information (q, q), or (q + k, q + k) with doubts."""
+    information = information[: len(covariance), : len(covariance)]
     return np.asarray(np.linalg.solve(np.eye(len(covariance)) + covariance @ information, covariance))
 
 
@@ -211,7 +246,7 @@ def place_information(
     """
     rows, columns = nearest_pixels(places_um / chip.um_per_px, chip.mask.shape)
     pixel = (np.cumsum(chip.mask.ravel()) - 1)[rows * chip.mask.shape[1] + columns]
-    effect = uncertainty.effect(pixel, np.zeros((len(pixel), 2)))
+    effect = replace(uncertainty, doubts=Doubts.none(0)).effect(pixel, np.zeros((len(pixel), 2)))
     variance = noise_um_s**2 + uncertainty.error_um_s[pixel] ** 2
     need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
     return need, [effect[:, k] @ effect[:, k].T / variance[k] for k in range(len(pixel))]

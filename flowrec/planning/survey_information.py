@@ -8,6 +8,7 @@ the goal can still be reached, even in a flow that is worse than believed, and w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -64,6 +65,7 @@ class Information:
     swift: FastFlowMargin
     middle_pull: float
     outlet_gap_radii: float
+    distance_um: float | None
     fast_share: float
     drift_share: float
     route_share: float
@@ -100,17 +102,19 @@ class Information:
         if reach is None:
             return no_route(METHOD, "in the flow as it is known, the goal can not be reached from here")
         looks, covariance = self._looks(space, order, uncertainty), uncertainty.covariance
+        coming: Floats | None = None
         if order.present is not None:  # what the rest of it will show
             ahead = order.present.arrival_s >= order.progress_s
             rest = order.present.waypoints_um[ahead], order.present.arrival_s[ahead]
-            covariance, looks = covariance_after(covariance, looks.information(*rest)), looks.after_way(*rest)
+            coming = looks.information(*rest)
+            covariance, looks = covariance_after(covariance, coming), looks.after_way(*rest)
         need = self._need(space, order, uncertainty, start, reach)
-        now = need.error(covariance)
+        now = need.error(covariance, coming)
         finite = np.isfinite(reach.togo_s)
         crossing_s = float(reach.togo_s[finite].max(initial=1e-6))
         best: _Stretch | None = None
         best_rate = self.worth / crossing_s
-        for stretch in self._stretches(space, order, looks, covariance, need, start, reach):
+        for stretch in self._stretches(space, order, looks, covariance, coming, need, start, reach):
             rate = (now - stretch.error) / max(stretch.duration_s, order.least_s, _SHORTEST_SHARE * crossing_s)
             if rate > best_rate:
                 best, best_rate = stretch, rate
@@ -197,12 +201,16 @@ class Information:
         order: SurveyOrder,
         looks: Looks,
         covariance: Floats,
+        ahead: Floats | None,
         need: Need,
         start: Endpoint,
         reach: _Reach,
     ) -> Iterator[_Stretch]:
-        """The ways to compare: to each place, at each speed."""
+        """The ways to compare: to each place, at each speed. `ahead`: what the rest of the present way will show."""
         px = space.um_per_px
+        left_um = math.inf if self.distance_um is None else self.distance_um
+        if order.present is not None:
+            left_um -= _length(order.present.waypoints_um)
         weight = middle_weight(space, self.middle_pull)
         y, x = np.indices(space.free.shape)
         origin = space.pixel(start.node)
@@ -221,9 +229,11 @@ class Information:
             for end in _spread(reached, space.clearance, self.places):
                 path = backtrack(parent, end, space.width)
                 arrival = _timing(space, path, speed_um_s / px)
-                if arrival[-1] > order.left_s:
+                if arrival[-1] > order.left_s or _length(path) * px > left_um:
                     continue
-                error = need.error(covariance_after(covariance, looks.information(path * px, arrival)))
+                added = looks.information(path * px, arrival)
+                after = covariance_after(covariance, added)
+                error = need.error(after, added if ahead is None else ahead + added)
                 yield _Stretch(path, speed_um_s, float(arrival[-1]), error)
 
     def _timed(self, space: FreeSpace, believed: FlowField, stretch: _Stretch, start: Endpoint) -> Route:
@@ -252,6 +262,11 @@ def _spread(allowed: Mask, clearance: Raster, most: int) -> list[int]:
         if len(first) <= most:
             return [int(rows[k] * allowed.shape[1] + columns[k]) for k in first]
         size += max(size // 2, 1)
+
+
+def _length(path: Floats) -> float:
+    """Of a path (n, 2), in its units."""
+    return float(np.hypot(*np.diff(path, axis=0).T).sum())
 
 
 def _timing(space: FreeSpace, path: Floats, speed: float) -> Floats:

@@ -32,7 +32,7 @@ from flowrec.refine.hypothesis import NOISE, Fitted, Robust, State, Steps, begin
 from flowrec.refine.mask_variants import mask_variants
 from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import Floats, ObservationOperator
-from flowrec.refine.obstacles import PLACES, Obstacle, likely_obstacles
+from flowrec.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
 from flowrec.refine.prior import PriorSettings
 from flowrec.refine.report import report
 
@@ -214,9 +214,10 @@ class Assimilate(PriorSettings):
         best = every.best
         chip, solver = best.observed.model.chip, problem.solver
         steps, tried = Steps(self.max_steps, self.tolerance), []
-        for obstacle in likely_obstacles(best.observed, every.robust, solver):
+        for obstacle in likely_obstacles(best.observed, every.robust, solver, best.flow):
             with suppress(FlowError):  # a channel that is closed
                 observed = self._observed(obstacle.on(chip), problem.chip, problem.operator, solver)
+                observed = replace(observed, model=with_shape_error(observed.model, best.observed.model))
                 robust = robust_noise(observed)  # what was an outlier may be explained now
                 tried.append((obstacle, observed, robust, begin(observed, robust, steps)))
         if not tried:

@@ -10,8 +10,9 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.uncertainty import FlowUncertainty
-from flowrec.refine.assimilate import Assimilate, Hypotheses, field_columns, prior_of
+from flowrec.refine.assimilate import OBSTACLE_SHARE, Assimilate, Hypotheses, field_columns, prior_of
 from flowrec.refine.causes import GAIN
+from flowrec.refine.doubts import doubted_places
 from flowrec.refine.flow_model import flow_model
 from flowrec.refine.hypothesis import NOISE
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -38,7 +39,9 @@ def flow_uncertainty(
         every = replace(settings, doubt_walls=False).hypotheses(operator, chip, solver)
     except FlowError:
         return None
-    return _of(every)
+    best = every.best
+    doubts = doubted_places(best.observed, every.robust, solver, OBSTACLE_SHARE)
+    return replace(_of(every), doubts=doubts)
 
 
 def _of(every: Hypotheses) -> FlowUncertainty:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flowrec.chip.chip import Opening
-from flowrec.flow.uncertainty import FlowUncertainty
+from flowrec.flow.uncertainty import Doubts, FlowUncertainty
 from flowrec.interpolation import nearest_pixels
 from flowrec.planning.survey import SurveyPlanner
 from flowrec.planning.survey_design import Looks, Need, Sampling, SurveyOrder, covariance_after
@@ -209,6 +209,69 @@ def test_the_next_stretch_continues_the_present_way_with_its_times():
     np.testing.assert_array_equal(second.waypoints_um[:count], first.waypoints_um)
     np.testing.assert_array_equal(second.arrival_s[:count], first.arrival_s)
     assert (np.diff(second.arrival_s) > 0.0).all() and length_um(second) > length_um(first)
+
+
+def doubted(chip, field, *columns, probability=0.15):
+    """At these columns of the lower branch the flow may be three times as fast in one half and at rest in the other."""
+    velocity = field.velocity_um_s[chip.mask].astype(float)
+    y, x = np.nonzero(chip.mask)
+    changes = [velocity * ((np.abs(x - at) < 6) & (y > 48))[:, None] * np.where(y < 74, 2.0, -1.0)[:, None] for at in columns]
+    known = unknown(chip, field, (0.01, 0.01))
+    return replace(known, doubts=Doubts(np.stack(changes), np.full(len(changes), probability)))
+
+
+def test_where_a_channel_may_be_blocked_the_survey_passes_all_the_places_and_then_has_enough():
+    chip, field = junction()
+    assert not planner().plan(ordered(chip, field, unknown(chip, field, (0.01, 0.01)))).reachable
+    uncertainty = doubted(chip, field, 70, 90, 110)
+    route = planner().plan(ordered(chip, field, uncertainty))
+    while route.more:
+        new = planner().plan(
+            ordered(chip, field, uncertainty, start=route.waypoints_um[-1], present=route, progress_s=0.0)
+        )
+        if not new.more:
+            break
+        route = new
+    assert route.reachable and branch_of(route) == "lower"
+    assert route.waypoints_um[:, 0].max() >= 10.0 * 105, "it has seen the last one"
+    before, after = promised(route)[0], promised(new)[0]
+    assert after < 3.0 < before, (route.reason, new.reason)
+
+
+def test_observations_that_tell_a_doubt_apart_remove_its_error_and_others_do_not():
+    chip, field = junction()
+    uncertainty = doubted(chip, field, 70, 110)
+    looks = Looks.none(uncertainty, Sampling(20.0, 0.0, 2.0), chip, 30.0, 0.05)
+    need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
+    covariance = uncertainty.covariance
+
+    def left(*columns):
+        """The squared error of the doubts after looks around columns of the lower branch."""
+        total = 0.0
+        for at in columns:
+            way = np.column_stack([np.arange(at - 5.0, at + 6.0), np.full(11, 74.0)]) * PX
+            total = total + looks.information(way, np.linspace(0.0, 5.0, 11))
+        fixed = need.error(covariance * 0.0, np.zeros((4, 4))) ** 2 if not columns else None
+        return fixed if fixed is not None else need.error(covariance * 0.0, total) ** 2
+
+    # Two changes that exclude each other: w (1 - w) each, and the flow is 9 times 12 of its pixels otherwise.
+    square = (uncertainty.doubts.changes_um_s**2).sum(axis=(1, 2)) / (uncertainty.mean_um_s**2).sum()
+    pairs = 0.15 * 0.7 * square.sum() + 0.15 * 0.15 * square.sum()
+    assert left() == pytest.approx(pairs)
+    assert left(70, 110) < 0.01 * pairs
+    # To see that the first is not there leaves the second, and which of the two it is where there is one.
+    assert 0.15 * 0.7 * square[1] * 0.99 < left(70) < 0.6 * pairs
+    assert left(90) == pytest.approx(pairs, rel=0.05)
+
+
+def test_no_stretch_makes_the_survey_longer_than_its_limit():
+    chip, field = junction()
+    doubt = unknown(chip, field, (0.3, 0.3))
+    free = planner().plan(ordered(chip, field, doubt))
+    limited = planner(distance_um=200.0).plan(ordered(chip, field, doubt))
+    assert length_um(limited) <= 205.0 < length_um(free)
+    end = {"start": limited.waypoints_um[-1], "present": limited, "progress_s": 0.0}
+    assert not planner(distance_um=205.0).plan(ordered(chip, field, doubt, **end)).more
 
 
 def test_without_a_prior_the_survey_goes_downstream_and_says_so():

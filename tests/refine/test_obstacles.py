@@ -61,6 +61,30 @@ def test_a_branch_that_is_half_blocked_is_found_and_the_map_is_right_beside_it(c
     assert within.mean() > 0.9
 
 
+def test_the_survey_doubts_the_branch_that_carries_too_little_and_then_the_place_that_was_seen(chip, assumed):
+    truth = SOLVER.solve(blocked(chip))
+    every = observed(truth, chip)
+    x = every.position_um[:, 0]
+    for seen, within_um, least in ((np.abs(x - AT_UM[0]) > 600.0, 2500.0, 0.5), (x > 0.0, 400.0, 0.8)):
+        some = replace(
+            every,
+            position_um=every.position_um[seen],
+            flow_um_s=every.flow_um_s[seen],
+            std_um_s=every.std_um_s[seen],
+        )
+        doubts = PLAIN.uncertainty(assumed, some, chip, SOLVER).doubts
+        rows, columns = np.nonzero(chip.mask)
+        middle = np.hypot(*doubts.changes_um_s.transpose(2, 0, 1)).argmax(axis=1)
+        places = np.stack([columns[middle], rows[middle]], axis=1) * chip.um_per_px
+        near = np.hypot(*(places - AT_UM).T) < within_um
+        lower = places[:, 1] > 2700.0
+        assert doubts.probability[near & lower].sum() > least * doubts.probability.sum()
+        assert doubts.probability.sum() > 0.5
+    values = chip.boundary_values * np.array([1.2, 1.0])
+    free = PLAIN.uncertainty(assumed, observed(SOLVER.solve(chip.with_boundary(values)), chip), chip, SOLVER)
+    assert free.doubts.probability.sum() < 0.2
+
+
 def test_where_nothing_is_blocked_the_map_is_that_of_the_assimilation(chip, assumed):
     values = chip.boundary_values * np.array([1.2, 1.0])
     truth = SOLVER.solve(chip.with_boundary(values))
@@ -73,10 +97,11 @@ def test_where_nothing_is_blocked_the_map_is_that_of_the_assimilation(chip, assu
 
 
 def test_an_obstacle_closes_the_side_of_the_flow_that_it_names(chip):
-    left = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, -1, 0.0, 1.5, 100.0).friction_per_um2(chip)
-    whole = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, 0, 0.0, 1.5, 100.0).friction_per_um2(chip)
+    left = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, -1, 1.0, 1.5, 100.0).friction_per_um2(chip)
+    whole = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, 0, 1.0, 1.5, 100.0).friction_per_um2(chip)
     rows, columns = np.nonzero(left)
     assert rows.max() == 85  # image rows grow downwards: left of a flow to the right is above
-    assert (columns.min(), columns.max()) == (74, 86)
-    assert np.count_nonzero(whole) > 1.5 * np.count_nonzero(left)
+    assert (columns.min(), columns.max()) == (75, 85)
+    assert left[:, 75].sum() < 0.8 * left[:, 80].sum(), "a deposit is round"
+    assert whole.sum() > 2.0 * left.sum()
     assert not whole[~chip.mask].any()
