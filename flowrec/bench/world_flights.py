@@ -39,7 +39,7 @@ _IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compare
 # Clauses of a note that are no warning: what was used, what was not seen, what could not be told, the null model.
 _NO_WARNING = re.compile(
     r"assimilated|\d+ more distrusted|ignored|they say nothing|of (in|out)let|whether|they do not ask|not refined"
-    r"|the assumed flow times|the observations scatter around it|residual|$"
+    r"|the assumed flow times|the observations scatter around it|residual|start|corrected|misfit|$"
 )
 
 

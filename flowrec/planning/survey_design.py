@@ -102,8 +102,9 @@ class Need:
             matrix[: len(columns), : len(columns)] += flat @ flat.T
             rest += size * float((2.0 * weight * uncertainty.error_um_s**2).sum())
             if len(gram) > 1:
-                flat = (doubts.changes_um_s * np.sqrt(size * weight)[:, None]).reshape(len(gram) - 1, -1)
-                gram[:-1, :-1] += np.asarray(flat @ flat.T, np.float64)
+                change = np.asarray(doubts.changes_um_s, np.float64) * np.sqrt(size * weight)[:, None]
+                flat = change.reshape(len(gram) - 1, -1)
+                gram[:-1, :-1] += flat @ flat.T
         probability = np.append(doubts.probability, max(1.0 - float(doubts.probability.sum()), 0.0))
         return cls(matrix, rest, _distances(gram), 0.5 * np.outer(probability, probability))
 

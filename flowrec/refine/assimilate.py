@@ -28,7 +28,18 @@ from flowrec.refine.causes import RESISTANCE, SECTION, Observed
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.findings import PROBABLE, findings
 from flowrec.refine.flow_model import FlowModel, flow_model
-from flowrec.refine.hypothesis import NOISE, Fitted, Robust, State, Steps, begin, complete, of_the_field, robust_noise
+from flowrec.refine.hypothesis import (
+    NOISE,
+    Fitted,
+    Robust,
+    State,
+    Steps,
+    begin,
+    complete,
+    of_the_field,
+    outlying,
+    robust_noise,
+)
 from flowrec.refine.mask_variants import mask_variants
 from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -214,7 +225,7 @@ class Assimilate(PriorSettings):
         best = every.best
         chip, solver = best.observed.model.chip, problem.solver
         steps, tried = Steps(self.max_steps, self.tolerance), []
-        for obstacle in likely_obstacles(best.observed, every.robust, solver, best.flow):
+        for obstacle in likely_obstacles(best, every.robust, solver):
             with suppress(FlowError):  # a channel that is closed
                 observed = self._observed(obstacle.on(chip), problem.chip, problem.operator, solver)
                 observed = replace(observed, model=with_shape_error(observed.model, best.observed.model))
@@ -224,11 +235,14 @@ class Assimilate(PriorSettings):
             return every
         ln_odds = float(np.log(OBSTACLE_SHARE / (1.0 - OBSTACLE_SHARE) / PLACES))
         least = begin(best.observed, every.robust, steps).sizes.evidence + np.log(LEAST_WEIGHT) - ln_odds
-        tried = [entry for entry in tried if entry[3].sizes.evidence > least]
+        least -= outlying(every.robust)
+        tried = [entry for entry in tried if entry[3].sizes.evidence - outlying(entry[2]) > least]
         if not tried:
             return every
         found = [complete(observed, robust, state, steps) for _, observed, robust, state in tried]
         ln_ratio = np.array([one.posterior.evidence - best.posterior.evidence for one in found])
+        # Where observations are averaged, the evidence does not tell how many outliers were left out.
+        ln_ratio -= [outlying(robust) - outlying(every.robust) for _, _, robust, _ in tried]
         weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds, 500.0))
         weights = np.concatenate([every.weights, weight])
         # As for depths: of what is not likelier than the chip without it, nothing is left.

@@ -16,6 +16,7 @@ MOST_OBSERVATIONS = 120  # of which the evidence is computed: more are first ave
 LEAST_STD = 1e-3  # of the typical observed speed: no observation is more accurate
 LEAST_INLIER = 1e-6  # probability: the noise of an observation is divided by it
 OUTLIER_SCALE = 3.0  # size of an outlier's components over the typical component of the observations
+OUTLIER_NATS = 2.0 * float(np.log(OUTLIER_SCALE / 0.15))  # of two components; the noise is 15 % of the typical speed
 NOISE = ("noise", 0.7, 0.6)  # size of the stated noise: name, median, ln_std; a filter states what is safe
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
 LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
@@ -134,6 +135,16 @@ def robust_noise(observed: Observed) -> Robust:
     )
     found = Model(design.reshape(len(design), -1, 2), misfit, variance + local, wide).fit()
     return Robust(variance, np.maximum(found.inlier, LEAST_INLIER), found.noise_factor)
+
+
+def outlying(robust: Robust) -> float:
+    """By how much more ln likelihood observations have that are no outliers; 0 where the evidence counts that itself.
+
+    It does so for each observation that is not averaged with others.
+    """
+    if len(robust.inlier) <= MOST_OBSERVATIONS:
+        return 0.0
+    return OUTLIER_NATS * float((1.0 - robust.inlier).sum())
 
 
 def noise_variance(operator: ObservationOperator) -> Floats:

@@ -29,7 +29,7 @@ from flowrec.flow.newton_solver import NotConvergedError, System, local_friction
 from flowrec.flow.sensitivities import Sensitivities, sensitivities
 from flowrec.refine.causes import Observed
 from flowrec.refine.flow_model import FlowModel
-from flowrec.refine.hypothesis import NOISE, Robust
+from flowrec.refine.hypothesis import NOISE, Fitted, Robust, of_the_field
 from flowrec.refine.observation_operator import Floats
 from flowrec.units import UM_PER_M
 
@@ -40,10 +40,9 @@ SPACING = 1.0  # of the pieces along a channel, in half widths
 MOST_PIECES = 160  # of a chip: with more, they are farther apart
 PLACES = 3.0 * MOST_PIECES  # places of an obstacle that are equally probable: each piece as a whole, or one half of it
 WORTH_TRYING = 3.0  # gain in ln likelihood
-TRIED = 3  # pieces of either list that are computed in full
+TRIED = 3  # pieces of either list that are computed in full; a search starts from the best of each
 HEIGHTS = (0.8, 1.3)  # of the deposits that are tried first, in half widths
 KEPT = 4  # of these obstacles
-SEARCHED = 2  # of those, at different places, from which a search starts
 MOST_SOLUTIONS = 26  # of a search
 STEPS = (0.5, 0.25)  # of a search, in half widths for place and height, and in the logarithm of length or resistance
 CONTRADICTED = 20.0  # chi squared of the observations in a piece, from which on deposits are tried there
@@ -120,28 +119,31 @@ class Obstacle:
             yield replace(self, reach=self.reach * float(np.exp(sign * step)))
 
 
-def likely_obstacles(observed: Observed, robust: Robust, solver: FlowSolver, flow: Floats) -> list[Obstacle]:
+def likely_obstacles(free: Fitted, robust: Robust, solver: FlowSolver) -> list[Obstacle]:
     """Obstacles that could explain the observations of a chip, the likeliest first; [] where none is worth trying.
 
-    `flow` (n, 2) is the one that fits best without any.
+    `free` is the flow that fits best without any.
     """
+    observed = free.observed
     likelihood = Likelihood.of(observed, robust)
     pieces = pieces_of(observed.model.chip, observed.model.expansion.base)
-    tried = _ranked(pieces, observed, likelihood)
-    for piece in _contradicted(pieces, observed, flow):
-        tried += [
-            replace(piece, side=side, height=height, reach=DEPOSIT, ratio=BLOCKED)
-            for side in (-1, 1)
-            for height in HEIGHTS
-        ]
-    starts = sorted(((_gain(start, observed, likelihood, solver), start) for start in tried), key=lambda one: -one[0])
+    deposits = [
+        replace(piece, side=side, height=height, reach=DEPOSIT, ratio=BLOCKED)
+        for piece in _contradicted(pieces, free, robust)
+        for side in (-1, 1)
+        for height in HEIGHTS
+    ]
     found: list[tuple[float, Obstacle]] = []
-    for gain, start in starts:
-        if len(found) < SEARCHED and all(start.apart(other) for _, other in found):
-            found.append(_searched(gain, start, observed, likelihood, solver))
-    found += [entry for entry in starts if all(entry[1].apart(other) for _, other in found)]
+    for starts in (_ranked(pieces, observed, likelihood), deposits):
+        tried = sorted(((_gain(one, observed, likelihood, solver), one) for one in starts), key=lambda one: -one[0])
+        found += [_searched(*one, observed, likelihood, solver) for one in tried[:1]]
+        found += tried[1:]
     found.sort(key=lambda entry: -entry[0])
-    return [obstacle for gain, obstacle in found[:KEPT] if gain > WORTH_TRYING]
+    chosen: list[Obstacle] = []
+    for gain, obstacle in found:
+        if gain > WORTH_TRYING and len(chosen) < KEPT and all(obstacle.apart(other) for other in chosen):
+            chosen.append(obstacle)
+    return chosen
 
 
 def with_shape_error(model: FlowModel, free: FlowModel) -> FlowModel:
@@ -167,23 +169,30 @@ def _searched(
     return gain, obstacle
 
 
-def _contradicted(pieces: list[Obstacle], observed: Observed, flow: Floats) -> list[Obstacle]:
-    """Pieces at different places in which the observations contradict a flow (n, 2) most."""
-    here = observed.operator
-    misfit = ((here.predict(flow) - here.flow_um_s) ** 2).sum(axis=1) / here.noise_um_s**2
+def _contradicted(pieces: list[Obstacle], free: Fitted, robust: Robust) -> list[Obstacle]:
+    """Pieces at different places in which the observations contradict a flow most, whatever is wrong with the robot."""
+    here = free.observed.operator
+    measured, _ = of_the_field(free, robust)
+    misfit = ((here.predict(free.flow) - measured) ** 2).sum(axis=1) / here.noise_um_s**2
     excess = np.minimum(misfit, OUTLYING) - 2.0
     points = here.points
-    score = []
+    score, moved = [], []
     for piece in pieces:
         away = points - np.array([piece.column, piece.row])
         near = np.hypot(*away.T) <= 2.0 * piece.half_width_px
         score.append(float(excess[near].sum()))
+        # To the middle of the contradictions along the channel.
+        weight = np.maximum(excess[near], 0.0)
+        along = float((weight * (away[near] @ piece.along)).sum() / max(float(weight.sum()), 1e-9))
+        moved.append(
+            replace(piece, row=piece.row + along * piece.along[1], column=piece.column + along * piece.along[0])
+        )
     chosen: list[Obstacle] = []
     for index in np.argsort(-np.array(score)):
         if len(chosen) == TRIED or score[index] < CONTRADICTED:
             break
-        if all(pieces[index].apart(other) for other in chosen):
-            chosen.append(pieces[index])
+        if all(moved[index].apart(other) for other in chosen):
+            chosen.append(moved[index])
     return chosen
 
 

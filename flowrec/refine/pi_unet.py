@@ -77,7 +77,7 @@ class PiUnet(NetworkSettings):
         chi2 = float(before.mean()) / 2.0
         # Two standard deviations of chi2.
         if assimilated and float(before.mean()) <= 2.0 + 4.0 / np.sqrt(operator.count):
-            return _kept(initial, f"the observations lie within their noise (chi2 {chi2:.2f})")
+            return _kept(initial, f"nothing to correct: the observations lie within their noise (chi2 {chi2:.2f})")
         settings = replace(self, weights="none", finish="none") if assimilated else self
         case = Case.of(initial, operator, problem.chip)
         used = np.ones(operator.count, bool)

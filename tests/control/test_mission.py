@@ -361,6 +361,17 @@ def test_the_time_limit_of_a_survey_waits_for_the_order_under_way_so_that_there_
     assert (late.wanted, late.note) == ("refine", "survey cut short by its time limit")
 
 
+def test_a_survey_ends_when_something_holds_the_robot_up_and_not_when_it_is_slow_or_waits() -> None:
+    world = surveying(survey_stuck_s=0.5)
+    for _ in range(5):
+        assert world.tick(at=(200.0, 500.0), progress=1.0, error_um=10.0).phase == "survey", "it waits at its place"
+    held_up = world.tick(at=(200.0, 500.0), progress=1.0, error_um=200.0)
+    assert (held_up.wanted, held_up.note) == ("refine", "survey cut short: something is in the way")
+    slow = surveying(survey_stuck_s=0.5)
+    for passed_s in (0.8, 1.6, 2.4, 3.2, 4.0, 4.8):
+        assert slow.tick(at=(200.0, 500.0), progress=passed_s, error_um=200.0).phase == "survey"
+
+
 def test_a_stretch_that_arrives_under_a_hold_or_out_of_sight_is_taken_up_afterwards() -> None:
     for away in ({"operator": "pause"}, {"seen": False, "lost": 1}):
         world = surveying()

@@ -215,7 +215,9 @@ def doubted(chip, field, *columns, probability=0.15):
     """At these columns of the lower branch the flow may be three times as fast in one half and at rest in the other."""
     velocity = field.velocity_um_s[chip.mask].astype(float)
     y, x = np.nonzero(chip.mask)
-    changes = [velocity * ((np.abs(x - at) < 6) & (y > 48))[:, None] * np.where(y < 74, 2.0, -1.0)[:, None] for at in columns]
+    changes = [
+        velocity * ((np.abs(x - at) < 6) & (y > 48))[:, None] * np.where(y < 74, 2.0, -1.0)[:, None] for at in columns
+    ]
     known = unknown(chip, field, (0.01, 0.01))
     return replace(known, doubts=Doubts(np.stack(changes), np.full(len(changes), probability)))
 
