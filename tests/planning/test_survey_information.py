@@ -266,6 +266,21 @@ def test_observations_that_tell_a_doubt_apart_remove_its_error_and_others_do_not
     assert left(90) == pytest.approx(pairs, rel=0.05)
 
 
+def test_a_doubt_that_looks_like_an_unknown_of_the_flow_can_not_be_told_apart():
+    chip, field = junction()
+    way, times = np.array([[600.0, 745.0], [1200.0, 745.0]]), np.array([0.0, 30.0])
+    for unknown_std, told in ((0.01, True), (3.0, False)):
+        uncertainty = unknown(chip, field, (0.01, unknown_std))
+        lower = 0.5 * uncertainty.columns_um_s[1:]
+        uncertainty = replace(uncertainty, doubts=Doubts(lower, np.array([0.3])))
+        looks = Looks.none(uncertainty, Sampling(20.0, 0.0, 2.0), chip, 30.0, 0.0)
+        need = Need.of(uncertainty, (1.0, np.ones(len(uncertainty.mean_um_s))))
+        after = covariance_after(uncertainty.covariance, looks.information(way, times))
+        doubt = need.error(after, looks.information(way, times)) ** 2 - need.error(after, np.zeros((3, 3))) ** 2
+        whole = float((need.pairs * need.apart).sum())
+        assert (-doubt > 0.9 * whole) == told
+
+
 def test_no_stretch_makes_the_survey_longer_than_its_limit():
     chip, field = junction()
     doubt = unknown(chip, field, (0.3, 0.3))
