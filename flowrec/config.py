@@ -141,6 +141,8 @@ _BEFORE: dict[str, Any] = {
     "mission.survey_stuck_s": 0.0,
     "mission.hold_start_s": 0.0,
     "plan.policy_course_share": 1.0,
+    "plan.policy_margin_share": 0.2,
+    "plan.wall_error_um": 0.0,
     "plan.policy_points_per_radius": 3.0,
     "plan.policy_points_per_px": 4,
     "health.step_out.learned": False,

@@ -37,6 +37,7 @@ class TimeField:
     policy_share: float
     policy_margin_share: float
     policy_course_share: float
+    wall_error_um: float | None
     policy_points_per_radius: float
     policy_points_per_px: int
     robust_deviations: float
@@ -98,7 +99,7 @@ class TimeField:
         A route from whose start no time is known is returned as it is: a path without a policy is still a route.
         """
         course = problem.space.with_course_share(self.policy_course_share)
-        space = course.with_margin(self.policy_margin_share * problem.margin_um)
+        space = course.with_margin(self._policy_margin_um(problem))
         px = space.um_per_px
         finest = max(math.isqrt(_LARGEST_PX // space.free.size), 1)
         finer = min(max(math.ceil(self.policy_points_per_radius / space.radius), 1), self.policy_points_per_px, finest)
@@ -119,6 +120,12 @@ class TimeField:
             if np.isfinite(policy[row, column]):
                 return replace(route, time_to_go_s=policy, time_to_go_um_per_px=px / finer)
         return route
+
+    def _policy_margin_um(self, problem: Problem) -> float:
+        """What the time to go keeps from the walls beside the robot's radius and its course error."""
+        if self.wall_error_um is None:
+            return problem.margin_um
+        return min(max(self.policy_margin_share * problem.margin_um, self.wall_error_um), problem.margin_um)
 
     def _deviation(self, problem: Problem) -> NDArray[np.float64]:
         """(h, w) px/s, one standard deviation of the flow; a ratio of its speed if the field states none."""

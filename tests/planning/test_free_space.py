@@ -1,5 +1,6 @@
 """More clearance where the flow is fast, and the reason where there is not enough."""
 
+import numpy as np
 import pytest
 
 from flowrec.planning import Planner
@@ -59,3 +60,24 @@ def test_the_time_to_go_lets_the_robot_as_near_to_the_wall_as_it_fits_between_th
     route = plan.plan(poiseuille(mask, 90.0), (1000.0, 195.0), (100.0, 195.0), chip_of(mask), robot(100.0, 11.0))
     assert 11.0 - 1e-6 <= lowest_um(route) < 13.0  # pixels with room for it are 15 um away
     assert (len(route.time_to_go_s) - 1) % (len(mask) - 1) == 0 and len(route.time_to_go_s) > len(mask)
+
+
+def test_against_the_flow_the_time_to_go_leads_as_near_to_the_wall_as_walls_and_registration_are_known():
+    mask = channel(h=40, wall=8)
+    flow, swimmer = poiseuille(mask, 80.0), robot(radius_um=20.0)
+    ends = (1100.0, 195.0), (100.0, 195.0)
+
+    def clearance_um(**known):
+        route = Planner(clearance_margin_um=30.0, robust_deviations=0.0, **known).plan(
+            flow, *ends, chip_of(mask), swimmer
+        )
+        # Upstream the robot is earliest where T is least: in the middle of the way that is beside a wall.
+        px = route.time_to_go_um_per_px
+        column = route.time_to_go_s[:, round(600.0 / px)]
+        return float(np.nanargmin(column) * px) - (8 - 0.5) * PX  # from the wall, half a pixel above the first row
+
+    fastest, some, most = clearance_um(wall_error_um=0.0), clearance_um(wall_error_um=12.0), clearance_um()
+    assert fastest == pytest.approx(20.0 + 0.1 * 30.0, abs=3.0)
+    assert some == pytest.approx(20.0 + 12.0, abs=3.0)
+    assert most == pytest.approx(20.0 + 30.0, abs=3.0)
+    assert clearance_um(wall_error_um=1e3) == most, "never more than a planned route keeps"
