@@ -246,7 +246,7 @@ class Health(Message):
     pulsation_hz: float  # frequency of the strongest spectral line of the flow
     pulsation_share: float  # amplitude of that line divided by the mean flow
     line_share: float  # fraction of the flow's variance in that line, 0 to 1
-    bank_re: Annotated[Vector, Shape("n")]  # state of the 24 resonators, relative to the mean flow; real part
+    bank_re: Annotated[Vector, Shape("n")]  # state of the resonators, relative to the mean flow; real part
     bank_im: Annotated[Vector, Shape("n")]  # imaginary part
     bank_power: Annotated[Vector, Shape("n")]  # mean square of the input of each resonator
     mean_um_s: Vector2  # mean flow

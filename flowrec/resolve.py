@@ -41,7 +41,8 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     A robot that is not described fits the chip: radius 50 um, or a fifth of the median channel width if that is
     narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; a delay of 40 ms,
     or the time through a fifth of a channel at v_max if that is shorter. On another rig these numbers have to be given,
-    but for those that only matter for driving the robot where it is only observed. `derived` lists the numbers.
+    but for those that only matter for driving the robot where it is only observed. Walls that may lie elsewhere by an
+    amount that is not stated may do so by more than any margin. `derived` lists the numbers.
 
     Raises
     ------
@@ -55,6 +56,8 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     robot, camera = _fitted(config, chip)
     swift = {"frame_s": round(1.0 / camera.rate_hz, 6), "latency_s": robot.delay_s}
     plan = replace(config.plan, swift=_timed(config.plan.swift, swift))
+    if plan.wall_error_um is None:
+        plan = replace(plan, wall_error_um=max(robot.radius_um, plan.clearance_margin_um or 0.0))
     survey = replace(config.survey, swift=_timed(config.survey.swift, swift))
     course_error = plan.swift.course_error(robot, robot.speed_limit_um_s)
     if config.mission.observes and config.rig != SIMULATED:  # which needs to know where the robot starts

@@ -31,7 +31,7 @@ from flowrec.ranges import Range, Share
 from flowrec.robot import Robot
 from flowrec.units import seconds
 
-_BANK_HZ = 0.3 * 1.125 ** np.arange(24)  # 0.3 to 4.5 Hz
+_BANK_HZ, _STEP, _ABOVE = 0.3, 1.125, 24  # of the bank: a frequency, the ratio of neighbours, how many from there on
 _EXPECTED_NIS = 2.0
 _LARGEST_NIS = 50.0  # a single lost step must not cause a minute of alarm
 _SLOW_FRACTION = 0.1  # of v_max: a deviation relative to a slower flow is not meaningful
@@ -42,6 +42,9 @@ class HealthMonitor:
     """Settings of the alarms."""
 
     window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # of the means of NIS and of lost frames
+    # lowest frequency of a line that is looked for: that of the slowest syringe pumps. Its resonator needs the periods
+    # below to swing up, so a line of 0.1 Hz and 30 % is an alarm after half a minute, not in a short survey.
+    slowest_hz: Annotated[float, Range(0.01, 1.0)] = 0.05
     # alarm if the mean NIS exceeds 2 by this many standard deviations of the mean of white innovations
     nis_sigma: Annotated[float, Range(0.1, 1e6)] = 8.0
     lost_share: Share = 0.3  # alarm above this fraction of frames without the robot
@@ -73,8 +76,9 @@ class HealthMonitor:
         applied : None switches the detection of step-out off.
         wall_um : from the robot's centre to the nearest wall.
         """
+        bank_hz = _bank_hz(self.slowest_hz)
         if previous is None or before is None:
-            bank = np.zeros(len(_BANK_HZ))
+            bank = np.zeros(len(bank_hz))
             return Health(
                 estimate.stamp_ns, "", _EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0
             )
@@ -95,8 +99,8 @@ class HealthMonitor:
             deviation = float((estimate.flow_um_s - expected) @ expected) / speed**2
             deviation = min(max(deviation, -1.0), 1.0)
             offset += weight * (deviation - offset)
-            weights = _resonator_weights(dt, self.periods)
-            phase = np.exp(-2j * math.pi * _BANK_HZ * seconds(estimate.stamp_ns))
+            weights = 1.0 - np.exp(-dt / np.maximum(self.periods / bank_hz, 1.0))
+            phase = np.exp(-2j * math.pi * bank_hz * seconds(estimate.stamp_ns))
             z = z + weights * ((deviation - offset) * phase - z)
             power = power + weights * ((deviation - offset) ** 2 - power)
         strongest = int(np.argmax(np.abs(z)))
@@ -116,7 +120,7 @@ class HealthMonitor:
             nis=nis,
             lost_share=lost,
             heard_s=settled_s,
-            pulsation_hz=float(_BANK_HZ[strongest]),
+            pulsation_hz=float(bank_hz[strongest]),
             pulsation_share=amplitude,
             line_share=line,
             bank_re=z.real,
@@ -131,6 +135,7 @@ class HealthMonitor:
 
 
 @lru_cache(maxsize=16)
-def _resonator_weights(dt: float, periods: float) -> NDArray[np.float64]:
-    """(24,) weight of the newest frame in each resonator."""
-    return np.asarray(1.0 - np.exp(-dt / np.maximum(periods / _BANK_HZ, 1.0)))
+def _bank_hz(slowest_hz: float) -> NDArray[np.float64]:
+    """(n,) frequencies of the resonators."""
+    below = math.floor(math.log(_BANK_HZ / slowest_hz) / math.log(_STEP) + 1e-9)
+    return np.asarray(_BANK_HZ * _STEP ** np.arange(-below, _ABOVE))

@@ -77,7 +77,7 @@ def test_against_the_flow_the_time_to_go_leads_as_near_to_the_wall_as_walls_and_
         return float(np.nanargmin(column) * px) - (8 - 0.5) * PX  # from the wall, half a pixel above the first row
 
     fastest, some, most = clearance_um(wall_error_um=0.0), clearance_um(wall_error_um=12.0), clearance_um()
-    assert fastest == pytest.approx(20.0 + 0.1 * 30.0, abs=3.0)
+    assert fastest == pytest.approx(20.0 + 0.2 * 30.0, abs=3.0)
     assert some == pytest.approx(20.0 + 12.0, abs=3.0)
     assert most == pytest.approx(20.0 + 30.0, abs=3.0)
     assert clearance_um(wall_error_um=1e3) == most, "never more than a planned route keeps"
