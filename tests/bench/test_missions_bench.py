@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def test_there_is_no_optimum_against_a_flow_that_is_too_fast():
 @pytest.fixture(scope="module")
 def flown():
     ticks = []
-    row = fly(3, TINY, "down", "assumed", "vector", World("inlet", "real", ("plan.method=astar_time",)), ticks.append)
+    sets = "plan.method=astar_time", "observer.method=kalman_map"
+    row = fly(3, TINY, "down", "assumed", "vector", World("inlet", "real", sets), ticks.append)
     return row, ticks
 
 
@@ -89,6 +91,14 @@ def test_the_true_flow_is_wrong_by_what_was_asked(flown):
     assert len(inlet_um_s) == 1
     share = ticks[0].true_field.boundary_values.max() / inlet_um_s[0]
     assert abs(share - 1.0) == pytest.approx(0.1)
+
+
+def test_observations_of_a_mission_that_corrects_a_map_are_taken_from_the_filter_without_it(flown):
+    _, ticks = flown
+    taken = [now for last, now in pairwise(ticks) if now.observations is not last.observations and now.mapless]
+    assert len(taken) > 3 and all(tick.mapless.stamp_ns == tick.stamp_ns for tick in taken)
+    assert all(tick.observations.flow_um_s[-1].tolist() == tick.mapless.flow_um_s.tolist() for tick in taken)
+    assert all(tick.mapless.flow_um_s.tolist() != tick.estimate.flow_um_s.tolist() for tick in taken)
 
 
 def test_the_world_flies_as_it_is_with_its_walls_its_robot_and_its_coils(flown):
