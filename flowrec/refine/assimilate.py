@@ -24,18 +24,19 @@ from flowrec.flow import FlowSolver
 from flowrec.flow.sampling import fluid_image
 from flowrec.messages import FlowField
 from flowrec.ranges import Range
-from flowrec.refine.causes import RESISTANCE, SECTION, Observed
+from flowrec.refine.causes import LOCAL, RESISTANCE, WALLS, WALLS_LONG, Observed
+from flowrec.refine.channel_cells import steepness
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.findings import PROBABLE, findings
 from flowrec.refine.flow_model import FlowModel, flow_model
 from flowrec.refine.hypothesis import (
-    NOISE,
     Fitted,
     Robust,
     State,
     Steps,
     begin,
     complete,
+    doubtful,
     of_the_field,
     outlying,
     robust_noise,
@@ -54,8 +55,6 @@ DEPTH_STD_SHARE = 0.3  # standard deviation around each of them: half of their s
 UNSTATED_SHARE = 0.75  # prior probability that the depth of such a chip does not matter
 OBSTACLE_SHARE = 0.2  # prior probability that some channel is partly blocked, at any one of the tried places
 LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
-STRUCTURE_DOUBTED = 2.0  # size of the errors along the channels over the usual one, above which other walls are tried
-NOISE_DOUBTED = 1.2  # the same of the noise over the stated one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,17 +177,17 @@ class Assimilate(PriorSettings):
         for other, share in zip(chips, prior, strict=True):
             with suppress(FlowError):  # a depth whose flow can not be computed
                 observed = self._observed(other, chip, operator, solver)
-                begun.append((observed, begin(observed, robust, steps), np.log(share)))
-        ln_weight = np.array([state.sizes.evidence + ln_prior for _, state, ln_prior in begun])
+                begun.append((begin(observed, robust, steps), np.log(share)))
+        ln_weight = np.array([state.sizes.evidence + ln_prior for state, ln_prior in begun])
         best = begun[int(np.argmax(ln_weight))]
-        if self.doubt_walls and small and _doubtful(best[1]):
-            wrong, moved = self._better_mask(operator, best[0].model.chip, chip, solver, robust, best[1])
+        if self.doubt_walls and small and doubtful(best[0].evidence, best[0].sizes):
+            wrong, moved = self._better_mask(operator, best[0].observed.model.chip, chip, solver, robust, best[0])
             if moved is not None:
                 return Hypotheses([moved], np.ones(1), np.ones(1), robust, wrong)
         least = ln_weight.max() + np.log(LEAST_WEIGHT)
         found = [
-            (complete(observed, robust, state, steps), ln_prior)
-            for (observed, state, ln_prior), ln in zip(begun, ln_weight, strict=True)
+            (complete(robust, state, steps), ln_prior)
+            for (state, ln_prior), ln in zip(begun, ln_weight, strict=True)
             if ln > least
         ]
         ln_weight = np.array([one.posterior.evidence + ln_prior for one, ln_prior in found])
@@ -230,24 +229,24 @@ class Assimilate(PriorSettings):
                 observed = self._observed(obstacle.on(chip), problem.chip, problem.operator, solver)
                 observed = replace(observed, model=with_shape_error(observed.model, best.observed.model))
                 robust = robust_noise(observed)  # what was an outlier may be explained now
-                tried.append((obstacle, observed, robust, begin(observed, robust, steps)))
+                tried.append((obstacle, robust, begin(observed, robust, steps)))
         if not tried:
             return every
         ln_odds = float(np.log(OBSTACLE_SHARE / (1.0 - OBSTACLE_SHARE) / PLACES))
         least = begin(best.observed, every.robust, steps).sizes.evidence + np.log(LEAST_WEIGHT) - ln_odds
         least -= outlying(every.robust)
-        tried = [entry for entry in tried if entry[3].sizes.evidence - outlying(entry[2]) > least]
+        tried = [entry for entry in tried if entry[2].sizes.evidence - outlying(entry[1]) > least]
         if not tried:
             return every
-        found = [complete(observed, robust, state, steps) for _, observed, robust, state in tried]
+        found = [complete(robust, state, steps) for _, robust, state in tried]
         ln_ratio = np.array([one.posterior.evidence - best.posterior.evidence for one in found])
         # Where observations are averaged, the evidence does not tell how many outliers were left out.
-        ln_ratio -= [outlying(robust) - outlying(every.robust) for _, _, robust, _ in tried]
+        ln_ratio -= [outlying(robust) - outlying(every.robust) for _, robust, _ in tried]
         weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds, 500.0))
         weights = np.concatenate([every.weights, weight])
         # As for depths: of what is not likelier than the chip without it, nothing is left.
         shares = np.concatenate([every.shares, weight * -np.expm1(np.minimum(-ln_ratio, 0.0))])
-        robust = tried[int(np.argmax(weight))][2] if weight.max() > every.weights.max() else every.robust
+        robust = tried[int(np.argmax(weight))][1] if weight.max() > every.weights.max() else every.robust
         return Hypotheses(
             every.found + found,
             weights / weights.sum(),
@@ -291,7 +290,7 @@ class Assimilate(PriorSettings):
         state = begin(observed, robust, steps)
         if state.sizes.evidence <= own.sizes.evidence + LEAST_GAIN:
             return "", None
-        return words, complete(observed, robust, state, steps)
+        return words, complete(robust, state, steps)
 
     def _field(self, every: Hypotheses, problem: Problem) -> FlowField:
         """The mean over the hypotheses as a field on the chip's own mask."""
@@ -356,9 +355,7 @@ class Assimilate(PriorSettings):
 
 def field_columns(found: Fitted) -> Floats:
     """(p, n, 2) um/s per unit of each of the first p unknowns, which are those of the flow."""
-    model = found.observed.model
-    sections = model.cells.toarray()[:, :, None] * found.in_use
-    return np.concatenate([model.known, model.resistance, sections])
+    return _columns(found.observed.model, found.in_use)
 
 
 def field_variance(found: Fitted) -> Floats:
@@ -367,29 +364,46 @@ def field_variance(found: Fitted) -> Floats:
     values, vectors = np.linalg.eigh(found.posterior.covariance[: len(columns), : len(columns)])
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     spread = np.tensordot(root.T, columns, axes=1)
-    return np.asarray((spread**2).sum(axis=0) + found.observed.model.error_std[:, None] ** 2)
+    return np.asarray((spread**2).sum(axis=0) + left_variance(found))
+
+
+def left_variance(found: Fitted) -> Floats:
+    """(n, 2) the part of it that no unknown explains: the error of the grid, and of the profile beside walls."""
+    names, model = [effect.name for effect in found.effects], found.observed.model
+    local, walls = (float(found.posterior.square_sizes[names.index(name)]) for name in ("local", "walls"))
+    return np.asarray(local * model.error_std[:, None] ** 2 + walls * _beside_walls(model, found.in_use))
+
+
+def _columns(model: FlowModel, flow: Floats) -> Floats:
+    """(p, n, 2) of the unknowns of the flow: boundary values and fluid, resistances, walls."""
+    sections = model.cells.toarray()[:, :, None] * flow
+    walls = -WALLS_LONG * model.widening[:, None, None] * (3.0 * model.resistance + sections)
+    return np.concatenate([model.known, model.resistance, walls])
 
 
 def prior_of(model: FlowModel) -> tuple[Floats, Floats]:
     """Columns (p, n, 2) of the unknowns of the flow, and their covariance (p, p) before any observation."""
-    sections = model.cells.toarray()[:, :, None] * model.base
-    sizes = np.repeat([1.0, RESISTANCE[0], SECTION[0]], [len(model.known), len(model.resistance), len(sections)])
-    return np.concatenate([model.known, model.resistance, sections]), np.diag(sizes**2)
+    cells = len(model.resistance)
+    sizes = np.repeat([1.0, RESISTANCE[0], WALLS[0]], [len(model.known), cells, cells])
+    return _columns(model, model.base), np.diag(sizes**2)
 
 
 def _prior_variance(model: FlowModel) -> Floats:
     """(n, 2) variance of each component of the flow before any observation."""
     columns, covariance = prior_of(model)
     variance = (np.diag(covariance)[:, None, None] * columns**2).sum(axis=0)
-    return np.asarray(variance + model.error_std[:, None] ** 2)
+    return np.asarray(variance + prior_left_variance(model))
 
 
-def _doubtful(state: State) -> bool:
-    """Whether errors of the map along the channels, or the noise, are larger than usual."""
-    sizes = dict(zip([effect.name for effect in state.evidence.effects], np.exp(state.sizes.mode), strict=True))
-    usual = {"section": SECTION[0], "resistance": RESISTANCE[0]}
-    structure = any(sizes[name] > STRUCTURE_DOUBTED * size for name, size in usual.items())
-    return structure or sizes[NOISE[0]] > NOISE_DOUBTED
+def prior_left_variance(model: FlowModel) -> Floats:
+    """(n, 2) `left_variance` before any observation."""
+    return np.asarray((LOCAL[0] * model.error_std[:, None]) ** 2 + WALLS[0] ** 2 * _beside_walls(model, model.base))
+
+
+def _beside_walls(model: FlowModel, flow: Floats) -> Floats:
+    """(n, 2) variance, per square pixel by which walls are off, of what no cell explains."""
+    wider = (model.widening @ model.cells)[:, None] * flow
+    return np.asarray(steepness(model.chip.mask, flow) ** 2 + (1.0 - WALLS_LONG**2) * wider**2)
 
 
 def _error_share(flow: Floats, variance: Floats) -> float:

@@ -2,16 +2,23 @@
 
 With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, and the flow v:
 
-    y_i = v(x_i) + dv/dx (offset + scale (x_i - c) + angle J (x_i - c)) + (scale + angle J) v + scale r_i
+    y_i = v(x_i) + dv/dx (offset - scale (x_i - c) - angle J (x_i - c)) + (scale + angle J) v + scale r_i
           + (gain - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
-          - carry b_i v + v (g(x_i) + p(t_i)) + noise
+          - carry b_i v + curved d^2 / 6 lap v + walls(x_i) + v p(t_i) + local(x_i) + noise
 
 J turns from +x to +y, c is the mean of the places, b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the
 wall, d is the least one that was observed (the robot's radius is not part of a refinement, and it can not have been
 nearer), b is its mean: the gain is that of the robot where it was observed, and hindrance what differs nearer to or
-farther from a wall. g is an error of the cross-sections along the channels, p a change of the whole flow in time: slow
-wander, and a spectral line. Each effect is linear in its unknowns around the flow in use, so the assimilation repeats
-with the flow that it found.
+farther from a wall. A sphere of radius a follows the flow v + a^2 / 6 lap v (Faxen 1922), whatever holds it back
+besides: `curved` is (a / d)^2. p is a change of the whole flow in time: slow wander, and a spectral line. `local` is
+the error of the grid. Each effect is linear in its unknowns around the flow and the registration in use, so the
+assimilation repeats with those that it found.
+
+Walls that are off by w pixels (one standard deviation, each wall on its own) change the width of a cell of the channels
+by the fraction e = sqrt(2) w / width. In a channel at the same flow rate the mean speed changes by -e, the resistance
+by -3 e (lubrication; Poiseuille between plates); beside a wall the whole profile moves with it, by w times the gradient
+of the velocity. One size w belongs to all three, so the speeds that were observed in the middle of the channels tell
+how far to trust the flow beside their walls, where no robot has been.
 
 The median of a size is what is usual in a laboratory, the ln_std says how far that may be off: by a factor of 3 to 5,
 so that the observations decide (evidence.py), and an effect that nothing asks for stays small.
@@ -23,6 +30,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flowrec.chip.clearance import clearance_um
+from flowrec.interpolation import cells_at
+from flowrec.refine.channel_cells import curvature
 from flowrec.refine.evidence import Effect
 from flowrec.refine.flow_model import FlowModel
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -31,9 +41,12 @@ from flowrec.refine.observation_operator import Floats, ObservationOperator
 BOUNDARY = (1.0, 0.3)  # in the prior standard deviations of the settings
 FLUID = (1.0, 0.02)  # viscosity, density, depth, shapes of the inlets, fraction of the grid's error: as stated
 RESISTANCE = (0.05, 1.0)  # of a cell: a channel 3 % narrower than drawn has 9 % more
-SECTION = (0.01, 1.0)  # of the speed in a cell: a wall half a pixel off in a channel 20 px wide is 2.5 %
+WALLS = (0.29, 0.8)  # px by which a wall is off: a wall somewhere in its pixel, 1 / sqrt(12)
+WALLS_LONG = np.sqrt(0.5)  # of it, what extends over a cell: half of the variance; the rest over a channel's width
+LOCAL = (1.0, 0.8)  # of the error of the grid that the model states
 GAIN = (0.08, 1.3)  # um per revolution is known to a few per cent where it was calibrated, else to 15 %
 HEADING = (0.01, 0.8)  # rad: coils and camera are aligned to half a degree
+CURVED = (0.12, 0.8)  # of the part of Faxen's law that a sphere as large as the least distance to a wall would show
 HINDRANCE = (0.05, 1.3)  # of the own motion, between the least distance to a wall and far from one
 CARRY = (0.02, 0.4)  # of the flow, likewise: a sphere lags by few per cent until it nearly touches the wall
 OFFSET_PX = (0.3, 1.0)  # registration to a fraction of a pixel of the mask
@@ -63,12 +76,17 @@ class Observed:
     shifted: tuple[ObservationOperator, ...]  # half a pixel to the right, left, down, up
     cells: Floats  # (cells, n) weights of the cells there
     near: Floats  # (n,) b_i: 1 at the least distance to a wall
+    least_px: float  # least distance to a wall
     um_per_px: float
+    stated: ObservationOperator  # where the registration puts the observations
+    moved: Floats  # (n, 2) px from there to where the flow is read, by the registration in use
 
     @classmethod
-    def of(cls, model: FlowModel, operator: ObservationOperator) -> Observed:
-        """The observations of an operator. Those in solid are predicted to be at rest."""
+    def of(cls, model: FlowModel, operator: ObservationOperator, moved: Floats | None = None) -> Observed:
+        """The observations of an operator, moved by (n, 2) px. Those in solid are predicted to be at rest."""
         mask, wall_px = model.chip.mask, model.expansion.wall_px
+        stated, moved = operator, np.zeros_like(operator.points) if moved is None else moved
+        operator = replace(operator, points=np.clip(operator.points + moved, 0.0, np.array(mask.shape[::-1]) - 1.0))
         here = operator.with_walls(wall_px)
         steps = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
         last = np.array(mask.shape[::-1]) - 1.0
@@ -77,24 +95,49 @@ class Observed:
             for step in steps
         )
         here = here.on_fluid(mask)
-        column, row = operator.points.T.round().astype(np.intp)
-        distance = np.maximum(wall_px[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)], 0.0)
+        clearance = np.minimum(clearance_um(mask, 1.0), np.float32(max(mask.shape)))
+        distance = np.maximum(cells_at(operator.points, mask.shape).interpolate(clearance), 0.0)
         least = max(float(distance.min()), 0.5)
         near = np.exp(-np.maximum(distance - least, 0.0) / (NEAR_SHARE * least))
-        return cls(model, here, shifted, model.cells[:, here.pixels[:, 0]].toarray(), near, model.chip.um_per_px)
+        cells = model.cells[:, here.pixels[:, 0]].toarray()
+        return cls(model, here, shifted, cells, near, least, model.chip.um_per_px, stated, moved)
+
+    def at(self, registration: Floats) -> Observed:
+        """The same observations where a registration (4,) has them: offset x and y in px, scale, angle in rad."""
+        away = self.away
+        moved = np.asarray(registration[:2] - registration[2] * away - registration[3] * _turned(away))
+        return Observed.of(self.model, self.stated, moved)
+
+    @property
+    def away(self) -> Floats:
+        """(n, 2) px from the mean of the places."""
+        return np.asarray(self.stated.points - self.stated.points.mean(axis=0))
+
+    def misfit(self, flow: Floats, in_use: Floats) -> Floats:
+        """(n, 2) measured minus predicted from a flow (n, 2), for a registration without error.
+
+        The flow is read where the registration in use has the observations; what this adds is taken off to first order,
+        because the effects count from the stated registration.
+        """
+        added = np.einsum("an,anc->nc", self.moved.T, self._gradient(in_use)) if self.moved.any() else 0.0
+        return np.asarray(self.operator.flow_um_s - self.operator.predict(flow) + added)
+
+    def _gradient(self, flow: Floats) -> Floats:
+        """(2, n, 2) derivatives of a flow along x and y, um/s per px."""
+        right, left, down, up = (one.predict(flow) for one in self.shifted)
+        return np.stack([right - left, down - up])
 
     def effects(self, flow: Floats, line_hz: float | None) -> list[Effect]:
         """All effects around a flow (n, 2) of the model's pixels, with columns for the observations, x and y of each.
 
-        The first four have unknowns that belong to the field: boundary values, fluid, resistances, sections.
+        The first four have unknowns that belong to the field: boundary values, fluid, resistances, walls.
         """
         here, model = self.operator, self.model
         v = here.predict(flow)
-        right, left, down, up = (one.predict(flow) for one in self.shifted)
-        gradient = np.stack([right - left, down - up])  # (2, n, 2) um/s per px
+        gradient = self._gradient(flow)
         rolled, time_s = here.rolled_um_s, here.time_s
         own = np.zeros_like(v) if rolled is None else rolled
-        away = here.points - here.points.mean(axis=0)
+        away = self.away
         turned = _turned(away)
         stretch = v + own - np.einsum("an,anc->nc", away.T, gradient)
         turn = _turned(v) - np.einsum("an,anc->nc", turned.T, gradient)
@@ -103,11 +146,13 @@ class Observed:
             _effect("boundary", BOUNDARY, known[:openings]),
             _effect("fluid", FLUID, known[openings:]),
             _effect("resistance", RESISTANCE, here.predict(model.resistance)),
-            _effect("section", SECTION, self.cells[:, :, None] * v),
+            replace(_effect("walls", WALLS, self._widened(v)), kernel=self._beside_walls(v, gradient)),
             _effect("offset", OFFSET_PX, gradient),
             _effect("scale", SCALE, stretch[None]),
             _effect("angle", ANGLE, turn[None]),
             _effect("carry", CARRY, -(self.near[:, None] * v)[None]),
+            _effect("curved", CURVED, (self.least_px**2 / 6.0 * here.predict(curvature(model.chip.mask, flow)))[None]),
+            Effect("local", *LOCAL, np.zeros((0, v.size)), self.local_error()),
         ]
         if rolled is not None:
             found += [
@@ -128,6 +173,23 @@ class Observed:
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
         return found
+
+    def _widened(self, v: Floats) -> Floats:
+        """(cells, n, 2) what walls that are a pixel off in a cell do to the flow v (n, 2), there and elsewhere."""
+        resistance = self.operator.predict(self.model.resistance)
+        both = 3.0 * resistance + self.cells[:, :, None] * v
+        return np.asarray(-WALLS_LONG * self.model.widening[:, None, None] * both)
+
+    def _beside_walls(self, v: Floats, gradient: Floats) -> Floats:
+        """(2 n, 2 n) covariance of a profile that moves by a pixel and of what is shorter than a cell.
+
+        `v` (n, 2) is the flow, `gradient` (2, n, 2) its derivatives, um/s per px.
+        """
+        points = self.operator.points
+        apart = np.linalg.norm(points[:, None] - points, axis=-1)
+        wider = np.sqrt(1.0 - WALLS_LONG**2) * (self.model.widening @ self.cells)[:, None] * v
+        flat = np.concatenate([gradient, wider[None]]).reshape(3, -1)
+        return np.asarray((flat.T @ flat) * np.kron(np.exp(-apart / self.model.channel_px), np.ones((2, 2))))
 
     def local_error(self) -> Floats:
         """(2 n, 2 n) covariance of the model's own error: neighbours share it."""

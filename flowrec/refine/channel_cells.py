@@ -9,6 +9,7 @@ observations (evidence.py).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from scipy.sparse.csgraph import dijkstra
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um, median_width_um
 from flowrec.flow.linear_solver import cached, cell_count
+from flowrec.flow.sampling import fluid_image
 from flowrec.flow.sensitivities import Sensitivities
 from flowrec.refine.observation_operator import Floats
 
@@ -45,6 +47,47 @@ def _channel_cells(chip: Chip) -> Any:
         reach *= LONGER
     weights = sp.csr_array(np.stack(rows))
     return sp.csr_array(weights @ sp.diags_array(1.0 / np.maximum(weights.sum(axis=0), 1e-12)))
+
+
+def cell_widening(chip: Chip, cells: Any) -> Floats:
+    """(cells,) relative change of the width of each cell per pixel by which each of its two walls is off.
+
+    The walls are off independently, so their distance varies by sqrt(2) times that. The width is twice the largest
+    distance from a wall in the middle of the cell.
+    """
+    clearance = clearance_um(chip.mask, 1.0)[chip.mask].astype(np.float64)
+    inside = np.where(np.isfinite(clearance), clearance, 0.5 * max(chip.mask.shape))
+    weights = cells.toarray()
+    half = np.where(weights > 0.5 * weights.max(axis=1, keepdims=True), inside, 0.0).max(axis=1)
+    return np.asarray(np.sqrt(2.0) / (2.0 * np.maximum(half, 0.5)))
+
+
+def steepness(mask: NDArray[np.bool_], velocity: Floats) -> Floats:
+    """(n, 2) size of the gradient of each component of a compact velocity (n, 2), per pixel."""
+    image = fluid_image(mask, velocity)
+    slopes = [0.5 * (ahead - behind) for ahead, behind in _neighbours(mask, image)]
+    return np.asarray(np.hypot(*slopes)[mask])
+
+
+def curvature(mask: NDArray[np.bool_], velocity: Floats) -> Floats:
+    """(n, 2) Laplacian of each component of a compact velocity (n, 2), per square pixel."""
+    image = fluid_image(mask, velocity)
+    return np.asarray(sum(ahead + behind for ahead, behind in _neighbours(mask, image)) - 4.0 * image)[mask]
+
+
+def _neighbours(mask: NDArray[np.bool_], image: Floats) -> Iterator[tuple[Floats, Floats]]:
+    """Along each axis, the values (h, w, 2) of an image at the next and at the previous pixel.
+
+    The flow vanishes on a wall, half a pixel beyond the last fluid pixel: beyond it is minus that before it. Across the
+    border of the image a channel goes on.
+    """
+    for axis in (0, 1):
+        sides = []
+        for step, last in ((-1, -1), (1, 0)):
+            beyond = np.where(np.roll(mask, step, axis=axis)[..., None], np.roll(image, step, axis=axis), -image)
+            np.moveaxis(beyond, axis, 0)[last] = np.moveaxis(image, axis, 0)[last]
+            sides.append(beyond)
+        yield sides[0], sides[1]
 
 
 def _cover(graph: Any, order: NDArray[np.intp], reach: float) -> list[Floats] | None:

@@ -9,7 +9,7 @@ size s_g, one standard deviation of its unknowns, and a matrix G_g = D_g' D_g of
 are unknown themselves: ln s_g has a normal hyperprior. The marginal likelihood of the sizes (restricted likelihood for
 the effects that are integrated out) is maximised by a quasi-Newton method; the posterior of the sizes around that mode
 is a normal distribution with the expected information as its precision, corrected by importance weights at fixed
-quasi-random points (MacKay 1992; Rue, Martino and Chopin 2009 for the idea). The posterior of the unknowns is averaged
+points (MacKay 1992; Rue, Martino and Chopin 2009 for the idea). The posterior of the unknowns is averaged
 over the points, so an effect that the observations can not tell from another one widens the error bars by what it might
 be: a mean over models, not the choice of one.
 """
@@ -24,10 +24,8 @@ import scipy  # its linalg and optimize load at first use, not at start-up
 
 from flowrec.refine.observation_operator import Floats
 
-POINTS = 32  # at which the posterior of the sizes is integrated: two to three for each of a dozen sizes
-INFLATION = 1.2  # of the standard deviations of the points over those of the normal distribution at the mode
+POINTS = 32  # at which the posterior of the sizes is integrated; a power of two above the number of sizes
 NEGLIGIBLE = 1e-3  # weight of a point, relative to the largest, that is left out
-_PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +36,12 @@ class Effect:
     median: float  # of the size s
     ln_std: float  # of ln s
     columns: Floats  # (unknowns, m) what a unit of each unknown does to the observations; (0, m) for a kernel
-    kernel: Floats | None = None  # (m, m); None: that of the columns
+    kernel: Floats | None = None  # (m, m) of what no unknown stands for, in addition
 
     @property
     def matrix(self) -> Floats:
         """(m, m) covariance that it adds at size 1."""
-        return np.asarray(self.columns.T @ self.columns if self.kernel is None else self.kernel)
+        return np.asarray(self.columns.T @ self.columns + (0.0 if self.kernel is None else self.kernel))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,6 +53,7 @@ class Posterior:
     covariance: Floats  # (unknowns, unknowns)
     sizes: Floats  # (effects,) geometric posterior mean of each size
     ln_size_std: Floats  # (effects,)
+    square_sizes: Floats  # (effects,) posterior mean of the square of each size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +107,8 @@ class Evidence:
         owner = np.repeat(np.arange(len(self.effects)), [len(effect.columns) for effect in self.effects])
         medians = np.log([effect.median for effect in self.effects])
         stds = np.array([effect.ln_std for effect in self.effects])
-        root = INFLATION * np.linalg.cholesky(sizes.covariance)
-        normal = np.concatenate([np.zeros((1, len(medians))), _normal_points(POINTS - 1, len(medians))])
+        normal = _points(len(medians))
+        root = np.linalg.cholesky(sizes.covariance)
         points = sizes.mode + normal @ root.T
         points = np.clip(points, medians - 6.0 * stds, medians + 4.0 * stds)
         ln_weight = np.empty(len(points))
@@ -140,7 +139,8 @@ class Evidence:
         covariance = square - np.outer(mean, mean)
         centre = weight @ points
         spread = np.sqrt(np.maximum(weight @ (points - centre) ** 2, 0.0))
-        return Posterior(evidence, mean, 0.5 * (covariance + covariance.T), np.exp(centre), spread)
+        square_sizes = weight @ np.exp(2.0 * points)
+        return Posterior(evidence, mean, 0.5 * (covariance + covariance.T), np.exp(centre), spread, square_sizes)
 
     def most_probable(self, sizes: Sizes) -> Floats:
         """(unknowns,) at the most probable sizes."""
@@ -177,15 +177,14 @@ class Evidence:
         return value - 0.5 * len(self.y) * np.log(2.0 * np.pi), gradient
 
 
-def _normal_points(count: int, dimensions: int) -> Floats:
-    """(count, dimensions) points of the Halton sequence as standard normal deviates."""
-    uniform = np.empty((count, dimensions))
-    for axis in range(dimensions):
-        base = _PRIMES[axis % len(_PRIMES)]
-        index, fraction, value = np.arange(20, 20 + count), 1.0, np.zeros(count)
-        while index.any():
-            fraction /= base
-            value += fraction * (index % base)
-            index = index // base
-        uniform[:, axis] = value
-    return np.asarray(scipy.special.ndtri(np.clip(uniform, 1e-6, 1.0 - 1e-6)), np.float64)
+def _points(dimensions: int) -> Floats:
+    """(POINTS or more, dimensions) corners of a cube, +1 and -1: mean and covariance are those of a standard normal.
+
+    Columns of a Hadamard matrix are orthogonal to each other and to the first, which is constant (the design of
+    Plackett and Burman 1946). The points lie at the distance sqrt(dimensions), where a normal distribution has its
+    mass. (Of a Halton sequence in seventeen dimensions the first 32 points are correlated ramps.)
+    """
+    count = POINTS
+    while count <= dimensions:
+        count *= 2
+    return np.asarray(scipy.linalg.hadamard(count)[:, 1 : dimensions + 1], np.float64)

@@ -100,7 +100,7 @@ def _values(one: Fitted) -> dict[str, tuple[float, float]]:
         std = float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
         result[f"pump_{one.line_hz:.2f}_hz_share"] = (amplitude, std)
     names = [effect.name for effect in one.effects]
-    sizes = {"structural_share": ["section"], "resistance_share": ["resistance"]}
+    sizes = {"walls_px": ["walls"], "resistance_share": ["resistance"]}
     sizes["wander_share"] = [f"wander {length:g} s" for length in WANDER_S]
     for name, effects in sizes.items():
         chosen = [names.index(effect) for effect in effects if effect in names]
@@ -141,6 +141,6 @@ def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: fl
             words.append(f"the pump pulsates by {100.0 * values[name]:.0f} +- {100.0 * stds[name]:.0f} % at {hz} Hz")
     if values.get("wander_share", 0.0) > 0.06:
         words.append(f"the flow wanders in time by {100.0 * values['wander_share']:.0f} %")
-    if values["structural_share"] > 0.04:
-        words.append(f"the map differs along the channels by {100.0 * values['structural_share']:.0f} % of the speed")
+    if values["walls_px"] > 0.5:
+        words.append(f"the walls seem {values['walls_px'] * um_per_px:.0f} um off in places")
     return words

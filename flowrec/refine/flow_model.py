@@ -1,7 +1,8 @@
 """The linear model of a chip's flow: velocity = base + z columns, and the error that no column explains.
 
 The columns are the boundary values and the fluid (prior.py), the fraction of the grid's error (discretisation_error.py)
-and a wrong resistance of each cell of the channels (channel_cells.py). All of it depends on the chip alone.
+and a wrong resistance and wrong walls of each cell of the channels (channel_cells.py). All of it depends on the chip
+alone.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from flowrec.chip.chip import Chip
+from flowrec.chip.clearance import median_width_um
 from flowrec.flow import FlowSolver
 from flowrec.flow.linear_solver import cached, cell_count, chip_key
 from flowrec.flow.sensitivities import Sensitivities
-from flowrec.refine.channel_cells import channel_cells, resistance_modes
+from flowrec.refine.channel_cells import cell_widening, channel_cells, resistance_modes
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.observation_operator import Floats
 from flowrec.refine.prior import Prior, PriorSettings, law_widths
@@ -31,8 +33,10 @@ class FlowModel:
     known: Floats  # (p, n, 2) per prior standard deviation: boundary values, fluid, fraction of the grid's error
     resistance: Floats  # (cells, n, 2) per relative change of the resistance of each cell
     cells: Any  # (cells, n) sparse weights of the cells
+    widening: Floats  # (cells,) relative change of the width of each cell per pixel by which both walls are off
+    channel_px: float  # median width of the channels
     base: Floats  # (n, 2)
-    error_std: Floats  # (n,) of each component
+    error_std: Floats  # (n,) of each component: stated error of the grid, of which no unknown is a part
 
 
 def flow_model(settings: PriorSettings, error: ModelError, chip: Chip, solver: FlowSolver) -> FlowModel:
@@ -57,7 +61,9 @@ def flow_model(settings: PriorSettings, error: ModelError, chip: Chip, solver: F
         cells = channel_cells(chip)
         # Above rounding errors, also where an observation has a std of 0.
         std = np.maximum(grid.local_std, 1e-3 * grid.local_std.max() + 1e-9)
-        return FlowModel(chip, expansion, prior, known, resistance_modes(expansion, cells), cells, base, std)
+        modes = resistance_modes(expansion, cells)
+        widening, width_px = cell_widening(chip, cells), median_width_um(chip) / chip.um_per_px
+        return FlowModel(chip, expansion, prior, known, modes, cells, widening, width_px, base, std)
 
     key = ("flow model", settings, error, solver, chip_key(chip))
     model: FlowModel = cached(key, cell_count(chip, 1) // 5, compute)

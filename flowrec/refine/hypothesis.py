@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowrec.flow.sensitivities import Remainder
-from flowrec.refine.causes import Observed, lines_hz
+from flowrec.refine.causes import RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
 from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes
 from flowrec.refine.mixture_regression import Model
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -18,13 +18,19 @@ LEAST_INLIER = 1e-6  # probability: the noise of an observation is divided by it
 OUTLIER_SCALE = 3.0  # size of an outlier's components over the typical component of the observations
 OUTLIER_NATS = 2.0 * float(np.log(OUTLIER_SCALE / 0.15))  # of two components; the noise is 15 % of the typical speed
 NOISE = ("noise", 0.7, 0.6)  # size of the stated noise: name, median, ln_std; a filter states what is safe
+MOST_MOVES = 3  # of the observations to where the registration has them; the first finds nearly all of it
+# Registrations to start from where the map is doubted: offset in px, scale, angle.
+REGISTRATIONS = ((0.0, 0.0, 0.025, 0.0), (0.0, 0.0, -0.025, 0.0))
+# Effects, their usual size, and the factor on it above which the map is doubted.
+DOUBTED = (("walls", WALLS[0], 2.0), ("resistance", RESISTANCE[0], 2.0), ("noise", 1.0, 1.2))
+FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
 LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
 FIELD_EFFECTS = (
     "boundary",
     "fluid",
     "resistance",
-    "section",
+    "walls",
 )  # the first ones, in the order of the columns of the flow
 
 
@@ -128,10 +134,14 @@ def robust_noise(observed: Observed) -> Robust:
     power = (here.flow_um_s**2).sum(axis=1)
     wide = OUTLIER_SCALE**2 * 0.5 * float(np.median(power)) + float(here.std_um_s.max()) ** 2 + 1e-9
     misfit = here.flow_um_s - here.predict(observed.model.base)
-    local = np.diag(observed.local_error())[::2]
-    # A change of the flow in time is no noise, but no column either.
-    local = local + sum(
-        (effect.median**2 * np.diag(effect.matrix)[::2] for effect in effects if effect.kernel is not None), 0.0
+    # What changes in time, the errors of the grid and of the profile are no noise, but no columns either.
+    local = sum(
+        (
+            effect.median**2 * 0.5 * np.diag(effect.kernel).reshape(-1, 2).sum(axis=1)
+            for effect in effects
+            if effect.kernel is not None
+        ),
+        np.zeros(here.count),
     )
     found = Model(design.reshape(len(design), -1, 2), misfit, variance + local, wide).fit()
     return Robust(variance, np.maximum(found.inlier, LEAST_INLIER), found.noise_factor)
@@ -166,6 +176,7 @@ class Steps:
 class State:
     """The most probable flow of a hypothesis so far, with the most probable sizes."""
 
+    observed: Observed
     sizes: Sizes
     evidence: Evidence
     line_hz: float | None
@@ -179,8 +190,14 @@ def begin(observed: Observed, robust: Robust, steps: Steps) -> State:
     """The most probable flow, with the effects around the assumed flow; a spectral line where the evidence asks."""
     model = observed.model
     nothing = np.zeros_like(model.base)
-    evidence = _evidence(observed, robust, nothing, model.base, None)
-    sizes, line_hz = evidence.sizes(), None
+    observed, evidence, sizes = _settled(observed, robust, None)
+    line_hz = None
+    if doubtful(evidence, sizes):
+        # In the middle of a channel the flow has no gradient, so a few pixels to the side are not found from there.
+        others = [_settled(observed.at(np.array(start)), robust, sizes.mode) for start in REGISTRATIONS]
+        best = max(others, key=lambda entry: entry[2].evidence)
+        if best[2].evidence > sizes.evidence:
+            observed, evidence, sizes = best
     hz = _line_hz(observed, robust, evidence, sizes)
     if hz is not None:
         pulsating = _evidence(observed, robust, nothing, model.base, hz)
@@ -190,25 +207,53 @@ def begin(observed: Observed, robust: Robust, steps: Steps) -> State:
     return _followed(
         observed,
         robust,
-        State(sizes, evidence, line_hz, model.base, model.base, nothing, model.expansion.start()),
+        State(observed, sizes, evidence, line_hz, model.base, model.base, nothing, model.expansion.start()),
         steps,
     )
 
 
-def complete(observed: Observed, robust: Robust, state: State, steps: Steps) -> Fitted:
+def complete(robust: Robust, state: State, steps: Steps) -> Fitted:
     """The same with the effects around the flow that was found, and averaged over the sizes."""
     # That of the boundary values alone: a flow that follows the observations everywhere would explain them by itself.
+    observed, z = state.observed, state.evidence.most_probable(state.sizes)
     known = observed.model.known
-    z = state.evidence.most_probable(state.sizes)[: len(known)]
-    in_use = observed.model.base + state.nonlinear + np.tensordot(z, known, axes=1)
+    in_use = observed.model.base + state.nonlinear + np.tensordot(z[: len(known)], known, axes=1)
+    observed = _registered(observed, z, state.evidence) or observed
     evidence = _evidence(observed, robust, state.nonlinear, in_use, state.line_hz)
     sizes = evidence.sizes(state.sizes.mode)
-    state = replace(state, evidence=evidence, sizes=sizes, in_use=in_use)
+    state = replace(state, observed=observed, evidence=evidence, sizes=sizes, in_use=in_use)
     state = _followed(observed, robust, state, steps)
     posterior = state.evidence.posterior(sizes)
     flow = _flow(observed, posterior.mean, state.in_use, state.nonlinear)
     effects = list(state.evidence.effects)
     return Fitted(observed, effects, sizes, posterior, flow, state.in_use, state.remainder, state.line_hz, robust)
+
+
+def _settled(observed: Observed, robust: Robust, start: Floats | None) -> tuple[Observed, Evidence, Sizes]:
+    """The observations where the most probable registration has them, around the assumed flow."""
+    base = observed.model.base
+    for _ in range(MOST_MOVES):
+        evidence = _evidence(observed, robust, np.zeros_like(base), base, None)
+        sizes = evidence.sizes(start)
+        again = _registered(observed, evidence.most_probable(sizes), evidence)
+        if again is None:
+            break
+        observed, start = again, sizes.mode
+    return observed, evidence, sizes
+
+
+def doubtful(evidence: Evidence, sizes: Sizes) -> bool:
+    """Whether errors of the map along the channels, or the noise, are larger than usual."""
+    found = dict(zip([effect.name for effect in evidence.effects], np.exp(sizes.mode), strict=True))
+    return any(found[name] > factor * usual for name, usual, factor in DOUBTED)
+
+
+def _registered(observed: Observed, z: Floats, evidence: Evidence) -> Observed | None:
+    """The observations where the most probable registration has them; None where they are near that already."""
+    effects = evidence.effects
+    owner = np.repeat([effect.name for effect in effects], [len(effect.columns) for effect in effects])
+    there = observed.at(np.concatenate([z[owner == name] for name in ("offset", "scale", "angle")]))
+    return there if float(np.abs(there.moved - observed.moved).max()) > FAR_PX else None
 
 
 def _assumed(observed: Observed, robust: Robust, line_hz: float | None) -> float:
@@ -240,16 +285,17 @@ def _flow(observed: Observed, z: Floats, in_use: Floats, nonlinear: Floats) -> F
     """(n, 2) flow of unknowns z, those of the field first."""
     model = observed.model
     known, cells = len(model.known), len(model.resistance)
+    wider = WALLS_LONG * z[known + cells : known + 2 * cells] * model.widening
     flow = model.base + nonlinear + np.tensordot(z[:known], model.known, axes=1)
-    flow = flow + np.tensordot(z[known : known + cells], model.resistance, axes=1)
-    return np.asarray(flow + (z[known + cells : known + 2 * cells] @ model.cells)[:, None] * in_use)
+    flow = flow + np.tensordot(z[known : known + cells] - 3.0 * wider, model.resistance, axes=1)
+    return np.asarray(flow - (wider @ model.cells)[:, None] * in_use)
 
 
 def _evidence(observed: Observed, robust: Robust, nonlinear: Floats, in_use: Floats, line_hz: float | None) -> Evidence:
     """The observations, averaged, and the effects on them."""
     here = observed.operator
     average = _averages(robust, here)
-    misfit = here.flow_um_s - here.predict(observed.model.base + nonlinear)
+    misfit = observed.misfit(observed.model.base + nonlinear, in_use)
     noise = np.repeat(robust.factor**2 * robust.variance / robust.inlier, 2)
     effects = [
         replace(
@@ -261,10 +307,8 @@ def _evidence(observed: Observed, robust: Robust, nonlinear: Floats, in_use: Flo
     ]
     stated = (average * noise) @ average.T
     effects.append(Effect(*NOISE, np.zeros((0, len(average))), stated))
-    local = average @ observed.local_error() @ average.T
-    return Evidence(
-        average @ misfit.ravel(), local + 1e-9 * float(np.trace(stated)) / len(stated) * np.eye(len(stated)), effects
-    )
+    least = 1e-9 * float(np.trace(stated)) / len(stated)
+    return Evidence(average @ misfit.ravel(), least * np.eye(len(stated)), effects)
 
 
 def _averages(robust: Robust, operator: ObservationOperator) -> Floats:

@@ -13,31 +13,18 @@ from flowrec.chip.openings import border, run_around
 
 
 def mask_variants(chip: Chip) -> Iterator[tuple[str, Chip]]:
-    """What would be wrong with the mask, in words, and the chip with the mask corrected and its openings moved.
+    """What would be wrong with the mask, in words, and the chip with the mask corrected and its openings adapted.
 
-    A variant in which an opening vanishes or meets another is left out.
+    A mask that lies beside its place is an error of the registration (causes.py). A variant in which an opening vanishes
+    or meets another is left out.
     """
     mask = chip.mask
-    edge = np.pad(mask, 1, mode="edge")
     variants = (
-        (
-            "its channels are drawn a pixel too wide on each side",
-            scipy.ndimage.binary_erosion(mask, border_value=1),
-            (0, 0),
-        ),
-        ("its channels are drawn a pixel too narrow on each side", scipy.ndimage.binary_dilation(mask), (0, 0)),
-        ("it lies a pixel too far left", edge[1:-1, :-2], (1, 0)),
-        ("it lies a pixel too far right", edge[1:-1, 2:], (-1, 0)),
-        ("it lies a pixel too high", edge[:-2, 1:-1], (0, 1)),
-        ("it lies a pixel too low", edge[2:, 1:-1], (0, -1)),
+        ("its channels are drawn a pixel too wide on each side", scipy.ndimage.binary_erosion(mask, border_value=1)),
+        ("its channels are drawn a pixel too narrow on each side", scipy.ndimage.binary_dilation(mask)),
     )
-    for words, other, (right, down) in variants:
-        runs = [
-            run_around(
-                border(other, o.side), (o.first + o.last) // 2 + (down if o.side in ("left", "right") else right)
-            )
-            for o in chip.openings
-        ]
+    for words, other in variants:
+        runs = [run_around(border(other, o.side), (o.first + o.last) // 2) for o in chip.openings]
         openings = tuple(
             replace(o, first=run[0], last=run[1]) for o, run in zip(chip.openings, runs, strict=True) if run
         )

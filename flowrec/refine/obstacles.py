@@ -293,10 +293,10 @@ class Likelihood:
     def of(cls, observed: Observed, robust: Robust) -> Likelihood:
         here, model = observed.operator, observed.model
         noise = (NOISE[1] * robust.factor) ** 2 * robust.variance / np.maximum(robust.inlier, LEAST_INLIER)
-        others = observed.local_error() + np.diag(np.repeat(noise, 2))
+        others = np.diag(np.repeat(noise, 2))
         for effect in observed.effects(model.base, None):
             if effect.name not in ("boundary", "fluid"):
-                others += effect.median**2 * effect.matrix
+                others = others + effect.median**2 * effect.matrix
         y = here.flow_um_s.ravel()
         design = here.predict(model.known).reshape(len(model.known), -1)
         root = scipy.linalg.cholesky(others + design.T @ design, lower=True)

@@ -10,7 +10,15 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.uncertainty import FlowUncertainty
-from flowrec.refine.assimilate import OBSTACLE_SHARE, Assimilate, Hypotheses, field_columns, prior_of
+from flowrec.refine.assimilate import (
+    OBSTACLE_SHARE,
+    Assimilate,
+    Hypotheses,
+    field_columns,
+    left_variance,
+    prior_left_variance,
+    prior_of,
+)
 from flowrec.refine.causes import GAIN
 from flowrec.refine.doubts import doubted_places
 from flowrec.refine.flow_model import flow_model
@@ -32,9 +40,8 @@ def flow_uncertainty(
             model = flow_model(settings, settings.model, chip, solver)
             columns, covariance = prior_of(model)
             rolled = np.ones((1, len(model.base)))
-            return FlowUncertainty(
-                model.base, columns, rolled, _joined(covariance, np.diag([GAIN[0] ** 2])), model.error_std
-            )
+            left = _error_std(prior_left_variance(model))
+            return FlowUncertainty(model.base, columns, rolled, _joined(covariance, np.diag([GAIN[0] ** 2])), left)
         # The pixels of a chip with other walls are not those of the chip.
         every = replace(settings, doubt_walls=False).hypotheses(operator, chip, solver)
     except FlowError:
@@ -62,7 +69,12 @@ def _of(every: Hypotheses) -> FlowUncertainty:
         covariance = moved
     rolled = np.ones((0 if gain is None else 1, len(mean)))
     factor = every.robust.factor * best.size(NOISE[0])
-    return FlowUncertainty(mean, columns, rolled, covariance, best.observed.model.error_std, factor)
+    return FlowUncertainty(mean, columns, rolled, covariance, _error_std(left_variance(best)), factor)
+
+
+def _error_std(variance: Floats) -> Floats:
+    """(n,) root mean square of the components of (n, 2)."""
+    return np.asarray(np.sqrt(0.5 * variance.sum(axis=1)))
 
 
 def _gain_index(every: Hypotheses) -> int | None:
