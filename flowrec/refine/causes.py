@@ -122,6 +122,15 @@ class Observed:
         added = np.einsum("an,anc->nc", self.moved.T, self._gradient(in_use)) if self.moved.any() else 0.0
         return np.asarray(self.operator.flow_um_s - self.operator.predict(flow) + added)
 
+    def beyond_first_order(self, flow: Floats) -> Floats:
+        """(n, 2) what the registration in use adds to the observations of a flow, but for its first order."""
+        if not self.moved.any():
+            return np.zeros_like(self.moved)
+        wall_px, mask = self.model.expansion.wall_px, self.model.chip.mask
+        there = self.stated.with_walls(wall_px).on_fluid(mask).predict(flow)
+        first = np.einsum("an,anc->nc", self.moved.T, self._gradient(flow))
+        return np.asarray(self.operator.predict(flow) - there - first)
+
     def _gradient(self, flow: Floats) -> Floats:
         """(2, n, 2) derivatives of a flow along x and y, um/s per px."""
         right, left, down, up = (one.predict(flow) for one in self.shifted)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowrec.flow.sensitivities import Remainder
-from flowrec.refine.causes import RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
+from flowrec.refine.causes import CURVED, RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
 from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes
 from flowrec.refine.mixture_regression import Model
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -22,8 +22,14 @@ MOST_MOVES = 3  # of the observations to where the registration has them; the fi
 # Registrations to start from where the map is doubted: offset in px, scale, angle.
 REGISTRATIONS = ((0.0, 0.0, 0.025, 0.0), (0.0, 0.0, -0.025, 0.0))
 # Effects, their usual size, and the factor on it above which the map is doubted.
-DOUBTED = (("walls", WALLS[0], 2.0), ("resistance", RESISTANCE[0], 2.0), ("noise", 1.0, 1.2))
+DOUBTED = (
+    ("walls", WALLS[0], 2.0),
+    ("resistance", RESISTANCE[0], 2.0),
+    ("curved", CURVED[0], 3.0),
+    ("noise", 1.0, 1.2),
+)
 FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
+STRETCHES = 8  # of the survey that are left out in turn: each a few channel widths long
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
 LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
 FIELD_EFFECTS = (
@@ -43,6 +49,15 @@ class Robust:
     factor: float  # actual over stated standard deviation
 
 
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """How much better than the assumed flow a map explains the observations, when robot and pump may differ in both."""
+
+    gain: float  # in ln evidence
+    left_out: float  # in ln density of stretches of the survey that are predicted from all others
+    chi2: float  # of these stretches, 1 if the model is right
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
     """The flow of a hypothesis. Its unknowns are those of the effects, in order."""
@@ -56,10 +71,18 @@ class Fitted:
     remainder: Remainder
     line_hz: float | None
     robust: Robust
+    evidence: Evidence
 
-    def gain(self) -> float:
-        """Ln evidence over the assumed flow."""
-        return self.sizes.evidence - _assumed(self.observed, self.robust, self.line_hz)
+    def judged(self) -> Judged:
+        """The map beside the assumed flow, on the same observations."""
+        base = self.observed.model.base
+        full = _evidence(self.observed, self.robust, np.zeros_like(base), base, self.line_hz)
+        assumed = replace(full, effects=[effect for effect in full.effects if effect.name not in FIELD_EFFECTS])
+        sizes = assumed.sizes()
+        stretch = np.arange(len(self.evidence.y)) // 2 * STRETCHES // max(len(self.evidence.y) // 2, 1)
+        chi2, mine = self.evidence.left_out(self.sizes, stretch)
+        _, its = assumed.left_out(sizes, stretch)
+        return Judged(self.sizes.evidence - sizes.evidence, float((mine - its).sum()), float(chi2.mean()))
 
     def unknowns(self, *names: str) -> tuple[Floats, Floats]:
         """Mean (k,) and covariance (k, k) of the unknowns of effects; what there is not is left out."""
@@ -113,7 +136,7 @@ def of_the_field(found: Fitted, robust: Robust) -> tuple[Floats, Floats]:
     variance = robust.factor**2 * robust.variance / robust.inlier
     for effect in found.observed.effects(found.in_use, found.line_hz):
         count = len(effect.columns)
-        if effect.name not in FIELD_EFFECTS:
+        if effect.name not in (*FIELD_EFFECTS, "local"):
             z = slice(first, first + count)
             columns = effect.columns.reshape(count, len(own), 2)
             own -= np.tensordot(found.posterior.mean[z], columns, axes=1)
@@ -122,7 +145,7 @@ def of_the_field(found: Fitted, robust: Robust) -> tuple[Floats, Floats]:
                 spread = spread + found.size(effect.name) ** 2 * np.diag(effect.kernel).reshape(-1, 2).sum(axis=1)
             variance = variance + 0.5 * spread
         first += count
-    return own, np.sqrt(variance)
+    return own - found.observed.beyond_first_order(found.in_use), np.sqrt(variance)
 
 
 def robust_noise(observed: Observed) -> Robust:
@@ -226,7 +249,9 @@ def complete(robust: Robust, state: State, steps: Steps) -> Fitted:
     posterior = state.evidence.posterior(sizes)
     flow = _flow(observed, posterior.mean, state.in_use, state.nonlinear)
     effects = list(state.evidence.effects)
-    return Fitted(observed, effects, sizes, posterior, flow, state.in_use, state.remainder, state.line_hz, robust)
+    return Fitted(
+        observed, effects, sizes, posterior, flow, state.in_use, state.remainder, state.line_hz, robust, state.evidence
+    )
 
 
 def _settled(observed: Observed, robust: Robust, start: Floats | None) -> tuple[Observed, Evidence, Sizes]:
@@ -254,15 +279,6 @@ def _registered(observed: Observed, z: Floats, evidence: Evidence) -> Observed |
     owner = np.repeat([effect.name for effect in effects], [len(effect.columns) for effect in effects])
     there = observed.at(np.concatenate([z[owner == name] for name in ("offset", "scale", "angle")]))
     return there if float(np.abs(there.moved - observed.moved).max()) > FAR_PX else None
-
-
-def _assumed(observed: Observed, robust: Robust, line_hz: float | None) -> float:
-    """Ln evidence of the assumed flow: robot, registration and pump may explain the observations, the field may not."""
-    base = observed.model.base
-    full = _evidence(observed, robust, np.zeros_like(base), base, line_hz)
-    return (
-        replace(full, effects=[effect for effect in full.effects if effect.name not in FIELD_EFFECTS]).sizes().evidence
-    )
 
 
 def _followed(observed: Observed, robust: Robust, state: State, steps: Steps) -> State:

@@ -15,8 +15,8 @@ from flowrec.chip.openings import border, run_around
 def mask_variants(chip: Chip) -> Iterator[tuple[str, Chip]]:
     """What would be wrong with the mask, in words, and the chip with the mask corrected and its openings adapted.
 
-    A mask that lies beside its place is an error of the registration (causes.py). A variant in which an opening vanishes
-    or meets another is left out.
+    A mask that lies beside its place is an error of the registration (causes.py). A variant in which an opening
+    vanishes or meets another is left out.
     """
     mask = chip.mask
     variants = (

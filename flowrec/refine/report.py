@@ -41,7 +41,10 @@ def report(
     ]
     if far:
         parts.append(f"far from what was assumed: {', '.join(far)}")
-    if best.gain() < LEAST_GAIN:
+    judged = best.judged()
+    if judged.left_out < 0.0:
+        parts.append("stretches that are left out are predicted better by the assumed flow than by this map: doubt it")
+    elif judged.gain < LEAST_GAIN:
         parts.append("they do not ask for another flow than the assumed one")
     return "; ".join([*parts, *_unobserved(chip, covariance, best.observed.model.prior)])
 
