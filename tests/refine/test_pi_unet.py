@@ -66,7 +66,8 @@ def test_a_closed_branch_is_found_by_the_assimilation_and_pi_unet_does_not_make_
     assimilated = Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
     refined = Refiner("pi_unet").refine(case.assumed, case.observations, case.chip, case.solver)
     assert case.error(case.assumed) > 0.3 and case.error(assimilated) < 0.1
-    assert assimilated.error_share == pytest.approx(case.error(assimilated), rel=0.6)
+    # The cause is one place; the error bars allow for such places everywhere.
+    assert 0.6 < assimilated.error_share / case.error(assimilated) < 2.5
     assert case.error(refined) <= 1.02 * case.error(assimilated)
     assert (refined.std_um_s >= assimilated.std_um_s).all()
 
