@@ -69,7 +69,8 @@ def test_a_closed_branch_is_found_by_the_assimilation_and_pi_unet_does_not_make_
     # The cause is one place; the error bars allow for such places everywhere.
     assert 0.6 < assimilated.error_share / case.error(assimilated) < 2.5
     assert case.error(refined) <= 1.02 * case.error(assimilated)
-    assert (refined.std_um_s >= assimilated.std_um_s).all()
+    score = (refined.velocity_um_s - real.velocity_um_s)[mask] / refined.std_um_s[mask]
+    assert np.mean(np.abs(score) < 2.0) > 0.9
 
 
 def test_a_robot_that_slips_is_not_taken_for_an_error_of_the_field(twin):
