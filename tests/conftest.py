@@ -132,7 +132,8 @@ def realtime_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     A replay that does not know when each was adopted would wait for 100 s.
     """
-    sets = [*SMALL, "survey.method=information", "mission.phases=survey,refine,plan", "worker.adopt_after_s=100"]
+    sets = [*SMALL, "survey.method=information", "survey.worth=0.03", "mission.phases=survey,refine,plan"]
+    sets.append("worker.adopt_after_s=100")
     return made_once(
         tmp_path_factory,
         "realtime",
