@@ -86,7 +86,8 @@ class SurveyPlanner:
     model_share: Annotated[float, Range(0.0, 10.0)] = 0.05
     places: Annotated[int, Range(1, 10_000)] = 120  # at most so many ends of a stretch are compared, per speed
     # The survey ends when a crossing's time of it would lower the relative error of the flow by less than this.
-    # `flowrec bench survey`: mean error .0218 with 0.02, .0189 with 0.01.
+    # On six procedural vessels of `flowrec bench survey`: mean error .0209 in 4.1 crossings with 0.02, .0178 in 6.6
+    # crossings with 0.01.
     worth: Annotated[float, Range(0.0, 10.0)] = 0.01
 
     def plan(self, order: SurveyOrder) -> Route:

@@ -35,6 +35,16 @@ COLD_ITERATIONS = 80  # from random weights
 TRAINED_RATE = 0.1  # learning rate from trained weights, of that from random ones
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """Another field instead of the initial one."""
+
+    words: str  # how it was found
+    velocity_um_s: Floats  # (h, w, 2)
+    pressure_pa: Floats  # (h, w)
+    std_um_s: Floats | None = None  # (h, w, 2)
+
+
 @dataclass(frozen=True, slots=True)
 class PiUnet(NetworkSettings):
     """Settings of the PI-UNet."""
@@ -86,25 +96,32 @@ class PiUnet(NetworkSettings):
         test = used if used.all() else ~used
         before_loss = student_t_loss(before[test])
         found = settings.corrections(case.only(used))
-        losses = [student_t_loss(operator.misfit(velocity)[test]) for _, velocity, _ in found]
+        losses = [student_t_loss(operator.misfit(each.velocity_um_s)[test]) for each in found]
         # The balanced field must predict the held-out observations better, the network's alone clearly better.
         limits = [WORTH_TAKING * before_loss, (WORTH_TAKING if used.all() else 1.0) * before_loss]
         better = [index for index, loss in enumerate(losses) if loss < limits[index]]
         if not better:
             return _kept(initial, "a correction did not predict the observations better")
         # An assimilated start has used all observations already; a second fit is not worth its time.
-        words, velocity, pressure = (found if assimilated else settings.corrections(case))[better[-1]]
-        if not np.isfinite(velocity).all():
+        chosen = (found if assimilated else settings.corrections(case))[better[-1]]
+        words = chosen.words
+        if not np.isfinite(chosen.velocity_um_s).all():
             return _kept(initial, "a correction is not finite")
         # Where the start nearly explains the observations, much of what the correction follows is their noise.
         excess = (chi2 - 1.0) * np.sqrt(operator.count)
         fraction = 1.0 if assimilated else next((part for most, part in DAMPED if excess <= most), 1.0)
-        velocity = initial.velocity_um_s + fraction * (velocity - initial.velocity_um_s)
-        pressure = initial.pressure_pa + fraction * (pressure - initial.pressure_pa)
-        std = initial.std_um_s
+        change = chosen.velocity_um_s - initial.velocity_um_s
+        velocity = initial.velocity_um_s + fraction * change
+        pressure = initial.pressure_pa + fraction * (chosen.pressure_pa - initial.pressure_pa)
+        std, error_share = initial.std_um_s, initial.error_share
         if std is not None:
             # Where the correction changes the field, the start stays within the error bar.
             std = np.hypot(std, velocity - initial.velocity_um_s).astype(np.float32)
+        elif chosen.std_um_s is not None:
+            std = np.hypot(fraction * chosen.std_um_s, (1.0 - fraction) * change).astype(np.float32)
+        if std is not None:
+            power = float((velocity.astype(np.float64) ** 2).sum())
+            error_share = float(np.sqrt((std.astype(np.float64) ** 2).sum() / max(power, 1e-300)))
         after = float(operator.misfit(velocity).mean()) / 2.0
         words += "" if fraction == 1.0 else f", {fraction:.0%} of it"
         return replace(
@@ -113,11 +130,12 @@ class PiUnet(NetworkSettings):
             velocity_um_s=velocity.astype(np.float32),
             pressure_pa=pressure.astype(np.float32),
             std_um_s=std,
+            error_share=error_share,
             note=f"{words}; misfit of the observations (chi2) {chi2:.2f} to {after:.2f}; start: {_origin(initial)}",
         )
 
-    def corrections(self, case: Case) -> list[tuple[str, Floats, Floats]]:
-        """Description, velocity (h, w, 2) in um/s and pressure (h, w) in Pa: the network's field, and the balanced one.
+    def corrections(self, case: Case) -> list[Correction]:
+        """The network's field, and the balanced one with its standard deviation.
 
         The second is left out where it is not requested, or the case is too large.
         """
@@ -127,9 +145,11 @@ class PiUnet(NetworkSettings):
         with torch_run(self.device, self.threads, self.seed, "refine.pi_unet.device"):
             fitted = self._fit_network(case)
             words = f"corrected by {weights}" + (f" in {fitted.iterations} iterations" if fitted.iterations else "")
-            found = [(words, *case.dimensional(fitted.velocity, fitted.pressure))]
+            found = [Correction(words, *case.dimensional(fitted.velocity, fitted.pressure))]
             if self.finish == "balance" and self.observations == "soft" and int(case.fluid.sum()) <= LARGEST_PX:
-                found.append((f"{words} and balanced", *case.dimensional(*balance(case, fitted.velocity))))
+                velocity, pressure, std = balance(case, fitted.velocity)
+                field = case.dimensional(velocity, pressure)
+                found.append(Correction(f"{words} and balanced", *field, case.dimensional(std, pressure)[0]))
         return found
 
     def _fit_network(self, case: Case) -> Fitted:

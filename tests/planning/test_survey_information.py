@@ -240,6 +240,20 @@ def test_where_a_channel_may_be_blocked_the_survey_passes_all_the_places_and_the
     assert after < 3.0 < before, (route.reason, new.reason)
 
 
+def test_what_the_present_way_will_show_of_a_doubt_counts_for_the_next_stretch():
+    chip, field = junction()
+    near, far = (doubted(chip, field, at).doubts.changes_um_s for at in (60, 115))
+    uncertainty = replace(doubted(chip, field, 60), doubts=Doubts(np.concatenate([near, far]), np.array([0.4, 0.1])))
+    # The present way passes the first place and ends behind it.
+    x = np.linspace(300.0, 850.0, 56)
+    points = np.concatenate([np.full((31, 2), (445.0, 0.0)), np.column_stack([x[15:], np.full(41, 745.0)])])
+    points[:31, 1] = np.linspace(445.0, 745.0, 31)
+    present = replace(planner().plan(ordered(chip, field, uncertainty)), waypoints_um=points)
+    present = replace(present, arrival_s=np.arange(len(points)) * 0.25)
+    new = planner().plan(ordered(chip, field, uncertainty, start=points[-1], present=present, progress_s=0.0))
+    assert new.more and new.waypoints_um[-1, 0] > 1050.0, new.reason
+
+
 def test_observations_that_tell_a_doubt_apart_remove_its_error_and_others_do_not():
     chip, field = junction()
     uncertainty = doubted(chip, field, 70, 110)
