@@ -16,6 +16,7 @@ import pytest
 from hypothesis import settings
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
+from threadpoolctl import threadpool_limits
 
 from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
@@ -23,6 +24,9 @@ from flowrec.config import load_config
 from flowrec.system.numba_setup import _cache_folder
 
 Made = TypeVar("Made")
+
+# The workers share the cores, and idle threads of BLAS spin.
+threadpool_limits(limits=1, user_api="blas")
 
 # A shell that starts the tests in the background has SIGINT ignored, and so would all that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -23,6 +23,7 @@ from flowrec.refine.pi_unet import PiUnet
 from flowrec.refine.pinn import Pinn
 from flowrec.refine.uncertainty import flow_uncertainty
 from flowrec.refine.unet import Unet
+from flowrec.system.blas_threads import one_blas_thread
 
 REFINERS = Methods(
     "refine.method",
@@ -83,6 +84,7 @@ class Refiner:
         """Hash of the trained weights that the method uses, '' where it uses none."""
         return str(getattr(self._selected(), "weights_sha256", ""))
 
+    @one_blas_thread()
     def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
         """Better field on the same pixels; stamp and request are those of `assumed`.
 
@@ -114,10 +116,12 @@ class Refiner:
             return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
         return method.fit(problem)
 
+    @one_blas_thread()
     def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:
         """Expected relative RMSE of the chip's assumed flow; None where nothing says how wrong it may be."""
         return self.assimilate.prior_error_share(chip, solver)
 
+    @one_blas_thread()
     def uncertainty(
         self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver
     ) -> FlowUncertainty | None:

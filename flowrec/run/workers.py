@@ -15,6 +15,7 @@ from flowrec.errors import FlowError
 from flowrec.messages import FlowField, Mission, Route
 from flowrec.pipeline import Pipeline
 from flowrec.run.route_orders import observations_of, route, survey_route
+from flowrec.system.blas_threads import one_blas_thread
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from flowrec.units import nanoseconds
 
@@ -28,6 +29,7 @@ def ordered(tick: Tick) -> tuple[Mission, str]:
     return tick.mission, ANSWERED_BY[WorkOrder(tick.mission.wanted)]
 
 
+@one_blas_thread()
 def work(pipeline: Pipeline, order: Tick) -> Result:
     """Do what `order.mission` wants with what was known in that tick; the result has the order's stamp and number."""
     mission, _ = ordered(order)

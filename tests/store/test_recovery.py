@@ -168,11 +168,11 @@ def test_messages_of_a_damaged_declaration_are_counted_as_lost(small, tmp_path):
 
 
 def test_the_remains_are_kept_where_they_hold_topics_of_another_flowrec(small, tmp_path):
-    content = small.read_bytes().replace(b"/robot/estimate", b"/robot/surmised")
+    content = small.read_bytes().replace(b"/coils/command", b"/coils/unknown")
     path = tmp_path / "s.mcap.partial"
     path.write_bytes(content[: chunks_of(small)[-7][1]])
     done = recover(path)
-    assert "/robot/surmised, which this flowrec does not know (the old file is kept)" in done.lost
+    assert "/coils/unknown, which this flowrec does not know (the old file is kept)" in done.lost
     assert sorted(names_in(tmp_path)) == ["s.mcap", "s.mcap.partial"]
 
 
