@@ -190,7 +190,7 @@ def is_locked(path: Path) -> bool:
 def test_a_run_onto_a_session_that_another_process_records_is_refused_and_that_one_ends_whole(tmp_path, flowrec):
     out = tmp_path / "x.mcap"
     partial = tmp_path / "x.mcap.partial"
-    sets = [word for setting in SMALL for word in ("--set", setting)]
+    sets = [word for setting in (*SMALL, "safety.guard_timeout_s=20") for word in ("--set", setting)]
     command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(out), *sets]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as first:
         try:
