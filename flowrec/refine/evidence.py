@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy  # its linalg and optimize load at first use, not at start-up
-from numpy.typing import NDArray
 
 from flowrec.refine.observation_operator import Floats
 
@@ -152,24 +151,6 @@ class Evidence:
                 for effect, ln_size in zip(self.effects, sizes.mode, strict=True)
             ]
         )
-
-    def left_out(self, sizes: Sizes, groups: NDArray[np.intp]) -> tuple[Floats, Floats]:
-        """How the observations of each group (m,) are predicted from all others, at the most probable sizes.
-
-        With P the inverse of the covariance, the error of group B is e = (P_BB)^-1 (P y)_B, with covariance (P_BB)^-1.
-        Returned are e' P_BB e over its number of observations (g,), 1 in the mean if the model is right, and ln N(e).
-        """
-        factor, solved = self._solved(self._matrices(), sizes.mode)
-        precision = scipy.linalg.cho_solve((factor, True), np.eye(len(self.y)), check_finite=False)
-        chi2, density = [], []
-        for group in np.unique(groups):
-            which = np.flatnonzero(groups == group)
-            block = precision[np.ix_(which, which)]
-            square = float(solved[which] @ np.linalg.solve(block, solved[which]))
-            chi2.append(square / len(which))
-            ln_volume = len(which) * np.log(2.0 * np.pi) - float(np.linalg.slogdet(block)[1])
-            density.append(-0.5 * (square + ln_volume))
-        return np.array(chi2), np.array(density)
 
     def _matrices(self) -> Floats:
         """(effects, m, m) what each effect adds to the covariance at size 1."""

@@ -17,7 +17,6 @@ OBSERVED_TOGETHER = 0.4  # ratio of their sum below which they are
 FAR = 3.0  # prior standard deviations from the assumed value
 OUTLIER = 0.5  # inlier probability below which an observation counts as an outlier
 NOISIER = 1.3  # times the stated noise
-LEFT_OUT = -2.0  # in ln density of stretches that are left out, over the assumed flow: odds of seven to one
 LEAST_GAIN = 1.0  # in ln evidence over the assumed flow
 
 
@@ -42,10 +41,7 @@ def report(
     ]
     if far:
         parts.append(f"far from what was assumed: {', '.join(far)}")
-    judged = best.judged()
-    if judged.left_out < LEFT_OUT:
-        parts.append("stretches that are left out are predicted better by the assumed flow than by this map: doubt it")
-    elif judged.gain < LEAST_GAIN:
+    if best.gain() < LEAST_GAIN:
         parts.append("they do not ask for another flow than the assumed one")
     return "; ".join([*parts, *_unobserved(chip, covariance, best.observed.model.prior)])
 

@@ -65,26 +65,6 @@ def test_effects_that_look_alike_are_uncertain_alone_and_certain_together():
     assert abs(found.mean[0] - 0.2) < 2.5 * alone and abs(found.mean[0]) < 2.5 * alone
 
 
-def test_stretches_that_are_left_out_are_predicted_as_by_a_fit_to_the_others():
-    evidence, _ = drawn(2, count=12, unknowns=4)
-    groups = np.repeat([0, 1, 2], [3, 4, 5])
-    sizes = evidence.sizes()
-    chi2, density = evidence.left_out(sizes, groups)
-    total = evidence.noise + sum(
-        np.exp(2.0 * ln_size) * effect.matrix for effect, ln_size in zip(evidence.effects, sizes.mode, strict=True)
-    )
-    for group in range(3):
-        out, rest = groups == group, groups != group
-        gain = np.linalg.solve(total[np.ix_(rest, rest)], total[np.ix_(rest, out)])
-        error = evidence.y[out] - gain.T @ evidence.y[rest]
-        covariance = total[np.ix_(out, out)] - gain.T @ total[np.ix_(rest, out)]
-        square = error @ np.linalg.solve(covariance, error)
-        assert chi2[group] == pytest.approx(square / out.sum(), rel=1e-6)
-        assert density[group] == pytest.approx(
-            -0.5 * (square + np.linalg.slogdet(2.0 * np.pi * covariance)[1]), rel=1e-6
-        )
-
-
 def test_the_points_of_the_sizes_have_the_moments_of_a_normal_distribution():
     for dimensions in (3, 18, 40):
         points = _points(dimensions)
