@@ -10,7 +10,9 @@ from flowrec.flow import FlowSolver, sample
 from flowrec.flow.linear_solver import clear_cache
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner, causes
+from flowrec.refine.assimilate import field_columns
 from flowrec.refine.discretisation_error import ModelError
+from flowrec.refine.hypothesis import of_the_field
 from flowrec.refine.observation_operator import observation_operator
 
 
@@ -270,3 +272,24 @@ def test_a_chip_that_is_assumed_to_stand_still_is_refused(twin):
     case = twin(assumed=(0.0, 0.0, 0.0))
     with pytest.raises(FlowError, match="stand still"):
         Refiner().refine(case.assumed, case.observations, case.chip, case.solver)
+
+
+def test_the_mean_flow_is_the_sum_of_its_columns_times_the_mean_unknowns(twin):
+    case = twin(noise=0.02)
+    operator = observation_operator(case.observations, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    found = Assimilate().hypotheses(operator, case.chip, case.solver).best
+    columns, model = field_columns(found), found.observed.model
+    mean = model.base + model.expansion.pixels(found.remainder.flux)
+    mean = mean + np.tensordot(found.posterior.mean[: len(columns)], columns, axes=1)
+    assert np.abs(mean - found.flow).max() < 1e-3 * np.abs(found.flow).max()
+
+
+def test_less_what_the_registration_does_the_observations_lie_on_the_flow(twin):
+    case = twin(noise=0.001)
+    moved = replace(case.observations, position_um=case.observations.position_um + np.array([0.0, 22.0]))
+    operator = observation_operator(moved, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    every = Assimilate().hypotheses(operator, case.chip, case.solver)
+    flow_um_s, _ = of_the_field(every.best, every.robust)
+    stated = operator.with_walls(every.best.observed.model.expansion.wall_px).on_fluid(case.chip.mask)
+    off = flow_um_s - stated.predict(every.best.flow)
+    assert np.sqrt((off**2).mean()) < 0.01 * np.sqrt((flow_um_s**2).mean())
