@@ -66,7 +66,8 @@ def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path
     pytest.importorskip("nidaqmx")
     mission = ("mission.phases=survey,refine,plan,navigate", f"mission.goal={list(GOAL_UM)}", "robot.delay_s=0.19")
     # The inlet of this world is 32 % slower or faster than assumed: a busy computer costs the survey some percent.
-    config = load_config(None, [*COMMON, *mission, "camera.rate_hz=40.0", "simulated.seed=7"])
+    kind = ("simulated.world=kind", "simulated.seed=7")
+    config = load_config(None, [*COMMON, *mission, *kind, "camera.rate_hz=40.0"])
     chip = load_chip(config.chip)
     resolved = resolve(config, chip)
     session, errors = tmp_path / "s.mcap", tmp_path / "stderr"
