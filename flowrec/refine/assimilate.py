@@ -69,7 +69,6 @@ class Hypotheses:
     found: list[Fitted]
     weights: Floats  # probabilities
     shares: Floats  # of the mean
-    robust: Robust
     wrong_mask: str  # how the chip's mask is wrong, in words; '' where it is not
     obstacles: tuple[Obstacle, ...] = ()  # of the last hypotheses, one each
 
@@ -132,7 +131,7 @@ class Assimilate(PriorSettings):
             # Walls that are wrong everywhere and a single obstacle can look alike.
             if not every.wrong_mask or blocked.best.posterior.evidence > every.best.posterior.evidence:
                 every = blocked
-        flow_um_s, std_um_s = of_the_field(every.best, every.robust)
+        flow_um_s, std_um_s = of_the_field(every.best)
         return self._field(every, problem), replace(problem.operator, flow_um_s=flow_um_s, std_um_s=std_um_s)
 
     def unobserved(self, assumed: FlowField, chip: Chip, solver: FlowSolver) -> FlowField:
@@ -183,7 +182,7 @@ class Assimilate(PriorSettings):
         if self.doubt_walls and small and doubtful(best[0].evidence, best[0].sizes):
             wrong, moved = self._better_mask(operator, best[0].observed.model.chip, chip, solver, robust, best[0])
             if moved is not None:
-                return Hypotheses([moved], np.ones(1), np.ones(1), robust, wrong)
+                return Hypotheses([moved], np.ones(1), np.ones(1), wrong)
         least = ln_weight.max() + np.log(LEAST_WEIGHT)
         found = [
             (complete(robust, state, steps), ln_prior)
@@ -197,7 +196,7 @@ class Assimilate(PriorSettings):
             # weight - prior x evidence of the first: of what is not likelier than the first, nothing is left.
             first = found[0][0].posterior.evidence
             shares[1:] *= [-np.expm1(min(first - one.posterior.evidence, 0.0)) for one, _ in found[1:]]
-        return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), robust, "")
+        return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), "")
 
     def _plausible(
         self,
@@ -224,7 +223,7 @@ class Assimilate(PriorSettings):
         best = every.best
         chip, solver = best.observed.model.chip, problem.solver
         steps, tried = Steps(self.max_steps, self.tolerance), []
-        for obstacle in likely_obstacles(best, every.robust, solver):
+        for obstacle in likely_obstacles(best, solver):
             with suppress(FlowError):  # a channel that is closed
                 observed = self._observed(obstacle.on(chip), problem.chip, problem.operator, solver)
                 observed = replace(observed, model=with_shape_error(observed.model, best.observed.model))
@@ -233,25 +232,23 @@ class Assimilate(PriorSettings):
         if not tried:
             return every
         ln_odds = float(np.log(OBSTACLE_SHARE / (1.0 - OBSTACLE_SHARE) / PLACES))
-        least = begin(best.observed, every.robust, steps).sizes.evidence + np.log(LEAST_WEIGHT) - ln_odds
-        least -= outlying(every.robust)
+        least = begin(best.observed, best.robust, steps).sizes.evidence + np.log(LEAST_WEIGHT) - ln_odds
+        least -= outlying(best.robust)
         tried = [entry for entry in tried if entry[2].sizes.evidence - outlying(entry[1]) > least]
         if not tried:
             return every
         found = [complete(robust, state, steps) for _, robust, state in tried]
         ln_ratio = np.array([one.posterior.evidence - best.posterior.evidence for one in found])
         # Where observations are averaged, the evidence does not tell how many outliers were left out.
-        ln_ratio -= [outlying(robust) - outlying(every.robust) for _, robust, _ in tried]
+        ln_ratio -= [outlying(robust) - outlying(best.robust) for _, robust, _ in tried]
         weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds, 500.0))
         weights = np.concatenate([every.weights, weight])
         # As for depths: of what is not likelier than the chip without it, nothing is left.
         shares = np.concatenate([every.shares, weight * -np.expm1(np.minimum(-ln_ratio, 0.0))])
-        robust = tried[int(np.argmax(weight))][1] if weight.max() > every.weights.max() else every.robust
         return Hypotheses(
             every.found + found,
             weights / weights.sum(),
             shares / shares.sum(),
-            robust,
             "",
             tuple(obstacle for obstacle, *_ in tried),
         )
@@ -324,7 +321,6 @@ class Assimilate(PriorSettings):
         ]
         also = findings(every.found, every.weights)
         wrong = [f"the mask seems wrong: {every.wrong_mask}"] if every.wrong_mask else []
-        robust = every.robust
         names, values, stds = list(also.names), also.values, also.stds
         if every.obstacle is not None and every.obstacle[1] > PROBABLE:
             obstacle = every.obstacle[0]
@@ -333,7 +329,7 @@ class Assimilate(PriorSettings):
             names += ["obstacle_x_um", "obstacle_y_um"]
             values = np.append(values, [x_um, y_um])
             stds = np.append(stds, 2 * [obstacle.half_width_px * chip.um_per_px])
-        note = report(chip, problem.operator, best, robust.inlier, robust.factor, [*wrong, *also.words])
+        note = report(chip, problem.operator, best, [*wrong, *also.words])
         return replace(
             problem.assumed,
             method="assimilate",
@@ -371,7 +367,7 @@ def left_variance(found: Fitted) -> Floats:
     """(n, 2) the part of it that no unknown explains: the error of the grid, and of the profile beside walls."""
     names, model = [effect.name for effect in found.effects], found.observed.model
     local, walls = (float(found.posterior.square_sizes[names.index(name)]) for name in ("local", "walls"))
-    return np.asarray(local * model.error_std[:, None] ** 2 + walls * _beside_walls(model, found.in_use))
+    return _left(model, found.in_use, local, walls)
 
 
 def _columns(model: FlowModel, flow: Floats) -> Floats:
@@ -397,13 +393,14 @@ def _prior_variance(model: FlowModel) -> Floats:
 
 def prior_left_variance(model: FlowModel) -> Floats:
     """(n, 2) `left_variance` before any observation."""
-    return np.asarray((LOCAL[0] * model.error_std[:, None]) ** 2 + WALLS[0] ** 2 * _beside_walls(model, model.base))
+    return _left(model, model.base, LOCAL[0] ** 2, WALLS[0] ** 2)
 
 
-def _beside_walls(model: FlowModel, flow: Floats) -> Floats:
-    """(n, 2) variance, per square pixel by which walls are off, of what no cell explains."""
+def _left(model: FlowModel, flow: Floats, local: float, walls: float) -> Floats:
+    """(n, 2) the same for squared sizes of the grid's error and of walls that are off, as no cell explains them."""
     wider = (model.widening @ model.cells)[:, None] * flow
-    return np.asarray(steepness(model.chip.mask, flow) ** 2 + (1.0 - WALLS_LONG**2) * wider**2)
+    beside = steepness(model.chip.mask, flow) ** 2 + (1.0 - WALLS_LONG**2) * wider**2
+    return np.asarray(local * model.error_std[:, None] ** 2 + walls * beside)
 
 
 def _error_share(flow: Floats, variance: Floats) -> float:

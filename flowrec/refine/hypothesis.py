@@ -113,12 +113,12 @@ class Fitted:
         return result
 
 
-def of_the_field(found: Fitted, robust: Robust) -> tuple[Floats, Floats]:
+def of_the_field(found: Fitted) -> tuple[Floats, Floats]:
     """The observations (n, 2) less what robot, registration and pump explain of them, and their noise (n,) in um/s.
 
     What changes in time and follows from no unknown (wander, rolling) counts as noise.
     """
-    own, first = found.observed.operator.flow_um_s.copy(), 0
+    own, first, robust = found.observed.operator.flow_um_s.copy(), 0, found.robust
     variance = robust.factor**2 * robust.variance / robust.inlier
     for effect in found.observed.effects(found.in_use, found.line_hz):
         count = len(effect.columns)

@@ -122,17 +122,17 @@ class Obstacle:
             yield replace(self, reach=self.reach * float(np.exp(sign * step)))
 
 
-def likely_obstacles(free: Fitted, robust: Robust, solver: FlowSolver) -> list[Obstacle]:
+def likely_obstacles(free: Fitted, solver: FlowSolver) -> list[Obstacle]:
     """Obstacles that could explain the observations of a chip, the likeliest first; [] where none is worth trying.
 
     `free` is the flow that fits best without any.
     """
     observed = free.observed
-    likelihood = Likelihood.of(observed, robust)
+    likelihood = Likelihood.of(observed, free.robust)
     pieces = pieces_of(observed.model.chip, observed.model.expansion.base)
     deposits = [
         replace(piece, side=side, height=height, reach=DEPOSIT, ratio=BLOCKED)
-        for piece in _contradicted(pieces, free, robust)
+        for piece in _contradicted(pieces, free)
         for side in (-1, 1)
         for height in HEIGHTS
     ]
@@ -172,10 +172,10 @@ def _searched(
     return gain, obstacle
 
 
-def _contradicted(pieces: list[Obstacle], free: Fitted, robust: Robust) -> list[Obstacle]:
+def _contradicted(pieces: list[Obstacle], free: Fitted) -> list[Obstacle]:
     """Pieces at different places in which the observations contradict a flow most, whatever is wrong with the robot."""
     here = free.observed.operator
-    measured, _ = of_the_field(free, robust)
+    measured, _ = of_the_field(free)
     misfit = ((here.predict(free.flow) - measured) ** 2).sum(axis=1) / here.noise_um_s**2
     excess = np.minimum(misfit, OUTLYING) - 2.0
     points = here.points

@@ -20,19 +20,17 @@ NOISIER = 1.3  # times the stated noise
 LEAST_GAIN = 1.0  # in ln evidence over the assumed flow
 
 
-def report(
-    chip: Chip, operator: ObservationOperator, best: Fitted, inlier: Floats, noise_factor: float, causes: Sequence[str]
-) -> str:
+def report(chip: Chip, operator: ObservationOperator, best: Fitted, causes: Sequence[str]) -> str:
     """One line on the most probable hypothesis; `causes` are what it found besides the boundary values, in words."""
-    used = operator.count - int((inlier < OUTLIER).sum())
+    used = operator.count - int((best.robust.inlier < OUTLIER).sum())
     parts = [f"assimilated {used} observations" if used != 1 else "assimilated 1 observation"]
     if operator.count > used:
         parts.append(f"{operator.count - used} more distrusted as outliers")
     if operator.ignored:
         parts.append(f"ignored {operator.ignored}")
     parts += causes
-    if noise_factor > NOISIER:
-        parts.append(f"they scatter {noise_factor:.1f} times more than their std says, error bars widened")
+    if best.robust.factor > NOISIER:
+        parts.append(f"they scatter {best.robust.factor:.1f} times more than their std says, error bars widened")
     mean, covariance = best.unknowns("boundary")
     far = [
         f"{_name(chip, index)} ({abs(mean[index]):.0f} prior std off)"

@@ -47,7 +47,7 @@ def flow_uncertainty(
     except FlowError:
         return None
     best = every.best
-    doubts = doubted_places(best.observed, every.robust, solver, OBSTACLE_SHARE)
+    doubts = doubted_places(best.observed, best.robust, solver, OBSTACLE_SHARE)
     return replace(_of(every), doubts=doubts)
 
 
@@ -68,7 +68,7 @@ def _of(every: Hypotheses) -> FlowUncertainty:
         moved[new, new] = 1.0
         covariance = moved
     rolled = np.ones((0 if gain is None else 1, len(mean)))
-    factor = every.robust.factor * best.size(NOISE[0])
+    factor = best.robust.factor * best.size(NOISE[0])
     return FlowUncertainty(mean, columns, rolled, covariance, _error_std(left_variance(best)), factor)
 
 

@@ -289,7 +289,7 @@ def test_less_what_the_registration_does_the_observations_lie_on_the_flow(twin):
     moved = replace(case.observations, position_um=case.observations.position_um + np.array([0.0, 22.0]))
     operator = observation_operator(moved, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
     every = Assimilate().hypotheses(operator, case.chip, case.solver)
-    flow_um_s, _ = of_the_field(every.best, every.robust)
+    flow_um_s, _ = of_the_field(every.best)
     stated = operator.with_walls(every.best.observed.model.expansion.wall_px).on_fluid(case.chip.mask)
     off = flow_um_s - stated.predict(every.best.flow)
     assert np.sqrt((off**2).mean()) < 0.01 * np.sqrt((flow_um_s**2).mean())

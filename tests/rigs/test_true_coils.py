@@ -38,7 +38,8 @@ def test_a_robot_turns_about_the_axis_of_the_field_that_is_truly_made(kinds):
 def test_the_simulated_robot_goes_there_and_the_readback_states_what_was_commanded():
     commands = {0: replace(command(10.0, 0.4, 4.0), limit_hz=20.0)}
     right, wrong = (fly(rig_with(simulated=s, coils=Coils(ramp_s=0.0)), commands) for s in (EXACT, WRONG))
-    assert TrueCoils.of(Coils(), EXACT) is None and TrueCoils.of(None, WRONG) is None
+    assert TrueCoils.of(Coils(), EXACT) is None
+    assert TrueCoils.of(None, WRONG) is None
     assert [i.applied.turns.tolist() for i in right] == [i.applied.turns.tolist() for i in wrong]
     ways = [seen[-1].truth.position_um - seen[0].truth.position_um for seen in (right, wrong)]
     assert math.atan2(*ways[0][::-1]) == pytest.approx(0.4)
