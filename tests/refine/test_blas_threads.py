@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from flowrec.refine.refiner import AssumedFlow, Refiner
+from flowrec.run import workers
 from flowrec.system.blas_threads import one_blas_thread
+from tests.store.made_up import ticks_of
 
 
 def most_threads() -> int:
@@ -33,4 +36,19 @@ def test_a_refinement_has_one_blas_thread(twin: Any, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(AssumedFlow, "fit", fit)
     with threadpool_limits(limits=2, user_api="blas"):
         Refiner("fvm").refine(case.assumed, case.observations, case.chip, case.solver)
+    assert seen == [1]
+
+
+def test_a_route_of_a_mission_is_planned_with_one_blas_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    tick, seen = next(tick for tick in ticks_of(21) if tick.mission and tick.route), []
+    assert tick.mission is not None
+
+    def route(*_: Any) -> Any:
+        seen.append(most_threads())
+        return tick.route
+
+    monkeypatch.setattr(workers, "route", route)
+    order = replace(tick, mission=replace(tick.mission, wanted="route"))
+    with threadpool_limits(limits=2, user_api="blas"):
+        workers.work(None, order)  # type: ignore[arg-type]
     assert seen == [1]
