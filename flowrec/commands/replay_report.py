@@ -240,11 +240,11 @@ def _travel_time_s(route: Route | None, flow: FlowField | None, limit_um_s: floa
 
 
 def _navigation_s(flight: RunReport) -> float | None:
-    """Time from the adopted route to the end."""
-    mission, route = flight.last.mission, flight.last.route
-    if mission is None or route is None or not mission.finished or not len(route.arrival_s):
+    """Time on the way to the goal, new routes included."""
+    mission = flight.last.mission
+    if mission is None or not mission.finished or flight.navigating_ns is None:
         return None
-    return seconds(mission.since_ns - route.stamp_ns)
+    return seconds(mission.since_ns - flight.navigating_ns)
 
 
 def _planned_s(flight: RunReport) -> float | None:

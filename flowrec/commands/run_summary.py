@@ -104,8 +104,8 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
         figures["planner"] = route.method
         figures["route_length_um"] = length_um(route)
         figures["planned_s"] = float(route.arrival_s[-1])
-        if mission.outcome == Outcome.REACHED:
-            figures["navigation_s"] = seconds(mission.since_ns - route.stamp_ns)
+        if mission.outcome == Outcome.REACHED and report.navigating_ns is not None:
+            figures["navigation_s"] = seconds(mission.since_ns - report.navigating_ns)
     if true_field is not None:
         figures["contacts"] = report.contacts
         for name in FLOW_FIELDS:

@@ -46,6 +46,7 @@ class RunReport:
     wall_s: float = 0.0
     contacts: int = 0
     passed_over: int = 0  # frames whose stamp did not increase
+    navigating_ns: int | None = None  # stamp of the first tick on the way to the goal
     last: Tick = field(default_factory=Tick)
 
 
@@ -178,6 +179,8 @@ def run(
             report.ticks += 1
             report.duration_s = seconds(tick.stamp_ns - first_ns)
             report.contacts = inputs.truth.contacts if inputs.truth is not None else report.contacts
+            if report.navigating_ns is None and mission.phase == Phase.NAVIGATE:
+                report.navigating_ns = tick.stamp_ns
             if on_tick is not None:
                 on_tick(recorded)
             ended = tick

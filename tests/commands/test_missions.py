@@ -73,6 +73,24 @@ def test_the_paper_planner_goes_upstream_the_same_way_but_slower_and_loses_in_fl
     assert SessionReader(tmp_path / "flown.mcap").outcome["outcome"] == "reached"
 
 
+def test_a_map_that_is_refined_again_on_the_way_is_surer_and_replays(tmp_path: Path) -> None:
+    sets = ["simulated.world=kind", "mission.phases=refine,plan,navigate", "mission.reassimilate_observations=5"]
+    recorded = record(load_config(None, [*SMALL, *sets]), tmp_path / "again.mcap")
+    assert recorded.report.outcome == "reached"
+    session = SessionReader(recorded.path)
+    maps = list(session.messages("refined"))
+    assert len(maps) >= 3
+    assert len(list(session.messages("route"))) >= len(maps)  # each asks whether another way is better now
+    stated = [field.error_share for field in maps]
+    assert stated == sorted(stated, reverse=True)
+    assert stated[-1] < 0.8 * stated[0]
+    # A route that is kept does not begin anew.
+    missions = list(session.messages("mission"))
+    began_ns = next(mission.stamp_ns for mission in missions if mission.phase == "navigate")
+    assert recorded.facts["navigation_s"] == pytest.approx(1e-9 * (missions[-1].since_ns - began_ns))
+    assert verb.replay(recorded.path, verb.Change()).comparison.identical
+
+
 def test_a_robot_slower_than_the_flow_says_that_it_can_not_go_back(tmp_path: Path) -> None:
     sets = [*SMALL, "robot.max_speed_um_s=150"]
     recorded = record(load_config(SESSIONS / "upstream.toml", sets), tmp_path / "slow.mcap")
