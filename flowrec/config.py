@@ -136,6 +136,7 @@ class ResolvedConfig(Config):
 _BEFORE: dict[str, Any] = {
     "simulated.world": FIRST_WORLD,
     "survey.method": "downstream",
+    "survey.memory_stretches": 0,
     "mission.reassimilate_observations": 0,
     "mission.replan_slower": 0.0,
     "mission.survey_stuck_s": 0.0,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
@@ -11,6 +13,7 @@ from flowrec.chip.chip import Chip
 from flowrec.chip.openings import border, named_opening
 from flowrec.errors import ChipError
 
+_KEPT = 8  # masks of which the distances are kept: an assimilation asks for those of one mask a hundred times
 _PAD_PX = 16  # by which a channel goes on straight beyond the border
 
 
@@ -22,9 +25,15 @@ def clearance_um(mask: NDArray[np.bool_], um_per_px: float) -> NDArray[np.float3
     """
     if mask.all():
         return np.full(mask.shape, np.inf, np.float32)
-    padded = np.pad(mask, _PAD_PX, mode="edge")
+    return np.ascontiguousarray(_signed_px(mask.shape, mask.tobytes()) * um_per_px, np.float32)
+
+
+@functools.lru_cache(maxsize=_KEPT)
+def _signed_px(shape: tuple[int, int], data: bytes) -> NDArray[np.float64]:
+    """(h, w) the same in px, of the mask whose bytes are these."""
+    padded = np.pad(np.frombuffer(data, np.bool_).reshape(shape), _PAD_PX, mode="edge")
     signed = np.where(padded, _distance(padded) - 0.5, 0.5 - _distance(~padded))
-    return np.ascontiguousarray(signed[_PAD_PX:-_PAD_PX, _PAD_PX:-_PAD_PX] * um_per_px, np.float32)
+    return np.asarray(signed[_PAD_PX:-_PAD_PX, _PAD_PX:-_PAD_PX])
 
 
 def _distance(inside: NDArray[np.bool_]) -> NDArray[np.float64]:

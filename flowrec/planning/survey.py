@@ -31,6 +31,7 @@ SURVEYS = Methods(
             "model_share",
             "places",
             "worth",
+            "memory_stretches",
         ),
         needs=("uncertainty",),
     ),
@@ -89,6 +90,9 @@ class SurveyPlanner:
     # On eight procedural vessels of `flowrec bench survey`: mean error .0204 in 6.4 crossings with 0.02, .0153 in 8.4
     # crossings with 0.01.
     worth: Annotated[float, Range(0.0, 10.0)] = 0.01
+    # The next stretch is believed to be worth as much less as the latest ones were, in the fall of the stated error or
+    # in the move of the map, than was expected of them; so many count. 0: what is expected is believed.
+    memory_stretches: Annotated[int, Range(0, 1000)] = 2
 
     def plan(self, order: SurveyOrder) -> Route:
         """The route (stamp and request 0) of the survey as far as it is decided, or no route with the reason.

@@ -25,6 +25,7 @@ from flowrec.planning.path_refinement import refine_path
 from flowrec.planning.problem import Endpoint, attach_goal, attach_start, with_ends
 from flowrec.planning.route import no_route, planning_speed_um_s, timed_route
 from flowrec.planning.survey_design import METHOD, Looks, Need, SurveyOrder, covariance_after
+from flowrec.planning.survey_memory import SurveyMemory
 from flowrec.planning.survey_places import central_pixels, far_from_openings, middle_weight
 
 ENOUGH = "enough"  # the first word of the reason of a survey that is complete
@@ -74,6 +75,7 @@ class Information:
     model_share: float
     places: int
     worth: float
+    memory_stretches: int
 
     def plan(self, order: SurveyOrder) -> Route:
         """The survey so far and its next stretch; the survey so far alone when no stretch is worth its time."""
@@ -112,10 +114,13 @@ class Information:
         now = need.error(covariance, coming)
         finite = np.isfinite(reach.togo_s)
         crossing_s = float(reach.togo_s[finite].max(initial=1e-6))
+        memory = SurveyMemory.of(order.present, uncertainty.mean_um_s, now)
+        trust = memory.trust(self.memory_stretches)
         best: _Stretch | None = None
         best_rate = self.worth / crossing_s
         for stretch in self._stretches(space, order, looks, covariance, coming, need, start, reach):
-            rate = (now - stretch.error) / max(stretch.duration_s, order.least_s, _SHORTEST_SHARE * crossing_s)
+            took_s = max(stretch.duration_s, order.least_s, _SHORTEST_SHARE * crossing_s)
+            rate = trust * (now - stretch.error) / took_s
             if rate > best_rate:
                 best, best_rate = stretch, rate
         if best is None:
@@ -126,7 +131,8 @@ class Information:
             return route
         said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.arrival_s[-1]:.1f} s"
         remarks = filter(None, (start.remark, reach.remark, said))
-        return replace(_joined(order.present, route), reason="; ".join(remarks), more=True)
+        route = replace(_joined(order.present, route), reason="; ".join(remarks), more=True)
+        return memory.remembered(route, best.error) if self.memory_stretches else route
 
     def _looks(self, space: FreeSpace, order: SurveyOrder, uncertainty: FlowUncertainty) -> Looks:
         """The observations so far."""

@@ -37,6 +37,7 @@ from flowrec.refine.hypothesis import (
     begin,
     complete,
     doubtful,
+    first_evidence,
     of_the_field,
     outlying,
     robust_noise,
@@ -55,6 +56,9 @@ DEPTH_STD_SHARE = 0.3  # standard deviation around each of them: half of their s
 UNSTATED_SHARE = 0.75  # prior probability that the depth of such a chip does not matter
 OBSTACLE_SHARE = 0.2  # prior probability that some channel is partly blocked, at any one of the tried places
 LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
+# In ln evidence: what is farther behind at first sight is not begun. Registration, lines and inertia have then added up
+# to 3.6 more to a depth than to the chip as it is stated (surveys of procedural vessels).
+BEHIND = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,9 +173,9 @@ class Assimilate(PriorSettings):
             prior = [UNSTATED_SHARE, *[(1.0 - UNSTATED_SHARE) / len(DEPTHS_WIDTHS)] * len(DEPTHS_WIDTHS)]
         own = self._observed(chip, chip, operator, solver)
         robust = robust_noise(own)
-        if solver.k > 1 and len(chips) > 1:
+        if len(chips) > 1:
             # The coarse grid proposes: most depths are out of the question, and a factorisation is dear.
-            chips, prior = self._plausible(chips, prior, operator, replace(solver, k=1), robust, steps)
+            chips, prior = self._plausible(chips, prior, operator, replace(solver, k=1), robust)
         begun = []
         for other, share in zip(chips, prior, strict=True):
             with suppress(FlowError):  # a depth whose flow can not be computed
@@ -199,21 +203,15 @@ class Assimilate(PriorSettings):
         return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), "")
 
     def _plausible(
-        self,
-        chips: list[Chip],
-        prior: list[float],
-        operator: ObservationOperator,
-        solver: FlowSolver,
-        robust: Robust,
-        steps: Steps,
+        self, chips: list[Chip], prior: list[float], operator: ObservationOperator, solver: FlowSolver, robust: Robust
     ) -> tuple[list[Chip], list[float]]:
-        """The first chip, and those that are not far less likely than the likeliest."""
+        """The first chip, and those that are not far less likely than the likeliest at first sight."""
         ln_weight = np.full(len(chips), -np.inf)
         for index, (other, share) in enumerate(zip(chips, prior, strict=True)):
             with suppress(FlowError):
-                state = begin(self._observed(other, chips[0], operator, solver), robust, steps)
-                ln_weight[index] = state.sizes.evidence + np.log(share)
-        kept = ln_weight > ln_weight.max() + np.log(LEAST_WEIGHT)
+                observed = self._observed(other, chips[0], operator, solver)
+                ln_weight[index] = first_evidence(observed, robust) + np.log(share)
+        kept = ln_weight > ln_weight.max() + np.log(LEAST_WEIGHT) - BEHIND
         kept[0] = True
         which = np.flatnonzero(kept)
         return [chips[index] for index in which], [prior[index] for index in which]

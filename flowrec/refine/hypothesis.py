@@ -195,6 +195,12 @@ class State:
     remainder: Remainder
 
 
+def first_evidence(observed: Observed, robust: Robust) -> float:
+    """Ln evidence around the assumed flow, before the registration is moved, a line is tried or inertia is followed."""
+    base = observed.model.base
+    return _evidence(observed, robust, np.zeros_like(base), base, None).sizes().evidence
+
+
 def begin(observed: Observed, robust: Robust, steps: Steps) -> State:
     """The most probable flow, with the effects around the assumed flow; a spectral line where the evidence asks."""
     model = observed.model

@@ -1,0 +1,59 @@
+"""What stretches of a survey were worth, and that a survey without worth ends."""
+
+import numpy as np
+import pytest
+
+from flowrec.planning.survey_memory import SurveyMemory
+from tests.planning.test_survey_information import UPPER, junction, ordered, planner, unknown
+
+FLOW = np.full((10, 2), 40.0)
+
+
+def memory(stated, expected, moved):
+    """After stretches with these stated and expected errors; the last number of `stated` and `moved` is now."""
+    return SurveyMemory(np.column_stack([stated[:-1], expected, moved[:-1]]), FLOW, stated[-1], moved[-1])
+
+
+def test_stretches_that_lower_the_error_as_expected_or_move_the_map_as_far_are_trusted():
+    falls = memory([0.4, 0.3, 0.2, 0.1], [0.3, 0.2, 0.1], [0.0, 0.0, 0.0, 0.0])
+    assert falls.trust(2) == pytest.approx(1.0)
+    # By the law of total variance: sqrt(0.5^2 - 0.4^2) for the first stretch, whose observations come one choice later.
+    moves = memory([0.5, 0.5, 0.5, 0.5], [0.4, 0.4, 0.4], [0.0, 0.0, 0.3, 0.3])
+    assert moves.trust(2) == pytest.approx(1.0)
+    assert memory([0.5, 0.5, 0.5, 0.5], [0.4, 0.4, 0.4], [0.0, 0.0, 0.0, 0.15]).trust(2) == pytest.approx(0.125)
+
+
+def test_stretches_that_do_neither_are_trusted_no_more_and_too_few_are_believed():
+    stays = memory([0.4, 0.4, 0.4, 0.4], [0.3, 0.3, 0.3], [0.3, 0.3, 0.0, 0.0])
+    assert stays.trust(2) == 0.0
+    assert stays.trust(3) == 1.0 and stays.trust(0) == 1.0
+    # A stated error that rises and falls again has not fallen.
+    assert memory([0.2, 0.4, 0.3, 0.2], [0.1, 0.3, 0.2], [0.0, 0.0, 0.0, 0.0]).trust(2) == 0.0
+
+
+def test_the_move_is_that_of_the_flow_since_the_route_was_chosen():
+    chip, field = junction()
+    doubt = unknown(chip, field, (0.3, 0.3))
+    first = planner().plan(ordered(chip, field, doubt))
+    assert first.stretch_errors.shape == (1, 3)
+    after = SurveyMemory.of(first, 1.25 * doubt.mean_um_s, 0.1)
+    assert after.moved == pytest.approx(0.2) and SurveyMemory.of(first, doubt.mean_um_s, 0.1).moved == 0.0
+
+
+def test_a_survey_that_learns_nothing_ends_although_more_is_expected_of_the_next_stretch():
+    def stretches(count):
+        chip, field = junction()
+        doubt, route, start = unknown(chip, field, (0.3, 0.3)), None, np.array([300.0, 445.0])
+        for number in range(6):
+            # What was seen is forgotten: the flow is as little known as before.
+            ends = {} if route is None else {"present": route, "progress_s": float(route.arrival_s[-1])}
+            route = planner(memory_stretches=count).plan(ordered(chip, field, doubt, start=start, goal=UPPER, **ends))
+            if not route.more:
+                break
+            start = route.waypoints_um[-1]
+        return number, route
+
+    number, route = stretches(2)
+    assert number == 3 and route.reason.startswith("enough") and len(route.stretch_errors) == 3
+    number, route = stretches(0)
+    assert number == 5 and route.more and len(route.stretch_errors) == 0
