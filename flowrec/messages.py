@@ -175,11 +175,11 @@ class Route(Message):
     # Of a survey: the next stretch is to be ordered on the way. A route that is ordered on the way begins as the one
     # before, with the same times.
     more: bool = False
-    # Of a survey, for each stretch, relative to the flow: its error when the stretch was chosen, the one expected
-    # after it, and the change of the most probable flow since the stretch before was chosen.
-    stretch_errors: Annotated[Matrix, Shape("m", 3)] = field(default_factory=lambda: np.zeros((0, 3)))
+    # Of a survey that remembers, for each stretch, relative to the flow: its error when the stretch was chosen,
+    # the one expected after it, and the change of the most probable flow since the stretch before was chosen.
+    stretch_errors: Annotated[Matrix, Shape("m", 3)] | None = None
     # most probable flow when the latest stretch was chosen, at evenly spread fluid pixels
-    survey_flow_um_s: Annotated[Matrix, Shape("o", 2)] = field(default_factory=lambda: np.zeros((0, 2)))
+    survey_flow_um_s: Annotated[Matrix, Shape("o", 2)] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

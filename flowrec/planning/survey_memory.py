@@ -41,10 +41,11 @@ class SurveyMemory:
     def of(cls, present: Route | None, mean_um_s: Floats, stated: float) -> SurveyMemory:
         """The memory in the present route, and what is believed now: flow (n, 2) and error."""
         flow = mean_um_s[:: len(mean_um_s) // MOST_PLACES + 1]
-        if present is None or present.survey_flow_um_s.shape != flow.shape:
+        before = None if present is None else present.survey_flow_um_s
+        if present is None or before is None or present.stretch_errors is None or before.shape != flow.shape:
             return cls(np.zeros((0, 3)), flow, stated, 0.0)
         square = float((flow**2).sum())
-        moved = np.sqrt(float(((flow - present.survey_flow_um_s) ** 2).sum()) / max(square, 1e-300))
+        moved = np.sqrt(float(((flow - before) ** 2).sum()) / max(square, 1e-300))
         return cls(present.stretch_errors, flow, stated, float(moved))
 
     def trust(self, count: int) -> float:
