@@ -27,7 +27,7 @@ from flowrec.flow import stress as stresses
 from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.grid import Grid
 from flowrec.flow.level_set import LevelSet
-from flowrec.flow.linear_solver import Factors, cached, cell_count, factorise
+from flowrec.flow.linear_solver import Factors, cached, factorise
 from flowrec.flow.momentum import Momentum
 from flowrec.flow.newton_solver import (
     PATIENCE,
@@ -341,7 +341,7 @@ class GeneralisedSystem:
 def generalised_system(chip: Chip, law: Law, k: int) -> GeneralisedSystem:
     """The equations of a law on a chip's geometry, whose operators come from the cache if they are there."""
     key: Hashable = ("stress", *geometry_key(chip, k))
-    operators: StressOperators = cached(key, cell_count(chip, k), lambda: _operators(system(chip, k), chip))
+    operators: StressOperators = cached(key, lambda: _operators(system(chip, k), chip))
     return GeneralisedSystem(operators, law, _per_cell(chip, k))
 
 

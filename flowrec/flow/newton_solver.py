@@ -21,7 +21,7 @@ from flowrec.flow import streamfunction as streams
 from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.grid import INLET, Grid
 from flowrec.flow.level_set import LevelSet
-from flowrec.flow.linear_solver import Factors, cached, cell_count, factorise, friction_key
+from flowrec.flow.linear_solver import Factors, cached, factorise, friction_key
 from flowrec.flow.momentum import Momentum
 from flowrec.flow.streamfunction import StreamBasis
 from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
@@ -230,7 +230,7 @@ class System:
 def system(chip: Chip, k: int) -> System:
     """The factorised equations of a chip on k x k subcells a pixel, from the cache if they are there."""
     key = ("system", *geometry_key(chip, k))
-    equations: System = cached(key, cell_count(chip, k), lambda: _made(chip, k))
+    equations: System = cached(key, lambda: _made(chip, k))
     return equations
 
 

@@ -12,7 +12,7 @@ from flowrec.chip.fluid import law_text
 from flowrec.errors import FlowError
 from flowrec.flow.contour_smoothing import Floats
 from flowrec.flow.generalised import GeneralisedSystem, generalised_system
-from flowrec.flow.linear_solver import cached, cell_count, chip_key
+from flowrec.flow.linear_solver import cached, chip_key
 from flowrec.flow.newton_solver import NotConvergedError, Scales, System, system
 from flowrec.flow.sampling import fluid_image
 from flowrec.flow.sensitivities import Sensitivities, sensitivities
@@ -76,9 +76,7 @@ class FlowSolver:
         def compute() -> Sensitivities:
             return sensitivities(*self._steady(chip), friction, shapes, law)
 
-        expansion: Sensitivities = cached(
-            (self, chip_key(chip), friction, shapes, law), cell_count(chip, self.k), compute
-        )
+        expansion: Sensitivities = cached((self, chip_key(chip), friction, shapes, law), compute)
         return expansion
 
     def _steady(self, chip: Chip) -> tuple[System | GeneralisedSystem, Scales, Floats]:
@@ -92,7 +90,6 @@ class FlowSolver:
             # In the cache, because an assimilation needs the assumed flow again.
             flux: Floats = cached(
                 (self, chip_key(chip)),
-                cell_count(chip, self.k) // 50,  # a vector, not a matrix
                 lambda: equations.steady(scales.drive, scales.inertia, self.max_iterations, self.tolerance),
             )
         except NotConvergedError as failure:

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um, median_width_um
-from flowrec.flow.linear_solver import cached, cell_count
+from flowrec.flow.linear_solver import cached
 from flowrec.flow.sampling import fluid_image
 from flowrec.flow.sensitivities import Sensitivities
 from flowrec.refine.observation_operator import Floats
@@ -33,7 +33,7 @@ def channel_cells(chip: Chip) -> Any:
     """(cells, n) sparse weights of each cell on the fluid pixels in raster order; their sum is 1 on each pixel."""
     # All depths and laws of a chip have the same cells.
     key = ("channel cells", chip.mask.shape, chip.mask.tobytes(), median_width_um(chip) / chip.um_per_px)
-    return cached(key, cell_count(chip, 1) // 5, lambda: _channel_cells(chip))
+    return cached(key, lambda: _channel_cells(chip))
 
 
 def _channel_cells(chip: Chip) -> Any:

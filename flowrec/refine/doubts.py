@@ -14,7 +14,7 @@ import scipy  # its linalg loads at first use, not at start-up
 from numpy.typing import NDArray
 
 from flowrec.flow import FlowSolver
-from flowrec.flow.linear_solver import cached, cell_count, chip_key
+from flowrec.flow.linear_solver import cached, chip_key
 from flowrec.flow.uncertainty import Doubts
 from flowrec.refine.causes import Observed
 from flowrec.refine.flow_model import FlowModel
@@ -71,5 +71,5 @@ def _changes(model: FlowModel, solver: FlowSolver) -> Changes:
             found[first : first + len(batch)] = change[:, None, None] * modes
         return found
 
-    changes: Changes = cached(("doubts", solver, chip_key(chip)), cell_count(chip, 1), compute)
+    changes: Changes = cached(("doubts", solver, chip_key(chip)), compute)
     return changes

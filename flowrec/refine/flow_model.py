@@ -15,7 +15,7 @@ import numpy as np
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import median_width_um
 from flowrec.flow import FlowSolver
-from flowrec.flow.linear_solver import cached, cell_count, chip_key
+from flowrec.flow.linear_solver import cached, chip_key
 from flowrec.flow.sensitivities import Sensitivities
 from flowrec.refine.channel_cells import cell_widening, channel_cells, resistance_modes
 from flowrec.refine.discretisation_error import ModelError
@@ -66,5 +66,5 @@ def flow_model(settings: PriorSettings, error: ModelError, chip: Chip, solver: F
         return FlowModel(chip, expansion, prior, known, modes, cells, widening, width_px, base, std)
 
     key = ("flow model", settings, error, solver, chip_key(chip))
-    model: FlowModel = cached(key, cell_count(chip, 1) // 5, compute)
+    model: FlowModel = cached(key, compute)
     return model
