@@ -6,11 +6,9 @@ own, so that peak memory is that of the method.
 
 from __future__ import annotations
 
-import multiprocessing
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -31,6 +29,7 @@ from flowrec.messages import Observations
 from flowrec.refine import PiUnet, Refiner
 from flowrec.refine.refiner import REFINERS
 from flowrec.refine.training.vessels import draw_mask, make_case, with_mask_error
+from flowrec.system.processes import pool
 from flowrec.terminal import progress, say
 
 RANDOM_CASES = 10
@@ -109,7 +108,7 @@ def measure(
             chosen("bench flow: no case", case, [path.stem for path in paths])
         done = stack.enter_context(progress("refining", len(paths) * len(names)))
         for first, method in zip(range(0, len(paths) * len(names), len(paths)), names, strict=True):
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as worker:
+            with pool(1) as worker:
                 before_mb = worker.submit(_prepare).result()
                 for number, path in enumerate(paths, first + 1):
                     try:

@@ -11,9 +11,7 @@ currents truly make moves the robot. Each command is held against the limits tha
 from __future__ import annotations
 
 import math
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -43,6 +41,7 @@ from flowrec.robot import USUAL_DELAY_S, Robot
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
 from flowrec.simulated_settings import Simulated
+from flowrec.system.processes import pool
 from flowrec.terminal import progress, say
 from flowrec.topics import Tick
 from flowrec.units import seconds
@@ -205,7 +204,7 @@ def measure(
     rows: list[Row] = []
     with (
         progress("flying", len(missions)) as done,
-        ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as workers,
+        pool(jobs) as workers,
     ):
         columns = zip(*missions, strict=True)
         for row in workers.map(fly, *columns, chunksize=4) if jobs > 1 else map(fly, *columns):

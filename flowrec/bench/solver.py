@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import time
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +19,7 @@ from flowrec.chip.openings import find_openings, guess_inlets
 from flowrec.chip.synthetic import bifurcation, straight, vessels
 from flowrec.flow import FlowSolver
 from flowrec.flow.newton_solver import system
+from flowrec.system.processes import pool
 
 Pattern = Literal["vessels", "posts"]
 _PITCH_PX, _RADIUS_PX = 32, 13  # of the posts
@@ -99,7 +98,7 @@ def measure(quick: Quick = False) -> Results:
 
 def speed_case(pattern: Pattern, side_px: int, k: int) -> dict[str, Any]:
     """Cold and warm seconds, unknowns and peak memory of a solve, measured in a process of its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as worker:
+    with pool(1) as worker:
         return worker.submit(_speed, pattern, side_px, k).result()
 
 

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -26,6 +25,7 @@ from flowrec.bench.world_flights import WORLDS, Case, Flight, as_line, fly, refi
 from flowrec.errors import UsageError
 from flowrec.provenance import provenance
 from flowrec.refine.refiner import REFINERS
+from flowrec.system.processes import pool
 from flowrec.terminal import progress, say
 
 CHIPS = "bifurcation,vessels-1,vessels-2,vessels-3"
@@ -134,7 +134,7 @@ def _each(
     if jobs == 1:
         yield from (work(*task) for task in tasks)
         return
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as workers:
+    with pool(jobs) as workers:
         for future in as_completed([workers.submit(work, *task) for task in tasks]):
             yield future.result()
 

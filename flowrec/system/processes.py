@@ -1,12 +1,17 @@
-"""Processes of flowrec: how a child is started, and real-time (SCHED_FIFO) priority."""
+"""Processes of flowrec: how a child or a pool of them is started, and real-time (SCHED_FIFO) priority."""
 
 from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
 
 # Above every ordinary thread, below those of the kernel and of sound and field-bus servers, which ask for more.
 _PRIORITY = 1
@@ -27,6 +32,28 @@ def child_environment() -> dict[str, str]:
     here = Path.cwd()
     kept = [place for place in sys.path if place and (place == home or Path(place).resolve() != here)]
     return os.environ | {"PYTHONPATH": os.pathsep.join(kept if home in kept else [home, *kept])}
+
+
+def pool(processes: int) -> ProcessPoolExecutor:
+    """New processes for work that a bench shares out. They end with this process, also where that one is killed."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """By itself the pool's process waits for work for ever, because its siblings keep its pipe open."""
+    import multiprocessing
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)  # the main thread may be in a long computation
+
+    threading.Thread(target=watch, name="parent", daemon=True).start()
 
 
 @contextmanager
