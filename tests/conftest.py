@@ -45,6 +45,9 @@ SMALL = [
     "survey.method=downstream",
 ]
 
+# In real time, and still under way however long a busy machine takes for what a test does meanwhile.
+LONG = [*SMALL, "mission.hold_start_s=100", "safety.guard_timeout_s=20"]
+
 # For tests of what happens in real time: other tests beside them would be the cause of their failures.
 needs_quiet = pytest.mark.skipif(
     "PYTEST_XDIST_WORKER" in os.environ, reason="needs a quiet machine: pytest -n 0 tests/rigs/lab"
@@ -137,7 +140,7 @@ def realtime_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     A replay that does not know when each was adopted would wait for 100 s.
     """
     sets = [*SMALL, "survey.method=information", "survey.worth=0.03", "mission.phases=survey,refine,plan"]
-    sets.append("worker.adopt_after_s=100")
+    sets += ["worker.adopt_after_s=100", "safety.guard_timeout_s=20"]
     return made_once(
         tmp_path_factory,
         "realtime",

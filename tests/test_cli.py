@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flowrec.cli import with_default_refine
-from tests.conftest import HANG_S, SMALL, until
+from tests.conftest import HANG_S, LONG, until
 
 
 def flowrec(*words: object, timeout: float = HANG_S) -> subprocess.CompletedProcess[str]:
@@ -92,7 +92,7 @@ def test_files_that_are_no_session_are_told_apart(session: Path, tmp_path: Path)
 
 def test_sigterm_zeroes_the_coils_and_finishes_the_file(tmp_path: Path) -> None:
     out = tmp_path / "stopped.mcap"
-    words = [word for setting in SMALL for word in ("--set", setting)]
+    words = [word for setting in LONG for word in ("--set", setting)]
     process = subprocess.Popen(
         [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(out), *words],
         stderr=subprocess.PIPE,

@@ -15,7 +15,7 @@ import pytest
 import flowrec
 from flowrec.errors import SessionError, UsageError
 from flowrec.topics import Tick
-from tests.conftest import HANG_S, SMALL, until
+from tests.conftest import HANG_S, LONG, SMALL, until
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "sessions" / "golden.mcap"
@@ -121,8 +121,7 @@ def test_what_is_no_session_is_refused_in_one_line(name: str, tmp_path: Path) ->
 
 
 def test_a_finished_part_can_be_read_while_another_process_records_the_next_one(tmp_path: Path) -> None:
-    settings = (*SMALL, "recording.split_s=0.5", "safety.guard_timeout_s=20")
-    sets = [word for setting in settings for word in ("--set", setting)]
+    sets = [word for setting in (*LONG, "recording.split_s=0.5") for word in ("--set", setting)]
     out = tmp_path / "run.mcap"
     words = [sys.executable, "-m", "flowrec", "record", "--realtime", "--duration", "60", "--out", out, *sets]
     process = subprocess.Popen([*map(str, words)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

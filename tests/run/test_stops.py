@@ -171,7 +171,7 @@ def test_record_and_replay_are_functions_of_any_thread(tmp_path: Path) -> None:
 
     def both() -> None:
         try:
-            verb.record(load_config(None, [*SMALL, "duration_s=1"]), path, realtime=True)
+            verb.record(load_config(None, [*SMALL, "duration_s=1", PATIENT]), path, realtime=True)
             replay(path, Change(), out=tmp_path / "again.mcap")
         except BaseException as error:  # noqa: BLE001  told by the test
             errors.append(error)

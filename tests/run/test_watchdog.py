@@ -15,6 +15,7 @@ from flowrec.errors import RigError
 from flowrec.messages import Currents
 from flowrec.run.control import RAMP_PATIENCE_S, Interrupted, RunControl
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
+from tests.conftest import until
 
 
 class Driver:
@@ -40,14 +41,6 @@ class Driver:
 
 def field(amplitude_mt: float) -> Currents:
     return Currents(0, 1.0, 0.0, amplitude_mt, 0.0, np.zeros(3), False)
-
-
-def until(happened: Callable[[], bool]) -> None:
-    """Wait for another thread; the limit is only against hanging."""
-    end_s = time.monotonic() + 30.0
-    while not happened():
-        assert time.monotonic() < end_s
-        time.sleep(0.001)
 
 
 def guarded(driver: Driver, **more: object) -> Watchdog:

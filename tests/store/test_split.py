@@ -185,7 +185,7 @@ def test_a_next_part_that_can_not_be_made_ends_the_run_and_leaves_whole_parts(tm
     writer = SessionWriter(tmp_path / "x.mcap", HEADER, WriterOptions(files=Split(seconds=0.5)))
 
     def fly():
-        for tick in TICKS:
+        for tick in ticks_of(100_000, shape=(96, 96)):  # until the thread has told
             writer.write(tick)
             time.sleep(0.002)
 

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -24,7 +23,7 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import is_growing, open_new, remove_idle
-from tests.conftest import SMALL
+from tests.conftest import LONG, SMALL, until
 from tests.store.made_up import HEADER, ticks_of
 
 BRIEF = ["--duration", "0.3", *(word for setting in SMALL for word in ("--set", setting))]
@@ -190,12 +189,11 @@ def is_locked(path: Path) -> bool:
 def test_a_run_onto_a_session_that_another_process_records_is_refused_and_that_one_ends_whole(tmp_path, flowrec):
     out = tmp_path / "x.mcap"
     partial = tmp_path / "x.mcap.partial"
-    sets = [word for setting in (*SMALL, "safety.guard_timeout_s=20") for word in ("--set", setting)]
+    sets = [word for setting in LONG for word in ("--set", setting)]
     command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(out), *sets]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL) as first:
         try:
-            while not (partial.exists() and partial.stat().st_size > 500_000) and first.poll() is None:
-                time.sleep(0.05)
+            until(lambda: partial.exists() and partial.stat().st_size > 500_000)
             said = [
                 flowrec("record", *BRIEF, "--out", out, *more)
                 for more in (["--overwrite"], ["--overwrite", "--split", "1s"], [])

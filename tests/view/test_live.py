@@ -23,7 +23,7 @@ from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene
 from tests.conftest import HANG_S, until
 
-LISTENING = "0A"
+LISTENING, CONNECTED = "0A", "01"
 LOOPBACK = "0100007F"
 
 
@@ -33,8 +33,8 @@ def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
 
 
-def listeners(pid: int) -> list[tuple[str, int]]:
-    """Address, as the kernel writes it, and port of each socket on which a process listens."""
+def sockets(pid: int, state: str = LISTENING) -> list[tuple[str, int]]:
+    """Address, as the kernel writes it, and port of each socket of a process in that state."""
     inodes = set()
     for link in Path(f"/proc/{pid}/fd").iterdir():
         try:
@@ -49,7 +49,7 @@ def listeners(pid: int) -> list[tuple[str, int]]:
         if Path("/proc/net", table).exists()
         for line in Path("/proc/net", table).read_text().splitlines()[1:]
     ]
-    found = [row[1].split(":") for row in rows if row[3] == LISTENING and row[9] in inodes]
+    found = [row[1].split(":") for row in rows if row[3] == state and row[9] in inodes]
     return [(address, int(port, 16)) for address, port in found]
 
 
@@ -67,7 +67,7 @@ def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
 ) -> None:
     live = LiveView(scene, "serve", max_hz=50)
     assert live.pid is not None
-    until(lambda: listeners(live.pid or 0))
+    until(lambda: sockets(live.pid or 0))
     live.write(ticks[0])
     os.kill(live.pid, blow)
     # More than the queue and the pipe hold.
@@ -82,12 +82,13 @@ def test_a_live_view_listens_on_this_machine_only_and_ends_with_the_run(scene: S
     with LiveView(scene, "spawn") as live:
         pid = live.pid
         assert pid is not None
-        until(lambda: listeners(pid))
+        until(lambda: sockets(pid))
         for tick in ticks[:30]:
             live.write(tick)
-        assert {address for address, _ in listeners(pid)} == {LOOPBACK}
+        assert {address for address, _ in sockets(pid)} == {LOOPBACK}
         assert live.url in live.message
         assert "no screen" in live.message
+        live.close(HANG_S)
     assert live.dropped == 0
     assert not Path(f"/proc/{pid}").exists()
     live.write(ticks[0])  # late, and no error
@@ -101,13 +102,15 @@ def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
     program = viewer.executable()
     assert program is not None
     with LiveView(scene, "serve", max_hz=20) as live:
-        until(lambda: listeners(live.pid or 0))
+        until(lambda: sockets(live.pid or 0))
         received = tmp_path / "received.rrd"
         listener = subprocess.Popen(
             [program, live.url, "--save", received], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
+        until(lambda: sockets(live.pid or 0, CONNECTED))
         for i, tick in enumerate(ticks[:60]):
             live.write(replace(tick, frame=Frame(tick.stamp_ns, i, image)))
+        live.close(HANG_S)
     until(lambda: listener.poll() is not None)
     robot, images, scale = [], [], []
     for chunk in RrdReader(received).stream():

@@ -42,7 +42,7 @@ def test_stamps_are_the_times_at_which_micro_manager_received_the_images() -> No
     with Grabber(lambda: MmcoreCamera.of(WANTED), WANTED) as grabber:
         frames = frames_of(grabber, 30)
     intervals_ms = np.diff([frame.stamp_ns for frame in frames]) / 1e6
-    assert (intervals_ms > 0).all() and np.median(intervals_ms) == pytest.approx(10.0, rel=0.5)
+    assert (intervals_ms > 0).all() and np.median(intervals_ms) > 5.0
 
 
 def test_images_that_micro_manager_throws_away_because_its_buffer_is_full_are_counted() -> None:
