@@ -33,6 +33,43 @@ class Doubts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """Where a measured place x lies on the chip: x + offset - scale (x - c) - angle J (x - c); J turns from +x to +y.
+
+    Attributes
+    ----------
+    offset_um : (2,).
+    scale : relative error of um per pixel.
+    angle_rad : from +x to +y.
+    centre_um : (2,) c.
+    """
+
+    offset_um: Floats
+    scale: float
+    angle_rad: float
+    centre_um: Floats
+
+    @classmethod
+    def stated(cls) -> Registration:
+        """Measured places are those of the chip."""
+        return cls(np.zeros(2), 0.0, 0.0, np.zeros(2))
+
+    def on_chip(self, measured_um: Floats) -> Floats:
+        """(n, 2) places on the chip of measured places (n, 2)."""
+        return np.asarray(self.centre_um + self.offset_um + (measured_um - self.centre_um) @ self._turn.T)
+
+    def measured(self, on_chip_um: Floats) -> Floats:
+        """(n, 2) where places (n, 2) on the chip are measured."""
+        away = on_chip_um - self.centre_um - self.offset_um
+        return np.asarray(self.centre_um + np.linalg.solve(self._turn, away.T).T)
+
+    @property
+    def _turn(self) -> Floats:
+        grown = 1.0 - self.scale
+        return np.array([[grown, self.angle_rad], [-self.angle_rad, grown]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FlowUncertainty:
     """The flow is mean + z columns with z ~ N(0, covariance), on the n fluid pixels of a mask in raster order.
 
@@ -49,6 +86,7 @@ class FlowUncertainty:
     error_um_s : (n,) standard deviation of a component that no unknown explains.
     noise_factor : by which the noise of observations was wider than stated, neighbours that err alike included.
     doubts : what may be wrong in one place; neither `std_um_s` nor `error_share` contains it.
+    registration : the most probable one.
     """
 
     mean_um_s: Floats
@@ -58,6 +96,7 @@ class FlowUncertainty:
     error_um_s: Floats
     noise_factor: float = 1.0
     doubts: Doubts = field(default_factory=lambda: Doubts.none(0))
+    registration: Registration = field(default_factory=Registration.stated)
 
     @property
     def std_um_s(self) -> Floats:

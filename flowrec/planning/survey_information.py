@@ -4,6 +4,9 @@ From the start of the stretch a search finds the fastest way, in the middle of t
 a number of places are compared, at several speeds, by the error that the flow would have after the observations on the
 way (survey_design.py), in the flow along the ways to the goal and in the whole map. Only places are allowed from which
 the goal can still be reached, even in a flow that is worse than believed, and where the robot can wait.
+
+All this is on the chip. Routes, the start and the observations are where the camera measures them: where it shows the
+channels by the most probable registration.
 """
 
 from __future__ import annotations
@@ -97,7 +100,8 @@ class Information:
         return route if order.present is None else _so_far(order.present, route.reason)
 
     def _next(self, space: FreeSpace, believed: FlowField, order: SurveyOrder, uncertainty: FlowUncertainty) -> Route:
-        start = attach_start(space, order.start_um)
+        registration = uncertainty.registration
+        start = attach_start(space, registration.on_chip(order.start_um[None])[0])
         if start.error:
             return no_route(METHOD, start.error)
         reach = self._reach(space, order, uncertainty, start)
@@ -107,7 +111,7 @@ class Information:
         coming: Floats | None = None
         if order.present is not None:  # what the rest of it will show
             ahead = order.present.arrival_s >= order.progress_s
-            rest = order.present.waypoints_um[ahead], order.present.arrival_s[ahead]
+            rest = registration.on_chip(order.present.waypoints_um[ahead]), order.present.arrival_s[ahead]
             coming = looks.information(*rest)
             covariance, looks = covariance_after(covariance, coming), looks.after_way(*rest)
         need = self._need(space, order, uncertainty, start, reach)
@@ -131,6 +135,7 @@ class Information:
             return route
         said = f"from {100.0 * now:.1f} % to {100.0 * best.error:.1f} % of the flow in {route.arrival_s[-1]:.1f} s"
         remarks = filter(None, (start.remark, reach.remark, said))
+        route = replace(route, waypoints_um=registration.measured(route.waypoints_um))
         route = replace(_joined(order.present, route), reason="; ".join(remarks), more=True)
         return memory.remembered(route, best.error) if self.memory_stretches else route
 
@@ -143,7 +148,7 @@ class Information:
         if made is None or not len(made.std_um_s):
             return looks
         own = made.rolled_um_s if made.rolled_um_s is not None else np.zeros_like(made.flow_um_s)
-        return looks.after_places(made.position_um, own)
+        return looks.after_places(uncertainty.registration.on_chip(made.position_um), own)
 
     def _reach(
         self, space: FreeSpace, order: SurveyOrder, uncertainty: FlowUncertainty, start: Endpoint

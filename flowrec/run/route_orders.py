@@ -13,6 +13,7 @@ from flowrec.messages import Mission, Observations, Route
 from flowrec.pipeline import Pipeline
 from flowrec.planning.replanning import better_route
 from flowrec.planning.survey_design import Sampling, SurveyOrder
+from flowrec.robot import Robot
 from flowrec.topics import Tick
 from flowrec.units import seconds
 
@@ -47,7 +48,7 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
             field,
             mission.start_um,
             pipeline.chip,
-            pipeline.robot,
+            _robot(pipeline, order),
             mission.goal_um,
             _uncertainty(pipeline, order),
             _sampling(pipeline, order),
@@ -64,7 +65,7 @@ def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
     """The way to the goal; on the way there the present one, unless another is better."""
     field = order.field
     assert field is not None
-    robot = pipeline.robot.limited_to(order.health.limit_hz if order.health is not None else None)
+    robot = _robot(pipeline, order)
     if mission.phase != Phase.NAVIGATE:
         return pipeline.planner.plan(field, mission.start_um, mission.goal_um, pipeline.chip, robot)
     assert order.route is not None and order.demand is not None
@@ -78,6 +79,11 @@ def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
         pipeline.chip,
         robot,
     )
+
+
+def _robot(pipeline: Pipeline, order: Tick) -> Robot:
+    """The robot as it is known in the tick: slower where it has stepped out."""
+    return pipeline.robot.limited_to(order.health.limit_hz if order.health is not None else None)
 
 
 def _uncertainty(pipeline: Pipeline, order: Tick) -> FlowUncertainty | None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flowrec.chip.chip import Opening
-from flowrec.flow.uncertainty import Doubts, FlowUncertainty
+from flowrec.flow.uncertainty import Doubts, FlowUncertainty, Registration
 from flowrec.interpolation import nearest_pixels
 from flowrec.planning.survey import SurveyPlanner
 from flowrec.planning.survey_design import Looks, Need, Sampling, SurveyOrder, covariance_after
@@ -209,6 +209,28 @@ def test_the_next_stretch_continues_the_present_way_with_its_times():
     np.testing.assert_array_equal(second.waypoints_um[:count], first.waypoints_um)
     np.testing.assert_array_equal(second.arrival_s[:count], first.arrival_s)
     assert (np.diff(second.arrival_s) > 0.0).all() and length_um(second) > length_um(first)
+
+
+def test_where_the_image_is_off_the_stretch_runs_where_the_camera_shows_the_channels():
+    chip, field = junction()
+    doubt = unknown(chip, field, (0.3, 0.3))
+    off = Registration(np.array([6.0, -25.0]), 0.02, 0.01, np.array([700.0, 400.0]))
+    places = np.array([STEM, UPPER, LOWER])
+    np.testing.assert_allclose(off.on_chip(off.measured(places)), places, atol=1e-9)
+    # x - scale (x - c) - angle J (x - c), where J turns (10, 0) to (0, 10)
+    right = off.on_chip(np.array([[710.0, 400.0]]))[0] - off.on_chip(np.array([[700.0, 400.0]]))[0]
+    np.testing.assert_allclose(right, [10.0 * (1.0 - 0.02), -10.0 * 0.01])
+    straight = planner().plan(ordered(chip, field, doubt))
+    start = off.measured(np.array([STEM]))[0]
+    moved = planner().plan(ordered(chip, field, replace(doubt, registration=off), start=start))
+    np.testing.assert_allclose(off.on_chip(moved.waypoints_um), straight.waypoints_um, atol=1e-6)
+    np.testing.assert_allclose(moved.waypoints_um[0], start)
+    again = ordered(
+        *(chip, field, replace(doubt, registration=off), moved.waypoints_um[-1]), present=moved, progress_s=0.0
+    )
+    longer = planner().plan(again)
+    np.testing.assert_array_equal(longer.waypoints_um[: len(moved.waypoints_um)], moved.waypoints_um)
+    assert promised(longer)[0] == pytest.approx(promised(moved)[1], rel=0.1)
 
 
 def doubted(chip, field, *columns, probability=0.15):

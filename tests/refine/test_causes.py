@@ -105,6 +105,17 @@ def test_an_image_scale_that_moves_observations_across_a_channel_is_found(twin):
     assert case.error(refined) < 0.04
 
 
+def test_the_next_stretch_of_a_survey_is_told_where_the_chip_lies_under_the_image(twin):
+    case, scale = twin(), -0.04
+    observed = flown(case, noise=1.0, scale=scale, offset=(4.0, -8.0))
+    uncertainty = SETTINGS.uncertainty(case.assumed, observed, case.chip, case.solver)
+    places = observed.position_um
+    true = places + np.array([4.0, -8.0]) - scale * (places - places.mean(axis=0))
+    off = np.hypot(*(uncertainty.registration.on_chip(places) - true).T)
+    before = np.hypot(*(places - true).T)
+    assert off.max() < 0.5 * before.max() and np.median(off) < 0.5 * np.median(before)
+
+
 def test_the_distance_to_a_wall_is_that_of_the_chip(twin):
     # The solver's own distance ends at one pixel: with it every observation was as near to a wall as every other.
     case = twin()
