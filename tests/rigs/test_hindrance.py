@@ -14,6 +14,7 @@ from flowrec.rigs.simulated.hindrance import (
     carried,
     drag_along,
     drag_towards,
+    pressed,
     walls_around,
 )
 from flowrec.robot import Robot
@@ -121,6 +122,18 @@ def test_a_flow_carries_a_finite_sphere_by_faxens_law_and_a_wall_holds_it_back_b
         assert vy == pytest.approx(0.0, abs=0.05)
         vx, _ = speed_of(swimmer((2000.0, place), 0.0, velocity), 0.0, 0.0)
         assert vx == pytest.approx(undisturbed, rel=1e-3)
+
+
+def test_a_robot_that_a_flow_presses_to_a_wall_can_leave_it_again() -> None:
+    velocity = np.zeros((40, 200, 2), np.float32)
+    velocity[10:31, :, 1] = 60.0
+    robot = swimmer((2000.0, 450.0), 1.0, velocity)
+    robot.advance(4.0, 0.0, 0.0, 0.0)
+    assert robot.position_um[1] == pytest.approx(610.0 - RADIUS_UM, abs=0.1 * RADIUS_UM)
+    robot.advance(1.0, 18.0, -math.pi / 2, 1.0)
+    assert robot.position_um[1] < 610.0 - 1.5 * RADIUS_UM
+    # Nearly in contact: the force of a stagnation flow, 3.23 times Stokes', over the drag.
+    assert pressed(0.01) == pytest.approx(3.23 / drag_towards(0.01), rel=0.02)
 
 
 def test_a_sphere_in_a_shear_flow_along_one_wall_is_as_fast_as_goldman_says():

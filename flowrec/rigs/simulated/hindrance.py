@@ -24,8 +24,11 @@ a plane that is the mean over four points at sqrt(2/3) a. A wall holds it back i
 centre, by (1 - c) S l: c is the speed of a free sphere in a shear flow along a wall over that of the flow at its
 centre, Goldman, Cox and Brenner, Chem. Eng. Sci. 22 (1967) 653, with the exact values of their table, and
 1 - 5/16 (a / l)^3 far from the wall. The lags of two walls are added; in the middle of a channel there is no shear and
-no lag, as in Happel and Brenner (1973), section 7-4, up to terms of (a / l)^5: 3 % for a sphere of half the width. The
-surface is not smooth: no gap is less than half a percent of the radius.
+no lag, as in Happel and Brenner (1973), section 7-4, up to terms of (a / l)^5: 3 % for a sphere of half the width. What
+carries the sphere towards the nearest wall is squeezed out of the gap like its own motion: of that component
+g / (g + 1 / 3.23) is left. Near the wall that is 3.23 g, the force of a stagnation flow on a held sphere, 3.23 times
+Stokes' (Goren and O'Neill, Chem. Eng. Sci. 26 (1971) 325), over the drag 1 / g. Without it a flow would press the robot
+to a wall that it can not leave. The surface is not smooth: no gap is less than half a percent of the radius.
 """
 
 from __future__ import annotations
@@ -43,6 +46,7 @@ from flowrec.system.numba_setup import compiled
 FLOOR_DRAG = 2.9  # of the roller over its floor, relative to Stokes' drag
 FAXEN = math.sqrt(2.0 / 3.0)  # radii from the centre to the four points
 _LEAST_GAP = 0.005  # roughness, in radii
+_STAGNATION = 3.23  # force of a stagnation flow on a sphere at the wall over Stokes'
 # Goldman, Cox and Brenner (1967, part II): speed of a free sphere over that of the shear flow at its centre, by ln gap.
 _LAG_AT = np.log(np.array([0.003202, 0.005004, 0.0453, 0.1276, 0.5431, 1.3524, 2.7622, 9.0677]))
 _LAG = np.array([0.45022, 0.47861, 0.65375, 0.76692, 0.92185, 0.97768, 0.99436, 0.9997])
@@ -82,6 +86,13 @@ def carried(gap: float) -> float:
 
 
 @compiled
+def pressed(gap: float) -> float:
+    """Speed of a sphere that a flow carries towards a wall over that of the flow, at a gap in radii."""
+    gap = max(gap, _LEAST_GAP)
+    return gap / (gap + 1.0 / _STAGNATION)
+
+
+@compiled
 def hindered(
     x: float,
     y: float,
@@ -114,11 +125,13 @@ def hindered(
     to_wall = (across - along) * (own_x * nx + own_y * ny)
     apart = 2.0 * FAXEN * radius
     lag = share * ((1.0 - carried(near_gap)) * near - (1.0 - carried(far_gap)) * far)
+    mean_x, mean_y = flow[:, 0].mean(), flow[:, 1].mean()
+    squeezed = share * (1.0 - pressed(near_gap)) * (mean_x * nx + mean_y * ny)
     shear_x = (nx * (flow[0, 0] - flow[1, 0]) + ny * (flow[2, 0] - flow[3, 0])) / apart
     shear_y = (nx * (flow[0, 1] - flow[1, 1]) + ny * (flow[2, 1] - flow[3, 1])) / apart
     return (
-        along * own_x + to_wall * nx + flow[:, 0].mean() - lag * shear_x,
-        along * own_y + to_wall * ny + flow[:, 1].mean() - lag * shear_y,
+        along * own_x + (to_wall - squeezed) * nx + mean_x - lag * shear_x,
+        along * own_y + (to_wall - squeezed) * ny + mean_y - lag * shear_y,
     )
 
 
