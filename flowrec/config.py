@@ -139,7 +139,7 @@ _BEFORE: dict[str, Any] = {
     "survey.memory_stretches": 0,
     "mission.reassimilate_observations": 0,
     "mission.replan_slower": 0.0,
-    "mission.survey_stuck_s": 0.0,
+    "mission.stuck_s": 0.0,
     "mission.hold_start_s": 0.0,
     "plan.policy_course_share": 1.0,
     "plan.wall_error_um": 0.0,

@@ -37,6 +37,7 @@ Place = Point | str
 _IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
 _ON_THE_WAY = (Phase.SURVEY, Phase.NAVIGATE)  # the robot goes on while an order is under way
 _SLOWER = 0.3  # of the planned time: a robot that steps out at 0.7 of its limit is later by about so much
+_WAITING_RADII = 2.5  # off a reference that then has a fifth of its pace (Controller.lag_full_radii)
 _EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
 
 
@@ -58,9 +59,10 @@ class MissionStateMachine:
     hold_start_s: Annotated[float, Range(0.0, 3600.0)] | None = None
     goal_tolerance_um: Annotated[float, Range(0.01, 1e5)] | None = None  # None: the robot's radius
     survey_limit_s: Annotated[float, Range(0.1, 1e6)] = 120.0
-    # time by which a survey may be late, on top of what is usual, before it counts as stuck and ends; 0: never. As long
-    # as a robot at its speed limit needs for a few widths of a channel.
-    survey_stuck_s: Annotated[float, Range(0.0, 1e6)] = 5.0
+    # time by which a robot may be late on its route, on top of what is usual, before it counts as stuck: a survey ends,
+    # and the way to the goal is planned anew; 0: never. As long as a robot at its speed limit needs for a few widths of
+    # a channel.
+    stuck_s: Annotated[float, Range(0.0, 1e6)] = 5.0
     navigate_limit_s: Annotated[float, Range(0.1, 1e6)] = 300.0
     # no route is followed for longer than this factor times its planned duration, plus 5 s
     patience: Annotated[float, Range(0.1, 1e3)] = 3.0
@@ -308,15 +310,15 @@ class MissionStateMachine:
             return self._next_phase(Phase.SURVEY, previous, now)
         return previous
 
-    def _stuck(self, previous: Mission, now: Frame) -> bool:
-        """Whether the robot of a survey does not follow its reference, and both are late.
+    def _stuck(self, previous: Mission, now: Frame, radii: float = 1.0) -> bool:
+        """Whether the robot is off its reference by more than some radii, and both are late.
 
         What may block a channel is not on the map. The reference waits for the robot.
         """
-        if not self.survey_stuck_s or now.demand is None or now.demand.error_um <= now.robot.radius_um:
+        if not self.stuck_s or now.demand is None or now.demand.error_um <= radii * now.robot.radius_um:
             return False
         late_s = elapsed_s(previous, now) - now.demand.progress_s
-        return late_s > self.survey_stuck_s + _SLOWER * now.demand.progress_s
+        return late_s > self.stuck_s + _SLOWER * now.demand.progress_s
 
     def _time_limit_s(self, limit_s: float, route: Route) -> float:
         """How long a route may be followed: for a robot that is stuck, waiting does not help."""
@@ -338,18 +340,15 @@ class MissionStateMachine:
             note = f"the robot reaches {able_um_s:.0f} um/s and not {planned_um_s:.0f}: planning anew"
             return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, note)
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
-        if now.demand is None or not now.demand.error_um > limit_um:
+        stuck = self._stuck(previous, now, _WAITING_RADII)
+        if now.demand is None or not (stuck or now.demand.error_um > limit_um):
             return self._look_again(previous, now, route, result)
         if previous.request - previous.routine_orders >= self.orders_limit:
             note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
             return finish(previous, now, Outcome.GAVE_UP, note)
-        return order(
-            previous,
-            now,
-            Phase.PLAN,
-            WorkOrder.ROUTE,
-            f"blown {now.demand.error_um:.0f} um off the route: planning anew",
-        )
+        off = f"{now.demand.error_um:.0f} um off the route"
+        note = f"stuck {off}" if stuck else f"blown {off}"
+        return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, f"{note}: planning anew")
 
     def _look_again(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
         """On the way: after some observations refine the map again, then ask whether another route is better now."""

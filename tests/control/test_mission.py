@@ -362,12 +362,12 @@ def test_the_time_limit_of_a_survey_waits_for_the_order_under_way_so_that_there_
 
 
 def test_a_survey_ends_when_something_holds_the_robot_up_and_not_when_it_is_slow_or_waits() -> None:
-    world = surveying(survey_stuck_s=0.5)
+    world = surveying(stuck_s=0.5)
     for _ in range(5):
         assert world.tick(at=(200.0, 500.0), progress=1.0, error_um=10.0).phase == "survey", "it waits at its place"
     held_up = world.tick(at=(200.0, 500.0), progress=1.0, error_um=200.0)
     assert (held_up.wanted, held_up.note) == ("refine", "survey cut short: something is in the way")
-    slow = surveying(survey_stuck_s=0.5)
+    slow = surveying(stuck_s=0.5)
     for passed_s in (0.8, 1.6, 2.4, 3.2, 4.0, 4.8):
         assert slow.tick(at=(200.0, 500.0), progress=passed_s, error_um=200.0).phase == "survey"
 
@@ -395,6 +395,16 @@ def navigating(**settings) -> World:  # type: ignore[no-untyped-def]
     world.tick(refined=replace(field(3), stamp_ns=5_000_000_000))
     assert world.tick(route=route(4)).phase == "navigate"
     return world
+
+
+def test_a_robot_that_is_stuck_on_the_way_gets_a_new_route_and_one_that_is_slow_does_not() -> None:
+    for error_um, wanted in ((140.0, "route"), (110.0, "")):
+        world = navigating(stuck_s=0.5, reassimilate_observations=0)
+        for _ in range(8):
+            mission = world.tick(at=(200.0, 500.0), progress=1.0, error_um=error_um)
+        assert mission.wanted == wanted
+        assert mission.finished is False
+        assert mission.note == ("stuck 140 um off the route: planning anew" if wanted else "")
 
 
 def test_on_the_way_the_map_is_refined_again_after_some_observations_and_then_the_route_is_asked_for_anew() -> None:
