@@ -282,6 +282,7 @@ class Observations(Message):
     # not stated
     rolled_um_s: Annotated[Matrix, Shape("n", 2)] | None = None
     time_s: Annotated[Vector, Shape("n")] | None = None  # middle of that time on the session clock; None: not stated
+    radius_um: float | None = None  # of the robot, which the flow carries as a sphere; None: not stated
 
     def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
         """Some of the observations, chosen by an index of arrays."""
@@ -292,6 +293,7 @@ class Observations(Message):
             self.std_um_s[which],
             None if self.rolled_um_s is None else self.rolled_um_s[which],
             None if self.time_s is None else self.time_s[which],
+            self.radius_um,
         )
 
     def followed_by(self, more: Observations) -> Observations:
@@ -305,6 +307,7 @@ class Observations(Message):
             np.concatenate((self.std_um_s, more.std_um_s)),
             None if rolled[0] is None or rolled[1] is None else np.concatenate((rolled[0], rolled[1])),
             None if time[0] is None or time[1] is None else np.concatenate((time[0], time[1])),
+            more.radius_um if self.radius_um == more.radius_um else None,
         )
 
 

@@ -153,6 +153,7 @@ class Sampler:
             np.array([sigma]),
             estimate.rolled_um_s[None] if estimate.rolled_um_s.size else None,
             np.array([seconds(estimate.stamp_ns) - filter_memory_s]),
+            robot.radius_um,
         )
         return one if previous is None else previous.only(slice(-self.capacity + 1, None)).followed_by(one)
 

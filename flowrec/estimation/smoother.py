@@ -102,4 +102,5 @@ def observe(smoothed: Smoothed, robot: Robot, spacing_radii: float = 0.8, settle
         std[chosen],
         smoothed.rolled_um_s[chosen],
         time_s,
+        robot.radius_um,
     )

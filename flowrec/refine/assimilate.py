@@ -53,7 +53,11 @@ LEAST_GAIN = 4.0  # in ln evidence, before other walls than the chip's are taken
 LARGEST_PX = 30_000  # fluid pixels of a chip for which depths and walls are tried: each is a geometry of its own
 DEPTHS_WIDTHS = (0.4, 0.8, 1.6, 3.2)  # grid of depths of a chip that states none, in median channel widths
 DEPTH_STD_SHARE = 0.3  # standard deviation around each of them: half of their spacing in ln depth
-UNSTATED_SHARE = 0.75  # prior probability that the depth of such a chip does not matter
+UNSTATED_SHARE = 0.8  # prior probability that the depth of such a chip does not matter
+# Power of the likelihood ratio of depths (a coarsened posterior, Miller and Dunson 2019): what no hypothesis explains
+# (uneven rolling, optics, walls) favours one of them by chance. Where the depth does not matter, a wrong one was
+# likelier by up to 4 nats in 30 surveys (error 4 to 36 %); a true one of half a width by 15 to 20, of 0.8 by 0 to 8.
+DEPTH_POWER = 0.5
 OBSTACLE_SHARE = 0.2  # prior probability that some channel is partly blocked, at any one of the tried places
 LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
 # In ln evidence: what is farther behind at first sight is not begun. Registration, lines and inertia have then added up
@@ -181,7 +185,7 @@ class Assimilate(PriorSettings):
             with suppress(FlowError):  # a depth whose flow can not be computed
                 observed = self._observed(other, chip, operator, solver)
                 begun.append((begin(observed, robust, steps), np.log(share)))
-        ln_weight = np.array([state.sizes.evidence + ln_prior for state, ln_prior in begun])
+        ln_weight = np.array([DEPTH_POWER * state.sizes.evidence + ln_prior for state, ln_prior in begun])
         best = begun[int(np.argmax(ln_weight))]
         if self.doubt_walls and small and doubtful(best[0].evidence, best[0].sizes):
             wrong, moved = self._better_mask(operator, best[0].observed.model.chip, chip, solver, robust, best[0])
@@ -193,13 +197,14 @@ class Assimilate(PriorSettings):
             for (state, ln_prior), ln in zip(begun, ln_weight, strict=True)
             if ln > least
         ]
-        ln_weight = np.array([one.posterior.evidence + ln_prior for one, ln_prior in found])
+        ln_weight = np.array([DEPTH_POWER * one.posterior.evidence + ln_prior for one, ln_prior in found])
         weights = np.exp(ln_weight - ln_weight.max())
         shares = weights.copy()
         if found[0][0].observed.model.chip.depth_um == chip.depth_um:
             # weight - prior x evidence of the first: of what is not likelier than the first, nothing is left.
             first = found[0][0].posterior.evidence
-            shares[1:] *= [-np.expm1(min(first - one.posterior.evidence, 0.0)) for one, _ in found[1:]]
+            gains = np.array([one.posterior.evidence - first for one, _ in found[1:]])
+            shares[1:] *= -np.expm1(np.minimum(-DEPTH_POWER * gains, 0.0))
         return Hypotheses([one for one, _ in found], weights / weights.sum(), shares / shares.sum(), "")
 
     def _plausible(

@@ -4,15 +4,15 @@ With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, 
 
     y_i = v(x_i) + dv/dx (offset - scale (x_i - c) - angle J (x_i - c)) + (scale + angle J) v + scale r_i
           + (gain - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
-          - carry b_i v + curved d^2 / 6 lap v + walls(x_i) + v p(t_i) + local(x_i) + noise
+          + sphere(v) + walls(x_i) + v p(t_i) + local(x_i) + noise
 
-J turns from +x to +y, c is the mean of the places, b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the
-wall, d is the least one that was observed (the robot's radius is not part of a refinement, and it can not have been
-nearer), b is its mean: the gain is that of the robot where it was observed, and hindrance what differs nearer to or
-farther from a wall. A sphere of radius a follows the flow v + a^2 / 6 lap v (Faxen 1922), whatever holds it back
-besides: `curved` is (a / d)^2. p is a change of the whole flow in time: slow wander, and a spectral line. `local` is
-the error of the grid. Each effect is linear in its unknowns around the flow and the registration in use, so the
-assimilation repeats with those that it found.
+J turns from +x to +y, c is the mean of the places. b_i is the drag of the side walls on a sphere of the robot's radius,
+relative to the largest one, and b its mean: the gain is that of the robot where it was observed, and hindrance what
+differs nearer to or farther from a wall. sphere(v) is how a sphere lags behind the flow, sphere_between_walls.py. Where
+the radius is not stated (older sessions), b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the wall, d is
+the least one that was observed, and the lag is carry b_i v - curved d^2 / 6 lap v. p is a change of the whole flow in
+time: slow wander, and a spectral line. `local` is the error of the grid. Each effect is linear in its unknowns around
+the flow and the registration in use, so the assimilation repeats with those that it found.
 
 Walls that are off by w pixels (one standard deviation, each wall on its own) change the width of a cell of the channels
 by the fraction e = sqrt(2) w / width. In a channel at the same flow rate the mean speed changes by -e, the resistance
@@ -36,6 +36,7 @@ from flowrec.refine.channel_cells import curvature
 from flowrec.refine.evidence import Effect
 from flowrec.refine.flow_model import FlowModel
 from flowrec.refine.observation_operator import Floats, ObservationOperator
+from flowrec.refine.sphere_between_walls import SphereBetweenWalls
 
 # Median and ln_std of the size of each effect.
 BOUNDARY = (1.0, 0.3)  # in the prior standard deviations of the settings
@@ -49,6 +50,12 @@ HEADING = (0.01, 0.8)  # rad: coils and camera are aligned to half a degree
 CURVED = (0.12, 0.8)  # of the part of Faxen's law that a sphere as large as the least distance to a wall would show
 HINDRANCE = (0.05, 1.0)  # of the own motion, between the least distance to a wall and far from one
 CARRY = (0.02, 0.4)  # of the flow, likewise: a sphere lags by few per cent until it nearly touches the wall
+# Of the lag of a sphere of the stated radius (sphere_between_walls.py): a robot that the floor holds lags otherwise. In
+# two simulated surveys on each of four chips the size 0.5 around no lag had smaller errors than 0.5 or 1 +- 0.5 of it.
+SPHERE = (0.5, 0.3)
+# Of the own motion, per unit of the drag of the side walls: a roller's floor has 2.2 to 3.4 times Stokes' drag at gaps
+# of a tenth to a hundredth of its radius (Goldman, Cox and Brenner 1967), which the walls' drag adds to.
+HELD = (0.3, 1.0)
 OFFSET_PX = (0.3, 1.0)  # registration to a fraction of a pixel of the mask
 SCALE = (0.006, 1.0)  # um per pixel of a camera
 ANGLE = (0.004, 0.8)  # rad
@@ -75,8 +82,9 @@ class Observed:
     operator: ObservationOperator  # on the fluid pixels of the model
     shifted: tuple[ObservationOperator, ...]  # half a pixel to the right, left, down, up
     cells: Floats  # (cells, n) weights of the cells there
-    near: Floats  # (n,) b_i: 1 at the least distance to a wall
+    near: Floats  # (n,) b_i: 1 where walls hold the robot back most
     least_px: float  # least distance to a wall
+    sphere: SphereBetweenWalls | None  # None: the robot's radius is not stated
     um_per_px: float
     stated: ObservationOperator  # where the registration puts the observations
     moved: Floats  # (n, 2) px from there to where the flow is read, by the registration in use
@@ -98,9 +106,14 @@ class Observed:
         clearance = np.minimum(clearance_um(mask, 1.0), np.float32(max(mask.shape)))
         distance = np.maximum(cells_at(operator.points, mask.shape).interpolate(clearance), 0.0)
         least = max(float(distance.min()), 0.5)
-        near = np.exp(-np.maximum(distance - least, 0.0) / (NEAR_SHARE * least))
+        sphere = None
+        if operator.radius_px is None:
+            near = np.exp(-np.maximum(distance - least, 0.0) / (NEAR_SHARE * least))
+        else:
+            sphere = SphereBetweenWalls.of(operator.radius_px, mask, clearance, operator.points, distance)
+            near = sphere.drag / float(sphere.drag.max())
         cells = model.cells[:, here.pixels[:, 0]].toarray()
-        return cls(model, here, shifted, cells, near, least, model.chip.um_per_px, stated, moved)
+        return cls(model, here, shifted, cells, near, least, sphere, model.chip.um_per_px, stated, moved)
 
     def at(self, registration: Floats) -> Observed:
         """The same observations where a registration (4,) has them: offset x and y in px, scale, angle in rad."""
@@ -126,10 +139,13 @@ class Observed:
         """(n, 2) what the registration in use adds to the observations of a flow, but for its first order."""
         if not self.moved.any():
             return np.zeros_like(self.moved)
-        wall_px, mask = self.model.expansion.wall_px, self.model.chip.mask
-        there = self.stated.with_walls(wall_px).on_fluid(mask).predict(flow)
         first = np.einsum("an,anc->nc", self.moved.T, self._gradient(flow))
-        return np.asarray(self.operator.predict(flow) - there - first)
+        return np.asarray(self.operator.predict(flow) - self.predict_stated(flow) - first)
+
+    def predict_stated(self, flow: Floats) -> Floats:
+        """(n, 2) a flow (n, 2) where the stated registration has the observations."""
+        stated = self.stated.with_walls(self.model.expansion.wall_px).on_fluid(self.model.chip.mask)
+        return stated.predict(flow)
 
     def _gradient(self, flow: Floats) -> Floats:
         """(2, n, 2) derivatives of a flow along x and y, um/s per px."""
@@ -159,15 +175,14 @@ class Observed:
             _effect("offset", OFFSET_PX, gradient),
             _effect("scale", SCALE, stretch[None]),
             _effect("angle", ANGLE, turn[None]),
-            _effect("carry", CARRY, -(self.near[:, None] * v)[None]),
-            _effect("curved", CURVED, (self.least_px**2 / 6.0 * here.predict(curvature(model.chip.mask, flow)))[None]),
+            *self._carried(v, flow),
             Effect("local", *LOCAL, np.zeros((0, v.size)), self.local_error()),
         ]
         if rolled is not None:
             found += [
                 _effect("gain", GAIN, own[None]),
                 _effect("heading", HEADING, _turned(own)[None]),
-                _effect("hindrance", HINDRANCE, -((self.near - self.near.mean())[:, None] * own)[None]),
+                _effect("hindrance", self._held(), -((self.near - self.near.mean())[:, None] * own)[None]),
             ]
         if time_s is not None:
             along = v.ravel()[:, None] * v.ravel()
@@ -182,6 +197,20 @@ class Observed:
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
         return found
+
+    def _carried(self, v: Floats, flow: Floats) -> list[Effect]:
+        """How a flow (n, 2), which is v (n, 2) at the observations, carries a robot of finite size."""
+        laplacian = self.operator.predict(curvature(self.model.chip.mask, flow))
+        if self.sphere is not None:
+            return [_effect("sphere", SPHERE, self.sphere.carried(v, laplacian)[None])]
+        return [
+            _effect("carry", CARRY, -(self.near[:, None] * v)[None]),
+            _effect("curved", CURVED, (self.least_px**2 / 6.0 * laplacian)[None]),
+        ]
+
+    def _held(self) -> tuple[float, float]:
+        """Size of the hindrance of the own motion: median and ln_std."""
+        return HINDRANCE if self.sphere is None else (HELD[0] * float(self.sphere.drag.max()), HELD[1])
 
     def _widened(self, v: Floats) -> Floats:
         """(cells, n, 2) what walls that are a pixel off in a cell do to the flow v (n, 2), there and elsewhere."""

@@ -85,6 +85,7 @@ def _values(one: Fitted) -> dict[str, tuple[float, float]]:
         "um_per_px_share": ("scale", 1.0),
         "angle_deg": ("angle", 180.0 / np.pi),
         "carry_share": ("carry", 1.0),
+        "sphere_share": ("sphere", 1.0),
     }
     result: dict[str, tuple[float, float]] = dict(one.law)
     for name, (effect, factor) in singles.items():

@@ -262,7 +262,7 @@ def _settled(observed: Observed, robust: Robust, start: Floats | None) -> tuple[
 def doubtful(evidence: Evidence, sizes: Sizes) -> bool:
     """Whether errors of the map along the channels, or the noise, are larger than usual."""
     found = dict(zip([effect.name for effect in evidence.effects], np.exp(sizes.mode), strict=True))
-    return any(found[name] > factor * usual for name, usual, factor in DOUBTED)
+    return any(found.get(name, 0.0) > factor * usual for name, usual, factor in DOUBTED)
 
 
 def _registered(observed: Observed, z: Floats, evidence: Evidence) -> Observed | None:

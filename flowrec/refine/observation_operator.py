@@ -30,6 +30,7 @@ class ObservationOperator:
     ignored: str = ""  # number of unusable observations and why; for people
     rolled_um_s: Floats | None = None  # (n, 2) the robot's own motion; None: not stated, see Observations
     time_s: Floats | None = None  # (n,)
+    radius_px: float | None = None  # of the robot; None: not stated
 
     @property
     def count(self) -> int:
@@ -124,6 +125,7 @@ def observation_operator(
         " and ".join(f"{which.sum()} {why}" for which, why in unusable if which.any()),
         None if observations.rolled_um_s is None else observations.rolled_um_s[usable],
         None if observations.time_s is None else observations.time_s[usable],
+        None if observations.radius_um is None else observations.radius_um / um_per_px,
     )
 
 

@@ -175,8 +175,8 @@ def _searched(
 def _contradicted(pieces: list[Obstacle], free: Fitted) -> list[Obstacle]:
     """Pieces at different places in which the observations contradict a flow most, whatever is wrong with the robot."""
     here = free.observed.operator
-    measured, _ = of_the_field(free)
-    misfit = ((here.predict(free.flow) - measured) ** 2).sum(axis=1) / here.noise_um_s**2
+    measured, _ = of_the_field(free)  # where the stated registration has the observations; they were made `here`
+    misfit = ((free.observed.predict_stated(free.flow) - measured) ** 2).sum(axis=1) / here.noise_um_s**2
     excess = np.minimum(misfit, OUTLYING) - 2.0
     points = here.points
     score, moved = [], []

@@ -6,12 +6,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from flowrec.chip import clearance_um
 from flowrec.flow import sample
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
 from flowrec.refine.causes import Observed
 from flowrec.refine.flow_model import flow_model
 from flowrec.refine.observation_operator import observation_operator
+from flowrec.refine.sphere_between_walls import SphereBetweenWalls
 
 SETTINGS = Refiner(assimilate=Assimilate(doubt_walls=False, doubt_depth=False))
 
@@ -126,6 +128,34 @@ def test_the_distance_to_a_wall_is_that_of_the_chip(twin):
     observed = Observed.of(model, operator)
     assert observed.least_px == pytest.approx(2.5, abs=0.1)
     assert observed.near == pytest.approx([1.0, np.exp(-1.0 / 1.25)], abs=0.05)
+
+
+def test_a_sphere_between_walls_follows_published_limits():
+    # Goldman, Cox and Brenner (1967): a free sphere in a shear flow, its speed over that at its centre at gaps of
+    # 0.5431 and 2.7622 radii, and the drag along the wall over Stokes' there (part I).
+    mask = np.zeros((404, 8), bool)
+    mask[2:402] = True
+    clearance = clearance_um(mask, 1.0)
+    for gap, carried, drag in ((0.5431, 0.92185, 1.5675), (2.7622, 0.99436, 1.1738)):
+        near = 4.0 * (1.0 + gap)
+        sphere = SphereBetweenWalls.of(4.0, mask, clearance, np.array([[4.0, 1.5 + near]]), np.array([near]))
+        assert sphere.near_px + sphere.far_px == pytest.approx(400.0, abs=1.5)
+        assert 1.0 - sphere.lag == pytest.approx(carried, abs=0.015)
+        assert 1.0 + sphere.drag == pytest.approx(drag, abs=0.08)
+    # In the middle of a narrow channel there is no shear; Poiseuille flow carries a sphere by Faxen's law.
+    middle = SphereBetweenWalls(4.0, np.array([8.0]), np.array([8.0]))
+    v, laplacian = np.array([[90.0, 0.0]]), np.array([[-2.0 * 90.0 / 8.0**2, 0.0]])
+    assert middle.carried(v, laplacian)[0] == pytest.approx([-90.0 * 0.25 / 3.0, 0.0])
+
+
+def test_hindrance_and_lag_are_those_of_a_sphere_where_its_radius_is_stated(twin):
+    case = twin()
+    observed = flown(case)
+    names = SETTINGS.refine(case.assumed, observed, case.chip, case.solver).parameter_names
+    assert "carry_share" in names and "sphere_share" not in names
+    refined = SETTINGS.refine(case.assumed, replace(observed, radius_um=25.0), case.chip, case.solver)
+    assert "sphere_share" in refined.parameter_names and "carry_share" not in refined.parameter_names
+    assert case.error(refined) < 0.04
 
 
 def test_observations_without_motion_and_time_are_assimilated_as_those_of_older_sessions(twin):
