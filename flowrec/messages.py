@@ -175,9 +175,10 @@ class Route(Message):
     # Of a survey: the next stretch is to be ordered on the way. A route that is ordered on the way begins as the one
     # before, with the same times.
     more: bool = False
-    # Of a survey that remembers, for each stretch, relative to the flow: its error when the stretch was chosen,
-    # the one expected after it, and the change of the most probable flow since the stretch before was chosen.
-    stretch_errors: Annotated[Matrix, Shape("m", 3)] | None = None
+    # Of a survey that remembers, for each stretch: the relative error of the flow when it was chosen, the one expected
+    # after it, the relative change of the most probable flow since the choice before, and in s along the route the
+    # progress at the choice and the end of the stretch.
+    stretches: Annotated[Matrix, Shape("m", 5)] | None = None
     # most probable flow when the latest stretch was chosen, at evenly spread fluid pixels
     survey_flow_um_s: Annotated[Matrix, Shape("o", 2)] | None = None
 

@@ -92,7 +92,7 @@ class SurveyPlanner:
     worth: Annotated[float, Range(0.0, 10.0)] = 0.01
     # The next stretch is believed to be worth as much less as the latest ones were, in the fall of the stated error or
     # in the move of the map, than was expected of them; so many count. 0: what is expected is believed.
-    memory_stretches: Annotated[int, Range(0, 1000)] = 2
+    memory_stretches: Annotated[int, Range(0, 1000)] = 3
 
     def plan(self, order: SurveyOrder) -> Route:
         """The route (stamp and request 0) of the survey as far as it is decided, or no route with the reason.

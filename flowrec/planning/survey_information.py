@@ -118,7 +118,7 @@ class Information:
         now = need.error(covariance, coming)
         finite = np.isfinite(reach.togo_s)
         crossing_s = float(reach.togo_s[finite].max(initial=1e-6))
-        memory = SurveyMemory.of(order.present, uncertainty.mean_um_s, now)
+        memory = SurveyMemory.of(order.present, uncertainty.mean_um_s, now, order.progress_s)
         trust = memory.trust(self.memory_stretches)
         best: _Stretch | None = None
         best_rate = self.worth / crossing_s

@@ -17,7 +17,7 @@ from flowrec.messages import Route
 
 Floats = NDArray[np.float64]
 MOST_PLACES = 500  # of a map of which the move is taken; it is as smooth as the modes of the flow
-_STATED, _EXPECTED, _MOVED = range(3)  # columns of `Route.stretch_errors`
+_STATED, _EXPECTED, _MOVED, _PROGRESS, _END = range(5)  # columns of `Route.stretches`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,51 +26,57 @@ class SurveyMemory:
 
     Attributes
     ----------
-    errors : (m, 3) of the stretches so far, as in `Route.stretch_errors`.
+    stretches : (m, 5) so far, as in `Route.stretches`.
     flow_um_s : (k, 2) most probable flow now, in some places.
     stated : relative error of the flow now.
     moved : by which the most probable flow has changed since the choice before, relative.
+    progress_s : along the route now.
     """
 
-    errors: Floats
+    stretches: Floats
     flow_um_s: Floats
     stated: float
     moved: float
+    progress_s: float
 
     @classmethod
-    def of(cls, present: Route | None, mean_um_s: Floats, stated: float) -> SurveyMemory:
+    def of(cls, present: Route | None, mean_um_s: Floats, stated: float, progress_s: float) -> SurveyMemory:
         """The memory in the present route, and what is believed now: flow (n, 2) and error."""
         flow = mean_um_s[:: len(mean_um_s) // MOST_PLACES + 1]
         before = None if present is None else present.survey_flow_um_s
-        if present is None or before is None or present.stretch_errors is None or before.shape != flow.shape:
-            return cls(np.zeros((0, 3)), flow, stated, 0.0)
+        if present is None or before is None or present.stretches is None or before.shape != flow.shape:
+            return cls(np.zeros((0, 5)), flow, stated, 0.0, progress_s)
         square = float((flow**2).sum())
         moved = np.sqrt(float(((flow - before) ** 2).sum()) / max(square, 1e-300))
-        return cls(present.stretch_errors, flow, stated, float(moved))
+        return cls(present.stretches, flow, stated, float(moved), progress_s)
 
     def trust(self, count: int) -> float:
         """How far the latest `count` stretches have kept what was expected of them: 0 to 1, the better of two ratios.
 
         The error has fallen by the difference of the least errors that were stated before them and since, because each
-        observation moves what is stated up or down. The map has moved by what the stretches before the latest one have
-        shown: a stretch is chosen when the one before it is not yet travelled.
+        observation moves what is stated up or down. The map has moved since; what was expected of a stretch counts by
+        the part of it that was travelled in that time, because the next one is chosen before its end.
         """
-        rows = len(self.errors)
-        if not 0 < count < rows:
+        rows = len(self.stretches)
+        if not 0 < count <= rows:
             return 1.0
-        stated, expected = np.append(self.errors[:, _STATED], self.stated), self.errors[:, _EXPECTED]
+        stated, expected = np.append(self.stretches[:, _STATED], self.stated), self.stretches[:, _EXPECTED]
         first = rows + 1 - count
         fall = float(stated[:first].min() - stated[first:].min())
         expected_fall = float((stated[:-1] - expected)[-count:].sum())
-        moves = np.append(self.errors[:, _MOVED], self.moved)[-count:]
-        expected_squares = (stated[:-1] ** 2 - expected**2)[-count - 1 : -1]
-        ratios = (
-            fall / max(expected_fall, 1e-300),
-            float((moves**2).sum()) / max(float(expected_squares.sum()), 1e-300),
-        )
-        return min(max(*ratios, 0.0), 1.0)
+        moves = np.append(self.stretches[:, _MOVED], self.moved)[-count:]
+        travelled = self._travelled(self.progress_s) - self._travelled(float(self.stretches[-count, _PROGRESS]))
+        expected_square = float(travelled @ (stated[:-1] ** 2 - expected**2))
+        square = float((moves**2).sum())
+        return min(max(fall / max(expected_fall, 1e-300), square / max(expected_square, 1e-300), 0.0), 1.0)
+
+    def _travelled(self, progress_s: float) -> Floats:
+        """(m,) part of each stretch that lies before a place of the route."""
+        end_s = self.stretches[:, _END]
+        begin_s = np.concatenate([[0.0], end_s[:-1]])
+        return np.asarray(np.clip((progress_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
 
     def remembered(self, route: Route, expected: float) -> Route:
         """The route with this memory and one more stretch, after which an error is expected."""
-        errors = np.concatenate([self.errors, [[self.stated, expected, self.moved]]])
-        return replace(route, stretch_errors=errors, survey_flow_um_s=self.flow_um_s)
+        row = [self.stated, expected, self.moved, self.progress_s, float(route.arrival_s[-1])]
+        return replace(route, stretches=np.concatenate([self.stretches, [row]]), survey_flow_um_s=self.flow_um_s)
