@@ -105,9 +105,8 @@ def survey(task: Task, planner: SurveyPlanner, choose: bool = False) -> Seen:
     start = np.array(config.mission.start)
     sampling = Sampling(2.0 * task.spacing_um, 0.0, task.noise_um_s)
     route: Route | None = None
-    places = np.zeros((0, 2))
+    observed = task.observe(np.zeros((0, 2)))
     for _ in range(_MOST_STRETCHES):
-        observed = task.observe(places)
         uncertainty = config.refine.uncertainty(task.assumed, observed, task.chip, config.flow)
         ends = 0.0 if route is None else float(route.arrival_s[-1])
         order = SurveyOrder(
@@ -118,16 +117,22 @@ def survey(task: Task, planner: SurveyPlanner, choose: bool = False) -> Seen:
         if not new.reachable:
             break
         route, start = new, new.waypoints_um[-1]
-        places = _along(route, sampling.spacing_um)
+        observed = _continued(observed, task.observe(_along(route, sampling.spacing_um)))
         if not route.more:
             break
     if route is None:
-        return Seen(places, reason=new.reason)
+        return Seen(np.zeros((0, 2)), reason=new.reason)
     length = float(np.hypot(*np.diff(route.waypoints_um, axis=0).T).sum())
     places = _along(route, length / max(task.count - 1, 1) * (1.0 - 1e-9))
     if choose:
         places = _best(task, _along(route, task.chip.um_per_px))
     return Seen(places[: task.count], float(route.arrival_s[-1]), route.reason)
+
+
+def _continued(before: Observations, now: Observations) -> Observations:
+    """The observations of a longer way: those of its first part have been made and stay as they are."""
+    flow = np.concatenate([before.flow_um_s, now.flow_um_s[len(before.flow_um_s) :]])
+    return replace(now, flow_um_s=flow)
 
 
 def _along(route: Route, spacing_um: float) -> Points:
