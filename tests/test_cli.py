@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
 import pytest
 
-from flowrec.cli import with_default_refine
+from flowrec.cli import main, with_default_refine
 from tests.conftest import HANG_S, LONG, until
 
 
-def flowrec(*words: object, timeout: float = HANG_S) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "flowrec", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+def flowrec(*words: object) -> subprocess.CompletedProcess[str]:
+    """The command in this process, because to start another one takes longer than most commands."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        mock.patch("sys.argv", ["flowrec", *map(str, words)]),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return subprocess.CompletedProcess(words, int(ended.value.code or 0), out.getvalue(), err.getvalue())
 
 
 def one_line_error(done: subprocess.CompletedProcess[str], status: int, *words: str) -> None:

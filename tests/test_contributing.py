@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -30,6 +31,18 @@ def blocks(text: str, kind: str) -> list[str]:
     return [content for label, content in re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S) if label == kind]
 
 
+ONE_AFTER_THE_OTHER = """
+import json, sys
+from flowrec.cli import main
+for sys.argv in json.loads(sys.argv[1]):
+    try:
+        main()
+    except SystemExit as end:
+        if end.code:
+            sys.exit(f"{' '.join(sys.argv)}: {end.code}")
+"""
+
+
 def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     for folder in (PACKAGE, ROOT / "sessions"):
@@ -41,10 +54,9 @@ def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path
     for name, text in RECIPES.items():
         (change,), (commands,) = blocks(text, "diff"), blocks(text, "sh")
         run(["git", "apply", "--recount", "-"], f"{name}: the change does not apply", copy, outside, change)
-        for command in commands.splitlines():
-            program, *arguments = command.split()
-            assert program == "flowrec"
-            run([sys.executable, "-m", "flowrec", *arguments], f"{name}: {command}", copy, outside)
+        words = [command.split() for command in commands.splitlines()]
+        assert {program for program, *_ in words} == {"flowrec"}
+        run([sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(words)], name, copy, outside)
 
 
 def share_kernels(copy: Path, caches: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,41 +11,43 @@ import pytest
 
 GOLDEN = Path(__file__).parents[1] / "sessions" / "golden.mcap"
 WITHOUT_POSIX = """
-import sys
-sys.modules |= dict.fromkeys(sys.argv.pop(1).split(","))
+import contextlib, io, json, sys
+modules, commands = map(json.loads, sys.argv[1:])
+sys.modules |= dict.fromkeys(modules)
 from flowrec.cli import main
-main()
+for words in commands:
+    if words[0] == "export":  # Rerun imports psutil, which needs `resource` on Linux and not on Windows
+        del sys.modules["resource"]
+    sys.argv, said = ["flowrec", *words], io.StringIO()
+    with contextlib.redirect_stdout(said):
+        try:
+            main()
+        except SystemExit as end:
+            status = end.code or 0
+    print(json.dumps([status, said.getvalue()]))
 """
 
 
-def flowrec_without(modules: str, *words: object) -> subprocess.CompletedProcess[str]:
-    """Run a verb in an interpreter in which importing any of these modules fails."""
-    command = [sys.executable, "-c", WITHOUT_POSIX, modules, *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-@pytest.mark.parametrize(
-    ("words", "output", "status"),
-    [
+def test_a_verb_that_reads_needs_no_posix_module(tmp_path: Path) -> None:
+    exported = tmp_path / "golden.rrd"
+    cases: list[tuple[list[object], str, int]] = [
         (["--version"], "flowrec ", 0),
         (["info", GOLDEN], "reached", 0),
         (["check", GOLDEN], "golden.mcap: GOOD", 0),
         (["ls", GOLDEN.parent], "golden.mcap", 0),
         (["compare", GOLDEN, GOLDEN], "identical", 0),
         (["replay", GOLDEN, "--verify"], "by other numerics", 3),
-    ],
-)
-def test_a_verb_that_reads_needs_no_posix_module(words: list[object], output: str, status: int) -> None:
-    done = flowrec_without("fcntl,termios,tty,resource", *words)
-    assert done.returncode == status, done.stderr
-    assert output in done.stdout
-
-
-def test_an_rrd_is_exported_without_a_posix_module(tmp_path: Path) -> None:
-    # Rerun imports psutil, which needs `resource` on Linux and not on Windows.
-    done = flowrec_without("fcntl,termios,tty", "export", GOLDEN, "--out", tmp_path / "golden.rrd")
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "golden.rrd").stat().st_size > 100_000
+        (["export", GOLDEN, "--out", exported], "", 0),
+    ]
+    modules = json.dumps(["fcntl", "termios", "tty", "resource"])
+    commands = json.dumps([[str(word) for word in words] for words, _, _ in cases])
+    command = [sys.executable, "-c", WITHOUT_POSIX, modules, commands]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(answers) == len(cases), done.stderr
+    for (words, output, status), (ended, said) in zip(cases, answers, strict=True):
+        assert (ended, output in said) == (status, True), (words, said, done.stderr)
+    assert exported.stat().st_size > 100_000
 
 
 def test_every_lock_is_granted_where_there_are_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
