@@ -52,9 +52,8 @@ def events(done: Ended) -> list[tuple[str, str]]:
     return [(event.action, event.text) for event in found if isinstance(event, OperatorEvent)]
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
-def test_a_signal_takes_the_field_down_its_ramp_and_the_file_is_whole(name: str, tmp_path: Path) -> None:
-    done = ended(name, tmp_path, PATIENT)
+def test_a_signal_takes_the_field_down_its_ramp_and_the_file_is_whole(tmp_path: Path) -> None:
+    done = ended("SIGINT", tmp_path, PATIENT)
     sent = [amplitude_mt for event, amplitude_mt in done.after_cause() if event == "apply"]
     assert sent == sorted(sent, reverse=True)
     assert len(sent) > 3
@@ -87,14 +86,8 @@ def test_each_signal_ends_the_run_by_its_ramp_or_takes_the_field_away_at_once(na
     assert told[1:] == ([] if ends else ["no ramp"])
 
 
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [("SIGQUIT", "SIGQUIT"), ("SIGTERM twice", "SIGTERM again")],
-)
-def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run(
-    name: str, says: str, tmp_path: Path
-) -> None:
-    done = ended(name, tmp_path, PATIENT)
+def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run(tmp_path: Path) -> None:
+    done = ended("SIGTERM twice", tmp_path, PATIENT)
     told = done.after_cause()
     late = [one for one in told[told.index(("zero", 0.0)) :] if one[0] == "apply" and one[1] > 0.0]
     # A command that was under way at that moment is followed by another zero().
@@ -103,7 +96,7 @@ def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run
     assert done.status == 0, done.stderr
     assert outcome(done)[0] == "stopped"
     actions = events(done)
-    assert any(action == "zero" and says in text for action, text in actions), actions
+    assert any(action == "zero" and "SIGTERM again" in text for action, text in actions), actions
 
 
 def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_path: Path) -> None:
@@ -158,9 +151,9 @@ def test_a_stage_that_raises_ends_the_run_after_the_field(tmp_path: Path) -> Non
     assert SessionReader(done.path).outcome["reason"] == "ValueError: a stage that fails"
 
 
-@pytest.mark.parametrize("name", ["worker killed", "worker stopped"])
-def test_a_worker_that_is_killed_or_stopped_ends_the_run_after_the_field(name: str, tmp_path: Path) -> None:
-    done = ended(name, tmp_path, PATIENT)
+def test_a_worker_that_is_killed_ends_the_run_after_the_field(tmp_path: Path) -> None:
+    """That one is stopped is told in the same way: tests/run/test_worker_process.py."""
+    done = ended("worker killed", tmp_path, PATIENT)
     assert done.status == 1
     assert SessionReader(done.path).outcome["outcome"] == "failed"
 

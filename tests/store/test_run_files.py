@@ -297,7 +297,7 @@ def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut
 
 
 def test_a_stretch_of_a_survey_that_was_ordered_before_a_part_begins_is_taken_as_recorded(tmp_path):
-    sets = [*SMALL, "survey.method=information", "mission.phases=survey"]
+    sets = [*SMALL, "survey.method=information", "survey.worth=0.03", "mission.phases=survey"]
     with SessionReader(record(load_config(None, sets), tmp_path / "survey.mcap").path) as reader:
         ticks, header = list(reader.ticks()), reader.header
     (cut,) = [
