@@ -34,7 +34,10 @@ ROOMS = "vision,estimation,planning,control,refine,flow"
 FLIGHTS = (
     ("chip.name=bifurcation", "simulated.seed=11"),
     ("chip.name=vessels", "chip.seed=12", "simulated.seed=12"),
-    ("chip.name=bifurcation", "simulated.seed=13", "survey.share=1.0", "mission.goal=inlet", "control.method=policy"),
+    (
+        *("chip.name=bifurcation", "simulated.seed=13", "survey.method=downstream", "survey.share=1.0"),
+        *("mission.goal=inlet", "control.method=policy"),
+    ),
 )
 # Numbers that name something, or that only a bench or a training uses.
 NOT_QUANTITIES = ("LENGTH, TRAVEL_TIME, PAPER", "USED, SKIPPED, RESTART", "SIGNS", "LEVELS", "OUTPUTS", "INPUTS")

@@ -14,11 +14,11 @@ import struct
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.conftest import until
 from tests.twins.coils import environment
 
 _ROOT = Path(__file__).parents[2]
@@ -38,10 +38,10 @@ def port() -> Iterator[None]:
         yield
 
 
-def register(address: int, host: str = "127.0.0.1") -> int:
+def register(address: int, host: str = "127.0.0.1", timeout_s: float = 5.0) -> int:
     """A register of a GigE camera, read by the standard's own READREG: by nobody who may have cached it."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        line.settimeout(5.0)
+        line.settimeout(timeout_s)
         line.sendto(struct.pack(">BBHHHI", 0x42, 1, 0x80, 4, 7, address), (host, 3956))
         status, command, _, _, value = struct.unpack(">HHHHI", line.recv(100))
     assert (status, command) == (0, 0x81)
@@ -63,7 +63,7 @@ class Aravis:
         self._command = [PROGRAM, "-i", address, "-s", serial, "-r", str(lost_packets)]
         if shown is not None:
             self._command = [sys.executable, "-m", "tests.twins.gige_images", str(shown), serial]
-        self._speaks = shown is not None
+        self._speaks, self._address = shown is not None, address
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Aravis:
@@ -74,16 +74,21 @@ class Aravis:
         self.unplug()
 
     def plug_in(self) -> None:
-        """Start it; it answers after some hundredths of a second."""
+        """Start it, and wait until it answers."""
         silent = subprocess.DEVNULL
         told = subprocess.PIPE if self._speaks else silent
         self._process = subprocess.Popen(self._command, stdout=told, stderr=silent, cwd=_ROOT, env=environment())
         if self._process.stdout is not None:
             with self._process.stdout:
                 self._process.stdout.readline()
-        else:
-            time.sleep(0.1)
+        until(lambda: self._process is None or self._process.poll() is not None or self._speaks or self._answers())
         assert self._process.poll() is None, f"{PROGRAM} has ended; is port 3956 in use?"
+
+    def _answers(self) -> bool:
+        try:
+            return register(WIDTH, self._address, timeout_s=0.1) > 0
+        except OSError:
+            return False
 
     def unplug(self) -> None:
         """kill -9: nothing is said to anybody."""

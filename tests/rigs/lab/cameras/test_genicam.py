@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,6 +15,7 @@ import pytest
 from flowrec.errors import RigError
 from flowrec.rigs.lab.cameras.camera import Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
+from tests.conftest import until
 from tests.rigs.lab.cameras.watching import absent, adds_up, frames_of, frames_until, rest_of
 from tests.twins.gige import (
     EXPOSURE_US,
@@ -80,13 +82,18 @@ def test_what_aravis_sends_is_handed_on_or_counted_and_the_library_counts_the_sa
     with Aravis(lost_packets) as camera, grabbing(wanted) as (grabber, (driver,)):
         frames_of(grabber, 40)
         camera.freeze()  # nothing is on its way any more
-        rest_of(grabber)
+
+        def all_handed_on() -> bool:
+            rest_of(grabber)
+            assert grabber.losses is not None
+            return bool(driver.stats.frames_complete == grabber.losses.frames + grabber.losses.backlog)
+
+        until(all_handed_on)
         losses, stats = grabber.losses, driver.stats
         camera.thaw()
     assert losses is not None and adds_up(losses)
     assert (losses.incomplete > 0) == (lost_packets > 0)
     # After the last whole frame there may be incomplete ones, which no frame reports.
-    assert stats.frames_complete == losses.frames + losses.backlog
     assert 0 <= stats.frames_incomplete - losses.incomplete <= 5
     assert stats.frames_backpressure == losses.driver
 
@@ -155,11 +162,12 @@ def test_blocks_that_lost_packets_are_known_by_their_ids(port_3956: None) -> Non
 
 def test_a_software_trigger_exposes_one_frame_each(port_3956: None) -> None:
     with FakeGigeCamera(128, 96, 100) as fake:
+        before_ns = time.monotonic_ns()
         with grabbing(replace(WANTED, rate_hz=20.0, trigger="software")) as (grabber, _):
             frames = frames_of(grabber, 8)
         assert fake.software_triggers() >= 8
-    intervals_ms = np.diff([frame.arrival_ns for frame in frames]) / 1e6
-    assert np.median(intervals_ms) > 25.0  # not at the 100 Hz of a camera that runs freely
+    # Not at the 100 Hz of a camera that runs freely.
+    assert all(frame.arrival_ns > before_ns + 50_000_000 * frame.index for frame in frames)
     assert frames[-1].losses.triggers == 0
 
 
