@@ -1,0 +1,34 @@
+"""What a survey and a plan are given of what is known in the tick of their order."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from flowrec.enums import Phase
+from flowrec.estimation import Sampler
+from flowrec.run.route_orders import route, survey_route
+from tests.planning.worlds import robot
+
+
+@pytest.mark.parametrize("limit_hz", [None, 5.0])
+def test_a_survey_and_a_plan_count_on_a_robot_as_slow_as_it_has_stepped_out(limit_hz):
+    given = []
+    pipeline = SimpleNamespace(
+        survey=SimpleNamespace(plan=lambda order: given.append(order.robot)),
+        planner=SimpleNamespace(plan=lambda field, start, goal, chip, able: given.append(able)),
+        mission=SimpleNamespace(survey_limit_s=10.0, lead_s=2.0),
+        refiner=SimpleNamespace(uncertainty=lambda *_: None),
+        **{"robot": robot(600.0), "sampler": Sampler(), "hindsight": None, "solver": None, "chip": None},
+    )
+    tick = SimpleNamespace(
+        estimate=SimpleNamespace(covariance=np.eye(4)),
+        health=SimpleNamespace(limit_hz=limit_hz),
+        **{"field": 1, "assumed": 1, "route": None, "demand": None, "observations": None, "stamp_ns": 0},
+    )
+    mission = SimpleNamespace(phase=Phase.START, start_um=np.zeros(2), goal_um=np.ones(2))
+    survey_route(pipeline, tick, mission)
+    route(pipeline, tick, mission)
+    able = robot(600.0).limited_to(limit_hz)
+    assert [one.speed_limit_um_s for one in given] == [able.speed_limit_um_s] * 2
+    assert (able.speed_limit_um_s < robot(600.0).speed_limit_um_s) is (limit_hz is not None)
