@@ -24,11 +24,12 @@ from flowrec.flow import FlowSolver
 from flowrec.flow.sampling import fluid_image
 from flowrec.messages import FlowField
 from flowrec.ranges import Range
-from flowrec.refine.causes import LOCAL, RESISTANCE, WALLS, WALLS_LONG, Observed
-from flowrec.refine.channel_cells import steepness
+from flowrec.refine.causes import Observed
 from flowrec.refine.discretisation_error import ModelError
+from flowrec.refine.disturbances import held_back
+from flowrec.refine.field_variance import expected_error, field_variance, prior_variance
 from flowrec.refine.findings import PROBABLE, findings
-from flowrec.refine.flow_model import FlowModel, flow_model
+from flowrec.refine.flow_model import flow_model
 from flowrec.refine.hypothesis import (
     Fitted,
     Robust,
@@ -41,6 +42,7 @@ from flowrec.refine.hypothesis import (
     of_the_field,
     outlying,
     robust_noise,
+    shaking_stage,
 )
 from flowrec.refine.mask_variants import mask_variants
 from flowrec.refine.method import Problem
@@ -59,6 +61,8 @@ UNSTATED_SHARE = 0.8  # prior probability that the depth of such a chip does not
 # likelier by up to 4 nats in 30 surveys (error 4 to 36 %); a true one of half a width by 15 to 20, of 0.8 by 0 to 8.
 DEPTH_POWER = 0.5
 OBSTACLE_SHARE = 0.2  # prior probability that some channel is partly blocked, at any one of the tried places
+HELD_SHARE = 0.2  # prior probability that something held the robot for a moment; it may be any one of the
+STRETCH = 4.0  # observations of a moment
 LEAST_WEIGHT = 0.02  # of a hypothesis that is computed to the end
 # In ln evidence: what is farther behind at first sight is not begun. Registration, lines and inertia have then added up
 # to 3.6 more to a depth than to the chip as it is stated (surveys of procedural vessels).
@@ -129,7 +133,8 @@ class Assimilate(PriorSettings):
         FlowError
             If the flow of the fitted parameters can not be computed.
         """
-        problem = replace(problem, operator=problem.operator.distinct())
+        operator = self.with_shaking(problem.operator.distinct(), problem.chip, problem.solver)
+        problem = replace(problem, operator=operator)
         every = self.hypotheses(problem.operator, problem.chip, problem.solver)
         if obstacles and problem.chip.law is None and np.count_nonzero(problem.chip.mask) <= LARGEST_PX:
             drawn = every
@@ -148,9 +153,9 @@ class Assimilate(PriorSettings):
             model = flow_model(self, self.model, chip, solver)
         except FlowError:
             return assumed
-        variance = _prior_variance(model)
+        variance = prior_variance(model)
         std = fluid_image(chip.mask, np.sqrt(variance).astype(np.float32))
-        return replace(assumed, std_um_s=std, error_share=_error_share(model.base, variance))
+        return replace(assumed, std_um_s=std, error_share=expected_error(model.base, variance))
 
     def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:
         """Expected relative RMSE of the assumed flow; None where there is no prior."""
@@ -158,7 +163,13 @@ class Assimilate(PriorSettings):
             model = flow_model(self, self.model, chip, solver)
         except FlowError:
             return None
-        return _error_share(model.base, _prior_variance(model))
+        return expected_error(model.base, prior_variance(model))
+
+    def with_shaking(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> ObservationOperator:
+        """The observations with the shaking of the stage among their disturbances, where they show one."""
+        own = self._observed(chip, chip, operator, solver)
+        found = shaking_stage(own, robust_noise(own))
+        return operator if found is None else replace(operator, disturbances=(*operator.disturbances, found))
 
     def hypotheses(self, operator: ObservationOperator, chip: Chip, solver: FlowSolver) -> Hypotheses:
         """The flows of the plausible hypotheses.
@@ -241,10 +252,17 @@ class Assimilate(PriorSettings):
         if not tried:
             return every
         found = [complete(robust, state, steps) for _, robust, state in tried]
+        robusts = [robust for _, robust, _ in tried]
+        ln_odds_each = [ln_odds] * len(tried)
+        likeliest = tried[int(np.argmax([one.posterior.evidence - outlying(one.robust) for one in found]))][0]
+        held = self._held_back(best, likeliest, problem, steps)
+        if held is not None:
+            found.insert(0, held)
+            robusts.insert(0, held.robust)
+            ln_odds_each.insert(0, float(np.log(HELD_SHARE * STRETCH / max(problem.operator.count, STRETCH))))
         ln_ratio = np.array([one.posterior.evidence - best.posterior.evidence for one in found])
-        # Where observations are averaged, the evidence does not tell how many outliers were left out.
-        ln_ratio -= [outlying(robust) - outlying(best.robust) for _, robust, _ in tried]
-        weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds, 500.0))
+        ln_ratio -= [outlying(robust) - outlying(best.robust) for robust in robusts]
+        weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds_each, 500.0))
         weights = np.concatenate([every.weights, weight])
         # As for depths: of what is not likelier than the chip without it, nothing is left.
         shares = np.concatenate([every.shares, weight * -np.expm1(np.minimum(-ln_ratio, 0.0))])
@@ -255,6 +273,20 @@ class Assimilate(PriorSettings):
             "",
             tuple(obstacle for obstacle, *_ in tried),
         )
+
+    def _held_back(self, best: Fitted, obstacle: Obstacle, problem: Problem, steps: Steps) -> Fitted | None:
+        """The chip without an obstacle, by a robot that was held where it is; None where no observation was near."""
+        time_s = problem.operator.time_s
+        if time_s is None:
+            return None
+        away = best.observed.operator.points - np.array([obstacle.column, obstacle.row])
+        held = held_back(np.hypot(*away.T) <= 2.0 * obstacle.half_width_px, time_s)
+        if held is None:
+            return None
+        operator = replace(problem.operator, disturbances=(*problem.operator.disturbances, held))
+        observed = self._observed(best.observed.model.chip, problem.chip, operator, problem.solver)
+        robust = robust_noise(observed)
+        return complete(robust, begin(observed, robust, steps), steps)
 
     def _observed(self, chip: Chip, stated: Chip, operator: ObservationOperator, solver: FlowSolver) -> Observed:
         """The observations in the model of a chip. A depth that is not stated is known to the spacing of the grid."""
@@ -344,69 +376,9 @@ class Assimilate(PriorSettings):
             viscosity_mpa_s=fitted.viscosity_mpa_s,
             density_kg_m3=fitted.density_kg_m3,
             note=note,
-            error_share=_error_share(mean, variance),
+            error_share=expected_error(mean, variance),
             parameter_names="; ".join(names),
             parameters=values,
             parameter_std=stds,
             viscosity_law=law_text(fitted.law),
         )
-
-
-def field_columns(found: Fitted) -> Floats:
-    """(p, n, 2) um/s per unit of each of the first p unknowns, which are those of the flow."""
-    return _columns(found.observed.model, found.in_use)
-
-
-def field_variance(found: Fitted) -> Floats:
-    """(n, 2) posterior variance of each component of the flow of a hypothesis."""
-    columns = field_columns(found)
-    values, vectors = np.linalg.eigh(found.posterior.covariance[: len(columns), : len(columns)])
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
-    spread = np.tensordot(root.T, columns, axes=1)
-    return np.asarray((spread**2).sum(axis=0) + left_variance(found))
-
-
-def left_variance(found: Fitted) -> Floats:
-    """(n, 2) the part of it that no unknown explains: the error of the grid, and of the profile beside walls."""
-    names, model = [effect.name for effect in found.effects], found.observed.model
-    local, walls = (float(found.posterior.square_sizes[names.index(name)]) for name in ("local", "walls"))
-    return _left(model, found.in_use, local, walls)
-
-
-def _columns(model: FlowModel, flow: Floats) -> Floats:
-    """(p, n, 2) of the unknowns of the flow: boundary values and fluid, resistances, walls."""
-    sections = model.cells.toarray()[:, :, None] * flow
-    walls = -WALLS_LONG * model.widening[:, None, None] * (3.0 * model.resistance + sections)
-    return np.concatenate([model.known, model.resistance, walls])
-
-
-def prior_of(model: FlowModel) -> tuple[Floats, Floats]:
-    """Columns (p, n, 2) of the unknowns of the flow, and their covariance (p, p) before any observation."""
-    cells = len(model.resistance)
-    sizes = np.repeat([1.0, RESISTANCE[0], WALLS[0]], [len(model.known), cells, cells])
-    return _columns(model, model.base), np.diag(sizes**2)
-
-
-def _prior_variance(model: FlowModel) -> Floats:
-    """(n, 2) variance of each component of the flow before any observation."""
-    columns, covariance = prior_of(model)
-    variance = (np.diag(covariance)[:, None, None] * columns**2).sum(axis=0)
-    return np.asarray(variance + prior_left_variance(model))
-
-
-def prior_left_variance(model: FlowModel) -> Floats:
-    """(n, 2) `left_variance` before any observation."""
-    return _left(model, model.base, LOCAL[0] ** 2, WALLS[0] ** 2)
-
-
-def _left(model: FlowModel, flow: Floats, local: float, walls: float) -> Floats:
-    """(n, 2) the same for squared sizes of the grid's error and of walls that are off, as no cell explains them."""
-    wider = (model.widening @ model.cells)[:, None] * flow
-    beside = steepness(model.chip.mask, flow) ** 2 + (1.0 - WALLS_LONG**2) * wider**2
-    return np.asarray(local * model.error_std[:, None] ** 2 + walls * beside)
-
-
-def _error_share(flow: Floats, variance: Floats) -> float:
-    """Expected relative RMSE of a mean flow (n, 2) whose components have a variance (n, 2)."""
-    total = float(variance.sum())
-    return float(np.sqrt(total / max(float((flow**2).sum()) + total, 1e-300)))

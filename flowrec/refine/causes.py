@@ -64,6 +64,7 @@ WANDER_S = (2.0, 20.0)  # correlation times: one effect each
 ROLLING = (0.02, 0.7)  # of the own motion: a roller's course and speed vary by that much, over `ROLLING_S`
 ROLLING_S = 1.0
 LINE = (0.04, 1.3)  # amplitude of a spectral line
+DISTURBED = (3.0, 1.0)  # of a disturbance that was noticed, in typical stated standard deviations of an observation
 NEIGHBOURHOOD_PX = 6.0  # over which the correlation of the model's local error falls to 1 / e
 SLOWEST_HZ = 0.05  # of a line
 LINE_STEP = 0.2  # of the frequencies that are tried, over the time that was observed: finer than its resolution
@@ -196,6 +197,8 @@ class Observed:
                 found.append(Effect("rolling", *ROLLING, none, sum(pushed) * np.exp(-apart / ROLLING_S)))
             if line_hz is not None:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
+        noise = float(np.median(here.std_um_s))
+        found += [_effect(name, (DISTURBED[0] * noise, DISTURBED[1]), every) for name, every in here.disturbances]
         return found
 
     def _carried(self, v: Floats, flow: Floats) -> list[Effect]:

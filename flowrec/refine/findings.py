@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowrec.refine.causes import LINE_NAME, WANDER_S
+from flowrec.refine.disturbances import SHAKE
 from flowrec.refine.hypothesis import Fitted
 from flowrec.refine.observation_operator import Floats
 
@@ -101,6 +102,12 @@ def _values(one: Fitted) -> dict[str, tuple[float, float]]:
         std = float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
         result[f"pump_{one.line_hz:.2f}_hz_share"] = (amplitude, std)
     names = [effect.name for effect in one.effects]
+    for name in names:
+        if name.startswith(SHAKE):
+            mean, covariance = one.unknowns(name)
+            amplitude = float(np.linalg.norm(mean))
+            std = float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
+            result[f"{name.replace(' ', '_')}_um_s"] = (amplitude, std)
     sizes = {"walls_px": ["walls"], "resistance_share": ["resistance"]}
     sizes["wander_share"] = [f"wander {length:g} s" for length in WANDER_S]
     for name, effects in sizes.items():
@@ -137,6 +144,8 @@ def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: fl
     for name in values:
         if name.startswith("viscosity_"):
             words.append(f"{name.replace('_', ' ')} {values[name]:.3g} +- {stds[name]:.2g}")
+        if name.startswith(SHAKE):
+            words.append(f"the image shakes at {name.split('_')[1]} Hz")
         if name.startswith("pump_") and values[name] > SURE * stds[name]:
             hz = name.split("_")[1]
             words.append(f"the pump pulsates by {100.0 * values[name]:.0f} +- {100.0 * stds[name]:.0f} % at {hz} Hz")

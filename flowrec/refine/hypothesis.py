@@ -8,9 +8,10 @@ import numpy as np
 
 from flowrec.flow.sensitivities import Remainder
 from flowrec.refine.causes import CURVED, RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
+from flowrec.refine.disturbances import likeliest_hz, shaking
 from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes
 from flowrec.refine.mixture_regression import Model
-from flowrec.refine.observation_operator import Floats, ObservationOperator
+from flowrec.refine.observation_operator import Disturbance, Floats, ObservationOperator
 
 MOST_OBSERVATIONS = 120  # of which the evidence is computed: more are first averaged along the way
 LEAST_STD = 1e-3  # of the typical observed speed: no observation is more accurate
@@ -30,6 +31,8 @@ DOUBTED = (
 )
 FAR_PX = 0.5  # by which an observation is moved at least: over less, the flow is linear
 WORTH_A_LINE = 4.0  # in ln evidence, for a spectral line at the best of some fifty independent frequencies
+NOISIER = 1.3  # than stated, from where on a shaking stage is looked for
+WORTH_A_SHAKE = 8.0  # in ln evidence, at the best of some hundred independent frequencies
 LINE_TRIALS = (0.03, 0.1, 0.3)  # amplitudes at which frequencies are compared
 FIELD_EFFECTS = (
     "boundary",
@@ -157,13 +160,31 @@ def robust_noise(observed: Observed) -> Robust:
 
 
 def outlying(robust: Robust) -> float:
-    """By how much more ln likelihood observations have that are no outliers; 0 where the evidence counts that itself.
+    """What the evidence of a hypothesis has to lose for its outliers, in nats.
 
-    It does so for each observation that is not averaged with others.
+    Of observations that are not averaged with others, the evidence itself loses too much: an outlier has the noise that
+    makes it harmless, not that of outliers.
     """
-    if len(robust.inlier) <= MOST_OBSERVATIONS:
-        return 0.0
-    return OUTLIER_NATS * float((1.0 - robust.inlier).sum())
+    nats = OUTLIER_NATS * float((1.0 - robust.inlier).sum())
+    return nats if len(robust.inlier) > MOST_OBSERVATIONS else nats + float(np.log(robust.inlier).sum())
+
+
+def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
+    """A stage that shakes, where observations scatter more than they state and one frequency explains that."""
+    here, base = observed.operator, observed.model.base
+    if here.time_s is None or robust.factor < NOISIER:
+        return None
+    nothing = np.zeros_like(base)
+    evidence = _evidence(observed, robust, nothing, base, None)
+    sizes = evidence.sizes()
+    hz = likeliest_hz(evidence, sizes, _averages(robust, here), here.time_s, float(np.median(here.std_um_s)))
+    if hz is None:
+        return None
+    found = shaking(hz, here.time_s)
+    shaken = replace(observed, operator=replace(here, disturbances=(*here.disturbances, found)))
+    calmer = robust_noise(shaken)
+    after = _evidence(shaken, calmer, nothing, base, None).sizes().evidence - outlying(calmer)
+    return found if after > sizes.evidence - outlying(robust) + WORTH_A_SHAKE else None
 
 
 def noise_variance(operator: ObservationOperator) -> Floats:

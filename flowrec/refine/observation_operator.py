@@ -12,6 +12,7 @@ from flowrec.interpolation import cells_at, nearest_pixels
 from flowrec.messages import Observations
 
 Floats = NDArray[np.float64]
+Disturbance = tuple[str, Floats]  # name, and (p, n, 2) what 1 um/s of each unknown adds to observations, whatever flows
 
 TAIL = 4.0  # degrees of freedom of the observations' Student-t noise
 RELATIVE_NOISE = 0.03  # of the measured speed, in addition to its std: what pixels can not represent
@@ -31,6 +32,7 @@ class ObservationOperator:
     rolled_um_s: Floats | None = None  # (n, 2) the robot's own motion; None: not stated, see Observations
     time_s: Floats | None = None  # (n,)
     radius_px: float | None = None  # of the robot; None: not stated
+    disturbances: tuple[Disturbance, ...] = ()  # see disturbances.py
 
     @property
     def count(self) -> int:

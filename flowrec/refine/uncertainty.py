@@ -10,17 +10,10 @@ from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
 from flowrec.flow.uncertainty import FlowUncertainty, Registration
-from flowrec.refine.assimilate import (
-    OBSTACLE_SHARE,
-    Assimilate,
-    Hypotheses,
-    field_columns,
-    left_variance,
-    prior_left_variance,
-    prior_of,
-)
+from flowrec.refine.assimilate import OBSTACLE_SHARE, Assimilate, Hypotheses
 from flowrec.refine.causes import GAIN
 from flowrec.refine.doubts import doubted_places
+from flowrec.refine.field_variance import field_columns, left_variance, prior_left_variance, prior_of
 from flowrec.refine.flow_model import flow_model
 from flowrec.refine.hypothesis import NOISE, Fitted
 from flowrec.refine.observation_operator import Floats, ObservationOperator
@@ -43,6 +36,7 @@ def flow_uncertainty(
             left = _error_std(prior_left_variance(model))
             return FlowUncertainty(model.base, columns, rolled, _joined(covariance, np.diag([GAIN[0] ** 2])), left)
         # The pixels of a chip with other walls are not those of the chip.
+        operator = settings.with_shaking(operator, chip, solver)
         every = replace(settings, doubt_walls=False).hypotheses(operator, chip, solver)
     except FlowError:
         return None

@@ -11,6 +11,7 @@ from flowrec.flow import sample
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
 from flowrec.refine.causes import Observed
+from flowrec.refine.disturbances import held_back
 from flowrec.refine.flow_model import flow_model
 from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.sphere_between_walls import SphereBetweenWalls
@@ -128,6 +129,30 @@ def test_the_distance_to_a_wall_is_that_of_the_chip(twin):
     observed = Observed.of(model, operator)
     assert observed.least_px == pytest.approx(2.5, abs=0.1)
     assert observed.near == pytest.approx([1.0, np.exp(-1.0 / 1.25)], abs=0.05)
+
+
+def test_a_stage_that_shakes_is_found_and_the_flow_is_that_without_it(twin):
+    case = twin()
+    observed = flown(case)
+    assert "shake" not in SETTINGS.refine(case.assumed, observed, case.chip, case.solver).parameter_names
+    sway = np.outer(np.cos(2.0 * np.pi * 1.3 * observed.time_s + 0.4), [60.0, -100.0])
+    shaken = replace(observed, flow_um_s=observed.flow_um_s + sway)
+    refined = SETTINGS.refine(case.assumed, shaken, case.chip, case.solver)
+    assert "the image shakes at 1.3" in refined.note
+    name = next(name for name in refined.parameter_names.split("; ") if name.startswith("shake"))
+    assert found(refined, name)[0] == pytest.approx(np.hypot(60.0, 100.0), rel=0.1)
+    assert case.error(refined) < 0.04
+
+
+def test_a_robot_that_was_held_is_another_unknown_in_each_stretch_of_time():
+    time_s, near = 0.15 * np.arange(40), np.isin(np.arange(40), (5, 6, 7, 30))
+    _, columns = held_back(near, time_s)
+    assert columns.shape == (12, 40, 2)  # the same, coming and going, changing sign: along two axes, in two stretches
+    first, other = (columns[start, :, 0] for start in (0, 3))
+    assert first[5:8] == pytest.approx(1.0) and other[30] == pytest.approx(1.0)
+    assert first[[3, 9]] == pytest.approx(np.exp(-0.5 * 2.0**2))
+    assert np.abs(first[20:]).max() < 1e-9 and np.abs(other[:20]).max() < 1e-9
+    assert held_back(np.zeros(40, bool), time_s) is None
 
 
 def test_a_sphere_between_walls_follows_published_limits():
