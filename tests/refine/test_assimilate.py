@@ -10,8 +10,8 @@ from flowrec.flow import FlowSolver, sample
 from flowrec.flow.linear_solver import clear_cache
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner, causes
-from flowrec.refine.field_variance import field_columns
 from flowrec.refine.discretisation_error import ModelError
+from flowrec.refine.field_variance import field_columns
 from flowrec.refine.hypothesis import of_the_field
 from flowrec.refine.observation_operator import observation_operator
 
