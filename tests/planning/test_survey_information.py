@@ -9,6 +9,7 @@ import pytest
 from flowrec.chip.chip import Opening
 from flowrec.flow.uncertainty import Doubts, FlowUncertainty, Registration
 from flowrec.interpolation import nearest_pixels
+from flowrec.messages import Observations
 from flowrec.planning.survey import SurveyPlanner
 from flowrec.planning.survey_design import Looks, Need, Sampling, SurveyOrder, covariance_after
 from tests.planning.worlds import PX, chip_of, field_of, length_um, robot
@@ -220,17 +221,21 @@ def test_where_the_image_is_off_the_stretch_runs_where_the_camera_shows_the_chan
     # x - scale (x - c) - angle J (x - c), where J turns (10, 0) to (0, 10)
     right = off.on_chip(np.array([[710.0, 400.0]]))[0] - off.on_chip(np.array([[700.0, 400.0]]))[0]
     np.testing.assert_allclose(right, [10.0 * (1.0 - 0.02), -10.0 * 0.01])
-    straight = planner().plan(ordered(chip, field, doubt))
-    start = off.measured(np.array([STEM]))[0]
-    moved = planner().plan(ordered(chip, field, replace(doubt, registration=off), start=start))
-    np.testing.assert_allclose(off.on_chip(moved.waypoints_um), straight.waypoints_um, atol=1e-6)
-    np.testing.assert_allclose(moved.waypoints_um[0], start)
-    again = ordered(
-        *(chip, field, replace(doubt, registration=off), moved.waypoints_um[-1]), present=moved, progress_s=0.0
-    )
-    longer = planner().plan(again)
-    np.testing.assert_array_equal(longer.waypoints_um[: len(moved.waypoints_um)], moved.waypoints_um)
-    assert promised(longer)[0] == pytest.approx(promised(moved)[1], rel=0.1)
+    seen = np.column_stack([np.full(24, 445.0), np.arange(130.0, 370.0, 10.0)])
+
+    def two_stretches(registration, measured):
+        looks = Observations(0, measured(seen), np.ones((24, 2)), np.full(24, 2.0))
+        known = {"uncertainty": replace(doubt, registration=registration), "observations": looks}
+        first = planner().plan(ordered(chip, field, start=measured(np.array([STEM]))[0], **known))
+        present = {"present": first, "progress_s": 0.0}
+        return first, planner().plan(ordered(chip, field, start=first.waypoints_um[-1], **present, **known))
+
+    straight = two_stretches(Registration.stated(), np.copy)
+    first, second = two_stretches(off, off.measured)
+    for moved, still in zip((first, second), straight, strict=True):
+        np.testing.assert_allclose(off.on_chip(moved.waypoints_um)[[0, -1]], still.waypoints_um[[0, -1]], atol=1e-6)
+    np.testing.assert_allclose(second.stretches, straight[1].stretches, rtol=1e-3)
+    np.testing.assert_array_equal(second.waypoints_um[: len(first.waypoints_um)], first.waypoints_um)
 
 
 def doubted(chip, field, *columns, probability=0.15):
