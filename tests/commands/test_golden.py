@@ -1,9 +1,9 @@
 """The golden sessions: recorded once by a release, replayed by every version since.
 
-The numerics of the first are version 1, in which the velocities of a flow field were means over pixels. All that its loop and its
-planner made of the recorded inputs, fields included, is still computed to the last digit; of the two fields
-themselves, the flow behind them is still the same. The second, of the moderate world, has a survey by information,
-stretch by stretch, and numerics version 3.
+The numerics of the first are version 1, in which the velocities of a flow field were means over pixels. All that its
+loop and its planner made of the recorded inputs, fields included, is still computed to the last digit; of the two
+fields themselves, the flow behind them is still the same. The second, of the moderate world, has a survey by
+information, stretch by stretch, and numerics version 3.
 """
 
 from __future__ import annotations
