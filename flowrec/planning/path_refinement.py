@@ -21,9 +21,9 @@ from flowrec.system.numba_setup import compiled
 
 Points = NDArray[np.float64]
 SPACING_PX = 1.5  # of the points of a path
-_LONGEST_CHORD_PX = 12.0
+_LONGEST_CHORD_PX = 12.0  # a straight piece that replaces points of a path: a channel's width or so
 _WIDEST_BUMP_PX = 48.0  # half width
-_SWEEPS = 12
+_SWEEPS = 12  # of a width at most: nearly always the height of the bump is too small to matter before
 
 
 def refined_route(

@@ -18,7 +18,7 @@ Points = NDArray[np.float64]
 
 # A mask does not locate a wall better than this; an end of a route is not refused for less.
 _WALL_TOLERANCE_PX = 0.5
-_NEAR_PX = 2.0
+_NEAR_PX = 2.0  # nodes so near to an end may be left out: a diagonal and a half
 
 
 @dataclass(frozen=True, slots=True, eq=False)

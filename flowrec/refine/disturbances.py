@@ -24,6 +24,7 @@ STEP = 0.2  # of the frequencies that are tried, over the time that was observed
 MOST = 2000
 TRIALS = (1.0, 3.0, 10.0)  # amplitudes at which frequencies are compared, in typical standard deviations of the noise
 ALIKE = 1.0  # in ln evidence
+# Assumptions: an observation every fifth of a second is usual, and a robot that slips does so for a second or less.
 STRETCH_S = 0.6  # observations of one stretch of time follow each other at least so soon
 FADES_S = 0.15  # by which such a stretch ends softly
 
