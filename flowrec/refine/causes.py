@@ -64,6 +64,11 @@ WANDER_S = (2.0, 20.0)  # correlation times: one effect each
 ROLLING = (0.02, 0.7)  # of the own motion: a roller's course and speed vary by that much, over `ROLLING_S`
 ROLLING_S = 1.0  # correlation time: as long as a roller needs for some ten revolutions
 LINE = (0.04, 1.3)  # amplitude of a spectral line
+AS_STATED = 0.1  # of these sizes, for a chip that is as drawn and a robot and a camera that are as calibrated
+_STATED = (
+    *("resistance", "walls", "offset", "scale", "angle"),
+    *("gain", "heading", "hindrance", "carry", "curved", "sphere"),
+)
 DISTURBED = (3.0, 1.0)  # of a disturbance that was noticed, in typical stated standard deviations of an observation
 NEIGHBOURHOOD_PX = 6.0  # over which the correlation of the model's local error falls to 1 / e
 SLOWEST_HZ = 0.05  # of a line
@@ -89,6 +94,7 @@ class Observed:
     um_per_px: float
     stated: ObservationOperator  # where the registration puts the observations
     moved: Floats  # (n, 2) px from there to where the flow is read, by the registration in use
+    usual: float = 1.0  # sizes of the effects in _STATED, over what is usual
 
     @classmethod
     def of(cls, model: FlowModel, operator: ObservationOperator, moved: Floats | None = None) -> Observed:
@@ -120,7 +126,7 @@ class Observed:
         """The same observations where a registration (4,) has them: offset x and y in px, scale, angle in rad."""
         away = self.away
         moved = np.asarray(registration[:2] - registration[2] * away - registration[3] * _turned(away))
-        return Observed.of(self.model, self.stated, moved)
+        return replace(Observed.of(self.model, self.stated, moved), usual=self.usual)
 
     @property
     def away(self) -> Floats:
@@ -199,7 +205,9 @@ class Observed:
                 found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
         noise = float(np.median(here.std_um_s))
         found += [_effect(name, (DISTURBED[0] * noise, DISTURBED[1]), every) for name, every in here.disturbances]
-        return found
+        return [
+            replace(effect, median=self.usual * effect.median) if effect.name in _STATED else effect for effect in found
+        ]
 
     def _carried(self, v: Floats, flow: Floats) -> list[Effect]:
         """How a flow (n, 2), which is v (n, 2) at the observations, carries a robot of finite size."""

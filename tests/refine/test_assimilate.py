@@ -9,7 +9,7 @@ from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver, sample
 from flowrec.flow.linear_solver import clear_cache
 from flowrec.messages import Observations
-from flowrec.refine import Assimilate, Refiner, causes
+from flowrec.refine import Assimilate, Refiner, assimilate, causes
 from flowrec.refine.discretisation_error import ModelError
 from flowrec.refine.field_variance import field_columns
 from flowrec.refine.hypothesis import of_the_field
@@ -182,6 +182,7 @@ def test_many_observations_in_one_square_say_no_more_of_the_model_than_one_and_i
 ):
     # The stem is 8 px wide; where the observations' own noise is far below the model's error only that counts.
     monkeypatch.setattr(causes, "LOCAL", (1.0, 1e-3))
+    monkeypatch.setattr(assimilate, "AS_STATED_SHARE", 1e-9)
     case = twin()
     settings = Assimilate(model=ModelError(coarse_share=0.1), doubt_walls=False)
 
@@ -198,6 +199,22 @@ def test_many_observations_in_one_square_say_no_more_of_the_model_than_one_and_i
     squares = posterior_std(range(2, 14, 4), range(20, 28))
     assert square > 0.6 * one
     assert squares < 0.6 * one
+
+
+def test_that_nothing_differs_but_the_boundary_values_is_believed_by_evidence_alone(twin):
+    points = 10.0 * np.array([[x, y] for x in (4, 12, 20, 45, 70) for y in (22, 24, 26)], float)
+    operator = {}
+    for name, slip in (("as stated", 0.0), ("slips", 0.2)):
+        case = twin(truth=np.array([130.0, 0.0, 0.0]))
+        rng = np.random.default_rng(3)
+        rolled = 150.0 * np.stack([np.cos(np.arange(15.0)), np.sin(np.arange(15.0))], axis=1)
+        flow = sample(case.true, points) - slip * rolled + 0.5 * rng.standard_normal(points.shape)
+        made = Observations(0, points, flow, np.full(len(points), 0.5), rolled, np.arange(15.0))
+        operator[name] = observation_operator(made, case.chip.mask, case.chip.um_per_px, case.assumed.wall_px)
+    for name, likely in (("as stated", True), ("slips", False)):
+        every = Assimilate().hypotheses(operator[name], case.chip, case.solver)
+        stated = sum(weight for one, weight in zip(every.found, every.weights, strict=True) if one.observed.usual < 1.0)
+        assert (stated > 0.5) == likely, name
 
 
 @pytest.mark.parametrize("which", ["one", "two that contradict", "std of 0", "huge std"])
