@@ -346,6 +346,10 @@ class MissionStateMachine:
         if previous.request - previous.routine_orders >= self.orders_limit:
             note = f"blown off every one of {previous.request} routes and maps: the robot can not be held here"
             return finish(previous, now, Outcome.GAVE_UP, note)
+        # Another route from here would be the same.
+        if stuck and math.dist(now.estimate.position_um, previous.start_um) <= 2.0 * now.robot.radius_um:
+            note = "stuck where its route begins: something that is not on the map is in the way"
+            return finish(previous, now, Outcome.GAVE_UP, note)
         off = f"{now.demand.error_um:.0f} um off the route"
         note = f"stuck {off}" if stuck else f"blown {off}"
         return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, f"{note}: planning anew")

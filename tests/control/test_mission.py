@@ -401,10 +401,17 @@ def test_a_robot_that_is_stuck_on_the_way_gets_a_new_route_and_one_that_is_slow_
     for error_um, wanted in ((140.0, "route"), (110.0, "")):
         world = navigating(stuck_s=0.5, reassimilate_observations=0)
         for _ in range(8):
-            mission = world.tick(at=(200.0, 500.0), progress=1.0, error_um=error_um)
+            mission = world.tick(at=(300.0, 500.0), progress=1.0, error_um=error_um)
         assert mission.wanted == wanted
         assert mission.finished is False
         assert mission.note == ("stuck 140 um off the route: planning anew" if wanted else "")
+    world = navigating(stuck_s=0.5, reassimilate_observations=0)
+    assert world.mission is not None
+    x_um, y_um = world.mission.start_um
+    for _ in range(8):
+        mission = world.tick(at=(x_um + 60.0, y_um), progress=1.0, error_um=140.0)
+    assert mission.outcome == "gave up"
+    assert "where its route begins" in mission.note
 
 
 def test_on_the_way_the_map_is_refined_again_after_some_observations_and_then_the_route_is_asked_for_anew() -> None:
