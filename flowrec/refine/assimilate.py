@@ -201,8 +201,8 @@ class Assimilate(PriorSettings):
         begun = []
         for other, usual, share in cases:
             with suppress(FlowError):  # a depth whose flow can not be computed
-                observed = replace(self._observed(other, chip, operator, solver), usual=usual)
-                begun.append((begin(observed, robust, steps), np.log(share)))
+                observed = own if other is chip else self._observed(other, chip, operator, solver)
+                begun.append((begin(replace(observed, usual=usual), robust, steps), np.log(share)))
         ln_weight = np.array([DEPTH_POWER * state.sizes.evidence + ln_prior for state, ln_prior in begun])
         best = begun[int(np.argmax(ln_weight))]
         if self.doubt_walls and small and doubtful(best[0].evidence, best[0].sizes):
@@ -260,16 +260,14 @@ class Assimilate(PriorSettings):
         if not tried:
             return every
         found = [complete(robust, state, steps) for _, robust, state in tried]
-        robusts = [robust for _, robust, _ in tried]
         ln_odds_each = [ln_odds] * len(tried)
         likeliest = tried[int(np.argmax([one.posterior.evidence - outlying(one.robust) for one in found]))][0]
         held = self._held_back(best, likeliest, problem, steps)
         if held is not None:
             found.insert(0, held)
-            robusts.insert(0, held.robust)
             ln_odds_each.insert(0, float(np.log(HELD_SHARE * STRETCH / max(problem.operator.count, STRETCH))))
         ln_ratio = np.array([one.posterior.evidence - best.posterior.evidence for one in found])
-        ln_ratio -= [outlying(robust) - outlying(best.robust) for robust in robusts]
+        ln_ratio -= [outlying(one.robust) - outlying(best.robust) for one in found]
         weight = every.weights.max() * np.exp(np.minimum(ln_ratio + ln_odds_each, 500.0))
         weights = np.concatenate([every.weights, weight])
         # As for depths: of what is not likelier than the chip without it, nothing is left.

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowrec.refine.evidence import Evidence, Sizes
+from flowrec.refine.evidence import Evidence, Sizes, gains_of_trials
 from flowrec.refine.observation_operator import Disturbance, Floats
 
 SHAKE = "shake"
@@ -68,18 +68,8 @@ def likeliest_hz(evidence: Evidence, sizes: Sizes, average: Floats, time_s: Floa
         return None
     scaled = zip(evidence.effects, sizes.mode, strict=True)
     base = evidence.noise + sum(np.exp(2.0 * ln_size) * effect.matrix for effect, ln_size in scaled)
-    inverse = np.linalg.inv(base)
-    solved = inverse @ evidence.y
-    gains = np.empty(len(frequencies))
-    for index, hz in enumerate(frequencies):
-        columns = shaking(float(hz), time_s)[1].reshape(4, -1) @ average.T
-        precision, score = columns @ inverse @ columns.T, columns @ solved
-        each = []
-        for trial in TRIALS:
-            inner = np.eye(4) + (trial * noise_um_s) ** 2 * precision
-            explained = float(score @ np.linalg.solve(inner, score))
-            each.append(0.5 * (trial * noise_um_s) ** 2 * explained - 0.5 * float(np.linalg.slogdet(inner)[1]))
-        gains[index] = np.logaddexp.reduce(each)
+    columns = np.stack([shaking(float(hz), time_s)[1].reshape(4, -1) @ average.T for hz in frequencies])
+    gains = gains_of_trials(columns, base, evidence.y, [trial * noise_um_s for trial in TRIALS])
     # Of aliases, which explain the same, the slowest.
     peak = (gains >= np.append(gains[1:], -np.inf)) & (gains >= np.append(-np.inf, gains[:-1]))
     return float(frequencies[np.flatnonzero(peak & (gains > gains.max() - ALIKE))[0]])

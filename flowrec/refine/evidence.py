@@ -177,6 +177,22 @@ class Evidence:
         return value - 0.5 * len(self.y) * np.log(2.0 * np.pi), gradient
 
 
+def gains_of_trials(columns: Floats, covariance: Floats, y: Floats, sizes: Sequence[float]) -> Floats:
+    """(k,) ln evidence gained by each of k effects on top of what else may explain y, of covariance (m, m).
+
+    `columns` (k, unknowns, m); summed over trial sizes.
+    """
+    inverse = np.linalg.inv(covariance)
+    precision = columns @ inverse @ columns.transpose(0, 2, 1)
+    score = columns @ (inverse @ y)
+    gains = []
+    for size in sizes:
+        inner = np.eye(columns.shape[1]) + size**2 * precision
+        explained = (score * np.linalg.solve(inner, score[..., None])[..., 0]).sum(axis=1)
+        gains.append(0.5 * size**2 * explained - 0.5 * np.linalg.slogdet(inner)[1])
+    return np.asarray(np.logaddexp.reduce(gains, axis=0))
+
+
 def _points(dimensions: int) -> Floats:
     """(POINTS or more, dimensions) corners of a cube, +1 and -1: mean and covariance are those of a standard normal.
 

@@ -98,16 +98,11 @@ def _values(one: Fitted) -> dict[str, tuple[float, float]]:
         result[f"offset_{axis}_um"] = (px * float(mean[index]), px * float(np.sqrt(covariance[index, index])))
     mean, covariance = one.unknowns(LINE_NAME)
     if len(mean) and one.line_hz is not None:
-        amplitude = float(np.hypot(*mean))
-        std = float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
-        result[f"pump_{one.line_hz:.2f}_hz_share"] = (amplitude, std)
+        result[f"pump_{one.line_hz:.2f}_hz_share"] = _amplitude(mean, covariance)
     names = [effect.name for effect in one.effects]
     for name in names:
         if name.startswith(SHAKE):
-            mean, covariance = one.unknowns(name)
-            amplitude = float(np.linalg.norm(mean))
-            std = float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
-            result[f"{name.replace(' ', '_')}_um_s"] = (amplitude, std)
+            result[f"{name.replace(' ', '_')}_um_s"] = _amplitude(*one.unknowns(name))
     sizes = {"walls_px": ["walls"], "resistance_share": ["resistance"]}
     sizes["wander_share"] = [f"wander {length:g} s" for length in WANDER_S]
     for name, effects in sizes.items():
@@ -118,6 +113,12 @@ def _values(one: Fitted) -> dict[str, tuple[float, float]]:
             std = float(np.sqrt(((size**2 * one.posterior.ln_size_std[chosen]) ** 2).sum())) / max(total, 1e-12)
             result[name] = (total, std)
     return result
+
+
+def _amplitude(mean: Floats, covariance: Floats) -> tuple[float, float]:
+    """Amplitude of a wave with the unknowns (k,), and its standard deviation."""
+    amplitude = float(np.hypot.reduce(mean))
+    return amplitude, float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
 
 
 def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float) -> list[str]:

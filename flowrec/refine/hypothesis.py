@@ -9,7 +9,7 @@ import numpy as np
 from flowrec.flow.sensitivities import Remainder
 from flowrec.refine.causes import CURVED, RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
 from flowrec.refine.disturbances import likeliest_hz, shaking
-from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes
+from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes, gains_of_trials
 from flowrec.refine.mixture_regression import Model
 from flowrec.refine.observation_operator import Disturbance, Floats, ObservationOperator
 
@@ -174,8 +174,7 @@ def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
     here, base = observed.operator, observed.model.base
     if here.time_s is None or robust.factor < NOISIER:
         return None
-    nothing = np.zeros_like(base)
-    evidence = _evidence(observed, robust, nothing, base, None)
+    evidence = _evidence(observed, robust, np.zeros_like(base), base, None)
     sizes = evidence.sizes()
     hz = likeliest_hz(evidence, sizes, _averages(robust, here), here.time_s, float(np.median(here.std_um_s)))
     if hz is None:
@@ -183,7 +182,7 @@ def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
     found = shaking(hz, here.time_s)
     shaken = replace(observed, operator=replace(here, disturbances=(*here.disturbances, found)))
     calmer = robust_noise(shaken)
-    after = _evidence(shaken, calmer, nothing, base, None).sizes().evidence - outlying(calmer)
+    after = first_evidence(shaken, calmer) - outlying(calmer)
     return found if after > sizes.evidence - outlying(robust) + WORTH_A_SHAKE else None
 
 
@@ -365,12 +364,4 @@ def _line_hz(observed: Observed, robust: Robust, evidence: Evidence, sizes: Size
     weighted = average * observed.operator.predict(observed.model.base).ravel()  # (m, 2 n): times a wave, its column
     phase = np.repeat(2.0 * np.pi * frequencies[:, None] * time_s, 2, axis=1)
     columns = np.stack([np.cos(phase), np.sin(phase)], axis=1) @ weighted.T  # (k, 2, m)
-    inverse = np.linalg.inv(base)
-    precision = columns @ inverse @ columns.transpose(0, 2, 1)
-    score = columns @ (inverse @ evidence.y)
-    gains = []
-    for amplitude in LINE_TRIALS:
-        inner = np.eye(2) + amplitude**2 * precision
-        explained = (score * np.linalg.solve(inner, score[..., None])[..., 0]).sum(axis=1)
-        gains.append(0.5 * amplitude**2 * explained - 0.5 * np.linalg.slogdet(inner)[1])
-    return float(frequencies[int(np.argmax(np.logaddexp.reduce(gains, axis=0)))])
+    return float(frequencies[int(np.argmax(gains_of_trials(columns, base, evidence.y, LINE_TRIALS)))])
