@@ -268,6 +268,8 @@ def test_observations_are_spaced_out_and_honest_about_their_noise() -> None:
     assert len(rows.position_um) > 25
     ways = np.linalg.norm(np.diff(rows.position_um, axis=0), axis=1)
     assert ways.min() >= sampler.spacing_radii * ROBOT.radius_um * 0.999
+    assert rows.radius_um == ROBOT.radius_um, "the flow carries it as a sphere of this size"
+    assert Sampler(method="trimmed").treat(rows).radius_um == ROBOT.radius_um
     true = 0.2 * across(rows.position_um)
     pulls = (rows.flow_um_s - true) / rows.std_um_s[:, None]
     assert np.sqrt(np.mean(np.square(pulls[5:]))) < 1.5

@@ -89,6 +89,7 @@ def test_the_smoother_is_better_than_the_filter_and_honest_about_it():
         late = slice(60, None)
         gains.append(np.std((smoothed.flow_um_s - truth)[late]) / np.std((np.array(filtered) - truth)[late]))
         observed = observe(smoothed, ROBOT)
+        assert observed.radius_um == ROBOT.radius_um, "the flow carries it as a sphere of this size"
         at = [int(np.argmin(np.abs(smoothed.position_um - point).sum(axis=1))) for point in observed.position_um]
         pulls.append((observed.flow_um_s - truth[at]) / observed.std_um_s[:, None])
         assert len(at) > 20

@@ -11,7 +11,8 @@ from flowrec.flow import sample
 from flowrec.messages import Observations
 from flowrec.refine import Assimilate, Refiner
 from flowrec.refine.causes import Observed
-from flowrec.refine.disturbances import held_back
+from flowrec.refine.disturbances import frequencies_hz, held_back, likeliest_hz, shaking
+from flowrec.refine.evidence import Effect, Evidence
 from flowrec.refine.flow_model import flow_model
 from flowrec.refine.observation_operator import observation_operator
 from flowrec.refine.sphere_between_walls import SphereBetweenWalls
@@ -142,6 +143,21 @@ def test_a_stage_that_shakes_is_found_and_the_flow_is_that_without_it(twin):
     name = next(name for name in refined.parameter_names.split("; ") if name.startswith("shake"))
     assert found(refined, name)[0] == pytest.approx(np.hypot(60.0, 100.0), rel=0.1)
     assert case.error(refined) < 0.04
+
+
+def test_of_frequencies_that_a_camera_can_not_tell_apart_the_slowest_is_taken():
+    # Four observations a second see 4 - f, 4 + f and 8 - f Hz as f. Here one of these is a frequency that is tried, and
+    # f lies between two of them, so that the alias explains a little more.
+    time_s, noise_um_s = 0.25 * np.arange(32), 3.0
+    tried = frequencies_hz(time_s)
+    for about_hz in (2.7, 6.2):
+        alias_hz = tried[np.abs(tried - about_hz).argmin()]
+        hz = min(abs(4.0 - alias_hz), abs(8.0 - alias_hz))
+        sway = 0.3 * noise_um_s * np.array([3.0, -1.0, 2.0, 1.0]) @ shaking(alias_hz, time_s)[1].reshape(4, -1)
+        noise = Effect("noise", 1.0, 0.1, np.zeros((0, len(sway))), noise_um_s**2 * np.eye(len(sway)))
+        evidence = Evidence(sway, 1e-9 * np.eye(len(sway)), [noise])
+        found = likeliest_hz(evidence, evidence.sizes(), np.eye(len(sway)), time_s, noise_um_s)
+        assert found == pytest.approx(hz, abs=tried[1] - tried[0])
 
 
 def test_a_robot_that_was_held_is_another_unknown_in_each_stretch_of_time():
