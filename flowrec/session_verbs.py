@@ -13,7 +13,7 @@ from typer.core import TyperCommand, TyperOption
 
 import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite
-from flowrec.errors import FlowrecError, printable
+from flowrec.errors import FlowrecError, UsageError, printable
 
 # Options that select a method, and the table of its methods.
 METHODS = {
@@ -21,7 +21,7 @@ METHODS = {
     "plan": "flowrec.planning.planner:PLANNERS",
     "observer": "flowrec.estimation.observer:OBSERVERS",
     "controller": "flowrec.control.controller:CONTROLLERS",
-    "file_format": "flowrec.commands.export:EXPORTS",
+    "file_format": "flowrec.exports.formats:EXPORTS",
 }
 
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
@@ -82,22 +82,27 @@ def view(
 
 def export(
     session: SessionFile,
-    file_format: Annotated[str, typer.Option("--format", metavar="FORMAT", help="Format of the file.")] = "rrd",
+    directory: Annotated[
+        Path | None, typer.Argument(metavar="[OUT]", help="File or folder to write, or a folder for the file.")
+    ] = None,
+    file_format: Annotated[str, typer.Option("--format", metavar="FORMAT", help="Format of the output.")] = "rrd",
     out: Annotated[
         Path | None,
         typer.Option(
             "--out",
             "-o",
-            help="File to write; by default beside the session, where it replaces an export of that session.",
+            help="The same as OUT; by default beside the session, where it replaces an export of that session.",
         ),
     ] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Convert a session to another format, such as a recording for Rerun (.rrd)."""
-    file = flowrec.export(session, out, overwrite, file_format)
+    if out is not None and directory is not None:
+        raise UsageError(f"{directory} and --out {out}: name the output once")
+    made = flowrec.export(session, out or directory, overwrite, file_format)
     if as_json:
-        typer.echo(_export_json(session, file, file_format))
+        typer.echo(_export_json(session, made, file_format))
 
 
 def info(
@@ -222,5 +227,7 @@ def compare(
     raise typer.Exit(0 if comparison.same else 3)
 
 
-def _export_json(session: Path, file: Path, file_format: str = "rrd") -> str:
-    return json.dumps({"session": str(session), file_format: str(file), "bytes": file.stat().st_size})
+def _export_json(session: Path, made: Path, file_format: str = "rrd") -> str:
+    files = [made] if made.is_file() else [file for file in made.rglob("*") if file.is_file()]
+    nbytes = sum(file.stat().st_size for file in files)
+    return json.dumps({"session": str(session), file_format: str(made), "bytes": nbytes})

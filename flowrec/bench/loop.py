@@ -18,11 +18,11 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, print_rows
-from flowrec.commands.export_rrd import scene_of
 from flowrec.commands.record import prepare
 from flowrec.commands.replay import Change, replay
 from flowrec.config import ResolvedConfig, load_config
 from flowrec.diagnostics import Timing
+from flowrec.exports.rrd import scene_of
 from flowrec.messages import Currents
 from flowrec.pipeline import Inputs, Pipeline
 from flowrec.rigs.simulated.rig import SimulatedRig

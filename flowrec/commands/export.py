@@ -2,71 +2,77 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
 
-from flowrec.methods import Method, Methods
+from flowrec.exports.formats import EXPORTS, Exporter
 from flowrec.session import Session, files_behind, input_blamed
+from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
 
-EXPORTS = Methods(
-    "--format",
-    Method("rrd", "flowrec.commands.export_rrd:RrdExport", "a recording for Rerun, what flowrec view opens"),
-)
-
-
-class Exporter(Protocol):
-    """What a row of EXPORTS implements.
-
-    Attributes
-    ----------
-    suffixes : of the files, the usual one first.
-    advice : how to open a file, as words before its name.
-    """
-
-    suffixes: tuple[str, ...]
-    advice: str
-
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        """Whether a file is an earlier export of this session, which may be replaced without being asked for."""
-
-    def write(self, session: Session, output: Output, progress: Callable[[float], None]) -> None:
-        """Write the file; `progress` takes the session time in s since the first tick."""
-
 
 def export(
-    session: Session | Path | str, out: Path | None = None, overwrite: bool = False, file_format: str = "rrd"
+    session: Session | Path | str,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    file_format: str = "rrd",
 ) -> Path:
-    """Write a session in another format.
+    """Write a session in another format; return the file or folder.
 
     Parameters
     ----------
-    out : the file; by default beside the session, with the suffix of the format, where an earlier export of the same
-        session is replaced. Any other existing file is refused.
-    overwrite : any existing file may be replaced, but none that is read.
+    out : the file or folder; by default beside the session, named like it. A format of one file is also written into an
+        existing folder, under the session's name. By default an earlier export of the same session is replaced, of
+        a format that is a folder under any name. Anything else that exists is refused.
+    overwrite : any existing file, and any folder that an export made, may be replaced, but nothing that is read.
     file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
 
     Raises
     ------
-    UsageError : there is no such format.
-    SessionError : the session can not be read, or the file not be written; OutputError if it may not be.
+    UsageError : there is no such format, or what it needs is not installed.
+    SessionError : the session can not be read, or the output not be written; OutputError if it may not be.
     """
     exporter: Exporter = EXPORTS[file_format].load()()
     session = Session.of(session)
-    path = session.path
-    target = out if out is not None else path.with_suffix(exporter.suffixes[0])
-    overwrite = overwrite or (out is None and exporter.is_export_of(target, session))
-    output = Output(target, exporter.suffixes, tuple(files_behind(path)), overwrite)
+    target = _target(session, exporter, file_format, None if out is None else Path(out))
+    output = _output(session, exporter, file_format, target, overwrite, named=out is not None)
     output.check()
     config = session.config
     began_s = time.perf_counter()
     with (
         progress(f"writing {target.name}", max(session.duration_s, 1e-3)) as done,
         input_blamed(session, config, "exported"),
+        _opened(output) as part,
     ):
-        exporter.write(session, output, done)
+        exporter.write(session, part, done)
     say(f"{target} written in {time.perf_counter() - began_s:.1f} s; {exporter.advice} {target}")
     return target
+
+
+def _target(session: Session, exporter: Exporter, file_format: str, out: Path | None) -> Path:
+    suffix = exporter.suffixes[0]
+    if exporter.folder:
+        return out if out is not None else session.path.with_name(session.path.stem + (suffix or f"_{file_format}"))
+    if out is None:
+        return session.path.with_suffix(suffix)
+    return out / (session.path.stem + suffix) if out.is_dir() else out
+
+
+def _output(
+    session: Session, exporter: Exporter, file_format: str, target: Path, overwrite: bool, *, named: bool
+) -> Output | OutputFolder:
+    inputs = tuple(files_behind(session.path))
+    if exporter.folder:
+        facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
+        return OutputFolder(target, facts, exporter.suffixes, inputs, overwrite)
+    overwrite = overwrite or (not named and exporter.is_export_of(target, session))
+    return Output(target, exporter.suffixes, inputs, overwrite)
+
+
+@contextlib.contextmanager
+def _opened(output: Output | OutputFolder) -> Iterator[Path]:
+    with output.new_folder() if isinstance(output, OutputFolder) else output.new_file() as part:
+        yield part

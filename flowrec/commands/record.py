@@ -278,7 +278,7 @@ def record(
         worker: Worker
         if view in ("spawn", "serve"):
             # Imported here because importing Rerun takes a second and most runs do not need it.
-            from flowrec.commands.export_rrd import scene_of
+            from flowrec.exports.rrd import scene_of
             from flowrec.view.live import LiveView
 
             live = stack.enter_context(LiveView(scene_of(resolved, chip, pipeline, path), view))

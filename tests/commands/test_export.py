@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 import flowrec
 from flowrec.cli import app
-from flowrec.commands.export import EXPORTS
 from flowrec.errors import UsageError
+from flowrec.exports.formats import EXPORTS
 from flowrec.system.outputs import OutputError
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"

@@ -75,11 +75,11 @@ def test_the_parent_of_a_replay_is_looked_for_beside_it_only(tmp_path, monkeypat
     def drawn_beside(_target, _scene, _ticks, replayed, *_, **__):
         drawn.append(replayed)
 
-    monkeypatch.setattr("flowrec.commands.export_rrd.write_rrd", drawn_beside)
+    monkeypatch.setattr("flowrec.exports.rrd.write_rrd", drawn_beside)
     for name in ("../secret.mcap", str(tmp_path / "secret.mcap"), "..", "a\0b", ""):
         parent = text("flowrec.parent") + packed_map({"file": name, "sha256": "0"})
         head = tuple(part for part in DRAFT.head if not part[1].startswith(text("flowrec.parent")))
-        export(file_of(inner, replace(DRAFT, head=(*head, (METADATA, parent)))))
+        export(file_of(inner, replace(DRAFT, head=(*head, (METADATA, parent)))), overwrite=True)
     assert drawn == [None] * 5
 
 

@@ -18,15 +18,16 @@ from flowrec.view.scene import Scene
 
 
 class RrdExport:
-    """Implements flowrec.commands.export.Exporter."""
+    """Implements flowrec.exports.formats.Exporter."""
 
     suffixes = RRD
+    folder = False
     advice = "open it with: rerun"
 
     def is_export_of(self, path: Path, session: Session) -> bool:
         return is_made_from(path, session.key)
 
-    def write(self, session: Session, output: Output, progress: Callable[[float], None]) -> None:
+    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         config, path = session.config, session.path
         scene = replace(scene_of(config, session.chip, assemble(config, session.chip), path), key=session.key)
         parent = _parent_of(session)
@@ -34,7 +35,7 @@ class RrdExport:
             ticks, replayed = Session(parent).ticks(), session.ticks(with_frames=False)
         else:
             ticks, replayed = session.ticks(), None
-        write_rrd(output, scene, ticks, replayed, progress)
+        write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress)
 
 
 def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:

@@ -1,0 +1,50 @@
+"""The table of the formats that a session can be exported to, and what a row implements."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from flowrec.methods import Method, Methods
+from flowrec.session import Session
+
+EXPORTS = Methods(
+    "--format",
+    Method("rrd", "flowrec.exports.rrd:RrdExport", "a recording for Rerun, what flowrec view opens"),
+)
+
+
+class Exporter(Protocol):
+    """What a row of EXPORTS implements.
+
+    Attributes
+    ----------
+    suffixes : that the name of the output ends in, the usual one first; of a folder "" allows any name.
+    folder : the output is a folder; else one file.
+    advice : how to open the output, as words before its name.
+    """
+
+    suffixes: tuple[str, ...]
+    folder: bool
+    advice: str
+
+    def is_export_of(self, path: Path, session: Session) -> bool:
+        """Whether a file is an earlier export of this session, which may be replaced without being asked for.
+
+        Not called for a folder: its marker tells (see system/output_folder.py).
+        """
+
+    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+        """Write a new file, or fill an empty folder, which gets its name when this returns.
+
+        Parameters
+        ----------
+        part : the empty file or the empty folder; the suffix of a file is that of the output.
+        progress : takes the session time in s since the first tick.
+
+        Raises
+        ------
+        SessionError : the session has nothing that this format holds, in one line. An OSError without a file name, or
+            with one inside `part`, becomes the error "can not be written".
+        """
