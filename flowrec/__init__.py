@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.commands.record import record as record
     from flowrec.commands.replay import Change as Change
     from flowrec.commands.replay import replay as replay
-    from flowrec.commands.replay_report import report as report
+    from flowrec.commands.replay_report import before_after as before_after
     from flowrec.config import Config as Config
     from flowrec.config import load_config as load_config
     from flowrec.errors import FlowrecError as FlowrecError
@@ -39,6 +39,7 @@ _MODULES = {
     "Config": "config",
     "FlowrecError": "errors",
     "Session": "session",
+    "before_after": "commands.replay_report",
     "check": "commands.check",
     "compare": "commands.compare",
     "export": "commands.export",
@@ -49,7 +50,6 @@ _MODULES = {
     "record": "commands.record",
     "recover": "store.recovery",
     "replay": "commands.replay",
-    "report": "commands.replay_report",
 }
 __all__ = list(_MODULES)
 

@@ -7,14 +7,15 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay import Change, planned_from, replay
-from flowrec.commands.replay_result import Replayed
+from flowrec.commands.replay_result import CommandDifference, Replayed
 from flowrec.commands.run_summary import length_um
+from flowrec.config import ResolvedConfig
 from flowrec.enums import Phase
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
@@ -26,7 +27,7 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import RunReport, Sink, run
 from flowrec.run.route_orders import no_observations
 from flowrec.run.workers import LockstepWorker, Preloaded
-from flowrec.session import files_behind
+from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
 from flowrec.summary import Row, Value, finite
 from flowrec.system.outputs import MCAP, RRD, Output
@@ -37,7 +38,30 @@ from flowrec.units import seconds
 _SAME_MAP = 1e-3  # of the largest speed: smaller changes are not visible in any table
 
 
-def report(done: Replayed) -> list[Row]:
+class ReplayPair(Protocol):
+    """What two runs of one recording are compared by: a `Replayed`, or two session files.
+
+    Attributes
+    ----------
+    session : what was replayed, with the recorded configuration.
+    config : the configuration of the replay.
+    recorded, replayed : the last tick of both.
+    commands : the difference of the demands of both.
+    """
+
+    @property
+    def session(self) -> Session: ...
+    @property
+    def config(self) -> ResolvedConfig: ...
+    @property
+    def recorded(self) -> Tick: ...
+    @property
+    def replayed(self) -> Tick: ...
+    @property
+    def commands(self) -> CommandDifference: ...
+
+
+def before_after(done: ReplayPair) -> list[Row]:
     """Key, recorded and replayed value of every figure that a replay may change, both on the map of the replay.
 
     Flow errors are relative to the true flow, where it is known. A route that can not be followed on that map has no
@@ -75,7 +99,7 @@ def report(done: Replayed) -> list[Row]:
     return rows
 
 
-def refinement_remarks(done: Replayed) -> list[str]:
+def refinement_remarks(done: ReplayPair) -> list[str]:
     """Lines about the refinement of a replay; why, if it left the recorded map unchanged."""
     was, now = done.recorded.refined, done.replayed.refined
     if now is None:
@@ -142,7 +166,7 @@ def replay_and_report(
     """Replay a session, report on it, and write all outputs; arguments and errors as of `replay` and `refly`."""
     output = outputs.session
     done = replay(path, change, from_s, False, output.path, output.overwrite, frames, control)
-    rows = report(done)
+    rows = before_after(done)
     if outputs.refly is not None:
         rows += refly(done, outputs.refly)
     if outputs.rrd is not None:
@@ -155,7 +179,7 @@ def replay_and_report(
 def refly(done: Replayed, out: Output | None) -> list[Row]:
     """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
 
-    Both flights begin where the recorded route does and have the same seed; rows as of `report`.
+    Both flights begin where the recorded route does and have the same seed; rows as of `before_after`.
 
     Parameters
     ----------
@@ -208,7 +232,7 @@ def _largest_change(was: FlowField, now: FlowField) -> float:
     return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
 
 
-def _flow_error(done: Replayed, flow: FlowField | None) -> float | None:
+def _flow_error(done: ReplayPair, flow: FlowField | None) -> float | None:
     truth = done.recorded.true_field
     if flow is None or truth is None or (flow.wall_px is None) != (truth.wall_px is None):
         return None  # means over pixels, of numerics 1, are not compared with values at their centres

@@ -7,7 +7,7 @@ import rerun as rr
 
 from flowrec.messages import FlowField, Route
 from flowrec.topics import Tick
-from flowrec.view import colours, maps
+from flowrec.view import colours, flow_values, maps
 from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label
 from flowrec.view.scene import Scene
@@ -28,7 +28,7 @@ class FlowLogger:
         self._speeds = speeds
         self._present = present
         self._painted = 0  # version of the scale with which the maps were painted
-        self._grid = maps.arrow_grid(scene)
+        self._grid = flow_values.arrow_grid(scene)
         self._bar = maps.ColourBar.beside(scene)
         for entity in _MAPS:
             self._log(entity, maps.placed(scene.mask_placement()), static=True)
@@ -52,7 +52,7 @@ class FlowLogger:
         new = {name for name, old in zip(fields, before, strict=True) if name in known and known[name] is not old}
         for name in fields:
             if name in new:
-                self._speeds.include(maps.peak(known[name]))
+                self._speeds.include(flow_values.peak(known[name]))
         scale = self._speeds.scale
         repaint = self._painted != self._speeds.version
         if scale is None or not known or not (new or repaint):
@@ -63,24 +63,24 @@ class FlowLogger:
         for name, entity in (("assumed", e.ASSUMED), ("refined", e.REFINED), ("truth", e.TRUE)):
             if name in known and (repaint or name in new):
                 self._present.add(name)
-                self._log(entity, maps.encoded(scale.paint(maps.speed(known[name], self._mask))))
+                self._log(entity, maps.encoded(scale.paint(flow_values.speed(known[name], self._mask))))
         if {"assumed", "refined"} <= known.keys() and new & {"assumed", "refined"}:
-            values = maps.change(known["refined"], known["assumed"], self._mask)
+            values = flow_values.change(known["refined"], known["assumed"], self._mask)
             self._log_map("change", e.CHANGE, e.CHANGE_SCALE, values)
         best = tick.field
         if best is None:
             return
         best_is_new = ("refined" if "refined" in known else "assumed") in new
         if best_is_new and best.std_um_s is not None:
-            values = maps.uncertainty(best, self._mask)
+            values = flow_values.uncertainty(best, self._mask)
             self._log_map("uncertainty", e.UNCERTAINTY, e.UNCERTAINTY_SCALE, values)
         if best_is_new or repaint:
             self._log_arrows(best, scale)
 
-    def _log_map(self, table: colours.Table, entity: str, scale_entity: str, values: maps.Floats) -> None:
+    def _log_map(self, table: colours.Table, entity: str, scale_entity: str, values: flow_values.Floats) -> None:
         """A map with a scale of its own."""
         self._present.add(table)
-        scale = maps.scale_of(values, table)
+        scale = flow_values.scale_of(values, table)
         self._log(entity, maps.encoded(scale.paint(values)))
         self._log_scale(scale_entity, scale)
 
@@ -89,7 +89,7 @@ class FlowLogger:
         self._log(f"{entity}/ticks", *self._bar.ticks(scale))
 
     def _log_arrows(self, field: FlowField, scale: colours.Scale) -> None:
-        origins, vectors, speed = maps.flow_arrows(self._scene, field, self._grid)
+        origins, vectors, speed = flow_values.flow_arrows(self._scene, field, self._grid)
         radius = 0.08 * self._scene.length_px(self._grid[1])
         arrows = rr.Arrows2D(origins=origins, vectors=vectors, colors=scale.paint(speed), radii=radius, draw_order=5.0)
         self._log(e.ARROWS, arrows)
@@ -104,7 +104,7 @@ class FlowLogger:
         um_per_px = self._scene.chip.um_per_px
         finer = round(um_per_px / (route.time_to_go_um_per_px or um_per_px))
         time_s = route.time_to_go_s[::finer, ::finer]
-        scale = maps.scale_of(np.where(self._mask, time_s, np.nan), "time")
+        scale = flow_values.scale_of(np.where(self._mask, time_s, np.nan), "time")
         self._log(e.TIME_TO_GO, maps.wave_fronts(time_s, self._mask, scale))
         self._log_scale(e.TIME_TO_GO_SCALE, scale)
 

@@ -10,7 +10,7 @@ import pytest
 
 from flowrec.commands import replay as verb
 from flowrec.commands.record import record
-from flowrec.commands.replay_report import refly, report
+from flowrec.commands.replay_report import before_after, refly
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded
 from flowrec.config import load_config
 from flowrec.store.reader import SessionReader
@@ -62,7 +62,7 @@ def test_the_paper_planner_goes_upstream_the_same_way_but_slower_and_loses_in_fl
     assert done.replayed.route.method == "astar_paper"
     assert done.replayed.route.waypoints_um[:, 1].min() < ISLAND_ROW_UM - 500.0
     assert done.replayed.route.arrival_s[-1] > done.recorded.route.arrival_s[-1]
-    predicted = {row[0]: row[1:] for row in report(done)}
+    predicted = {row[0]: row[1:] for row in before_after(done)}
     ours_s, paper_s = predicted["travel_time_on_replayed_map_s"]
     assert ours_s < 0.995 * paper_s
     flown = {row[0]: row[1:] for row in refly(done, Output(tmp_path / "flown.mcap", MCAP))}

@@ -14,10 +14,10 @@ from flowrec.chip.registration import Calibration
 from flowrec.flow import sample
 from flowrec.messages import FlowField
 from flowrec.topics import Tick
-from flowrec.view import colours, maps
+from flowrec.view import colours, flow_values, maps
 from flowrec.view.colours import Scale
+from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.logger import TickLogger
-from flowrec.view.maps import arrow_grid, flow_arrows
 from flowrec.view.scene import Scene
 
 
@@ -54,11 +54,11 @@ def test_maps_beside_each_other_have_one_scale_also_when_a_faster_flow_comes(sce
     logger.log(Tick(1, assumed=assumed, refined=times(assumed, 3.0)))
     after, refined = record.map("/flow/assumed/speed"), record.map("/flow/refined/speed")
     assert speeds.scale is not None
-    assert speeds.scale.high >= 3.0 * maps.peak(assumed)
+    assert speeds.scale.high >= 3.0 * flow_values.peak(assumed)
     assert not np.array_equal(before, after)  # painted again, or its colours would mean something else
     fluid = scene.chip.mask
-    assert np.array_equal(after, speeds.scale.paint(maps.speed(assumed, fluid)))
-    assert np.array_equal(refined, speeds.scale.paint(maps.speed(times(assumed, 3.0), fluid)))
+    assert np.array_equal(after, speeds.scale.paint(flow_values.speed(assumed, fluid)))
+    assert np.array_equal(refined, speeds.scale.paint(flow_values.speed(times(assumed, 3.0), fluid)))
     assert (after[~fluid] == colours.SOLID).all()
 
 
@@ -75,7 +75,7 @@ def test_a_recorded_and_a_replayed_session_share_one_scale(scene: Scene, ticks: 
     recorded.log(Tick(1, assumed=assumed))
     assert speeds.scale is not None
     assert np.array_equal(
-        record.map("/recorded/flow/assumed/speed"), speeds.scale.paint(maps.speed(assumed, scene.chip.mask))
+        record.map("/recorded/flow/assumed/speed"), speeds.scale.paint(flow_values.speed(assumed, scene.chip.mask))
     )
 
 
