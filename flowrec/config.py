@@ -148,6 +148,7 @@ _BEFORE: dict[str, Any] = {
     "plan.policy_points_per_px": 4,
     "health.step_out.learned": False,
     "sampler.without_map": False,
+    "refine.place_robot": False,
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}

@@ -154,6 +154,8 @@ class FlowField(Message):
     # How the viscosity over viscosity_mpa_s depends on the shear rate, for people; the chip holds the law. '': it does
     # not, or not stated.
     viscosity_law: str = ""
+    # The registration that the refinement found: a measured place x (2,) lies on the chip at R (x, 1). None: as stated.
+    registration: Annotated[Matrix, Shape(2, 3)] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,18 @@ from flowrec.enums import Action
 from flowrec.estimation import HealthMonitor, Observer, Sampler
 from flowrec.flow import FlowSolver
 from flowrec.interpolation import nearest_pixel
-from flowrec.messages import Appearance, Applied, FlowField, Frame, Observations, OperatorEvent, Route, Track, Truth
+from flowrec.messages import (
+    Appearance,
+    Applied,
+    Estimate,
+    FlowField,
+    Frame,
+    Observations,
+    OperatorEvent,
+    Route,
+    Track,
+    Truth,
+)
 from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
@@ -116,6 +127,15 @@ def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
     return float(p.clearance_um[nearest_pixel(x, y, p.clearance_um.shape)])
 
 
+def _placed(estimate: Estimate, refined: FlowField | None) -> Estimate:
+    """The estimate with its position on the chip, by the registration that the refinement found."""
+    if refined is None or refined.registration is None:
+        return estimate
+    # Not a matrix product, whose last bits depend on the machine.
+    turned = (refined.registration[:, :2] * estimate.position_um).sum(axis=1)
+    return replace(estimate, position_um=turned + refined.registration[:, 2])
+
+
 def _strength(coils: Coils, last: Tick) -> float:
     """Amplitude of the field in the tick before, relative to the full one; 1 before the first."""
     full_mt = coils.amplitude_mt
@@ -159,7 +179,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
     # Sessions recorded before step-out was monitored replay without it.
     looked = inputs.applied if inputs.applied.image_since_ns is not None else None
-    wall_um = _wall_um(p, estimate.position_um)
+    # Observations, their predictions and the pictures keep to the registration as stated.
+    placed = _placed(estimate, tick.refined)
+    wall_um = _wall_um(p, placed.position_um)
     health = last.health
     if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
         health = p.health.watch(health, last.estimate, estimate, flow, p.robot, looked, wall_um)
@@ -174,7 +196,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     mission = p.mission.update(
         last.mission,
         track,
-        estimate,
+        placed,
         tick.assumed,
         tick.refined,
         route,
@@ -190,7 +212,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         last.demand,
         mission,
         route,
-        estimate,
+        placed,
         flow,
         robot,
         p.clearance_um,

@@ -58,6 +58,11 @@ class Registration:
         """(n, 2) places on the chip of measured places (n, 2)."""
         return np.asarray(self.centre_um + self.offset_um + (measured_um - self.centre_um) @ self._turn.T)
 
+    @property
+    def matrix(self) -> Floats:
+        """R (2, 3): a measured place x (2,) lies on the chip at R (x, 1)."""
+        return np.column_stack((self._turn, self.centre_um + self.offset_um - self._turn @ self.centre_um))
+
     def measured(self, on_chip_um: Floats) -> Floats:
         """(n, 2) where places (n, 2) on the chip are measured."""
         away = on_chip_um - self.centre_um - self.offset_um

@@ -387,4 +387,5 @@ class Assimilate(PriorSettings):
             parameters=values,
             parameter_std=stds,
             viscosity_law=law_text(fitted.law),
+            registration=np.tensordot(every.weights, [one.registration.matrix for one in every.found], axes=1),
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowrec.flow.sensitivities import Remainder
+from flowrec.flow.uncertainty import Registration
 from flowrec.refine.causes import CURVED, RESISTANCE, WALLS, WALLS_LONG, Observed, lines_hz
 from flowrec.refine.disturbances import likeliest_hz, shaking
 from flowrec.refine.evidence import Effect, Evidence, Posterior, Sizes, gains_of_trials
@@ -86,6 +87,13 @@ class Fitted:
     def size(self, name: str) -> float:
         """Size of an effect."""
         return float(self.posterior.sizes[[effect.name for effect in self.effects].index(name)])
+
+    @property
+    def registration(self) -> Registration:
+        """The most probable one."""
+        px, places = self.observed.um_per_px, self.observed.stated.points
+        offset, scale, angle = (self.unknowns(name)[0] for name in ("offset", "scale", "angle"))
+        return Registration(px * offset, float(scale[0]), float(angle[0]), px * places.mean(axis=0))
 
     @property
     def depth_um(self) -> tuple[float, float]:

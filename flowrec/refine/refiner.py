@@ -73,6 +73,8 @@ class Refiner:
     """Chooses the method. `ni` and `pinn` do not use the assumed field."""
 
     method: Annotated[str, REFINERS] = "assimilate"
+    # Mission and controller place the robot on the chip by the registration that the refinement found.
+    place_robot: bool = True
     assimilate: Assimilate = field(default_factory=Assimilate)
     pi_unet: PiUnet = field(default_factory=PiUnet)
     ni: Ni = field(default_factory=Ni)
@@ -114,7 +116,8 @@ class Refiner:
             ignored = operator.ignored
             why = f"none of the observations is of use ({ignored})" if ignored else "no observations"
             return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
-        return method.fit(problem)
+        refined = method.fit(problem)
+        return refined if self.place_robot else replace(refined, registration=None)
 
     @one_blas_thread()
     def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:

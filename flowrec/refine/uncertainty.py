@@ -9,13 +9,13 @@ import numpy as np
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver
-from flowrec.flow.uncertainty import FlowUncertainty, Registration
+from flowrec.flow.uncertainty import FlowUncertainty
 from flowrec.refine.assimilate import OBSTACLE_SHARE, Assimilate, Hypotheses
 from flowrec.refine.causes import GAIN
 from flowrec.refine.doubts import doubted_places
 from flowrec.refine.field_variance import field_columns, left_variance, prior_left_variance, prior_of
 from flowrec.refine.flow_model import flow_model
-from flowrec.refine.hypothesis import NOISE, Fitted
+from flowrec.refine.hypothesis import NOISE
 from flowrec.refine.observation_operator import Floats, ObservationOperator
 
 
@@ -64,14 +64,7 @@ def _of(every: Hypotheses) -> FlowUncertainty:
     rolled = np.ones((0 if gain is None else 1, len(mean)))
     factor = best.robust.factor * best.size(NOISE[0])
     left = _error_std(left_variance(best))
-    return FlowUncertainty(mean, columns, rolled, covariance, left, factor, registration=_registration(best))
-
-
-def _registration(found: Fitted) -> Registration:
-    """The most probable one of a hypothesis."""
-    px, places = found.observed.um_per_px, found.observed.stated.points
-    offset, scale, angle = (found.unknowns(name)[0] for name in ("offset", "scale", "angle"))
-    return Registration(px * offset, float(scale[0]), float(angle[0]), px * places.mean(axis=0))
+    return FlowUncertainty(mean, columns, rolled, covariance, left, factor, registration=best.registration)
 
 
 def _error_std(variance: Floats) -> Floats:

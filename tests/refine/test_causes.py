@@ -97,6 +97,12 @@ def test_an_offset_of_the_registration_is_found_in_its_direction(twin):
         value, std = found(refined, name)
         assert abs(value - true) < 3.0 * std and std < 4.0
     assert "from where the registration puts it" in refined.note
+    # Mission and controller place the robot by it, unless that is switched off, as in sessions from before.
+    places = np.column_stack((observed.position_um, np.ones(len(observed.position_um))))
+    placed = places @ refined.registration.T - observed.position_um
+    assert np.hypot(*(placed.mean(axis=0) - [4.0, -8.0])) < 4.0
+    stated = replace(SETTINGS, place_robot=False).refine(case.assumed, observed, case.chip, case.solver)
+    assert stated.registration is None and stated.parameters.tolist() == refined.parameters.tolist()
 
 
 def test_an_image_scale_that_moves_observations_across_a_channel_is_found(twin):
