@@ -33,6 +33,7 @@ from flowrec.session_verbs import (
     export,
     info,
     list_directory,
+    note,
     recover,
     view,
 )
@@ -203,7 +204,7 @@ def replay(
 
 
 app.command("import")(import_movie)
-for _verb in (doctor, view, export, info, list_directory, check, recover, compare):
+for _verb in (doctor, view, export, info, list_directory, note, check, recover, compare):
     app.command("ls" if _verb is list_directory else None, cls=HelpWithMethods)(_verb)
 
 

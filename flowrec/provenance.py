@@ -42,7 +42,7 @@ def provenance(anonymous: bool = False) -> dict[str, str]:
         "python": platform.python_version(),
     }
     if not anonymous:
-        facts |= {"platform": platform.platform(), "host": platform.node(), "user": _user()}
+        facts |= {"platform": platform.platform(), "host": platform.node(), "user": user_name()}
     monotonic_ns, wall_ns = read_clocks()
     facts |= {
         "wall_time": datetime.now(UTC).isoformat(),
@@ -79,7 +79,8 @@ def _built(file: Path) -> dict[str, str]:
         return {}
 
 
-def _user() -> str:
+def user_name() -> str:
+    """Name of the user on this machine, "unknown" where it has none."""
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a container may run under a number without a name

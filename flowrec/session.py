@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from flowrec.errors import FlowrecError, SessionError, UsageError
+from flowrec.provenance import user_name
+from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run, files_of, run_files
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.summary import Figures, of_text
@@ -185,6 +187,21 @@ class Session:
         header = self.header
         content = (header.config_toml, sorted(header.provenance.items()), sorted(header.parent.items()))
         return hashlib.sha256(repr((content, self.run.first_ns, self.run.last_ns)).encode()).hexdigest()[:32]
+
+    @property
+    def notes(self) -> list[Note]:
+        """Notes and tags that were added after the run, in order; those of the recording are in `provenance`."""
+        return read_notes(self.path, self.key)
+
+    def add_note(self, text: str, tags: Sequence[str] = ()) -> Note:
+        """Add a note, tags or both to a file beside the session, X.mcap.notes.jsonl; the recording is not changed.
+
+        Raises
+        ------
+        UsageError : there is neither text nor tag, or one is too long.
+        SessionError : the note can not be written.
+        """
+        return append_note(self.path, self.key, text, tags, user_name())
 
     def close(self) -> None:
         """Close the files; nothing more can be read."""

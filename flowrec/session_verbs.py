@@ -123,37 +123,47 @@ def info(
 
 
 def list_directory(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory to list.")] = Path(),
+    places: Annotated[
+        list[Path] | None, typer.Argument(metavar="[PLACE]...", help="Directories and sessions; by default this one.")
+    ] = None,
+    where: Annotated[
+        str, typer.Option(metavar="SQL", help="Only sessions for which this holds, of the facts of flowrec info.")
+    ] = "",
+    sort: Annotated[str, typer.Option(metavar="FACT", help="Sort by this fact; -FACT: the largest first.")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """List the sessions in a directory, unfinished and unreadable ones included."""
-    from flowrec.commands.info import list_sessions
+    """List sessions, unfinished and unreadable ones included."""
+    from flowrec.commands.ls import columns_for_people, list_sessions
 
-    rows = list_sessions(directory)
+    places = places or [Path()]
+    rows = list_sessions(*places, where=where, sort=sort)
     if as_json:
-        typer.echo(json.dumps([asdict(row) for row in rows]))
+        typer.echo(json.dumps([row.as_json() for row in rows]))
         return
-    from flowrec.terminal import say, table
+    from flowrec.terminal import say, table, width
 
-    columns = ("name", "outcome", "duration", "size", "chip", "recorded")
-    table(
-        str(directory),
-        columns,
-        [
-            (
-                row.name + (f" ({row.parts} parts)" if row.parts else ""),
-                row.outcome,
-                "" if row.duration_s is None else f"{row.duration_s:.1f} s",
-                f"{row.size_bytes / 1e6:.1f} MB",
-                row.chip,
-                row.recorded[:16].replace("T", " "),
-            )
-            for row in rows
-        ],
-    )
+    table(", ".join(map(str, places)), *columns_for_people(rows, width()), text="notes")
     for row in rows:
         if row.duration_s is None:
             say(f"{row.name}: {row.note}")
+
+
+def note(
+    session: SessionFile,
+    text: Annotated[str, typer.Argument(metavar="[TEXT]", help="The note; without one, notes are printed.")] = "",
+    tags: Annotated[list[str] | None, typer.Option("--tag", metavar="WORD", help="Add a tag; may be repeated.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Add a note or tags to a recorded session, in a file beside it, or print them."""
+    opened = flowrec.open(session)
+    if text or tags:
+        opened.add_note(text, tags or [])
+    if as_json:
+        typer.echo(json.dumps({"session": str(session), "notes": [asdict(each) for each in opened.notes]}))
+    elif not text and not tags:
+        for each in opened.notes:
+            words = " ".join([*(f"#{tag}" for tag in each.tags), each.text])
+            typer.echo(printable(f"{each.written[:16].replace('T', ' ')} {each.author}: {words}"))
 
 
 def check(

@@ -70,13 +70,24 @@ def time_left(estimate_s: float | None, stands_s: float) -> str:
     return f"{estimate_s:.0f} s left"
 
 
-def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], to: TextIO | None = None) -> None:
-    """Print a table on stdout, or on `to`."""
+def table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], to: TextIO | None = None, text: str = ""
+) -> None:
+    """Print a table on stdout, or on `to`; if there is a column `text`, it and the first one are folded and no other."""
     to = to or sys.stdout
     shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
     for number, column in enumerate(columns):
-        shown.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
+        words = number == 0 or column == text
+        shown.add_column(
+            column, justify="left" if words else "right", overflow="fold", no_wrap=text in columns and not words
+        )
     for row in rows:
         shown.add_row(*(escape(printable(cell)) for cell in row))
+    Console(file=to, highlight=False, width=width(to)).print(shown)
+
+
+def width(to: TextIO | None = None) -> int:
+    """Characters of a line on stdout, or on `to`."""
+    to = to or sys.stdout
     # In a log rich takes 80 columns; 110 hold each row of the widest table on one line.
-    Console(file=to, highlight=False, width=None if to.isatty() else 110).print(shown)
+    return Console(file=to).width if to.isatty() else 110

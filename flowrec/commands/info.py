@@ -1,4 +1,4 @@
-"""`flowrec info` and `flowrec ls`: facts about sessions, from headers and indexes only, however large they are.
+"""`flowrec info`: facts about a session, from its head and index only, however large it is.
 
 The configuration is read as plain TOML, and topics by their names in the file: importing stages and messages takes
 long.
@@ -9,19 +9,15 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flowrec.errors import SessionError
 from flowrec.session import Session, toml_table
-from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX, Run, part_number, run_path
+from flowrec.store.run_files import Run, run_path
 from flowrec.store.session_metadata import Part
 from flowrec.summary import name_of, of_text, shown
-from flowrec.system.locks import is_growing
 from flowrec.units import seconds
 
-_NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _PNG_SIZE = struct.Struct(">II")  # width and height follow the signature and the head of the first part
 _PNG_SIZE_AT = 16
 _REPEATED = ("reason", "duration")  # the second is a sentence of older files
@@ -64,6 +60,9 @@ def info(session: Session | Path | str) -> dict[str, Any]:
             facts["weights"] = f"{key.removeprefix('weights.')} {code[:16]}"
     if session.setting("recording", "region") == "robot" and "frames_windows" not in outcome:
         facts["frames_windows"] = "most images hold what the tracker read, and are black elsewhere"
+    added = session.notes
+    facts["notes_added"] = [note.text for note in added if note.text]
+    facts["tags"] = list(dict.fromkeys(tag for note in added for tag in note.tags))
     recorded_figures = of_text(outcome)
     return facts | {key: value for key, value in recorded_figures.items() if key not in (*facts, *_REPEATED)}
 
@@ -85,6 +84,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         "derived": ", ".join(f"{key} = {value}" for key, value in facts["derived"].items()),
         "flowrec": facts["flowrec"] + _in_brackets((facts["commit"] or "")[:10] + changed),
     }
+    words |= {"notes_added": "; ".join(facts["notes_added"]), "tags": ", ".join(facts["tags"])}
     words |= {key: str(code)[:16] for key, code in facts.items() if key.endswith("_sha256")}
     names = {"observer": "stages", "flowrec": "by flowrec"}
     without = (
@@ -100,57 +100,8 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         (names.get(key, name_of(key)), words.get(key) or shown(key, value))
         for key, value in facts.items()
-        if key not in (*without, *stages[1:], *_CLOCK_READINGS) and value not in (None, "", {})
+        if key not in (*without, *stages[1:], *_CLOCK_READINGS) and value not in (None, "", {}, [])
     ]
-
-
-@dataclass(frozen=True, slots=True)
-class Listed:
-    """One session of a directory, or one run with all its parts; unknown values are None or empty."""
-
-    name: str
-    outcome: str  # or: recording, unfinished, unreadable
-    note: str  # why
-    size_bytes: int
-    duration_s: float | None = None
-    chip: str = ""
-    recorded: str = ""
-    parts: int = 0  # of a run that was split; finished or not
-
-
-def list_sessions(directory: Path) -> list[Listed]:
-    """The sessions in a directory by name, unfinished and unreadable ones included.
-
-    Reads heads and indexes only. Raises SessionError when there is no such directory.
-    """
-    if not directory.is_dir():
-        raise SessionError(f"{directory}: no such directory; flowrec ls lists the sessions in one")
-    try:
-        paths = [path for path in directory.iterdir() if path.is_file() and path.name.endswith(_NAMES)]
-    except OSError as error:
-        raise SessionError(f"{directory}: can not be listed ({error.strerror}); check its permissions") from error
-    rows: dict[Path, list[Path]] = {}
-    for path in sorted(paths):
-        run = run_path(path)
-        # Beside a file of that name the parts are not what opens under it: each is a session of its own.
-        rows.setdefault(run if part_number(path) and run not in paths else path, []).append(path)
-    return [_listed(path, files) for path, files in sorted(rows.items())]
-
-
-def _listed(path: Path, files: list[Path]) -> Listed:
-    size = sum(file.stat().st_size for file in files)
-    parts = len(files) if files != [path] else 0
-    try:
-        session = Session(path)
-        head, ended = session.header, session.run.outcome
-        outcome = ended.get("outcome", "unknown"), _why(ended)
-        chip = str(toml_table(head.chip_toml, f"{path}: chip.toml inside").get("name", ""))
-        recorded = head.provenance.get("wall_time", "")
-        return Listed(path.name, *outcome, size, session.duration_s, chip, recorded, parts)
-    except SessionError as error:
-        unfinished = any(file.name.endswith(PARTIAL_SUFFIX) for file in files)
-        what = "recording" if any(map(is_growing, files)) else "unfinished" if unfinished else "unreadable"
-        return Listed(path.name, what, str(error).removeprefix(f"{path}: "), size, parts=parts)
 
 
 def _size(run: Run) -> int:

@@ -24,7 +24,8 @@ import typer
 
 from flowrec.bench.harness import Results, Seed, peak_mb, run
 from flowrec.commands.check import check
-from flowrec.commands.info import info, list_sessions
+from flowrec.commands.info import info
+from flowrec.commands.ls import list_sessions
 from flowrec.errors import FlowrecError, printable
 from flowrec.session import Session
 from flowrec.store.reader import SessionReader

@@ -15,7 +15,8 @@ from flowrec.cli import app
 from flowrec.commands import replay as verb
 from flowrec.commands.check import check
 from flowrec.commands.compare import compare
-from flowrec.commands.info import info, list_sessions
+from flowrec.commands.info import info
+from flowrec.commands.ls import list_sessions
 from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.config import load_config

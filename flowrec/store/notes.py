@@ -1,0 +1,107 @@
+"""Notes and tags that people add to a session after its run: lines of JSON in a file beside it, X.mcap.notes.jsonl.
+
+The recording is never changed, and a line is never rewritten. Each line names its session by the key of that session:
+notes that lie beside another file are not its notes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from flowrec.errors import SessionError, UsageError
+
+SUFFIX = ".notes.jsonl"
+TEXT_LIMIT = 10_000  # characters of a note
+_LINE_LIMIT = 200_000  # bytes; a longer line was not written by flowrec
+_TAG_LIMIT = 60  # characters
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """One note; text and tags are as a person typed them.
+
+    Attributes
+    ----------
+    written : time in UTC, ISO 8601.
+    author : name of the user on that machine.
+    """
+
+    written: str
+    author: str
+    text: str
+    tags: tuple[str, ...] = ()
+
+
+def notes_file(session: Path) -> Path:
+    """The file of the notes of a session or run X.mcap."""
+    return session.with_name(session.name + SUFFIX)
+
+
+def read_notes(session: Path, key: str) -> list[Note]:
+    """The notes of the session with a key, in order; lines that are damaged or of another session are left out.
+
+    Raises
+    ------
+    SessionError : the file can not be read.
+    """
+    path = notes_file(session)
+    try:
+        with path.open("rb") as file:
+            return [note for line in _lines(file.read()) if (note := _parsed(line, key)) is not None]
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise SessionError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
+
+
+def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
+    """Write one note behind the others, and onto the disk.
+
+    Raises
+    ------
+    UsageError : there is neither text nor tag, or one is too long.
+    SessionError : the file can not be written.
+    """
+    tags = tuple(dict.fromkeys(tag.strip() for tag in tags))
+    if not text.strip() and not tags:
+        raise UsageError("a note needs a text or a --tag")
+    if len(text) > TEXT_LIMIT or any(not 0 < len(tag) <= _TAG_LIMIT for tag in tags):
+        raise UsageError(f"a note has at most {TEXT_LIMIT} characters, a tag 1 to {_TAG_LIMIT}")
+    note = Note(datetime.now(UTC).isoformat(timespec="seconds"), author, text.strip(), tags)
+    line = json.dumps({"session": key, **asdict(note)}).encode()
+    path = notes_file(session)
+    try:
+        with path.open("ab+", buffering=0) as file:
+            if file.seek(0, os.SEEK_END):
+                file.seek(-1, os.SEEK_END)
+                # A line that a power cut has left without its end is not continued.
+                line = (b"" if file.read(1) == b"\n" else b"\n") + line
+            file.write(line + b"\n")  # at once, behind what another process may have added
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise SessionError(f"{path}: the note can not be written ({error.strerror}); check folder and disk") from error
+    return note
+
+
+def _lines(content: bytes) -> Iterator[bytes]:
+    return (line for line in content.split(b"\n") if 0 < len(line) <= _LINE_LIMIT)
+
+
+def _parsed(line: bytes, key: str) -> Note | None:
+    """The note of a line; None if it is damaged or of another session."""
+    try:
+        found = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(found, dict) or found.get("session") != key:
+        return None
+    tags = found.get("tags")
+    if not isinstance(tags, list):
+        return None
+    written, author, text = (str(found.get(name, "")) for name in ("written", "author", "text"))
+    return Note(written, author, text, tuple(map(str, tags)))
