@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from flowrec.errors import FlowrecError, SessionError, UsageError
-from flowrec.provenance import user_name
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run, files_of, run_files
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
@@ -201,6 +200,8 @@ class Session:
         UsageError : there is neither text nor tag, or one is too long.
         SessionError : the note can not be written.
         """
+        from flowrec.provenance import user_name
+
         return append_note(self.path, self.key, text, tags, user_name())
 
     def close(self) -> None:
