@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
 from typing import Annotated, Any
@@ -175,20 +175,24 @@ def shape_error(message: Message) -> str:
 
     The wire keeps any shape, so a damaged or forged file is refused here, before its arrays are used.
     """
+    return shape_fault(type(message), lambda name: None if (array := getattr(message, name)) is None else array.shape)
+
+
+def shape_fault(message_type: type, shape_of: Callable[[str], tuple[int, ...] | None]) -> str:
+    """The same for the shapes of arrays by name of the field; None for an array that is not there."""
     lengths: dict[str, int] = {}
-    kind: type = type(message)
-    for name, wanted in array_shapes(kind):
-        array = getattr(message, name)
-        if array is None or array.shape == wanted:
+    for name, wanted in array_shapes(message_type):
+        shape = shape_of(name)
+        if shape is None or shape == wanted:
             continue
-        fits = array.ndim == len(wanted)
-        for found, length in zip(array.shape, wanted, strict=False):
+        fits = len(shape) == len(wanted)
+        for found, length in zip(shape, wanted, strict=False):
             if isinstance(length, int):
                 fits = fits and found == length
             else:
                 fits = fits and lengths.setdefault(length, found) == found and (found > 0 or length in _MAY_BE_EMPTY)
         if not fits:
-            return f"{name} has the shape {array.shape} where ({', '.join(map(str, wanted))}) belongs"
+            return f"{name} has the shape {shape} where ({', '.join(map(str, wanted))}) belongs"
     return ""
 
 

@@ -18,6 +18,8 @@ from flowrec.system.toml_file import parse_toml
 from flowrec.units import nanoseconds, seconds
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from flowrec.chip.chip import Chip
     from flowrec.chip.registration import Calibration
     from flowrec.config import ResolvedConfig
@@ -154,6 +156,39 @@ class Session:
     def messages(self, field: str) -> Iterator[Any]:
         """All messages of one topic, named by its field of `Tick`, such as "estimate"; SessionError if unknown."""
         return self.reader.messages(field)
+
+    def table(self, topic: str) -> pa.Table:
+        """All messages of one topic as an Arrow table, one row a message; `.to_pandas()` makes a DataFrame of it.
+
+        Columns carry the unit in their names, and unit and meaning in the metadata of their fields; each table begins
+        with `stamp_ns`, `time_s` and `wall_time` (see tables/columns.py). It is as large as its content; `batches`
+        reads the same in pieces. The table of "frame" has no images: `frames` has them.
+
+        Parameters
+        ----------
+        topic : named by its field of `Tick`, such as "track".
+
+        Raises
+        ------
+        SessionError : there is no such topic, or the file is damaged. UsageError if pyarrow is not installed.
+        """
+        from flowrec.tables.arrow import table
+
+        return table(topic, self._rows([topic]), self.header.start_unix_ns)
+
+    def batches(self, topics: Sequence[str]) -> Iterator[tuple[str, pa.RecordBatch]]:
+        """Topic and next record batch of the tables of some topics, in one pass over the file; errors as of `table`."""
+        from flowrec.tables.arrow import batches
+
+        return batches(self._rows(topics), self.header.start_unix_ns)
+
+    def _rows(self, topics: Sequence[str]) -> Iterator[tuple[str, tuple[Any, ...]]]:
+        from flowrec.topics import BY_FIELD
+
+        for topic in topics:
+            if topic not in BY_FIELD:
+                raise SessionError(f"{self.path}: there is no topic {topic!r}; the topics are {', '.join(BY_FIELD)}")
+        return self.reader.rows(topics)
 
     @property
     def frames(self) -> Iterator[Frame]:

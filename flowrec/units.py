@@ -49,3 +49,42 @@ def amounts(text: str) -> dict[str, list[float]]:
         else:
             raise ValueError(f"{part.strip()!r} is neither a time (ms, s, min, h) nor a size (kB, MB, GB, TB)")
     return found
+
+
+# What the ends of names mean, the longer ones first; a name with none of them is of a pure number or of a text.
+_SYMBOLS = {
+    "_um_per_px": "um/px",
+    "_um_per_rev": "um/rev",
+    "_kg_m3": "kg/m3",
+    "_mpa_s": "mPa*s",
+    "_per_s": "1/s",
+    "_um_s": "um/s",
+    "_px_s": "px/s",
+    "_rad": "rad",
+    "_share": "1",
+    "_um": "um",
+    "_px": "px",
+    "_pa": "Pa",
+    "_hz": "Hz",
+    "_mt": "mT",
+    "_ns": "ns",
+    "_ms": "ms",
+    "_mb": "MB",
+    "_s": "s",
+    "_a": "A",
+    "_v": "V",
+}
+
+
+def unit_suffix(name: str) -> str:
+    """The end of a name that tells its unit, such as "_um_s"; "" if it has none."""
+    return next((suffix for suffix in _SYMBOLS if f"_{name}".endswith(suffix)), "")
+
+
+def unit_of(name: str) -> str:
+    """The unit that a name ends in, such as "um/s"; "" if it has none.
+
+    >>> unit_of("flow_um_s"), unit_of("nis")
+    ('um/s', '')
+    """
+    return _SYMBOLS.get(unit_suffix(name), "")

@@ -12,6 +12,8 @@ from flowrec.session import Session
 EXPORTS = Methods(
     "--format",
     Method("rrd", "flowrec.exports.rrd:RrdExport", "a recording for Rerun, what flowrec view opens"),
+    Method("parquet", "flowrec.exports.tabular:ParquetExport", "a folder with a table a topic", extra="export"),
+    Method("csv", "flowrec.exports.tabular:CsvExport", "the same as text, for spreadsheets", extra="export"),
 )
 
 

@@ -255,7 +255,7 @@ def _unpacker(form: MessageField) -> Callable[[Any], Any]:
 
         def present(parsed: Any) -> Any:
             field = getattr(parsed, name)
-            return _array(field, field.data, dtype)
+            return array_of(field, field.data, dtype)
 
     if not form.optional:
         return present
@@ -265,10 +265,11 @@ def _unpacker(form: MessageField) -> Callable[[Any], Any]:
 def _cut_array(field: memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
     rest, found = cut_byte_fields(field, (ARRAY_DATA,))
     parsed = array_schema().wire.FromString(rest)
-    return _array(parsed, found.get(ARRAY_DATA, parsed.data), dtype)
+    return array_of(parsed, found.get(ARRAY_DATA, parsed.data), dtype)
 
 
-def _array(parsed: Any, data: bytes | memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
+def array_of(parsed: Any, data: bytes | memoryview, dtype: np.dtype[Any] | None) -> NDArray[Any]:
+    """The array in a parsed flowrec.Array and its data, read-only; ValueError if they do not fit each other."""
     assert dtype is not None  # schema.py gives one to each array
     if parsed.dtype != dtype.str:
         raise ValueError(f"an array of {parsed.dtype!r} where {dtype.str!r} belongs")

@@ -22,6 +22,7 @@ from flowrec.store.channels import SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
+from flowrec.store.rows import Row, row_decoder
 from flowrec.store.write_queue import NewMessages
 from flowrec.topics import BY_FIELD
 
@@ -101,6 +102,31 @@ class FileReader:
                     message = self._message(record)
                     if message is not None:
                         yield record.log_ns, message
+
+    def rows(self, fields: Collection[str]) -> Iterator[tuple[int, str, Row]]:
+        """Stamp of the tick, field of Tick and row of plain values (see rows.py) of each message of some topics."""
+        channels = self._channels_of(fields)
+        decoders = {channel: row_decoder(self.contents, channel) for channel in channels}
+        with _threads() as executor:
+            for record in _merged(self._source, self._chunks_with(channels), executor):
+                if record.channel in channels:
+                    try:
+                        row = decoders[record.channel](record)
+                    except SessionError as error:
+                        path = BY_FIELD[self._fields[record.channel]].path
+                        raise DamageError(self.path, f"{path} at {record.log_ns} ns: {error}") from error
+                    yield record.log_ns, self._fields[record.channel], row
+
+    def stamps(self, field: str) -> list[int]:
+        """The stamps of the ticks with a message of a topic, in order, from the index of the file where it has one."""
+        found: list[int] = []
+        for channel in self._channels_of({field}):
+            for chunk in self._chunks_with({channel}):
+                times = self._source.message_times(chunk, channel)
+                if times is None:
+                    times = [record.log_ns for record in self._source.messages(chunk) if record.channel == channel]
+                found += times
+        return sorted(found)
 
     def state_at(self, stamp_ns: int, fields: Collection[str]) -> tuple[int, NewMessages]:
         """The latest message of each of these topics at or before a stamp, from as few chunks as possible.

@@ -17,7 +17,7 @@ import zstandard
 from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Footer, Header, Metadata, MetadataIndex
+from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Footer, Header, MessageIndex, Metadata, MetadataIndex
 
 from flowrec.errors import SessionError
 from flowrec.store.byte_source import open_bytes
@@ -243,6 +243,19 @@ class McapReader:
                     payload = view[at + MESSAGE_HEAD.size : at + length]
                     found.append(Record(log_ns - self.start_unix_ns, channel, sequence, payload))
         return found
+
+    def message_times(self, index: ChunkIndex, channel: int) -> list[int] | None:
+        """The times on the session clock of a chunk's messages of a channel; None if the file has no index of them."""
+        at, nbytes = index.chunk_start_offset + index.chunk_length, index.message_index_length
+        if not nbytes or nbytes > _SMALL_LIMIT_BYTES:
+            return None
+        data = self.read(at, nbytes)
+        with self.parsing(at):
+            for opcode, begin, length in records_in(data):
+                if opcode == Opcode.MESSAGE_INDEX and int.from_bytes(data[begin : begin + 2], "little") == channel:
+                    found = MessageIndex.read(stream_of(data[begin : begin + length]))
+                    return [log_ns - self.start_unix_ns for log_ns, _ in found.records]
+        return None
 
     def messages(self, index: ChunkIndex) -> list[Record]:
         """All messages of one chunk, in file order."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +13,7 @@ from flowrec.errors import SessionError
 from flowrec.store.channels import SessionContents
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.roi import Region
+from flowrec.store.rows import Row
 from flowrec.store.run_files import Run, RunFile
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS, Tick
@@ -154,6 +155,31 @@ class SessionReader:
                 for stamp_ns, message in self._file(number).messages(field):
                     if not number or stamp_ns > file.first_ns:
                         yield message
+
+    def rows(self, fields: Collection[str]) -> Iterator[tuple[str, Row]]:
+        """Field of Tick and row of plain values (see rows.py) of each message of some topics, in order of time.
+
+        The rows of "frame" come last. They are made from the file's index, without numbers and images, which are None.
+        """
+        small = set(fields) - {"frame"}
+        for number, file in enumerate(self._run.files):
+            if self._fields[number] & small:
+                for stamp_ns, field, row in self._file(number).rows(small):
+                    if not number or stamp_ns > file.first_ns:
+                        yield field, row
+        if "frame" in fields:
+            for stamp_ns in self.frame_stamps:
+                yield "frame", (stamp_ns, None, None, self.frame_bits)
+
+    @functools.cached_property
+    def frame_stamps(self) -> list[int]:
+        """The stamps of the recorded images, in order; no image is read for them."""
+        found: list[int] = []
+        for number, file in enumerate(self._run.files):
+            if "frame" in self._fields[number]:
+                stamps = self._file(number).stamps("frame")
+                found += [stamp_ns for stamp_ns in stamps if not number or stamp_ns > file.first_ns]
+        return found
 
     def close(self) -> None:
         """Close the session; forgotten readers close theirs when they are collected."""

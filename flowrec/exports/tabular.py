@@ -1,0 +1,148 @@
+"""The export formats parquet and csv: a table a topic, streamed, with a datapackage.json that explains each column.
+
+Besides the topics there are a table of each flow field and one of the observed flow, with a row a place.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from flowrec.errors import SessionError
+from flowrec.exports.datapackage import write_datapackage
+from flowrec.session import Session
+from flowrec.tables.arrow import schema_of
+from flowrec.tables.long import field_values, observed_flow
+from flowrec.tables.meanings import summary_of
+from flowrec.topics import BY_FIELD, TOPICS
+from flowrec.units import seconds
+
+_LEVEL = 1  # of zstd: a quarter of the time of level 3 for a tenth more bytes
+
+
+class _Tables:
+    """What both formats share: implements flowrec.exports.formats.Exporter but for the writer of a file."""
+
+    suffixes = ("",)
+    folder = True
+    suffix: str
+
+    @abstractmethod
+    def opened(self, path: Path, schema: pa.Schema) -> Any:
+        """A writer of record batches with that schema, as a context manager with `write`."""
+
+    def kept(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
+        """The columns that the format holds."""
+        return table
+
+    def is_export_of(self, _path: Path, _session: Session) -> bool:
+        return False
+
+    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+        topics = [topic.field for topic in TOPICS if session.topics.get(topic.path)]
+        if not topics:
+            raise SessionError(f"{session.path}: holds no messages, so there are no tables; see flowrec info")
+        begin_s = seconds(session.run.first_ns)
+        about: dict[str, tuple[pa.Schema, str]] = {}
+        with ExitStack() as stack:
+            writers: dict[str, Any] = {}
+            for topic in topics:
+                name, schema = topic + self.suffix, self.kept(schema_of(topic))
+                writers[topic] = stack.enter_context(self.opened(part / name, schema))
+                about[name] = schema, f"{summary_of(BY_FIELD[topic].type)}; {BY_FIELD[topic].path}, a row a message"
+            for topic, batch in session.batches(topics):
+                writers[topic].write(self.kept(batch))
+                progress(batch.column("time_s")[-1].as_py() - begin_s)
+        for name, table, meaning in _places(session):
+            with self.opened(part / (name + self.suffix), table.schema) as writer:
+                for batch in table.to_batches():
+                    writer.write(batch)
+            about[name + self.suffix] = table.schema, meaning
+        write_datapackage(part, session, about)
+
+
+def _places(session: Session) -> Iterator[tuple[str, pa.Table, str]]:
+    """Name, table and description of what has a row a place, as it was last known."""
+    for name, field in session.fields.items():
+        meaning = f"the {name} flow field, at the centres of the fluid pixels; method {field.method}"
+        yield f"field_{name}", field_values(field, session.chip.mask), meaning
+    observations = session.reader.tick_before(session.run.last_ns, with_frames=False).observations
+    if observations is not None:
+        meaning = "the latest observations of the flow, a row each, as flowrec.refine reads them"
+        yield "observed_flow", observed_flow(observations), meaning
+
+
+class ParquetExport(_Tables):
+    """Parquet, compressed; https://parquet.apache.org. Arrays are nested lists."""
+
+    suffix = ".parquet"
+    advice = "a table a topic, for pandas.read_parquet, DuckDB and others, is in"
+
+    def opened(self, path: Path, schema: pa.Schema) -> Any:
+        writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", compression_level=_LEVEL)
+        return _Batches(writer)
+
+
+class _Batches:
+    """Of a ParquetWriter, with the method names that CSVWriter has."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Write one batch as a row group."""
+        self._writer.write_batch(batch)
+
+    def __enter__(self) -> _Batches:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._writer.close()
+
+
+class CsvExport(_Tables):
+    """CSV by RFC 4180, UTF-8, numbers exact; an array is a cell with a JSON array, rasters are left out.
+
+    The last flow field of each kind is in a table by itself, with a row a pixel. NaN and infinities are `nan` and
+    `inf`, in arrays `NaN` and `Infinity`; what is not stated is an empty cell.
+    """
+
+    suffix = ".csv"
+    advice = "a table a topic, for spreadsheets and everything else, is in"
+
+    def opened(self, path: Path, schema: pa.Schema) -> Any:
+        flat = pa.schema([field if not pa.types.is_nested(field.type) else _text(field) for field in schema])
+        return pyarrow.csv.CSVWriter(path, flat)
+
+    def kept(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
+        schema = table if isinstance(table, pa.Schema) else table.schema
+        kept = [field for field in schema if not _is_raster(field.type)]
+        if table is schema:
+            return pa.schema(kept, metadata=schema.metadata)
+        columns = [table.column(field.name) for field in kept]
+        texts = [
+            pa.array([None if cell is None else json.dumps(cell) for cell in column.to_pylist()], pa.string())
+            if pa.types.is_nested(field.type)
+            else column
+            for field, column in zip(kept, columns, strict=True)
+        ]
+        return pa.RecordBatch.from_arrays(texts, schema=pa.schema([_text(field) for field in kept]))
+
+
+def _text(field: pa.Field) -> pa.Field:
+    return pa.field(field.name, pa.string()) if pa.types.is_nested(field.type) else field
+
+
+def _is_raster(kind: pa.DataType) -> bool:
+    """Whether the cells of a column are arrays of float32: fields on the pixels of the chip, and looks of the robot."""
+    while pa.types.is_nested(kind):
+        kind = kind.value_type
+    return bool(pa.types.is_float32(kind))

@@ -1,0 +1,85 @@
+"""The columns of the table of a topic, derived from the declaration of its message type.
+
+A plain number, a truth value or a text is a column; a vector of two or three is a column a component, `position_um`
+becomes `position_x_um` and `position_y_um`; every other array is a column of (nested) lists. The table of the images
+has neither pixels nor their numbers, for which gigabytes would be decompressed: `Session.frames` has both.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+from flowrec.declarations import MessageField, message_fields
+from flowrec.messages import Frame
+from flowrec.tables.meanings import meanings, summary_of
+from flowrec.topics import BY_FIELD
+from flowrec.units import unit_of, unit_suffix
+
+_AXES = "xyz"
+_KINDS = {int: "int64", float: "float64", bool: "bool", str: "string"}
+
+# The columns that every table begins with.
+STAMP, TIME, WALL = "stamp_ns", "time_s", "wall_time"
+_COMMON = {
+    STAMP: ("int64", "stamp of the message on the session clock"),
+    TIME: ("float64", "the same in s, as in Session.at"),
+    WALL: ("timestamp", "the same as time of day, UTC; empty in files that do not state when their clock was 0"),
+}
+_READ_WITH_PIXELS: dict[type, tuple[str, ...]] = {Frame: ("index", "image")}
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column.
+
+    Attributes
+    ----------
+    name : with the unit at its end.
+    field : of the message, "" for a column that every table has.
+    component : of a vector field, which this column holds; None: the whole field.
+    kind : int64, float64, float32, bool, string or timestamp: of its values, or of the elements of its lists.
+    shape : of the lists, a letter for a length that changes; () for single values.
+    unit : such as "um/s"; "" for pure numbers, texts, and where it is not the same for all elements.
+    meaning : in words.
+    """
+
+    name: str
+    field: str
+    component: int | None
+    kind: str
+    shape: tuple[int | str, ...]
+    unit: str
+    meaning: str
+
+
+@functools.cache
+def columns_of(topic: str) -> tuple[Column, ...]:
+    """The columns of the table of a topic, which is named by its field of `Tick`."""
+    message_type: type = BY_FIELD[topic].type
+    known = meanings(message_type)
+    columns = [Column(name, "", None, kind, (), unit_of(name), text) for name, (kind, text) in _COMMON.items()]
+    for each in message_fields(message_type):
+        if each.name not in (STAMP, *_READ_WITH_PIXELS.get(message_type, ())):
+            columns += _columns(each, known.get(each.name) or summary_of(message_type))
+    # A field that is called like a column of every table: the times of observations.
+    return tuple(
+        replace(column, name=f"{topic}_{column.name}") if column.field and column.name in _COMMON else column
+        for column in columns
+    )
+
+
+def _columns(field: MessageField, meaning: str) -> list[Column]:
+    unit = unit_of(field.name)
+    if field.dtype is None:
+        return [Column(field.name, field.name, None, _KINDS[field.kind], (), unit, meaning)]
+    assert field.shape is not None  # topics.py asks for it
+    shape, kind = field.shape.lengths, field.dtype.name
+    if len(shape) == 1 and shape[0] in (2, 3) and not field.optional:
+        suffix = unit_suffix(field.name)
+        stem = field.name.removesuffix(suffix)
+        return [
+            Column(f"{stem}_{axis}{suffix}", field.name, number, kind, (), unit, f"{axis}: {meaning}")
+            for number, axis in enumerate(_AXES[: int(shape[0])])
+        ]
+    return [Column(field.name, field.name, None, kind, shape, unit, meaning)]

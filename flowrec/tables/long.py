@@ -1,0 +1,77 @@
+"""Flow fields and observations as tables with a row a place: what a person plots, and what `flowrec.refine` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from flowrec.messages import FlowField, Observations
+from flowrec.units import unit_of
+
+# Columns of observations in the order of a user's file; the first four are needed, the others may be left out.
+OBSERVED = {
+    "x_um": "place of the observation, x in the chip frame",
+    "y_um": "place of the observation, y in the chip frame",
+    "u_um_s": "measured flow along x",
+    "v_um_s": "measured flow along y",
+    "std_um_s": "one standard deviation of each component of the measured flow",
+    "own_u_um_s": "the robot's own motion through the fluid as assumed, along x; it is subtracted already",
+    "own_v_um_s": "the robot's own motion through the fluid as assumed, along y; it is subtracted already",
+    "time_s": "middle of the time that the flow is a mean over, on the session clock",
+}
+_FIELD = {
+    "x_um": "centre of the pixel, x in the chip frame",
+    "y_um": "centre of the pixel, y in the chip frame",
+    "u_um_s": "flow velocity along x",
+    "v_um_s": "flow velocity along y",
+    "std_u_um_s": "one standard deviation of u_um_s; empty if the method states none",
+    "std_v_um_s": "one standard deviation of v_um_s; empty if the method states none",
+    "pressure_pa": "pressure above that of an outlet at 0 Pa",
+}
+
+
+def observed_flow(observations: Observations) -> pa.Table:
+    """Observations with a row each, in the columns OBSERVED; what is not stated is empty."""
+    n = len(observations.position_um)
+    none = np.full((n, 2), np.nan)
+    rolled = observations.rolled_um_s if observations.rolled_um_s is not None else none
+    time_s = observations.time_s if observations.time_s is not None else none[:, 0]
+    parts = (observations.position_um, observations.flow_um_s, observations.std_um_s[:, None], rolled, time_s[:, None])
+    empty = {
+        "own_u_um_s": observations.rolled_um_s is None,
+        "own_v_um_s": observations.rolled_um_s is None,
+        "time_s": observations.time_s is None,
+    }
+    return _table(OBSERVED, np.hstack(parts), empty)
+
+
+def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
+    """A flow field with a row for each pixel of fluid.
+
+    Parameters
+    ----------
+    fluid : (h, w), where the chip holds fluid.
+    """
+    rows, columns = np.nonzero(fluid)
+    places = np.column_stack([columns, rows]) * field.um_per_px
+    std = field.std_um_s[fluid] if field.std_um_s is not None else np.full((len(rows), 2), np.nan)
+    values = np.hstack([places, field.velocity_um_s[fluid], std, field.pressure_pa[fluid][:, None]])
+    return _table(_FIELD, values, dict.fromkeys(("std_u_um_s", "std_v_um_s"), field.std_um_s is None))
+
+
+def _table(columns: Mapping[str, str], values: NDArray[Any], empty: Mapping[str, bool]) -> pa.Table:
+    schema = pa.schema(
+        [
+            pa.field(name, pa.float64(), metadata={"unit": unit_of(name), "meaning": text})
+            for name, text in columns.items()
+        ]
+    )
+    arrays = [
+        pa.nulls(len(values), pa.float64()) if empty.get(name) else pa.array(np.ascontiguousarray(values[:, number]))
+        for number, name in enumerate(columns)
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
