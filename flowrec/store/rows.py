@@ -1,6 +1,6 @@
 """Records -> rows of plain values, for tables: a fifth of the time that messages with their arrays take.
 
-A row has one value for each field of the message type, in order: int, float, bool, str, a list for a vector, an array
+A row has one value for each field of the message type, in order: int, float, bool, str, a tuple for a vector, an array
 for an array, or None.
 """
 
@@ -61,10 +61,10 @@ def row_decoder(contents: SessionContents, channel: int) -> Callable[[Record], R
     return small
 
 
-def _shape(value: list[float] | NDArray[Any] | None) -> tuple[int, ...] | None:
+def _shape(value: tuple[float, ...] | NDArray[Any] | None) -> tuple[int, ...] | None:
     if value is None:
         return None
-    return (len(value),) if isinstance(value, list) else value.shape
+    return (len(value),) if isinstance(value, tuple) else value.shape
 
 
 def _unpacker(form: MessageField) -> Callable[[Any], Any]:
@@ -73,7 +73,7 @@ def _unpacker(form: MessageField) -> Callable[[Any], Any]:
     if form.kind == "vector":
 
         def present(parsed: Any) -> Any:
-            return list(getattr(parsed, name))
+            return tuple(getattr(parsed, name))  # not a list, which the garbage collector visits again and again
 
     elif form.kind == "array":
         assert dtype is not None

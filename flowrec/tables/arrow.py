@@ -24,7 +24,7 @@ try:
 except ModuleNotFoundError as error:
     raise UsageError("tables need pyarrow, which is not installed: pip install 'flowrec[export]'") from error
 
-_ROWS = 8192
+_ROWS = 4096
 _BATCH_BYTES = 32 << 20
 
 
@@ -96,8 +96,8 @@ def _type_of(column: Column) -> pa.DataType:
 
 
 def _flat(cells: tuple[Any, ...], kind: str) -> NDArray[Any]:
-    """All elements of vectors or arrays one after the other; a vector is a list."""
-    if cells and isinstance(cells[0], list):
+    """All elements of vectors or arrays one after the other; a vector is a tuple."""
+    if cells and isinstance(cells[0], tuple):
         return np.fromiter(itertools.chain.from_iterable(cells), kind)
     return np.concatenate([np.ravel(cell) for cell in cells]) if cells else np.zeros(0, kind)
 
@@ -105,7 +105,7 @@ def _flat(cells: tuple[Any, ...], kind: str) -> NDArray[Any]:
 def _lists(column: Column, cells: tuple[Any, ...]) -> pa.Array:
     """Arrays of one number of dimensions and of any shape, None among them, as nested lists without a copy a number."""
     there = [cell for cell in cells if cell is not None]
-    shapes = np.array([(len(cell),) if isinstance(cell, list) else cell.shape for cell in there], np.int64)
+    shapes = np.array([(len(cell),) if isinstance(cell, tuple) else cell.shape for cell in there], np.int64)
     axes = len(column.shape)
     shapes = shapes.reshape(len(there), axes)  # also where there is none
     values = pa.array(_flat(tuple(there), column.kind))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +12,7 @@ from typer.testing import CliRunner
 
 import flowrec
 from flowrec.cli import app
-from flowrec.errors import UsageError
+from flowrec.errors import SessionError, UsageError
 from flowrec.exports.formats import EXPORTS
 from flowrec.system.outputs import OutputError
 
@@ -28,15 +30,16 @@ def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_f
     any_export: str, tmp_path: Path
 ) -> None:
     session = Path(shutil.copy(GOLDEN, tmp_path))
-    file = flowrec.export(session, file_format=any_export)
-    assert file.parent == tmp_path
-    assert file.stem == session.stem
-    assert file.stat().st_size > 0
-    assert flowrec.export(session, file_format=any_export) == file
-    file.write_bytes(b"precious")
-    with pytest.raises(OutputError, match="exists already"):
+    made = flowrec.export(session, file_format=any_export)
+    assert made.parent == tmp_path
+    assert made.stem.startswith(session.stem)
+    assert flowrec.export(session, file_format=any_export) == made
+    assert set(tmp_path.iterdir()) == {session, made}
+    precious = made / "precious" if made.is_dir() else made
+    precious.write_bytes(b"precious")
+    with pytest.raises(OutputError, match=r"exists already|flowrec export did not write"):
         flowrec.export(session, file_format=any_export)
-    assert file.read_bytes() == b"precious"
+    assert precious.read_bytes() == b"precious"
 
 
 def test_the_help_of_export_lists_every_format_with_its_summary(any_export: str) -> None:
@@ -49,3 +52,82 @@ def test_an_unknown_format_is_an_error_that_names_the_formats(tmp_path: Path) ->
     with pytest.raises(UsageError, match=r"--format = 'cvs': must be one of .*rrd"):
         flowrec.export(GOLDEN, tmp_path / "x.cvs", file_format="cvs")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_format_whose_library_is_not_installed_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib
+
+    def absent(name: str) -> object:
+        raise ModuleNotFoundError("No module named 'pyarrow'", name="pyarrow")
+
+    monkeypatch.setattr(importlib, "import_module", absent)
+    with pytest.raises(UsageError, match=r"needs pyarrow, which is not installed: pip install 'flowrec\[export\]'"):
+        EXPORTS["parquet"].load()
+
+
+@pytest.fixture(scope="module")
+def tables(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The folders of the golden session in both formats of tables."""
+    folder = tmp_path_factory.mktemp("tables")
+    return {name: flowrec.export(GOLDEN, folder / name, file_format=name) for name in ("parquet", "csv")}
+
+
+def test_other_programs_read_the_tables_with_stamps_to_the_nanosecond(tables: dict[str, Path]) -> None:
+    import duckdb
+    import pandas
+
+    track = list(flowrec.open(GOLDEN).messages("track"))
+    stamps, x_um = [each.stamp_ns for each in track], [float(each.position_um[0]) for each in track]
+    parquet, text = tables["parquet"] / "track.parquet", tables["csv"] / "track.csv"
+    for frame in (pandas.read_parquet(parquet), pandas.read_csv(text)):
+        assert frame["stamp_ns"].tolist() == stamps
+        assert frame["position_x_um"].tolist() == pytest.approx(x_um, rel=1e-14)
+    for file in (parquet, text):
+        rows = duckdb.sql(f"select stamp_ns, position_x_um from '{file}' order by stamp_ns").fetchall()
+        assert rows == list(zip(stamps, x_um, strict=True))
+    with text.open(newline="", encoding="utf-8") as lines:
+        read = list(csv.DictReader(lines))
+    assert [(int(row["stamp_ns"]), float(row["position_x_um"])) for row in read] == list(zip(stamps, x_um, strict=True))
+    assert json.loads(read[0]["roi_px"]) == track[0].roi_px.tolist()
+
+
+def test_the_data_package_names_every_file_and_column_with_unit_and_meaning(tables: dict[str, Path]) -> None:
+    import pandas
+
+    for name, folder in tables.items():
+        package = json.loads((folder / "datapackage.json").read_text(encoding="utf-8"))
+        files = {each["path"]: each for each in package["resources"]}
+        assert set(files) | {"datapackage.json", "flowrec_export.json"} == {path.name for path in folder.iterdir()}
+        read = pandas.read_parquet if name == "parquet" else pandas.read_csv
+        for path, resource in files.items():
+            if "schema" in resource:
+                columns = [each["name"] for each in resource["schema"]["fields"]]
+                assert columns == list(read(folder / path).columns)
+                assert all(each["description"] for each in resource["schema"]["fields"])
+    units = {each["name"]: each.get("unit") for each in files["track.csv"]["schema"]["fields"]}
+    assert units["position_x_um"] == "um" and units["seen"] is None
+    field = flowrec.open(GOLDEN).fields["refined"]
+    table = pandas.read_parquet(tables["parquet"] / "field_refined.parquet")
+    row, column = (table[["y_um", "x_um"]].to_numpy() / field.um_per_px).round().astype(int)[100]
+    assert table[["u_um_s", "v_um_s"]].to_numpy()[100].tolist() == field.velocity_um_s[row, column].tolist()
+
+
+def test_a_disk_that_is_full_halfway_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import errno
+
+    import pyarrow.parquet
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(pyarrow.parquet.ParquetWriter, "write_batch", full)
+    with pytest.raises(SessionError, match=r"a: can not be written \(No space left on device\); choose another place"):
+        flowrec.export(GOLDEN, tmp_path / "a", file_format="parquet")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_verb_takes_the_folder_as_a_word_and_says_what_it_made(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["export", str(GOLDEN), str(tmp_path / "t"), "--format", "parquet", "--json"])
+    facts = json.loads(done.stdout)
+    nbytes = sum(path.stat().st_size for path in (tmp_path / "t").iterdir())
+    assert facts == {"session": str(GOLDEN), "parquet": str(tmp_path / "t"), "bytes": nbytes}
