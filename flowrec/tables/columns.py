@@ -82,4 +82,6 @@ def _columns(field: MessageField, meaning: str) -> list[Column]:
             Column(f"{stem}_{axis}{suffix}", field.name, number, kind, (), unit, f"{axis}: {meaning}")
             for number, axis in enumerate(_AXES[: int(shape[0])])
         ]
+    if field.optional:  # lists of one fixed length can not be absent
+        shape = ("any", *shape[1:])
     return [Column(field.name, field.name, None, kind, shape, unit, meaning)]
