@@ -73,7 +73,7 @@ def time_left(estimate_s: float | None, stands_s: float) -> str:
 def table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], to: TextIO | None = None, text: str = ""
 ) -> None:
-    """Print a table on stdout, or on `to`; if there is a column `text`, it and the first one are folded and no other."""
+    """Print a table on stdout, or on `to`; where a column is named `text`, only it and the first one are folded."""
     to = to or sys.stdout
     shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
     for number, column in enumerate(columns):

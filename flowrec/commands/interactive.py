@@ -33,6 +33,7 @@ _PERIOD_S = 0.12
 _CLOSE_TIMEOUT_S = 0.3  # for the last events to be shown
 _EVENTS_LIMIT = 1000
 _COLOURS: dict[str, str] = {Level.WARNING: "yellow", Level.ERROR: "red"}
+_QUEUE_SHOWN_MB = 1.0  # a smaller queue of the writer is usual
 _NOTE_SHOWN = 60  # characters of a long note, from its end
 
 
@@ -198,19 +199,22 @@ class StatusLine:
         latency = np.percentile(latencies, [50, 99]) if latencies else (0.0, 0.0)
         queue_mb, drops = (timing.queue_mb, timing.dropped_frames) if timing is not None else (0.0, 0)
         error = tick.demand.error_um if tick.demand is not None else float("nan")
+        # In the order of their worth: what does not fit into the line is left out from the end.
         parts = [
             *(["HELD"] if mission is not None and mission.held_since_ns is not None else []),
             f"{phase}{wait}",
-            f"t {seconds(tick.stamp_ns):.1f} s",
-            f"{rate:.0f} fps",
-            f"tick {latency[0]:.1f}/{latency[1]:.1f} ms (median/p99)",
+            f"{seconds(tick.stamp_ns):.1f} s",
+            *([f"{drops} images dropped"] if drops else []),
             f"error {error:.0f} um" if np.isfinite(error) else "no route",
-            f"drops {drops}",
-            f"queue {queue_mb:.0f} MB",
-            f"file {self._file_bytes() / 1e6:.0f} MB",
+            *([f"queue {queue_mb:.0f} MB"] if queue_mb >= _QUEUE_SHOWN_MB else []),
             self._disk(),
+            f"{rate:.0f} images/s",
+            f"tick {latency[0]:.1f} ms",
+            f"p99 {latency[1]:.1f} ms",
+            f"file {self._file_bytes() / 1e6:.0f} MB",
         ]
-        return Text("  ".join(parts), style="bold", no_wrap=True, overflow="ellipsis")
+        fits = [k for k in range(1, len(parts) + 1) if len("  ".join(parts[:k])) < console.width]
+        return Text("  ".join(parts[: max(fits, default=1)]), style="bold", no_wrap=True, overflow="ellipsis")
 
 
 def _print(event: Event) -> None:

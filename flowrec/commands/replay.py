@@ -16,6 +16,7 @@ from flowrec import topics
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay_result import CommandDifference, Replayed, WorkerCheck, digest_lines
+from flowrec.commands.run_summary import figures_of
 from flowrec.config import ResolvedConfig, with_sets
 from flowrec.control.controller import CONTROLLERS
 from flowrec.enums import Outcome, Phase, WorkOrder
@@ -33,7 +34,7 @@ from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
 from flowrec.store.writer import SessionWriter
-from flowrec.summary import Figures, as_text
+from flowrec.summary import as_text
 from flowrec.system.outputs import MCAP, Output
 from flowrec.terminal import warn
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
@@ -204,14 +205,10 @@ def replay(
             if last is not report.last and sinks:
                 sinks[0].write(last)
         if writer is not None:
-            figures: Figures = {
-                "outcome": Outcome.STOPPED if stopped else Outcome.REPLAYED,
-                "note": f"replay of {path.name}" + (f", {stopped}" if stopped else ""),
-                "duration_s": report.duration_s,
-                "wall_s": report.wall_s,
-                "ticks": report.ticks,
-            }
-            writer.close(as_text(figures))
+            ended = Outcome.STOPPED if stopped else Outcome.REPLAYED
+            note = f"replay of {path.name}" + (f", {stopped}" if stopped else "")
+            figures = figures_of(session.chip, replace(report, last=last), rig.recorded.true_field)
+            writer.close(as_text(figures | {"outcome": ended, "note": note}))
     result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing)
     if verify:
         result.worker_check, result.digest = check, digest_lines(path)

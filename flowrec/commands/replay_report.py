@@ -14,12 +14,11 @@ import numpy as np
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay import Change, planned_from, replay
 from flowrec.commands.replay_result import CommandDifference, Replayed
-from flowrec.commands.run_summary import length_um
+from flowrec.commands.run_summary import flow_error, length_um
 from flowrec.config import ResolvedConfig
 from flowrec.enums import Phase
 from flowrec.errors import SessionError, UsageError
 from flowrec.flow import sample
-from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import FlowField, Observations, Route
 from flowrec.pipeline import assemble
 from flowrec.planning import travel_time
@@ -75,8 +74,8 @@ def before_after(done: ReplayPair) -> list[Row]:
 
     add("map", lambda tick: tick.field.method if tick.field is not None else "none")
     if was.true_field is not None:
-        add("assumed_flow_error", lambda tick: _flow_error(done, tick.assumed))
-        add("refined_flow_error", lambda tick: _flow_error(done, tick.refined))
+        add("assumed_flow_error", lambda tick: flow_error(done.session.chip, tick.assumed, was.true_field))
+        add("refined_flow_error", lambda tick: flow_error(done.session.chip, tick.refined, was.true_field))
     observations = now.observations or was.observations or no_observations(0)
     if len(observations.position_um) and was.field is not None and now.field is not None:
         add("observations", lambda _: len(observations.position_um))
@@ -230,13 +229,6 @@ def _largest_change(was: FlowField, now: FlowField) -> float:
     """Largest change of a velocity component relative to the largest component."""
     largest = float(np.abs(was.velocity_um_s).max())
     return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
-
-
-def _flow_error(done: ReplayPair, flow: FlowField | None) -> float | None:
-    truth = done.recorded.true_field
-    if flow is None or truth is None or (flow.wall_px is None) != (truth.wall_px is None):
-        return None  # means over pixels, of numerics 1, are not compared with values at their centres
-    return finite(float(relative_rmse(flow, truth, done.session.chip.mask).v))
 
 
 def _residual_um_s(flow: FlowField | None, observations: Observations) -> float | None:

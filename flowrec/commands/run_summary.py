@@ -112,10 +112,17 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
             flow: FlowField | None = getattr(last, name)
             if flow is not None:
                 figures[f"{name}_method"] = flow.method
-                figures[f"{name}_flow_error"] = finite(float(relative_rmse(flow, true_field, chip.mask).v))
+                figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)
     if last.observations is not None:
         figures["observations"] = len(last.observations.position_um)
     return figures
+
+
+def flow_error(chip: Chip, flow: FlowField | None, true_field: FlowField | None) -> float | None:
+    """Relative RMSE of a flow over the fluid pixels; None where one is not known, or not comparable."""
+    if flow is None or true_field is None or (flow.wall_px is None) != (true_field.wall_px is None):
+        return None  # means over pixels, of numerics 1, are not compared with values at their centres
+    return finite(float(relative_rmse(flow, true_field, chip.mask).v))
 
 
 def length_um(route: Route) -> float:
