@@ -30,9 +30,11 @@ from flowrec.session_verbs import (
     SessionFile,
     check,
     compare,
+    examples,
     export,
     info,
     list_directory,
+    methods_of,
     note,
     recover,
     view,
@@ -69,7 +71,7 @@ def root(
     """Record, replay and view missions of magnetic micro-robots in flow."""
 
 
-@app.command()
+@app.command(epilog=examples("record"))
 def record(
     config: Annotated[Path | None, typer.Argument(help="Configuration (TOML); --dry-run prints one.")] = None,
     rig: Annotated[str | None, typer.Option(help="Rig to use: simulated, movie, lab.")] = None,
@@ -149,15 +151,28 @@ def record(
     raise typer.Exit(recorded.exit_status)
 
 
-@app.command(cls=HelpWithMethods)
+@app.command(cls=HelpWithMethods, epilog=examples("replay"))
 def replay(
     session: SessionFile,
     refine: Annotated[
-        str | None, typer.Option(metavar="[METHOD]", help=f"Refine the flow again; without a method: {DEFAULT_REFINE}.")
+        str | None,
+        typer.Option(
+            autocompletion=methods_of("refine"),
+            metavar="[METHOD]",
+            help=f"Refine the flow again; without a method: {DEFAULT_REFINE}.",
+        ),
     ] = None,
-    plan: Annotated[str | None, typer.Option(metavar="METHOD", help="Plan with another planner.")] = None,
-    observer: Annotated[str | None, typer.Option(metavar="NAME", help="Estimate with another observer.")] = None,
-    controller: Annotated[str | None, typer.Option(metavar="NAME", help="Control with another control law.")] = None,
+    plan: Annotated[
+        str | None, typer.Option(autocompletion=methods_of("plan"), metavar="METHOD", help="Plan with another planner.")
+    ] = None,
+    observer: Annotated[
+        str | None,
+        typer.Option(autocompletion=methods_of("observer"), metavar="NAME", help="Estimate with another observer."),
+    ] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(autocompletion=methods_of("controller"), metavar="NAME", help="Control with another control law."),
+    ] = None,
     sets: Sets = None,
     from_s: Annotated[float | None, typer.Option("--from", metavar="TIME", help="Resume at this second.")] = None,
     verify: Annotated[bool, typer.Option("--verify", help="Compare with the recording, message by message.")] = False,
@@ -203,9 +218,10 @@ def replay(
         say(line)
 
 
-app.command("import")(import_movie)
+app.command("import", epilog=examples("import"))(import_movie)
 for _verb in (doctor, view, export, info, list_directory, note, check, recover, compare):
-    app.command("ls" if _verb is list_directory else None, cls=HelpWithMethods)(_verb)
+    _name = "ls" if _verb is list_directory else _verb.__name__
+    app.command(_name, cls=HelpWithMethods, epilog=examples(_name))(_verb)
 
 
 def _split(text: str) -> dict[str, float]:

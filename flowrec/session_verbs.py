@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,6 +25,22 @@ METHODS = {
     "file_format": "flowrec.exports.formats:EXPORTS",
 }
 
+# What a person may type, at the end of the help of each verb.
+EXAMPLES = {
+    "record": ("flowrec record --goal 5200,1400", "flowrec record lab.toml -o run.mcap --split 2GB,10min"),
+    "replay": ("flowrec replay a.mcap --refine", "flowrec replay a.mcap --plan astar_time --refly -o b.mcap"),
+    "import": ("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap",),
+    "doctor": ("flowrec doctor lab.toml",),
+    "view": ("flowrec view a.mcap", "flowrec view a.mcap --screenshot a.png --time 12"),
+    "export": ("flowrec export a.mcap", "flowrec export a.mcap tables --format parquet"),
+    "info": ("flowrec info a.mcap --json",),
+    "ls": ("flowrec ls runs", 'flowrec ls runs/*.mcap --where "refined_flow_error < 0.05" --sort -duration_s'),
+    "note": ('flowrec note a.mcap "bubble at the outlet" --tag bubble', "flowrec note a.mcap"),
+    "check": ("flowrec check a.mcap",),
+    "recover": ("flowrec recover a.mcap.partial",),
+    "compare": ("flowrec compare a.mcap b.mcap",),
+}
+
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
 RrdOut = Annotated[
     Path | None,
@@ -33,14 +50,33 @@ RrdOut = Annotated[
 ]
 
 
+def examples(verb: str) -> str:
+    """The examples of a verb as the end of its help."""
+    return "\n\n".join(["Examples:", *EXAMPLES[verb]])
+
+
+def methods_of(parameter: str) -> Callable[[str], list[str]]:
+    """What a shell offers to complete an option that selects a method."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in _table(parameter) if name.startswith(incomplete)]
+
+    return complete
+
+
+def _table(parameter: str) -> Mapping[str, Any]:
+    module, _, table = METHODS[parameter].partition(":")
+    found: Mapping[str, Any] = getattr(importlib.import_module(module), table)
+    return found
+
+
 class HelpWithMethods(TyperCommand):
     """A verb whose help names the methods of its options; the tables are imported when the help is printed."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         for parameter in self.params:
             if isinstance(parameter, TyperOption) and parameter.name in METHODS:
-                module, _, table = METHODS[parameter.name].partition(":")
-                rows = getattr(importlib.import_module(module), table).values()
+                rows = _table(parameter.name).values()
                 parameter.help = f"{parameter.help} " + "; ".join(f"{row.name}: {row.summary}" for row in rows) + "."
         super().format_help(ctx, formatter)
 
@@ -85,7 +121,12 @@ def export(
     directory: Annotated[
         Path | None, typer.Argument(metavar="[OUT]", help="File or folder to write, or a folder for the file.")
     ] = None,
-    file_format: Annotated[str, typer.Option("--format", metavar="FORMAT", help="Format of the output.")] = "rrd",
+    file_format: Annotated[
+        str,
+        typer.Option(
+            "--format", metavar="FORMAT", help="Format of the output.", autocompletion=methods_of("file_format")
+        ),
+    ] = "rrd",
     out: Annotated[
         Path | None,
         typer.Option(

@@ -5,16 +5,20 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import os
+import shlex
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from flowrec import terminal
 from flowrec.bench import plan
-from flowrec.cli import app, main
-from flowrec.session_verbs import METHODS
+from flowrec.cli import app, main, with_default_refine
+from flowrec.session_verbs import EXAMPLES, METHODS
 
 SESSIONS = Path(__file__).parents[1] / "sessions"
 
@@ -75,8 +79,33 @@ def test_wrong_usage_is_told_in_one_line_that_names_the_help(
     assert line.endswith("--help")
 
 
-def test_a_shell_can_complete_the_verbs() -> None:
-    assert "--install-completion" in CliRunner().invoke(app, ["--help"], env={"COLUMNS": "120"}).output
+def test_the_help_of_every_verb_ends_with_examples_that_can_be_typed() -> None:
+    group = get_command(app)
+    verbs = {name: verb for name, verb in group.commands.items() if name not in ("bench", "calibrate")}  # type: ignore[attr-defined]
+    assert verbs.keys() == EXAMPLES.keys()
+    for name, verb in verbs.items():
+        assert all(example in verb.epilog for example in EXAMPLES[name])
+        for example in EXAMPLES[name]:
+            program, first, *words = shlex.split(example)
+            assert (program, first) == ("flowrec", name)
+            verb.make_context(name, with_default_refine(words))
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("flowrec rec", "record recover"),
+        ("flowrec replay a.mcap --plan astar_t", "astar_time"),
+        ("flowrec export a.mcap --format r", "rrd"),
+    ],
+)
+def test_a_shell_completes_verbs_and_methods(words: str, offered: str) -> None:
+    count = len(words.split()) - 1
+    asked = {"_FLOWREC_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count)}
+    done = subprocess.run(
+        [sys.executable, "-m", "flowrec"], env={**os.environ, **asked}, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == offered.split()
 
 
 def test_the_help_of_calibrate_coils_names_the_section_that_it_writes() -> None:
