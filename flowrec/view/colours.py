@@ -81,3 +81,9 @@ def _round_step(step: float) -> float:
     """The smallest of 1, 2, 2.5, 5, 10 times a power of ten that is not below `step`."""
     power = 10.0 ** math.floor(math.log10(step))
     return next(m * power for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= step * (1 - 1e-9))
+
+
+def round_below(number: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above a positive number."""
+    power = 10.0 ** math.floor(math.log10(number))
+    return max(m * power for m in (0.5, 1.0, 2.0, 5.0) if m * power <= number * (1 + 1e-9))

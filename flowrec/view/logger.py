@@ -12,12 +12,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
 from flowrec.diagnostics import Timing
 from flowrec.enums import Level, Phase
 from flowrec.flow import sample
 from flowrec.messages import Currents, Demand, Estimate, Event, Frame, Health, Mission, OperatorEvent, Route, Track
-from flowrec.store.roi import nonzero_window
 from flowrec.topics import Tick
 from flowrec.units import NS_PER_S
 from flowrec.view import colours, maps
@@ -25,9 +23,9 @@ from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label, points
 from flowrec.view.flow_logger import FlowLogger
 from flowrec.view.scene import Scene
+from flowrec.view.window_images import WindowCompleter
 
 _JPEG_QUALITY = 85
-_DIMMING = 0.6  # factor on an older image around the region that was recorded
 _NOMINAL_PX = 640.0  # width of the image that the sizes below are meant for
 _TRAIL_S = 4.0
 _TRAIL_STEP_PX = 1.0
@@ -77,8 +75,7 @@ class TickLogger:
         self._log = self._entities.log
         self._style = self._entities.style
         self._images = images
-        self._complete: Image | None = None  # the last image without a region, and the same dimmed
-        self._dimmed: Image | None = None
+        self._windows = WindowCompleter()
         self._placed_step = 0
         self._flow = FlowLogger(self._entities, scene, maps.SpeedScale() if speeds is None else speeds, self.present)
         self._tick = self._last = Tick()
@@ -141,26 +138,12 @@ class TickLogger:
         if self._placed_step != self.image_step:
             self._placed_step = self.image_step
             self._log(e.IMAGE, maps.placed(self._scene.preview_placement(self.image_step)), static=True)
-        image = self._completed(frame.image) if self._scene.windows else frame.image
+        image = self._windows.completed(frame.image) if self._scene.windows else frame.image
         if frame.bits > 8:
             image = (image >> (frame.bits - 8)).astype(np.uint8)
         done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         assert done
         self._log(e.IMAGE, rr.EncodedImage(contents=jpeg.tobytes(), media_type="image/jpeg", draw_order=-20.0))
-
-    def _completed(self, image: Image) -> Image:
-        """A recorded region within the last complete image, dimmed to show that it is older."""
-        x0, y0, x1, y1 = nonzero_window(image)
-        if (x0, y0) == (0, 0) and (y1, x1) == image.shape:
-            self._complete, self._dimmed = image, None
-            return image
-        if self._complete is None or self._complete.shape != image.shape:
-            return image
-        if self._dimmed is None:
-            self._dimmed = (_DIMMING * self._complete).astype(image.dtype)
-        completed = self._dimmed.copy()
-        completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
-        return completed
 
     def _log_route(self, route: Route) -> None:
         self.present.add("route")

@@ -1,0 +1,162 @@
+"""The camera images of a session for exports: which are shown, with which grey levels, and what is told of them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator
+from dataclasses import asdict
+from datetime import datetime
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from flowrec.config_tree import without_none
+from flowrec.declarations import Image
+from flowrec.errors import SessionError, printable
+from flowrec.messages import Frame
+from flowrec.movies.notes import MovieNotes
+from flowrec.session import Session
+from flowrec.topics import Tick
+from flowrec.units import seconds
+
+_SAMPLED = 9  # images that determine the scale of grey levels
+_DARKEST, _BRIGHTEST = 0.1, 99.9  # percentiles of grey levels that become black and white
+_OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")  # settings that the images do not tell
+
+
+def with_images(session: Session) -> Iterator[tuple[Tick, Frame]]:
+    """Ticks with a new image of the camera. Where the camera gave none, or the last one again, there is no row.
+
+    Raises
+    ------
+    SessionError : the session holds no images.
+    """
+    last: Frame | None = None
+    for tick in session.ticks():
+        frame, applied = tick.frame, tick.applied
+        if frame is None or frame is last:
+            continue
+        last = frame
+        again = applied is not None and applied.stamp_ns == frame.stamp_ns and applied.repeats_image
+        if frame.image.size and not again:
+            yield tick, frame
+    if last is None:
+        raise without_frames(session)
+
+
+def without_frames(session: Session) -> SessionError:
+    """The error for a session that has no images to export."""
+    return SessionError(
+        f"{session.path}: holds no camera images, so there is no movie; export the numbers with --format parquet or csv"
+    )
+
+
+def refuse_windows(session: Session) -> None:
+    """SessionError for a session whose images are black but for a region."""
+    if session.config.recording.region != "whole":
+        raise SessionError(
+            f"{session.path}: its images hold only the region around the robot (recording.region), which a movie without "
+            "drawings would show on black; export --format mp4 to look at it, tiff for the images as they are"
+        )
+
+
+def first_frame(session: Session) -> Frame:
+    """The first image; SessionError if there is none."""
+    if not session.topics.get("/camera/frame", 0):
+        raise without_frames(session)
+    return next(frame for _, frame in with_images(session))
+
+
+class GreyScale:
+    """Grey levels of the camera to 8 bits: black at `low`, white at `high`, linear between them.
+
+    Images of 8 bits stay as they are. Of deeper ones, `low` and `high` are the extremes over nine images of the session
+    of the 0.1 and 99.9 percentiles, because a camera rarely uses all of its levels.
+    """
+
+    def __init__(self, bits: int, low: int, high: int) -> None:
+        self.low, self.high = low, high
+        self._table: NDArray[np.uint8] | None = None
+        if bits > 8:
+            levels = np.arange(1 << 16, dtype=np.float64)
+            self._table = np.clip(np.rint((levels - low) * (255.0 / (high - low))), 0, 255).astype(np.uint8)
+
+    @classmethod
+    def of(cls, session: Session, first: Frame) -> GreyScale:
+        """That of a session."""
+        if first.bits <= 8:
+            return cls(8, 0, 255)
+        lows, highs = [], []
+        for share in np.linspace(0.0, 1.0, _SAMPLED):
+            begin, end = session.run.first_ns, session.run.last_ns
+            frame = session.at(seconds(begin + round(share * (end - begin)))).frame
+            levels = first.image if frame is None else frame.image
+            seen = levels[levels > 0]  # 0 is also what lies outside of a recorded region
+            if seen.size:
+                low, high = np.percentile(seen, (_DARKEST, _BRIGHTEST))
+                lows.append(low)
+                highs.append(high)
+        low, high = (int(min(lows)), int(np.ceil(max(highs)))) if lows else (0, 0)
+        return cls(first.bits, low, high) if high > low else cls(first.bits, 0, (1 << first.bits) - 1)
+
+    def __call__(self, image: Image) -> NDArray[np.uint8]:
+        """The image (h, w) in 8 bits."""
+        if self._table is None:
+            return image  # type: ignore[return-value]  # of 8 bits
+        scaled: NDArray[np.uint8] = self._table[image]
+        return scaled
+
+    @staticmethod
+    def text_of(notes: MovieNotes) -> str:
+        """The scale in one phrase for people."""
+        if notes.bits <= 8:
+            return "grey levels of the camera"
+        return f"grey levels {notes.grey_low} to {notes.grey_high} of {(1 << notes.bits) - 1} are 0 to 255"
+
+
+def notes_of(session: Session, first: Frame, grey: GreyScale, *, drawn: bool = False, zoom: int = 1) -> MovieNotes:
+    """What is written into a movie of a session.
+
+    Parameters
+    ----------
+    first : its first image.
+    zoom : pixels of the movie per pixel of the camera.
+    """
+    config, header = session.config, session.header
+    settings = {"robot": asdict(config.robot), "coils": asdict(config.coils)}
+    settings["camera"] = {key: value for key, value in asdict(config.camera).items() if key in _OF_CAMERA}
+    height, width = first.image.shape
+    return MovieNotes(
+        session=session.path.name,
+        session_key=session.key,
+        started=started(session),
+        first_stamp_ns=first.stamp_ns,
+        um_per_px=config.camera.um_per_px / zoom,
+        width_px=width,
+        height_px=height,
+        bits=first.bits,
+        grey_low=grey.low,
+        grey_high=grey.high,
+        drawn=drawn,
+        region=config.recording.region,
+        settings=tomli_w.dumps(without_none(settings)),
+        chip_png=base64.b64encode(header.chip_png).decode(),
+        chip_toml=header.chip_toml,
+    )
+
+
+def started(session: Session) -> str:
+    """Wall time of the start of the run, ISO 8601 with its zone; '' if the session does not state one."""
+    text = session.provenance.get("wall_time", "")
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        return ""
+    return time.isoformat() if time.tzinfo is not None else ""
+
+
+def title_of(session: Session) -> str:
+    """Name of the session and, where it is stated, of the sample."""
+    sample = printable(session.config.recording.sample)[:200]
+    return session.path.stem + (f": {sample}" if sample else "")

@@ -1,0 +1,127 @@
+"""Lines, arrows and letters on pictures (h, w, 3) in BGR. Lines have a dark rim: they are seen on light and on dark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.view.colours import SOLID, Rgb
+
+Picture = NDArray[np.uint8]
+Points = NDArray[np.float64]
+SUBPIXEL_BITS = 4  # coordinates of OpenCV's lines are given in 1/16 px
+_RIM = 0.75  # opacity of the rim
+_FAR_PX = 1e5  # beyond it nothing is drawn
+_HEAD = 0.45  # length of an arrow's head over that of the arrow
+_HEAD_PX = (2.5, 6.0)  # least and largest, in widths of its line
+_ANGLE = np.linspace(0.0, 2.0 * np.pi, 33)
+CIRCLE: Points = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], 1)
+CROSS: tuple[Points, Points] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
+
+
+class Layer:
+    """Lines that stay for many images. They are mixed with an image of grey levels as a x grey level + b, pixel by pixel.
+
+    Parameters
+    ----------
+    shape : rows and columns.
+    """
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._kept = np.ones(shape, np.float32)
+        self._added = np.zeros((*shape, 3), np.float32)
+        self._where = np.zeros(0, np.intp)
+        self._factor, self._offset = np.zeros((0, 1), np.float32), np.zeros((0, 3), np.float32)
+
+    def lines(self, lines: Iterable[Points], colour: Rgb, width_px: float) -> None:
+        """Polylines, each (n, 2) as x, y."""
+        strips = [fixed(each) for each in lines if drawable(each)]
+        for ink, width, opacity in ((SOLID, width_px + 2.0, _RIM), (colour, width_px, 1.0)):
+            mask = np.zeros(self._kept.shape, np.uint8)
+            cv2.polylines(mask, strips, False, 255, max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+            self._mix(mask, ink, opacity)
+
+    def arrows(self, begins: Points, ends: Points, colour: Rgb, width_px: float) -> None:
+        """Arrows from `begins` to `ends`, both (n, 2)."""
+        strips, heads = [], []
+        for begin, end in zip(begins, ends, strict=True):
+            length = float(np.hypot(*(end - begin)))
+            if not drawable(np.array([begin, end])) or length <= 0.0:
+                continue
+            along = (end - begin) / length
+            head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
+            across = 0.45 * head * np.array([-along[1], along[0]])
+            base = end - head * along
+            strips.append(fixed(np.array([begin, base])))
+            heads.append(fixed(np.array([end, base + across, base - across])))
+        for ink, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
+            mask = np.zeros(self._kept.shape, np.uint8)
+            cv2.polylines(mask, strips, False, 255, max(round(width_px + rim), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+            for each in heads:
+                cv2.fillPoly(mask, [each], 255, cv2.LINE_AA, SUBPIXEL_BITS)
+            if rim:
+                cv2.polylines(mask, heads, True, 255, round(rim), cv2.LINE_AA, SUBPIXEL_BITS)
+            self._mix(mask, ink, opacity)
+
+    def finish(self) -> None:
+        """End the drawing; only then the layer can be mixed with images."""
+        self._where = np.flatnonzero(self._kept < 1.0)
+        self._factor = self._kept.reshape(-1, 1)[self._where]
+        self._offset = self._added.reshape(-1, 3)[self._where] + 0.5
+
+    def blend(self, grey: NDArray[np.uint8], picture: Picture) -> None:
+        """Put the lines over an image (h, w) into a picture (h, w, 3) that shows it."""
+        levels = grey.reshape(-1)[self._where]
+        mixed = (levels[:, None] * self._factor + self._offset).astype(np.uint8)
+        picture.reshape(-1, 3)[self._where] = mixed
+
+    def _mix(self, mask: NDArray[np.uint8], colour: Rgb, opacity: float) -> None:
+        alpha = mask * np.float32(opacity / 255.0)
+        self._kept *= 1.0 - alpha
+        self._added = self._added * (1.0 - alpha[..., None]) + alpha[..., None] * np.array(bgr(colour), np.float32)
+
+
+def rimmed(picture: Picture, strips: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
+    """Polylines, as `fixed` returns them, that are drawn for one image only."""
+    for ink, width in ((SOLID, width_px + 1.0), (colour, width_px)):
+        cv2.polylines(picture, strips, False, bgr(ink), max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def stamp(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
+    """Put letters (see lettering.py) on a picture of one colour; returns their width in px."""
+    rows, columns = max(picture.shape[0] - top, 0), max(picture.shape[1] - left, 0)
+    mask = mask[:rows, :columns]
+    part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]
+    alpha = mask[..., None] * np.float32(1.0 / 255.0)
+    part[:] = part * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32) + 0.5
+    return mask.shape[1]
+
+
+def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) -> None:
+    """Put the pixels of `clean` back within a circle."""
+    x, y = centre.tolist()
+    x0, y0 = max(int(x - radius_px), 0), max(int(y - radius_px), 0)
+    x1, y1 = min(int(x + radius_px) + 2, picture.shape[1]), min(int(y + radius_px) + 2, picture.shape[0])
+    if x0 >= x1 or y0 >= y1:
+        return
+    rows, columns = np.ogrid[y0:y1, x0:x1]
+    inside = (columns - x) ** 2 + (rows - y) ** 2 <= radius_px**2
+    picture[y0:y1, x0:x1][inside] = clean[y0:y1, x0:x1][inside]
+
+
+def fixed(points: Points) -> NDArray[np.int32]:
+    """Points (n, 2) in 1/16 px, as OpenCV takes them."""
+    return np.rint(points * (1 << SUBPIXEL_BITS)).astype(np.int32).reshape(-1, 1, 2)
+
+
+def drawable(points: ArrayLike) -> bool:
+    """Whether all points are finite, and not absurdly far away."""
+    return bool((np.abs(np.asarray(points, np.float64)) < _FAR_PX).all())  # NaN is not below
+
+
+def bgr(colour: Rgb) -> Rgb:
+    """OpenCV's order of colours."""
+    return colour[2], colour[1], colour[0]

@@ -1,0 +1,152 @@
+"""Robot, route and flow drawn over the camera's images by OpenCV, with a strip below them for clock, state and scale.
+
+Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the strip.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.messages import Estimate, FlowField, Mission, Route
+from flowrec.topics import Tick
+from flowrec.units import NS_PER_S
+from flowrec.view import colours
+from flowrec.view.colours import round_below
+from flowrec.view.ink import CIRCLE, Layer, Picture, Points, drawable, fixed, restore, rimmed
+from flowrec.view.maps import arrow_grid, flow_arrows
+from flowrec.view.scene import Scene
+from flowrec.view.strip import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, Strip
+
+_LEAST_WIDTH_PX = 480  # smaller images are enlarged by a whole factor, so that words and lines are readable
+_NOMINAL_PX = 640.0  # width of the picture that the sizes below are meant for
+_LETTER_PX = 13.0
+_LINE_PX = 1.6
+_SPARSER = 1.9  # distance of the arrows over that of the viewer's map, which is larger
+_TRAIL_S = 4.0
+_TRAIL_STEP_PX = 1.0
+_RING_PX = 3.0  # between the robot and its ring
+_LONGEST = 0.9  # arrow, in spacings of the arrows
+_FASTEST = 0.99  # quantile of the speeds that has this length
+
+
+class Overlay:
+    """Draws the ticks of one session in order.
+
+    Parameters
+    ----------
+    image_px : width and height of the camera's images.
+
+    Attributes
+    ----------
+    zoom : pixels of the picture per pixel of the camera.
+    size_px : width and height of the picture, both even.
+    """
+
+    def __init__(self, scene: Scene, image_px: tuple[int, int]) -> None:
+        self.zoom = max(1, math.ceil(_LEAST_WIDTH_PX / image_px[0]))
+        self._width, self._height = (self.zoom * each for each in image_px)
+        self._unit = max(1.0, self._width / _NOMINAL_PX)
+        letter = round(_LETTER_PX * self._unit)
+        width, height = self._width, self._height + round(1.9 * letter)
+        self.size_px = width + width % 2, height + height % 2
+        self._scene = scene
+        self._canvas = np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
+        self._robot_px = self.zoom * scene.length_px(scene.robot.radius_um)
+        self._grid = _sparser(*arrow_grid(scene))
+        self._trail: deque[tuple[int, Points]] = deque()
+        um_per_px = scene.calibration.um_per_px / self.zoom
+        self._strip = Strip((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
+        self._tick = Tick()
+        self._layer = Layer((0, 0))
+        self._redraw(self._tick)
+
+    def draw(self, image: NDArray[np.uint8], tick: Tick) -> Picture:
+        """The picture in BGR of an image (h, w) of 8 bits and its tick; it is valid until the next call."""
+        last, self._tick = self._tick, tick
+        if tick.field is not last.field or tick.route is not last.route or _goal(tick.mission) != _goal(last.mission):
+            self._redraw(tick)
+        if self.zoom > 1:
+            size = (self._width, self._height)
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+        clean = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), np.uint8)
+        picture = clean.copy()
+        self._layer.blend(image, picture)
+        if tick.estimate is not None:
+            self._draw_robot(picture, clean, tick.estimate)
+        canvas = self._canvas
+        canvas[: self._height, : self._width] = picture
+        canvas[: self._height, self._width :] = picture[:, -1:]
+        self._strip.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
+        return canvas
+
+    def _to_px(self, points_um: Points) -> Points:
+        """Chip coordinates (..., 2) to pixels of the picture, counted at their centres."""
+        return self.zoom * self._scene.to_plane(points_um) - 0.5
+
+    def _redraw(self, tick: Tick) -> None:
+        """Draw what does not move: flow, route, goal, and the legend."""
+        layer, field, route = Layer((self._height, self._width)), tick.field, tick.route
+        flow = None if field is None else self._draw_flow(layer, field, refined=tick.refined is not None)
+        path = self._to_px(route.waypoints_um) if route is not None and route.reachable else np.zeros((0, 2))
+        has_route = len(path) > 1 and drawable(path)
+        if has_route:
+            layer.lines([path], ROUTE, _LINE_PX * self._unit)
+        goal = _goal(tick.mission)
+        if goal is not None:
+            centre, reach = self._to_px(np.array(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
+            layer.lines([centre + reach * part for part in GOAL_SIGN], GOAL, _LINE_PX * self._unit)
+        layer.finish()
+        self._layer = layer
+        self._strip.set_legend(goal=goal is not None, route=has_route, flow=flow)
+
+    def _draw_flow(self, layer: Layer, field: FlowField, *, refined: bool) -> tuple[str, float, float] | None:
+        """Arrows as long as the flow is fast; returns what the legend says of them."""
+        origins, vectors, speed = flow_arrows(self._scene, field, self._grid)
+        known = np.isfinite(speed) & np.isfinite(vectors).all(axis=1) & (speed > 0.0)
+        if not known.any():
+            return None
+        fastest = float(np.quantile(speed[known], _FASTEST))
+        px_per_speed = _LONGEST * self.zoom * self._scene.length_px(self._grid[1]) / fastest
+        middle = self.zoom * (origins + 0.5 * vectors)[known] - 0.5
+        along = vectors[known] / np.linalg.norm(vectors[known], axis=1, keepdims=True)
+        half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along
+        layer.arrows(middle - half, middle + half, FLOW, 0.8 * _LINE_PX * self._unit)
+        return "refined flow" if refined else "assumed flow", round_below(fastest), px_per_speed
+
+    def _draw_robot(self, picture: Picture, clean: Picture, estimate: Estimate) -> None:
+        centre, trail, unit = self._to_px(estimate.position_um), self._trail, self._unit
+        if not drawable(centre):
+            return
+        if not trail or math.dist(trail[-1][1], centre) >= _TRAIL_STEP_PX * unit:
+            trail.append((estimate.stamp_ns, centre))
+        while trail and estimate.stamp_ns - trail[0][0] > _TRAIL_S * NS_PER_S:
+            trail.popleft()
+        colour = ROBOT if estimate.seen else colours.PALE
+        way = np.array([*(point for _, point in trail), centre])
+        rimmed(picture, [fixed(way)], colour, _LINE_PX * unit)
+        ring = self._robot_px + _RING_PX * unit
+        restore(picture, clean, centre, ring)
+        rimmed(picture, [fixed(centre + ring * CIRCLE)], colour, _LINE_PX * unit)
+
+
+def _goal(mission: Mission | None) -> tuple[float, float] | None:
+    """Where the mission goes; None: nowhere."""
+    if mission is None or not drawable(mission.goal_um):
+        return None
+    x, y = mission.goal_um.tolist()
+    return x, y
+
+
+def _sparser(points_um: Points, spacing_um: float) -> tuple[Points, float]:
+    """Every point of a grid, first come first served, that is far enough from those before; and their spacing."""
+    spacing_um *= _SPARSER
+    chosen: list[Points] = []
+    for point in points_um:
+        if not chosen or np.hypot(*(np.array(chosen) - point).T).min() >= spacing_um:
+            chosen.append(point)
+    return np.array(chosen, np.float64).reshape(-1, 2), spacing_um

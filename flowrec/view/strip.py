@@ -1,0 +1,142 @@
+"""The strip below a picture: clock and state on the left; on the right a legend that ends with the scale bar."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from flowrec.enums import Phase
+from flowrec.errors import printable
+from flowrec.messages import Estimate, Mission
+from flowrec.units import seconds
+from flowrec.view import colours
+from flowrec.view.colours import Rgb, round_below
+from flowrec.view.ink import CIRCLE, CROSS, Layer, Picture, bgr, stamp
+from flowrec.view.lettering import clock_mask, text_mask
+
+ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
+_TEXT, _GROUND = colours.WHITE, (24, 24, 28)
+GOAL_SIGN = (*(np.array([0.5 * arm, arm]) for line in CROSS for arm in line), 0.75 * CIRCLE)  # a crosshair, open inside
+_LONGEST_BAR = 0.16  # of the width of the picture
+_PHASES: dict[str, str] = {
+    Phase.START: "starting",
+    Phase.SURVEY: "surveying the flow",
+    Phase.REFINE: "refining the flow",
+    Phase.PLAN: "planning the route",
+    Phase.NAVIGATE: "going to the goal",
+    Phase.OBSERVE: "observing",
+}
+_MOST_LETTERS = 40  # of words from a file
+
+
+class Strip:
+    """Draws the strip of one picture after another.
+
+    Parameters
+    ----------
+    size_px : width and height.
+    letter_px : height of the letters.
+    um_per_px : of the picture above it.
+    """
+
+    def __init__(self, size_px: tuple[int, int], letter_px: int, um_per_px: float) -> None:
+        self._width, self._height = size_px
+        self._letter, self._um_per_px = letter_px, um_per_px
+        self._line = letter_px / 9.0  # width of lines
+        self._top = (self._height - round(1.3 * letter_px)) // 2
+        self._parts: list[Picture] = []
+
+    def set_legend(self, *, goal: bool, route: bool, flow: tuple[str, float, float] | None) -> None:
+        """What the legend explains besides the robot.
+
+        Parameters
+        ----------
+        flow : words before its arrow's speed, such as "refined flow", that speed in um/s, and px per um/s.
+        """
+        r, middle = 0.34 * self._letter, 0.5 * self._height
+        centre = np.array([1.2 * r, middle])
+        self._parts = [self._part(2.4 * r, "robot", lambda layer: layer.lines([centre + r * CIRCLE], ROBOT, self._line))]
+        if goal:
+            sign = [centre + 1.2 * r * part for part in GOAL_SIGN]
+            self._parts.append(self._part(2.4 * r, "goal", lambda layer: layer.lines(sign, GOAL, 0.8 * self._line)))
+        if route:
+            px = 1.4 * self._letter
+            line = [np.array([(0.0, middle), (px, middle)])]
+            self._parts.append(self._part(px, "route", lambda layer: layer.lines(line, ROUTE, self._line)))
+        if flow is not None:
+            words, speed, px_per_speed = flow
+            tail, tip = np.array([[1.0, middle]]), np.array([[1.0 + speed * px_per_speed, middle]])
+            text = f"{words} {speed:g} µm/s"
+            self._parts.append(
+                self._part(tip[0, 0], text, lambda layer: layer.arrows(tail, tip, FLOW, 0.8 * self._line))
+            )
+        self._parts.append(self._scale_bar())
+
+    def draw(self, strip: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
+        """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
+        strip[:] = bgr(_GROUND)
+        left = round(0.6 * self._letter)
+        left += stamp(strip, clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
+        left += round(0.9 * self._letter)
+        left += stamp(strip, text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
+        right = strip.shape[1]
+        for part in reversed(self._parts):
+            begin = right - part.shape[1]
+            if begin < left + self._letter:
+                return
+            strip[:, begin:right] = part
+            right = begin
+
+    def _scale_bar(self) -> Picture:
+        length_um = round_below(_LONGEST_BAR * self._width * self._um_per_px)
+        px, middle, tick = length_um / self._um_per_px, 0.5 * self._height, 0.3 * self._letter
+        bar = np.array([(1.0, middle), (1.0 + px, middle)])
+        ends = [np.array([(x, middle - tick), (x, middle + tick)]) for x in bar[:, 0]]
+        return self._part(px + 2.0, length_text(length_um), lambda layer: layer.lines([bar, *ends], _TEXT, self._line))
+
+    def _part(self, sign_px: float, words: str, draw: Callable[[Layer], None]) -> Picture:
+        """A sign of some width with its words to the right of it."""
+        gap, mask = round(0.45 * self._letter), text_mask(words, self._letter)
+        sign = math.ceil(sign_px)
+        picture = np.empty((self._height, sign + gap + mask.shape[1] + round(1.2 * self._letter), 3), np.uint8)
+        picture[:] = bgr(_GROUND)
+        stamp(picture, mask, sign + gap, self._top, _TEXT)
+        layer = Layer(picture.shape[:2])
+        draw(layer)
+        layer.finish()
+        layer.blend(picture[..., 0].copy(), picture)
+        return picture
+
+
+def clock_text(time_s: float) -> str:
+    """A time of the session: 12.34 s, 1:02.34 or 1:00:02.34."""
+    hundredths = math.floor(100.0 * time_s + 1e-6)
+    minutes, rest = divmod(hundredths, 6000)
+    hours, minutes = divmod(minutes, 60)
+    part = f"{rest // 100}.{rest % 100:02d}"
+    if hours:
+        return f"{hours}:{minutes:02d}:{part.zfill(5)}"
+    return f"{minutes}:{part.zfill(5)}" if minutes else f"{part} s"
+
+
+def length_text(length_um: float) -> str:
+    """A length with its unit: 50 µm, 2 mm."""
+    return f"{length_um / 1e3:g} mm" if length_um >= 1e3 else f"{length_um:g} µm"
+
+
+def state_text(mission: Mission | None, estimate: Estimate | None) -> str:
+    """What happens, in a few words."""
+    words = ""
+    if mission is not None:
+        if mission.finished:
+            words = mission.outcome or "done"
+        elif mission.held_since_ns is not None:
+            words = "held by the operator"
+        else:
+            words = _PHASES.get(mission.phase, mission.phase)
+    if estimate is not None and not estimate.seen:
+        words += ", robot not seen" if words else "robot not seen"
+    words = printable(words)
+    return words if len(words) <= _MOST_LETTERS else words[: _MOST_LETTERS - 1] + "…"

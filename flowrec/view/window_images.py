@@ -1,0 +1,30 @@
+"""Images of which only a region was recorded (store/roi.py), completed with an older image for people to look at."""
+
+from __future__ import annotations
+
+from flowrec.declarations import Image
+from flowrec.store.roi import nonzero_window
+
+_DIMMING = 0.6  # factor on the older image, which shows that it is older
+
+
+class WindowCompleter:
+    """Completes one image after the other."""
+
+    def __init__(self) -> None:
+        self._complete: Image | None = None  # the last image without a region, and the same dimmed
+        self._dimmed: Image | None = None
+
+    def completed(self, image: Image) -> Image:
+        """A recorded region (h, w) within the last complete image, which is dimmed."""
+        x0, y0, x1, y1 = nonzero_window(image)
+        if (x0, y0) == (0, 0) and (y1, x1) == image.shape:
+            self._complete, self._dimmed = image, None
+            return image
+        if self._complete is None or self._complete.shape != image.shape:
+            return image
+        if self._dimmed is None:
+            self._dimmed = (_DIMMING * self._complete).astype(image.dtype)
+        completed = self._dimmed.copy()
+        completed[y0:y1, x0:x1] = image[y0:y1, x0:x1]
+        return completed
