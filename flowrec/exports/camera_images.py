@@ -6,6 +6,7 @@ import base64
 from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import tomli_w
@@ -47,17 +48,17 @@ def with_images(session: Session) -> Iterator[tuple[Tick, Frame]]:
 
 def without_frames(session: Session) -> SessionError:
     """The error for a session that has no images to export."""
-    return SessionError(
-        f"{session.path}: holds no camera images, so there is no movie; export the numbers with --format parquet or csv"
-    )
+    parent = printable(Path(session.header.parent.get("file", "")).name)
+    advice = f"it replays {parent}: export that" if parent else "flowrec info lists the topics that it holds"
+    return SessionError(f"{session.path}: holds no camera images; {advice}")
 
 
 def refuse_windows(session: Session) -> None:
     """SessionError for a session whose images are black but for a region."""
     if session.config.recording.region != "whole":
         raise SessionError(
-            f"{session.path}: its images hold only the region around the robot (recording.region), which a movie without "
-            "drawings would show on black; export --format mp4 to look at it, tiff for the images as they are"
+            f"{session.path}: its images hold only the region around the robot (recording.region), the rest is black; "
+            "use --format mp4 to look at it, tiff to have the images as they are"
         )
 
 

@@ -14,6 +14,18 @@ EXPORTS = Methods(
     Method("rrd", "flowrec.exports.rrd:RrdExport", "a recording for Rerun, what flowrec view opens"),
     Method("parquet", "flowrec.exports.tabular:ParquetExport", "a folder with a table a topic", extra="export"),
     Method("csv", "flowrec.exports.tabular:CsvExport", "the same as text, for spreadsheets", extra="export"),
+    Method(
+        "mp4",
+        "flowrec.exports.mp4:Mp4Export",
+        "a movie with robot, route, flow, clock and scale bar drawn over the images",
+        extra="export",
+    ),
+    Method(
+        "mp4_plain",
+        "flowrec.exports.mp4:PlainMp4Export",
+        "the camera's images alone, which flowrec import reads",
+        extra="export",
+    ),
 )
 
 

@@ -1,11 +1,10 @@
 """The formats mp4 and mp4_plain: the camera's images as H.264, with what happens drawn over them, or as they are.
 
-The time base is 1 us. The presentation time of an image is its session stamp less that of the first image, which is 0 in
-most sessions, rounded to 1 us. Intervals are as they were: where the camera delivered no image, or the same once more,
-the one before is shown longer. Without B-frames the file needs no edit list, and each player sees the same times.
+The time base is 1 us. The presentation time of an image is its session stamp less that of the first image, which is 0
+in most sessions, rounded to 1 us. Intervals are as they were: where the camera delivered no image, or the same once
+more, the one before is shown longer. Without B-frames the file needs no edit list, and all players see the same times.
 
-Frame rate over that of PyAV alone, which encodes the bare images with the same preset on the same two cores: see
-`python -m tests.perf.movie_export`.
+`python -m tests.perf.movie_export` compares the frame rate with that of PyAV alone.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from flowrec.view.window_images import WindowCompleter
 
 TIME_BASE = Fraction(1, 1_000_000)
 PRESET = "fast"
-_DRAWN_CRF, _PLAIN_CRF = 20, 8  # quality; the tracker is to find in plain images what it found in the camera's
+DRAWN_CRF, PLAIN_CRF = 20, 8  # quality; the tracker is to find in plain images what it found in the camera's
 _NS_PER_PTS = NS_PER_S // TIME_BASE.denominator
 _WAITING = 8  # pictures that wait for the encoder
 _KEY_S = 2.0  # between images that a player can jump to
@@ -68,7 +67,7 @@ class Mp4Export:
             for tick, frame in with_images(session):
                 image = frame.image if windows is None else windows.completed(frame.image)
                 picture = overlay.draw(grey(image), tick)
-                planes = cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420)
+                planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
                 writer.write(frame.stamp_ns - first.stamp_ns, planes)
                 progress(seconds(frame.stamp_ns - session.run.first_ns))
 
@@ -135,7 +134,7 @@ class Mp4Writer:
             raise
 
     def _options(self, rate: Fraction) -> dict[str, str]:
-        crf = _PLAIN_CRF if self._full_range else _DRAWN_CRF
+        crf = PLAIN_CRF if self._full_range else DRAWN_CRF
         return {"preset": PRESET, "crf": str(crf), "bf": "0", "g": str(max(round(_KEY_S * rate), 1))}
 
     def __enter__(self) -> Self:

@@ -1,6 +1,6 @@
-"""What flowrec writes of a session into the movies that it exports, as JSON text, so that `flowrec import` needs not be told.
+"""What flowrec writes of a session into the movies that it exports, so that `flowrec import` need not be told.
 
-MP4 holds the text as its description, OME-TIFF as a structured annotation.
+It is JSON: the description of an MP4 file, and a structured annotation in OME-TIFF.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def notes_in(text: str, path: Path) -> MovieNotes | None:
         raise MovieError(
             f"{path}: its notes are of version {str(tree[_KEY])[:20]}, this flowrec reads {_VERSION}; update flowrec"
         )
-    given = {each.name: tree.get(each.name) for each in fields(MovieNotes)}
+    given: dict[str, Any] = {each.name: tree.get(each.name) for each in fields(MovieNotes)}
     wrong = next((name for name, value in given.items() if not _fits(name, value)), None)
     if wrong is not None:
         raise _damaged(path, f"{wrong} is {str(given[wrong])[:40]!r}")

@@ -23,7 +23,7 @@ CROSS: tuple[Points, Points] = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0
 
 
 class Layer:
-    """Lines that stay for many images. They are mixed with an image of grey levels as a x grey level + b, pixel by pixel.
+    """Lines that stay for many images. Each pixel becomes a x grey level + b.
 
     Parameters
     ----------
@@ -79,9 +79,11 @@ class Layer:
         picture.reshape(-1, 3)[self._where] = mixed
 
     def _mix(self, mask: NDArray[np.uint8], colour: Rgb, opacity: float) -> None:
-        alpha = mask * np.float32(opacity / 255.0)
-        self._kept *= 1.0 - alpha
-        self._added = self._added * (1.0 - alpha[..., None]) + alpha[..., None] * np.array(bgr(colour), np.float32)
+        inked = np.flatnonzero(mask)  # a few percent of the pixels
+        alpha = mask.reshape(-1)[inked, None] * np.float32(opacity / 255.0)
+        kept, added = self._kept.reshape(-1, 1), self._added.reshape(-1, 3)
+        kept[inked] *= 1.0 - alpha
+        added[inked] = added[inked] * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32)
 
 
 def rimmed(picture: Picture, strips: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
@@ -97,7 +99,7 @@ def stamp(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour
     part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]
     alpha = mask[..., None] * np.float32(1.0 / 255.0)
     part[:] = part * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32) + 0.5
-    return mask.shape[1]
+    return int(mask.shape[1])
 
 
 def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) -> None:

@@ -12,13 +12,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.messages import Estimate, FlowField, Mission, Route
+from flowrec.messages import Estimate, FlowField, Mission
 from flowrec.topics import Tick
 from flowrec.units import NS_PER_S
 from flowrec.view import colours
 from flowrec.view.colours import round_below
+from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.ink import CIRCLE, Layer, Picture, Points, drawable, fixed, restore, rimmed
-from flowrec.view.maps import arrow_grid, flow_arrows
 from flowrec.view.scene import Scene
 from flowrec.view.strip import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, Strip
 
@@ -28,7 +28,7 @@ _LETTER_PX = 13.0
 _LINE_PX = 1.6
 _SPARSER = 1.9  # distance of the arrows over that of the viewer's map, which is larger
 _TRAIL_S = 4.0
-_TRAIL_STEP_PX = 1.0
+_TRAIL_STEP_PX = 3.0
 _RING_PX = 3.0  # between the robot and its ring
 _LONGEST = 0.9  # arrow, in spacings of the arrows
 _FASTEST = 0.99  # quantile of the speeds that has this length

@@ -12,7 +12,7 @@ from flowrec.errors import printable
 from flowrec.messages import Estimate, Mission
 from flowrec.units import seconds
 from flowrec.view import colours
-from flowrec.view.colours import Rgb, round_below
+from flowrec.view.colours import round_below
 from flowrec.view.ink import CIRCLE, CROSS, Layer, Picture, bgr, stamp
 from flowrec.view.lettering import clock_mask, text_mask
 
@@ -57,7 +57,9 @@ class Strip:
         """
         r, middle = 0.34 * self._letter, 0.5 * self._height
         centre = np.array([1.2 * r, middle])
-        self._parts = [self._part(2.4 * r, "robot", lambda layer: layer.lines([centre + r * CIRCLE], ROBOT, self._line))]
+        self._parts = [
+            self._part(2.4 * r, "robot", lambda layer: layer.lines([centre + r * CIRCLE], ROBOT, self._line))
+        ]
         if goal:
             sign = [centre + 1.2 * r * part for part in GOAL_SIGN]
             self._parts.append(self._part(2.4 * r, "goal", lambda layer: layer.lines(sign, GOAL, 0.8 * self._line)))

@@ -1,0 +1,164 @@
+"""Movies of a session, read by PyAV and ffprobe: every image at its stamp; scale, time and session in the file."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+import flowrec
+from flowrec.errors import SessionError
+from flowrec.exports import mp4
+from flowrec.exports.camera_images import with_images
+from flowrec.messages import Applied, Frame
+from flowrec.topics import Tick
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+STAMPS_NS = [0, 33_333_333, 66_666_667, 500_000_001, 533_333_333]  # one interval is a loss
+
+
+@pytest.fixture(scope="module")
+def session() -> flowrec.Session:
+    return flowrec.open(GOLDEN)
+
+
+class OfTicks:
+    """A session whose ticks are replaced."""
+
+    def __init__(self, session: flowrec.Session, ticks: list[Tick]) -> None:
+        self._session, self._ticks = session, ticks
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._session, name)
+
+    def ticks(self) -> list[Tick]:
+        return self._ticks
+
+    def at(self, _time_s: float) -> Tick:
+        return self._ticks[0]
+
+
+def made(stamps_ns=STAMPS_NS, shape=(120, 160), bits=8, repeated=()) -> list[Tick]:
+    """Ticks whose images are noise on a slope."""
+    rng, top = np.random.default_rng(1), 2**bits - 1
+    dtype = np.uint8 if bits == 8 else np.uint16
+    slope = np.linspace(0.1, 0.6, shape[1]) * top * np.ones((shape[0], 1))
+    ticks = []
+    for index, stamp in enumerate(stamps_ns):
+        image = np.clip(slope + rng.normal(0, top / 50, shape), 0, top).astype(dtype)
+        since = stamps_ns[index - 1] if index in repeated else stamp
+        applied = Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2), since)
+        ticks.append(Tick(stamp, Frame(stamp, index, image, bits), applied))
+    return ticks
+
+
+def written(exporter: Any, session: Any, path: Path) -> Path:
+    exporter.write(session, path, lambda _time_s: None)
+    return path
+
+
+def read(path: Path) -> tuple[list[Any], dict[str, str], Any]:
+    """Decoded frames, metadata, and stream."""
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        return list(container.decode(stream)), dict(container.metadata), stream
+
+
+@pytest.mark.parametrize("exporter", [mp4.Mp4Export(), mp4.PlainMp4Export()])
+def test_every_image_is_shown_at_its_stamp_to_half_a_microsecond_and_a_loss_stays_a_gap(exporter, session, tmp_path):
+    path = written(exporter, OfTicks(session, made(repeated=[2])), tmp_path / "x.mp4")
+    frames, _, stream = read(path)
+    assert stream.time_base == mp4.TIME_BASE
+    shown_ns = [frame.pts * 1000 for frame in frames]
+    assert np.abs(np.array(shown_ns) - np.delete(STAMPS_NS, 2)).max() <= 500
+    probed = subprocess.run(
+        ["ffprobe", "-v", "error", "-show_entries", "packet=pts_time,duration_time", "-of", "json", str(path)],
+        capture_output=True, check=True,
+    ) if shutil.which("ffprobe") else None  # fmt: skip
+    if probed is not None:
+        packets = json.loads(probed.stdout)["packets"]
+        assert [float(each["pts_time"]) for each in packets] == [0.0, 0.033333, 0.5, 0.533333]
+        assert float(packets[1]["duration_time"]) == pytest.approx(0.466667)
+        assert float(packets[-1]["duration_time"]) == pytest.approx(0.033333)
+
+
+def test_the_file_is_what_players_open_and_states_scale_time_and_session(session, tmp_path):
+    path = written(mp4.Mp4Export(), session, tmp_path / "x.mp4")
+    frames, metadata, stream = read(path)
+    assert len(frames) == session.topics["/camera/frame"]
+    assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+    assert stream.width % 2 == 0 and stream.height % 2 == 0
+    data = path.read_bytes()
+    assert data.index(b"moov") < data.index(b"mdat"), "a browser can play it while it loads"
+    assert metadata["title"].startswith("golden")
+    assert f"session {session.key}" in metadata["comment"]
+    scale = session.config.camera.um_per_px / 3
+    assert f"{scale:.6g} um per pixel" in metadata["comment"]  # the picture is enlarged by 3
+    assert metadata["creation_time"][:19] == session.provenance["wall_time"][:19]
+
+
+def test_the_robot_is_in_its_ring_and_nothing_is_drawn_over_it(session, tmp_path):
+    frames, _, _ = read(written(mp4.Mp4Export(), session, tmp_path / "x.mp4"))
+    ticks = list(with_images(session))
+    radius = 3 * session.config.robot.radius_um / session.config.camera.um_per_px
+    for place in (20, 60, len(ticks) - 1):
+        tick, _ = ticks[place]
+        x, y = (3 * (session.calibration.to_px(tick.estimate.position_um) + 0.5) - 0.5).tolist()
+        picture = frames[place].to_ndarray(format="rgb24").astype(int)
+        rows, columns = np.ogrid[: picture.shape[0], : picture.shape[1]]
+        distance = np.hypot(columns - x, rows - y)
+        red_over_blue = picture[..., 0] - picture[..., 2]
+        assert np.median(red_over_blue[np.abs(distance - radius - 3.0) < 0.8]) > 40, "an orange ring"
+        assert np.abs(red_over_blue[distance < radius - 3.0]).mean() < 15, "the camera's grey within it"
+
+
+def test_odd_sizes_are_made_even_and_deep_images_keep_the_scale_of_their_levels(session, tmp_path):
+    ticks = made(shape=(61, 83), bits=12)
+    frames, metadata, _ = read(written(mp4.PlainMp4Export(), OfTicks(session, ticks), tmp_path / "x.mp4"))
+    notes = json.loads(metadata["description"])
+    assert (frames[0].width, frames[0].height, notes["width_px"], notes["height_px"]) == (84, 62, 83, 61)
+    low, high = notes["grey_low"], notes["grey_high"]
+    assert 0 < low < 800 and 2000 < high < 4095
+    assert f"grey levels {low} to {high} of 4095 are 0 to 255" in metadata["comment"]
+    luma = frames[2].to_ndarray()[:61, :83].astype(float)
+    expected = np.clip((ticks[2].frame.image.astype(float) - low) * 255 / (high - low), 0, 255)
+    assert np.abs(luma - expected).mean() < 2.0
+
+
+@pytest.mark.parametrize("text", ["<script>alert(1)</script>", "\x1b[31mred\x1b[0m \u202eevil"])
+def test_a_sample_from_elsewhere_is_a_title_without_control_characters(text, session, tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    config = replace(session.config, recording=replace(session.config.recording, sample=text))
+    monkeypatch.setitem(vars(session), "config", config)
+    _, metadata, _ = read(written(mp4.Mp4Export(), OfTicks(session, made()), tmp_path / "x.mp4"))
+    assert not set(metadata["title"]) & {"\x1b", "\u202e"}
+    assert metadata["title"].startswith("golden: ")
+
+
+def test_a_session_without_images_or_with_regions_only_is_refused_in_one_line(session, tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    monkeypatch.setitem(vars(session), "topics", {})
+    with pytest.raises(SessionError, match=r"golden.mcap: holds no camera images"):
+        written(mp4.Mp4Export(), session, tmp_path / "x.mp4")
+    config = replace(session.config, recording=replace(session.config.recording, region="robot"))
+    monkeypatch.setitem(vars(session), "config", config)
+    with pytest.raises(SessionError, match=r"only the region around the robot .* use --format mp4"):
+        written(mp4.PlainMp4Export(), session, tmp_path / "x.mp4")
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_file(session, tmp_path, monkeypatch):
+    def full(self, packets):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(mp4.Mp4Writer, "_mux", full)
+    with pytest.raises(SessionError, match=r"x.mp4: can not be written \(No space left on device\)"):
+        flowrec.export(GOLDEN, tmp_path / "x.mp4", file_format="mp4")
+    assert not list(tmp_path.iterdir())
