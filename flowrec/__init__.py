@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.commands.replay import Change as Change
     from flowrec.commands.replay import replay as replay
     from flowrec.commands.replay_report import before_after as before_after
+    from flowrec.commands.report import report as report
     from flowrec.config import Config as Config
     from flowrec.config import load_config as load_config
     from flowrec.errors import FlowrecError as FlowrecError
@@ -50,6 +51,7 @@ _MODULES = {
     "record": "commands.record",
     "recover": "store.recovery",
     "replay": "commands.replay",
+    "report": "commands.report",
 }
 __all__ = list(_MODULES)
 

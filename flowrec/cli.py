@@ -37,6 +37,7 @@ from flowrec.session_verbs import (
     methods_of,
     note,
     recover,
+    report,
     view,
 )
 from flowrec.units import amounts
@@ -219,7 +220,7 @@ def replay(
 
 
 app.command("import", epilog=examples("import"))(import_movie)
-for _verb in (doctor, view, export, info, list_directory, note, check, recover, compare):
+for _verb in (doctor, view, export, report, info, list_directory, note, check, recover, compare):
     _name = "ls" if _verb is list_directory else _verb.__name__
     app.command(_name, cls=HelpWithMethods, epilog=examples(_name))(_verb)
 

@@ -33,6 +33,7 @@ EXAMPLES = {
     "doctor": ("flowrec doctor lab.toml",),
     "view": ("flowrec view a.mcap", "flowrec view a.mcap --screenshot a.png --time 12"),
     "export": ("flowrec export a.mcap", "flowrec export a.mcap tables --format parquet"),
+    "report": ("flowrec report a.mcap", "flowrec report a.mcap a_replay_001.mcap -o report.html --figures figures"),
     "info": ("flowrec info a.mcap --json",),
     "ls": ("flowrec ls runs", 'flowrec ls runs/*.mcap --where "refined_flow_error < 0.05" --sort -duration_s'),
     "note": ('flowrec note a.mcap "bubble at the outlet" --tag bubble', "flowrec note a.mcap"),
@@ -144,6 +145,27 @@ def export(
     made = flowrec.export(session, out or directory, overwrite, file_format)
     if as_json:
         typer.echo(_export_json(session, made, file_format))
+
+
+def report(
+    session: SessionFile,
+    replays: Annotated[
+        list[Path] | None, typer.Argument(metavar="[REPLAY]...", help="Replays of it (.mcap), compared with it.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Page to write (.html); SESSION_report.html by default.")
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write the figures, too, as SVG and PDF of 88 and 180 mm.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write one page (HTML) about a session, to read, print or send: outcome, path, flow before and after, losses."""
+    page = flowrec.report(session, replays or (), out, figures, overwrite)
+    if as_json:
+        found = {"session": str(session), "html": str(page), "bytes": page.stat().st_size}
+        typer.echo(json.dumps(found | ({"figures": str(figures)} if figures is not None else {})))
 
 
 def info(

@@ -1,0 +1,368 @@
+"""`flowrec report`: what happened in a session, and in replays of it, as one HTML page and as figures for a paper."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flowrec.commands.check import check
+from flowrec.commands.info import facts_for_people, info
+from flowrec.commands.replay_report import before_after, refinement_remarks
+from flowrec.commands.replay_result import CommandDifference
+from flowrec.commands.verdict import Verdict
+from flowrec.config import ResolvedConfig
+from flowrec.enums import Outcome
+from flowrec.errors import UsageError
+from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
+from flowrec.summary import comparison_for_people, name_of, shown
+from flowrec.system.output_folder import OutputFolder
+from flowrec.system.outputs import Output
+from flowrec.terminal import progress, say
+from flowrec.topics import Tick
+
+if TYPE_CHECKING:
+    from flowrec.reporting.page import Page, ReplayPart, ReportFigure, Table
+    from flowrec.reporting.story import Story
+
+HTML = (".html", ".htm")
+_PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
+_HIDDEN = frozenset({"outcome", "note", "reason", "wall_s", "wall_ns", "monotonic_ns", "clocks", "recovered_from"})
+_LINES = 600  # of settings or local changes on the page
+_EVENTS = 60  # rows of the table of events
+_OF_RECORDING = ("content", "length", "images", "losses", "clocks", "windows", "digest", "replay")
+_OF_CODE = ("flowrec", "numerics_version", "git_commit", "git_changed")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayFiles:
+    """A session and the file of a replay of it; implements replay_report.ReplayPair.
+
+    Attributes
+    ----------
+    replay : the session of the replay.
+    recorded : the last tick of the session that the replay covers.
+    """
+
+    session: Session
+    replay: Session
+    recorded: Tick
+    replayed: Tick
+    commands: CommandDifference
+
+    @classmethod
+    def of(cls, session: Session, replay: Session) -> ReplayFiles:
+        """Read both; SessionError where a message is damaged."""
+        commands = CommandDifference()
+        replayed = iter(replay.messages("demand"))
+        now = next(replayed, None)
+        for was in session.messages("demand"):
+            while now is not None and now.stamp_ns < was.stamp_ns:
+                now = next(replayed, None)
+            if now is not None and now.stamp_ns == was.stamp_ns:
+                commands.add(was, now)
+        end_ns = min(session.run.last_ns, replay.run.last_ns)
+        recorded = session.reader.tick_before(end_ns, with_frames=False)
+        return cls(session, replay, recorded, replay.reader.tick_before(replay.run.last_ns), commands)
+
+    @property
+    def config(self) -> ResolvedConfig:
+        """The configuration of the replay."""
+        return self.replay.config
+
+
+def report(
+    session: Session | Path | str,
+    replays: Sequence[Session | Path | str] = (),
+    out: Path | str | None = None,
+    figures: Path | str | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Write the report of a session: one HTML file that needs no network and no script.
+
+    Parameters
+    ----------
+    session : what is reported on.
+    replays : replays of this session, each of which is compared with it.
+    out : the file (.html); by default SESSION_report.html beside the session.
+    figures : a folder for the figures as SVG and PDF, 88 and 180 mm wide.
+    overwrite : an existing output may be replaced, but nothing that is read.
+
+    Returns
+    -------
+    The path of the page.
+
+    Raises
+    ------
+    UsageError : a package of the extra `report` is not installed, or a replay is not one of this session.
+    SessionError : a session can not be read, or an output not be written; OutputError if it may not be.
+    """
+    _require_packages()
+    from flowrec.reporting import style
+    from flowrec.reporting.page import render
+    from flowrec.reporting.story import Story
+
+    session = Session.of(session)
+    parts = [Session.of(each) for each in replays]
+    path = session.path
+    read = tuple(file for each in (session, *parts) for file in files_behind(each.path))
+    output = Output(Path(out) if out is not None else path.with_name(f"{path.stem}_report.html"), HTML, read, overwrite)
+    output.check()
+    folder = None
+    if figures is not None:
+        made_from = {"format": "figures", "session": session.key, "replays": " ".join(each.key for each in parts)}
+        folder = OutputFolder(Path(figures), made_from, inputs=read, overwrite=overwrite)
+        folder.check()
+    _check_parents(session, parts)
+    config = session.config
+    with ExitStack() as stack:
+        done = stack.enter_context(progress(f"reading {path.name}", max(session.duration_s, 1e-3)))
+        stack.enter_context(input_blamed(session, config, "reported on"))
+        verdict = check(session)
+        story = Story.of(session, done)
+        pairs = [ReplayFiles.of(session, each) for each in parts]
+        with style.drawing():
+            kinds = _figures(story, verdict, pairs)
+            page = _page(story, verdict, pairs, kinds)
+            # Made before either is written: an error in one leaves neither.
+            files = dict(_files(kinds, story)) if folder is not None else {}
+        text = render(page)
+    with ExitStack() as stack:  # what fails in one leaves neither
+        stack.enter_context(output.new_file()).write_text(text, encoding="utf-8")
+        if folder is not None:
+            place = stack.enter_context(folder.new_folder())
+            for name, content in files.items():
+                (place / name).write_bytes(content)
+    if folder is not None:
+        say(f"{folder.path}: {len(files)} files, figures of 88 and 180 mm")
+    say(f"{output.path} written; open it in a browser, print it, or send it as it is")
+    return output.path
+
+
+def _require_packages() -> None:
+    for module, package in _PACKAGES.items():
+        if importlib.util.find_spec(module) is None:
+            raise UsageError(f"a report needs {package}, which is not installed: pip install 'flowrec[report]'")
+
+
+def _check_parents(session: Session, replays: Sequence[Session]) -> None:
+    """Refuse a file that is no replay of this session."""
+    sha256 = session_sha256([file.path for file in session.run.files]) if replays else ""
+    for replay in replays:
+        parent = replay.header.parent
+        if parent.get("sha256") != sha256:
+            what = f"is a replay of {parent.get('file', '?')}, another recording" if parent else "is no replay"
+            raise UsageError(
+                f"{replay.path}: {what}; name replays of {session.path}, which "
+                f"`flowrec replay {session.path} --refine` makes, or compare any two with flowrec compare"
+            )
+
+
+def _figures(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles]) -> list[ReportFigure]:
+    from flowrec.reporting.curves import Span
+    from flowrec.reporting.map_figure import ChangeFigure, MapFigure
+    from flowrec.reporting.motion_figure import MotionFigure
+    from flowrec.reporting.observer_figure import ObserverFigure
+    from flowrec.reporting.path_figure import PathFigure
+    from flowrec.reporting.recording_figure import RecordingFigure
+    from flowrec.reporting.timeline_figure import TimelineFigure
+    from flowrec.reporting.way_figure import WayFigure
+
+    first_s = story.history.first_s
+    gaps = [Span("no image", first_s + gap.at_s, first_s + gap.at_s + gap.length_s) for gap in verdict.gaps]
+    changes = [ChangeFigure(pair.recorded.field, pair.replayed.field, n) for n, pair in enumerate(pairs, 1)]
+    return [
+        PathFigure(),
+        MapFigure(),
+        WayFigure(),
+        ObserverFigure(),
+        MotionFigure(),
+        TimelineFigure(gaps),
+        RecordingFigure(),
+        *changes,
+    ]
+
+
+def _files(kinds: Sequence[ReportFigure], story: Story) -> Iterator[tuple[str, bytes]]:
+    """Name and content of each figure's files."""
+    from flowrec.reporting import style
+
+    for kind in kinds:
+        if kind.why_not(story):
+            continue
+        for width_mm in style.WIDTHS_MM:
+            figure = kind.draw(story, width_mm)
+            name = f"{kind.name}_{width_mm:.0f}mm"
+            yield f"{name}.svg", style.as_svg(figure, kind.title, text="none")
+            yield f"{name}.pdf", style.as_pdf(figure, kind.title)
+
+
+def _page(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: Sequence[ReportFigure]) -> Page:
+    from flowrec.reporting.page import Folded, Page, Table, drawn
+    from flowrec.reporting.words import GLOSSARY, sentence
+
+    session = story.session
+    facts = info(session)
+    outcome = str(facts["outcome"])
+    done = {kind.name: drawn(kind, story) for kind in kinds}
+    judgement, *_ = verdict.lines()
+    provenance = session.provenance
+    packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
+    return Page(
+        name=session.path.name,
+        outcome=outcome,
+        good=any(outcome == each and each.completes_mission for each in Outcome),
+        sentence=sentence(outcome),
+        note=str(facts["note"] or ""),
+        about=_about(facts, session),
+        key_figures=_key_figures(story),
+        figures=done,
+        refinement=story.refined.note.split("; ") if story.refined is not None and story.refined.note else [],
+        boundary=_boundary(story),
+        events=_events(story),
+        recording=Table("", [(name, verdict.facts[name]) for name in _OF_RECORDING if name in verdict.facts]),
+        findings=[judgement, *(finding.text for finding in verdict.findings)],
+        replays=[_replay_part(pair, done[f"replay_{number}"]) for number, pair in enumerate(pairs, 1)],
+        provenance=[Table("", _provenance(facts, session))],
+        folded=[
+            Folded("Packages", [f"{name} {text}" for name, text in packages]),
+            Folded("Local changes to the code", _cut(provenance.get("git_diff", "").splitlines())),
+            Folded("All settings", _cut(session.header.config_toml.splitlines())),
+        ],
+        glossary=GLOSSARY,
+    )
+
+
+def _about(facts: dict[str, Any], session: Session) -> str:
+    """When, where, with what, in one line."""
+    rig = {"simulated": "in simulation", "movie": "from a movie", "lab": "in the laboratory"}
+    parts = [f"recorded {str(facts['recorded'])[:16].replace('T', ' ')} UTC"]
+    if facts["replay_of"]:
+        parts[0] = f"replay of {facts['replay_of']}, made {str(facts['recorded'])[:16].replace('T', ' ')} UTC"
+    parts += [rig.get(str(facts["rig"]), f"rig {facts['rig']}"), f"chip {facts['chip']}"]
+    parts.append(f"{session.duration_s:.1f} s")
+    for key in ("operator", "sample"):
+        if facts.get(key):
+            parts.append(f"{key} {facts[key]}")
+    return ", ".join(parts)
+
+
+def _key_figures(story: Story) -> Table:
+    from flowrec.reporting.page import Table
+    from flowrec.reporting.words import MEANINGS
+
+    session = story.session
+    figures = {"duration_s": session.duration_s} | {
+        key: value for key, value in session.outcome.items() if key not in _HIDDEN and value not in (None, "")
+    }
+    rows = [(name_of(key), _micro(shown(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
+    for name, field in (("assumed", story.assumed), ("refined", story.refined)):
+        if field is not None and field.error_share is not None:
+            text = shown("_error", field.error_share)
+            rows.append((f"{name} flow: stated error", text, f"that the {name} map expects of itself"))
+    if story.truth is None:
+        rows.append(("error of the flow", "-", "not known: only a simulation knows the true flow"))
+    return Table("In numbers", rows, ("", "", ""))
+
+
+def _micro(text: str) -> str:
+    """A number with its unit, spelt as on the figures."""
+    return text.replace(" um", " µm")
+
+
+def _boundary(story: Story) -> Table | None:
+    """Inflow and pressure at the openings of the chip, before and after."""
+    from flowrec.reporting.page import Table
+
+    named = {"assumed": story.assumed, "refined": story.refined, "true": story.truth}
+    fields = {name: field for name, field in named.items() if field is not None}
+    openings = story.scene.chip.openings
+    if any(len(field.boundary_values) != len(openings) for field in fields.values()) or not fields:
+        return None
+    rows = []
+    for number, opening in enumerate(openings):
+        inlet = opening.kind == "inlet"
+        values = [float(field.boundary_values[number]) for field in fields.values()]
+        texts = [f"{value:.0f} µm/s" if inlet else f"{value:.3g} Pa" for value in values]
+        what = "mean inward speed" if inlet else "pressure"
+        rows.append((f"{opening.kind} on the {opening.side}", what, *texts))
+    return Table("At the openings of the chip", rows, ("opening", "", *fields))
+
+
+def _events(story: Story) -> list[Table]:
+    from flowrec.reporting.page import Table
+    from flowrec.reporting.timeline_figure import numbered
+
+    history = story.history
+    tables = []
+    actions = [(number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered(history.remarks)]
+    if actions:
+        columns = ("number", "time", "action", "text")
+        tables.append(Table("The operator", actions[:_EVENTS], columns, _more(len(actions), 0)))
+    events = [(f"{each.time_s:.2f} s", each.level, each.text) for each in history.remarks if not each.action]
+    if events:
+        note = _more(len(events), history.remarks_left_out)
+        tables.append(Table("Events", events[:_EVENTS], ("time", "level", "event"), note))
+    phases = [(span.name, f"{span.from_s:.2f} s", f"{span.to_s - span.from_s:.2f} s") for span in history.phases.spans]
+    if phases:
+        tables.append(Table("Phases of the mission", phases[:_EVENTS], ("phase", "from", "for"), _more(len(phases), 0)))
+    return tables
+
+
+def _more(count: int, left_out: int) -> str:
+    missing = max(count - _EVENTS, 0) + left_out
+    return f"The first {_EVENTS} of {count + left_out}; the session holds all." if missing else ""
+
+
+def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]]:
+    """The facts of `flowrec info` that are no figures of the run, with what it leaves out of the provenance."""
+    figures = session.outcome.keys()
+    kept = {key: None if key in figures and key not in ("outcome", "note") else value for key, value in facts.items()}
+    rows = [row for row in facts_for_people(facts | kept) if row[0] != "outcome"]
+    machine = ("platform", "python", "host", "user")
+    return rows + [(name_of(key), session.provenance[key]) for key in machine if key in session.provenance]
+
+
+def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
+    from flowrec.reporting.page import ReplayPart, Table
+
+    rows = [tuple(map(_micro, row)) for row in comparison_for_people(before_after(pair))]
+    tables = [Table("Before and after", rows, ("", "recorded", "replayed"), "Both on the map of the replay.")]
+    changed = _changed_settings(pair)
+    note = "" if changed else "The replay has the settings and the code of the recording."
+    tables.append(Table("What was changed", changed, ("setting", "recorded", "replayed") if changed else (), note))
+    return ReplayPart(pair.replay.path.name, tables, refinement_remarks(pair), figure)
+
+
+def _changed_settings(pair: ReplayFiles) -> list[tuple[str, str, str]]:
+    """Settings, weights and versions of the code that differ."""
+    sides = []
+    for each in (pair.session, pair.replay):
+        settings = dict(_flat(toml_table(each.header.config_toml, f"{each.path}: config.toml inside"), ""))
+        code = {
+            key: text
+            for key, text in each.provenance.items()
+            if key in _OF_CODE or key.startswith(("weights.", "package."))
+        }
+        sides.append(settings | code)
+    was, now = sides
+    keys = [key for key in was | now if was.get(key) != now.get(key)]
+    return [(key, was.get(key, "-")[:80], now.get(key, "-")[:80]) for key in keys[:_LINES]]
+
+
+def _flat(tree: dict[str, Any], prefix: str) -> Iterator[tuple[str, str]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value if isinstance(value, str) else json.dumps(value, default=str)
+
+
+def _cut(lines: list[str]) -> list[str]:
+    if len(lines) <= _LINES:
+        return lines or ["none"]
+    return [*lines[:_LINES], f"... {len(lines) - _LINES} lines more in the session"]

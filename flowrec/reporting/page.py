@@ -1,0 +1,148 @@
+"""The page of a report: one HTML file that needs no network and no script; every text of a session is escaped."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from flowrec.errors import printable
+from flowrec.reporting import style
+from flowrec.reporting.story import Story
+from flowrec.reporting.words import LONGEST
+from flowrec.version import __version__
+
+_TEMPLATE = "page.html"
+
+
+class ReportFigure(Protocol):
+    """A figure of a report.
+
+    Attributes
+    ----------
+    name : of its files, without a suffix.
+    title : its heading.
+    """
+
+    name: str
+    title: str
+
+    def why_not(self, story: Story) -> str:
+        """Why it can not be drawn of this session, as words after a colon; '' if it can."""
+
+    def caption(self, story: Story) -> str:
+        """What it shows, and what it can not show of this session."""
+
+    def alt(self, story: Story) -> str:
+        """What it shows, for a reader who does not see it."""
+
+    def draw(self, story: Story, width_mm: float) -> Any:
+        """A matplotlib figure of this width."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A figure on the page: data URIs at both widths, or the reason why there is none."""
+
+    name: str
+    title: str
+    caption: str = ""
+    alt: str = ""
+    narrow: str = ""
+    wide: str = ""
+    why_not: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text under a heading; no heading of columns where `columns` is empty."""
+
+    title: str
+    rows: Sequence[Sequence[str]]
+    columns: Sequence[str] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayPart:
+    """One replay on the page."""
+
+    name: str
+    tables: Sequence[Table]
+    remarks: Sequence[str]
+    figure: Drawn
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """Lines of text that are folded away until the reader opens them, and not printed."""
+
+    title: str
+    lines: Sequence[str]
+
+
+@dataclass(slots=True)
+class Page:
+    """Content of the page, in the order of reading; all texts may come from a session and are not trusted."""
+
+    name: str
+    outcome: str
+    good: bool
+    sentence: str
+    note: str
+    about: str  # when, where, with what, in one line
+    key_figures: Table
+    figures: dict[str, Drawn] = field(default_factory=dict)
+    refinement: Sequence[str] = ()
+    boundary: Table | None = None
+    events: Sequence[Table] = ()
+    recording: Table | None = None
+    findings: Sequence[str] = ()
+    replays: Sequence[ReplayPart] = ()
+    provenance: Sequence[Table] = ()
+    folded: Sequence[Folded] = ()
+    glossary: Sequence[tuple[str, str]] = ()
+
+
+def drawn(figure: ReportFigure, story: Story) -> Drawn:
+    """Draw a figure for the page; call it within `style.drawing()`."""
+    why = figure.why_not(story)
+    if why:
+        return Drawn(figure.name, figure.title, why_not=why)
+    narrow, wide = (
+        "data:image/svg+xml;base64,"
+        + base64.b64encode(style.as_svg(figure.draw(story, width_mm), figure.title)).decode("ascii")
+        for width_mm in style.WIDTHS_MM
+    )
+    return Drawn(figure.name, figure.title, figure.caption(story), figure.alt(story), narrow, wide)
+
+
+def plain(value: Any) -> Any:
+    """A text of a session for the page: control and bidi characters as escape sequences, a very long one cut."""
+    from markupsafe import Markup
+
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    if len(value) > LONGEST:
+        value = f"{value[:LONGEST]} ... (cut here; {len(value)} characters in all)"
+    return printable(value)
+
+
+def render(page: Page) -> str:
+    """The page as HTML."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        finalize=plain,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["uri"] = Markup  # of images that were made here
+    environment.globals["flowrec_version"] = __version__
+    return environment.get_template(_TEMPLATE).render(page=page)

@@ -1,0 +1,131 @@
+"""What the figures of a report draw of one session: its history, chip, flow fields, and a picture of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.declarations import Image
+from flowrec.messages import FlowField, Observations, Route
+from flowrec.reporting.history import History
+from flowrec.session import Session
+from flowrec.store.roi import nonzero_window
+from flowrec.view.colours import Scale
+from flowrec.view.flow_values import peak
+from flowrec.view.scene import Scene
+
+_IMAGES = 7  # of which the median is the picture: what moves disappears
+_LARGEST_PX = 900  # width of the picture; a wider one is thinned
+_DARKEST, _BRIGHTEST = 0.5, 99.5  # percentiles of the grey levels that become black and white
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """What the camera saw.
+
+    Attributes
+    ----------
+    image : (h, w) uint8, every `step`-th row and column of the camera's image.
+    images : number of images of which it is the median.
+    """
+
+    image: NDArray[np.uint8]
+    step: int
+    images: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Story:
+    """One session for its figures; `picture` is None where no image is in the file."""
+
+    session: Session
+    scene: Scene
+    history: History
+    picture: Picture | None
+
+    @classmethod
+    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> Story:
+        """Read a session; `progress` takes the session time in s since the first tick.
+
+        Raises
+        ------
+        FlowrecError : header, chip or a message is not valid.
+        """
+        config = session.config
+        size_px = (config.camera.width_px, config.camera.height_px)
+        scene = Scene(session.chip, session.calibration, config.robot, session.path.stem, image_px=size_px)
+        return cls(session, scene, History.of(session, progress), picture_of(session))
+
+    @property
+    def assumed(self) -> FlowField | None:
+        """The map before any refinement."""
+        return self.history.last.assumed
+
+    @property
+    def refined(self) -> FlowField | None:
+        """The map of the last refinement."""
+        return self.history.last.refined
+
+    @property
+    def truth(self) -> FlowField | None:
+        """The true flow of a simulation."""
+        return self.session.fields.get("true")
+
+    @property
+    def observations(self) -> Observations | None:
+        """The observations of the flow; None where there is none."""
+        found = self.history.last.observations
+        return found if found is not None and len(found.position_um) else None
+
+    @property
+    def route(self) -> Route | None:
+        """The last route that was planned, if it leads anywhere."""
+        route = self.history.last.route
+        return route if route is not None and route.reachable and len(route.waypoints_um) > 1 else None
+
+    @property
+    def goal_um(self) -> NDArray[np.float64] | None:
+        """Where the robot was to go."""
+        mission = self.history.last.mission
+        return mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
+
+    @property
+    def path_um(self) -> NDArray[np.float64]:
+        """(n, 2) the way of the robot; a row of NaN interrupts it."""
+        curves = self.history.curve("x_um"), self.history.curve("y_um")
+        return np.column_stack([curve.mean for curve in curves])
+
+    def speed_scale(self) -> Scale:
+        """The one scale of all maps of speed of this session."""
+        fields = (self.assumed, self.refined, self.truth)
+        return Scale.up_to(max((peak(field) for field in fields if field is not None), default=1.0), "speed")
+
+
+def picture_of(session: Session) -> Picture | None:
+    """The median of some images over the whole session, in 8 bit; of whole images only, where most are cut."""
+    if not session.reader.counts.get("frame"):
+        return None
+    first_ns, last_ns = session.run.first_ns, session.run.last_ns
+    frames = {}
+    for stamp_ns in np.linspace(first_ns, last_ns, _IMAGES).astype(np.int64).tolist():
+        frame = session.reader.tick_before(stamp_ns).frame
+        if frame is not None and frame.image.size:
+            frames[frame.index] = frame
+    if not frames:
+        return None
+    images = [frame.image for frame in frames.values()]
+    whole = [image for image in images if image.shape == images[0].shape and _is_whole(image)]
+    chosen = np.stack(whole or images[:1])
+    step = -(-chosen.shape[2] // _LARGEST_PX)
+    grey = np.median(chosen[:, ::step, ::step], axis=0)
+    low, high = np.percentile(grey, (_DARKEST, _BRIGHTEST))
+    levels = np.clip((grey - low) / max(high - low, 1.0) * 255.0, 0.0, 255.0)
+    return Picture(levels.astype(np.uint8), step, len(chosen))
+
+
+def _is_whole(image: Image) -> bool:
+    height, width = image.shape
+    return nonzero_window(image) == (0, 0, width, height)

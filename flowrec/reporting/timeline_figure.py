@@ -1,0 +1,116 @@
+"""Figure: what happened when: sight of the robot, alarms, the operator, warnings, losses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from flowrec.enums import Action, Alarm, Level
+from flowrec.reporting import style
+from flowrec.reporting.curves import Span
+from flowrec.reporting.history import History, Remark
+from flowrec.reporting.story import Story
+from flowrec.reporting.time_axis import panels, spans
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LANE_MM = 5.0
+_LEAST_WIDTH = 0.004  # of the time axis: shorter spans are drawn this long
+_NUMBERED = 12  # remarks with their number in the figure: more would hide each other
+ALARMS: dict[str, str] = {
+    Alarm.NIS: "motion not explained",
+    Alarm.PULSATION: "flow pulsates",
+    Alarm.TRACKING: "robot often unseen",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """One line of the figure: spans of time, and moments with their numbers in the table of events ('': none)."""
+
+    name: str
+    colour: str
+    spans: Sequence[Span] = ()
+    moments: Sequence[tuple[float, str]] = field(default=())
+
+
+class TimelineFigure:
+    """Marks, alarms and losses on the time axis."""
+
+    name = "timeline"
+    title = "What happened when"
+
+    def __init__(self, gaps: Sequence[Span] = ()) -> None:
+        self._gaps = gaps
+
+    def why_not(self, story: Story) -> str:
+        history = story.history
+        return "" if history.phases.spans or self._lanes(history) else "the session holds no phase, event or alarm"
+
+    def caption(self, story: Story) -> str:
+        drawn = {lane.name for lane in self._lanes(story.history)}
+        parts = []
+        if any(remark.action for remark in story.history.remarks):
+            parts.append("Numbers: actions of the operator in the table below.")
+        absent = [
+            words
+            for words, names in (
+                ("no alarm", ALARMS.values()),
+                ("no mark or other action of the operator", ("operator",)),
+                ("no warning", ("warnings",)),
+                ("no time without the robot in view", ("robot not in view",)),
+                ("no gap in the images", ("no image",)),
+            )
+            if not drawn & set(names)
+        ]
+        if absent:
+            parts.append(f"There was {', '.join(absent)}.")
+        return " ".join(parts)
+
+    def alt(self, story: Story) -> str:
+        phases = ", ".join(span.name for span in story.history.phases.spans) or "none recorded"
+        lanes = ", ".join(lane.name for lane in self._lanes(story.history)) or "nothing else"
+        return f"Time line. Phases: {phases}. Beside them: {lanes}."
+
+    def draw(self, story: Story, width_mm: float) -> Figure:
+        history = story.history
+        lanes = self._lanes(history)
+        figure, (ax,) = panels(history, width_mm, [_LANE_MM * max(len(lanes), 1)])
+        least_s = _LEAST_WIDTH * (history.last_s - history.first_s)
+        for y, lane in enumerate(lanes):
+            spans(ax, list(lane.spans), y, 0.55, lane.colour, least_s)
+            for number, (time_s, name) in enumerate(lane.moments):
+                ax.plot(time_s, y, marker="|", ms=7, mew=1.2, color=lane.colour)
+                if name and number < _NUMBERED:
+                    ax.annotate(name, (time_s, y), (2.0, 0.0), textcoords="offset points", va="center")
+        ax.set_yticks(range(len(lanes)), [lane.name for lane in lanes])
+        ax.set_ylim(max(len(lanes), 1) - 0.5, -0.5)
+        ax.tick_params(axis="y", length=0)
+        ax.spines["left"].set_visible(False)
+        return figure
+
+    def _lanes(self, history: History) -> list[Lane]:
+        lanes = [
+            Lane("robot not in view", style.VERMILLION, history.unseen.spans),
+            Lane("held by the operator", style.BLUE, history.held.spans),
+            *(
+                Lane(ALARMS.get(name, name), style.ORANGE, found.spans)
+                for name, found in sorted(history.alarms.items())
+            ),
+            Lane("warnings", style.ORANGE, (), [(each.time_s, "") for each in history.remarks if _warns(each)]),
+            Lane("operator", style.BLUE, (), [(each.time_s, number) for number, each in numbered(history.remarks)]),
+            Lane("no image", style.INK, self._gaps),
+        ]
+        return [lane for lane in lanes if lane.spans or lane.moments]
+
+
+def numbered(remarks: Sequence[Remark]) -> list[tuple[str, Remark]]:
+    """The actions of the operator with their numbers; the end of a movie is none."""
+    actions = [remark for remark in remarks if remark.action and remark.action != Action.END]
+    return [(str(number), remark) for number, remark in enumerate(actions, 1)]
+
+
+def _warns(remark: Remark) -> bool:
+    return remark.level in (Level.WARNING, Level.ERROR)

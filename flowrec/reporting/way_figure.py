@@ -1,0 +1,98 @@
+"""Figure: the flow along the robot's way, before and after the refinement, with error bars."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.flow import sample
+from flowrec.reporting import style
+from flowrec.reporting.history import std_at
+from flowrec.reporting.motion_figure import speed_of
+from flowrec.reporting.story import Story
+from flowrec.reporting.time_axis import line, panels
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+
+class WayFigure:
+    """What both maps say of the places where the robot was, and what was observed there."""
+
+    name = "before_after"
+    title = "Flow at the robot's places, before and after the refinement"
+
+    def why_not(self, story: Story) -> str:
+        if story.assumed is None and story.refined is None:
+            return "the session holds no map of the flow"
+        if not story.history.curve("x_um"):
+            return "the session holds no estimate of the robot's position"
+        return ""
+
+    def caption(self, story: Story) -> str:
+        parts = ["Speed of the flow at the place where the robot was at each time, by the last map of each kind."]
+        if story.refined is None:
+            parts.append("The flow was not refined in this session.")
+        elif story.refined.std_um_s is None:
+            parts.append(f"The method {story.refined.method} states no standard deviation, so there is no band.")
+        else:
+            parts.append("Band: one standard deviation that the refined map states for itself.")
+        if story.observations is None:
+            parts.append("No observation of the flow was taken.")
+        elif story.observations.time_s is None:
+            parts.append("The observations do not state their times and are not drawn.")
+        else:
+            count = len(story.observations.position_um)
+            parts.append(
+                f"Points: {count} observations with one standard deviation. An observation is the robot's motion over "
+                "ground less the motion that it was driven to; so it holds the robot's own errors, too, which a "
+                "refinement tells from the flow."
+            )
+        return " ".join(parts)
+
+    def alt(self, story: Story) -> str:
+        kinds = [name for name, field in (("assumed", story.assumed), ("refined", story.refined)) if field is not None]
+        return f"Curves over time: speed of the flow at the robot by the {' and the '.join(kinds)} map."
+
+    def draw(self, story: Story, width_mm: float) -> Figure:
+        history = story.history
+        figure, (ax,) = panels(history, width_mm, [44.0])
+        path_um, time_s = story.path_um, history.curve("x_um").time_s
+        line(ax, speed_of(story, "true"), style.INK, "true (simulated)", lw=0.7)
+        if story.assumed is not None:
+            speed = _speed(sample(story.assumed, path_um), path_um)
+            ax.plot(time_s, speed, color=style.QUIET, ls=(0, (4, 2)), label="assumed")
+        top = 0.0
+        if story.refined is not None:
+            speed, std = _speed(sample(story.refined, path_um), path_um), std_at(story.refined, path_um)
+            ax.fill_between(time_s, np.maximum(speed - std, 0.0), speed + std, color=style.ORANGE, alpha=0.3, lw=0.0)
+            ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
+            top = float(np.nanmax(speed, initial=0.0))
+        observations = story.observations
+        if observations is not None and observations.time_s is not None:
+            observed = np.hypot(*observations.flow_um_s.T)
+            ax.errorbar(
+                observations.time_s,
+                observed,
+                observations.std_um_s,
+                fmt="o",
+                ms=2.0,
+                lw=0.6,
+                color=style.PURPLE,
+                label="observations",
+            )
+            top = max(top, float(observed.max()))
+        _, high = ax.get_ylim()
+        ax.set_ylim(0.0, min(high, 1.6 * top) if top else high)
+        ax.set_ylabel("speed of the flow (µm/s)")
+        style.legend_above(ax, 2 if width_mm <= style.NARROW_MM else 4)
+        return figure
+
+
+def _speed(velocity: Floats, at_um: Floats) -> Floats:
+    speed: Floats = np.where(np.isfinite(at_um[:, 0]), np.hypot(velocity[:, 0], velocity[:, 1]), np.nan)
+    return speed
