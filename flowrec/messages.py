@@ -11,10 +11,10 @@ Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flowrec.declarations import (
     Image,
@@ -28,6 +28,12 @@ from flowrec.declarations import (
     Vector3,
 )
 from flowrec.errors import RigError
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+
+    from flowrec.field_views import Shown
 
 PIXEL_BITS = (8, 10, 12, 14, 16)
 
@@ -156,6 +162,18 @@ class FlowField(Message):
     viscosity_law: str = ""
     # The registration that the refinement found: a measured place x (2,) lies on the chip at R (x, 1). None: as stated.
     registration: Annotated[Matrix, Shape(2, 3)] | None = None
+
+    def to_xarray(self) -> xarray.Dataset:
+        """The field as an xarray Dataset with the dimensions y_um, x_um and component; see field_views.py."""
+        from flowrec.field_views import to_xarray
+
+        return to_xarray(self)
+
+    def plot(self, ax: Axes | None = None, show: Shown = "speed", path_um: ArrayLike | None = None) -> Axes:
+        """Draw speed and arrows, or with `show="error"` the stated error, with Matplotlib; see field_views.py."""
+        from flowrec.field_views import plot
+
+        return plot(self, ax, show, path_um)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

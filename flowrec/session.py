@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from flowrec.chip.chip import Chip
     from flowrec.chip.registration import Calibration
     from flowrec.config import ResolvedConfig
-    from flowrec.messages import Event, FlowField, Frame
+    from flowrec.messages import Event, FlowField
+    from flowrec.store.frames import Frames
     from flowrec.store.reader import SessionReader
     from flowrec.topics import Tick
 
@@ -190,10 +191,12 @@ class Session:
                 raise SessionError(f"{self.path}: there is no topic {topic!r}; the topics are {', '.join(BY_FIELD)}")
         return self.reader.rows(topics)
 
-    @property
-    def frames(self) -> Iterator[Frame]:
-        """The recorded camera images, in order."""
-        return self.messages("frame")
+    @cached_property
+    def frames(self) -> Frames:
+        """The recorded camera images, in order: a sequence, of which `frames[i]` reads one image only."""
+        from flowrec.store.frames import Frames
+
+        return Frames(self.reader)
 
     @property
     def events(self) -> list[Event]:

@@ -26,6 +26,7 @@ EXPORTS = Methods(
         "the camera's images alone, which flowrec import reads",
         extra="export",
     ),
+    Method("zarr", "flowrec.exports.zarr:ZarrExport", "images and flow fields in chunks, for xarray", extra="export"),
 )
 
 

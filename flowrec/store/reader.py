@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from flowrec.errors import SessionError
+from flowrec.messages import Frame
 from flowrec.store.channels import SessionContents
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.roi import Region
@@ -180,6 +181,17 @@ class SessionReader:
                 stamps = self._file(number).stamps("frame")
                 found += [stamp_ns for stamp_ns in stamps if not number or stamp_ns > file.first_ns]
         return found
+
+    def frame_at(self, stamp_ns: int) -> Frame:
+        """The image of the tick with this stamp, one of `frame_stamps`; SessionError if it is damaged."""
+        for number, file in enumerate(self._run.files):
+            # A later part may begin with a copy of the last image of the part before: the same pixels.
+            if file.first_ns <= stamp_ns <= file.last_ns and "frame" in self._fields[number]:
+                found_ns, state = self._file(number).state_at(stamp_ns, {"frame"})
+                if found_ns == stamp_ns:
+                    frame: Frame = state["frame"]
+                    return frame
+        raise SessionError(f"{self.path}: has no image at {stamp_ns} ns")
 
     def close(self) -> None:
         """Close the session; forgotten readers close theirs when they are collected."""

@@ -11,8 +11,8 @@ import functools
 from dataclasses import dataclass, replace
 
 from flowrec.declarations import MessageField, message_fields
+from flowrec.meanings import meanings, summary_of
 from flowrec.messages import Frame
-from flowrec.tables.meanings import meanings, summary_of
 from flowrec.topics import BY_FIELD
 from flowrec.units import unit_of, unit_suffix
 

@@ -12,11 +12,11 @@ import pytest
 import flowrec
 from flowrec.declarations import message_fields
 from flowrec.errors import SessionError
+from flowrec.meanings import meanings
 from flowrec.messages import Estimate
 from flowrec.session import Session
 from flowrec.tables.arrow import batches, schema_of
 from flowrec.tables.columns import columns_of
-from flowrec.tables.meanings import meanings
 from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import unit_of
 from tests.store.drafts import made_up

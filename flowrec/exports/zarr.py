@@ -1,0 +1,99 @@
+"""The export format zarr: images and flow fields in chunks, for xarray, napari and Dask.
+
+The images are the array `frames` of the root group, dimensions time, y_px, x_px; each flow field is a group with the
+dimensions y_um, x_um, component. `xarray.open_zarr(folder)` opens the images, with `group="refined"` a field.
+Format 2 of Zarr, which every reader takes, and which has texts, as the names of the components, and consolidated
+metadata; format 3 specifies neither yet. https://zarr-specs.readthedocs.io/en/latest/v2/v2.0.html
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numcodecs
+import numpy as np
+import zarr
+
+from flowrec.errors import SessionError
+from flowrec.session import Session
+from flowrec.tables.columns import columns_of
+from flowrec.units import seconds
+
+_CHUNK_BYTES = 8 << 20
+_FORMAT = 2
+_LEVEL = 1  # of zstd: camera noise does not become smaller with more
+_DIMENSIONS = "_ARRAY_DIMENSIONS"  # where xarray looks for the names of the dimensions
+_EPOCH = "nanoseconds since 1970-01-01T00:00:00"
+
+
+class ZarrExport:
+    """Implements flowrec.exports.formats.Exporter."""
+
+    suffixes = (".zarr",)
+    folder = True
+    advice = "open it with xarray.open_zarr:"
+
+    def is_export_of(self, _path: Path, _session: Session) -> bool:
+        return False
+
+    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+        fields, frames = session.fields, session.frames
+        if not fields and not len(frames):
+            raise SessionError(f"{session.path}: holds neither images nor a flow field, which is what zarr takes")
+        root = zarr.create_group(part, zarr_format=_FORMAT)
+        root.attrs.update(
+            {
+                "session": session.path.name,
+                "provenance": dict(session.provenance),
+                "description": "images of the camera; the groups hold flow fields in the chip frame, y down",
+            }
+        )
+        if len(frames):
+            _write_frames(root, session, progress)
+        for name, field in fields.items():
+            field.to_xarray().to_zarr(part, group=name, zarr_format=_FORMAT, consolidated=False)
+        zarr.consolidate_metadata(part, zarr_format=_FORMAT)
+
+
+def _write_frames(root: zarr.Group, session: Session, progress: Callable[[float], None]) -> None:
+    frames, start_unix_ns = session.frames, session.header.start_unix_ns
+    stamps_ns = frames.stamps_ns
+    coordinates: dict[str, tuple[Any, dict[str, Any]]] = {
+        column.name: (values, {"description": column.meaning} | ({"unit": column.unit} if column.unit else {}))
+        for column, values in zip(columns_of("frame")[:2], (stamps_ns, stamps_ns / 1e9), strict=True)
+    }
+    if start_unix_ns:
+        coordinates["time"] = stamps_ns + start_unix_ns, {"units": _EPOCH, "calendar": "proleptic_gregorian"}
+    numbers = np.empty(len(frames), np.int64)
+    first = frames[0].image
+    per_chunk = max(1, min(_CHUNK_BYTES // max(first.nbytes, 1), len(frames)))
+    array = root.create_array(
+        "frames",
+        shape=(len(frames), *first.shape),
+        chunks=(per_chunk, *first.shape),
+        dtype=first.dtype,
+        compressors=numcodecs.Zstd(level=_LEVEL),
+        fill_value=None,  # xarray reads a fill value as NaN, and 0 is a grey level
+    )
+    array.attrs.update(
+        {_DIMENSIONS: ["time", "y_px", "x_px"], "description": "grey levels", "bits": session.reader.frame_bits}
+    )
+    block = np.empty((per_chunk, *first.shape), first.dtype)
+    for number, frame in enumerate(frames):
+        if frame.image.shape != first.shape:
+            raise SessionError(
+                f"{session.path}: frame {frame.index} has the shape {frame.image.shape}, not {first.shape}"
+            )
+        numbers[number], place = frame.index, number % per_chunk
+        block[place] = frame.image
+        if place == per_chunk - 1 or number == len(frames) - 1:
+            array[number - place : number + 1] = block[: place + 1]
+            progress(seconds(frame.stamp_ns - session.run.first_ns))
+    coordinates["frame_index"] = numbers, {"description": "of the camera; a gap is images that it did not deliver"}
+    for name, (values, attributes) in coordinates.items():
+        made = root.create_array(name, shape=values.shape, dtype=values.dtype, fill_value=None)
+        made[:] = values
+        made.attrs.update({_DIMENSIONS: ["time"]} | attributes)
+    root["frames"].attrs["coordinates"] = " ".join(name for name in coordinates if name != "time")
