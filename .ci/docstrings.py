@@ -1,4 +1,4 @@
-"""Docstrings of the house for mkdocstrings: `name : meaning` on one line becomes numpydoc's name and indented meaning."""
+"""Docstrings of the house for mkdocstrings: `name : meaning` becomes numpydoc's name and its indented meaning."""
 
 import re
 
