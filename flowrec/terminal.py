@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TextIO, cast
 
@@ -32,13 +32,24 @@ def warn(text: str) -> None:
     console.print(f"[yellow]warning:[/yellow] {escape(printable(text))}", soft_wrap=True)
 
 
+class Progress:
+    """Takes how far work is, and shows it nowhere."""
+
+    def __call__(self, done: float) -> None:
+        """How much of the total is done."""
+
+    def stage(self, name: str) -> None:
+        """What is done meanwhile, which may take long; '': nothing in particular."""
+
+
 @contextmanager
-def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
-    """A progress bar; the yielded function takes how much of `total` is done. Prints nothing without a terminal."""
+def progress(what: str, total: float) -> Iterator[Progress]:
+    """A progress bar, which takes how much of `total` is done. Prints nothing without a terminal."""
     if not console.is_terminal:
-        yield lambda _done: None
+        yield Progress()
         return
-    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+    from rich import progress as progress_bar
+    from rich.progress import BarColumn, ProgressColumn, Task, TextColumn, TimeElapsedColumn
 
     advanced_s = time.monotonic()
 
@@ -46,15 +57,20 @@ def progress(what: str, total: float) -> Iterator[Callable[[float], None]]:
         def render(self, task: Task) -> Text:
             return Text(time_left(task.time_remaining, time.monotonic() - advanced_s))
 
-    def advance(done: float) -> None:
-        nonlocal advanced_s
-        advanced_s = time.monotonic()
-        bar.update(task, completed=done)
+    class Shown(Progress):
+        def __call__(self, done: float) -> None:
+            nonlocal advanced_s
+            advanced_s = time.monotonic()
+            bar.update(task, completed=done)
 
-    bar = Progress(TextColumn(what), BarColumn(), TimeElapsedColumn(), Left(), console=console, transient=True)
+        def stage(self, name: str) -> None:
+            bar.update(task, description=f"{what}: {name}" if name else what, refresh=True)
+
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), Left())
+    bar = progress_bar.Progress(*columns, console=console, transient=True)
     with bar:
         task = bar.add_task(what, total=total)
-        yield advance
+        yield Shown()
 
 
 def time_left(estimate_s: float | None, stands_s: float) -> str:

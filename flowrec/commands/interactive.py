@@ -21,7 +21,7 @@ from flowrec.run.control import RunControl
 from flowrec.run.disk_monitor import DiskMonitor
 from flowrec.run.watchdog import Watchdog
 from flowrec.store.writer import SessionWriter
-from flowrec.terminal import console, outlet, progress, say
+from flowrec.terminal import Progress, console, outlet, progress, say
 from flowrec.topics import Tick
 from flowrec.units import seconds
 
@@ -58,9 +58,9 @@ class Unattended:
         """Context in which the loop runs; yields a function that takes every tick."""
         return nullcontext(lambda _tick: None)
 
-    def progress(self, what: str, total: float) -> AbstractContextManager[Callable[[float], None]]:
-        """Context of long work; yields a function that takes how much of `total` is done."""
-        return nullcontext(lambda _done: None)
+    def progress(self, what: str, total: float) -> AbstractContextManager[Progress]:
+        """Context of long work; yields what takes how much of `total` is done."""
+        return nullcontext(Progress())
 
     @property
     def note(self) -> str | None:
@@ -104,7 +104,7 @@ class AtTerminal(Unattended):
                 say(help_text)
             yield status
 
-    def progress(self, what: str, total: float) -> AbstractContextManager[Callable[[float], None]]:
+    def progress(self, what: str, total: float) -> AbstractContextManager[Progress]:
         return progress(what, total)
 
     @property

@@ -36,7 +36,7 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.writer import SessionWriter
 from flowrec.summary import as_text
 from flowrec.system.outputs import MCAP, Output
-from flowrec.terminal import warn
+from flowrec.terminal import Progress, warn
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from flowrec.units import seconds
 
@@ -168,7 +168,10 @@ def replay(
         start_ns = max(start_ns or 0, reader.keyframe_ns + 1)
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
-    worker = LockstepWorker(pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale)
+    progress = Progress()  # until the bar is shown
+    worker = LockstepWorker(
+        pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale, lambda what: progress.stage(what)
+    )
     order = _order_under_way(reader, start)
     if order is not None:
         worker.submit(order)
@@ -201,6 +204,7 @@ def replay(
             raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
         stopped, last = control.run_control.reason, report.last
         if stale and not stopped:
+            progress.stage("work that was under way")
             last = _closing_work(pipeline, config, last, rig.recorded, stale)
             if last is not report.last and sinks:
                 sinks[0].write(last)

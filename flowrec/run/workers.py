@@ -6,7 +6,7 @@ gives the same result, live in a worker process or again in a replay.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
@@ -76,7 +76,8 @@ class LockstepWorker:
     """Adopts each result a fixed time after its order: same seed, same session, however fast the machine is.
 
     `schedule` (request number to stamp) overrides the time: a replay adopts where the recording did. Orders whose
-    result goes to a field outside `fills` are ignored (in a replay: their results are recorded).
+    result goes to a field outside `fills` are ignored (in a replay: their results are recorded). `announce` takes what
+    is computed, and '' after it.
     """
 
     def __init__(
@@ -85,8 +86,10 @@ class LockstepWorker:
         adopt_after_s: float,
         schedule: Mapping[int, int] | None = None,
         fills: Iterable[str] = WORKER_FIELDS,
+        announce: Callable[[str], None] = lambda _what: None,
     ) -> None:
         self._pipeline = pipeline
+        self._announce = announce
         self._after_ns = nanoseconds(adopt_after_s)
         self._schedule = dict(schedule or {})
         self._fills = frozenset(fills)
@@ -103,7 +106,10 @@ class LockstepWorker:
         if stamp_ns < self._schedule.get(mission.request, mission.requested_ns + self._after_ns):
             return {}
         order, self._order = self._order, None
-        return {name: replace(work(self._pipeline, order), stamp_ns=stamp_ns)}
+        self._announce(mission.wanted.replace("_", " "))
+        result = replace(work(self._pipeline, order), stamp_ns=stamp_ns)
+        self._announce("")
+        return {name: result}
 
     def close(self) -> None:
         """Nothing is held."""
