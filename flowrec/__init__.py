@@ -31,6 +31,8 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.config import Config as Config
     from flowrec.config import load_config as load_config
     from flowrec.errors import FlowrecError as FlowrecError
+    from flowrec.refine.user_flow import refine as refine
+    from flowrec.refine.user_flow import solve as solve
     from flowrec.session import Session as Session
     from flowrec.session import open as open  # noqa: A004 - flowrec.open
     from flowrec.store.recovery import recover as recover
@@ -50,7 +52,9 @@ _MODULES = {
     "open": "session",
     "record": "commands.record",
     "recover": "store.recovery",
+    "refine": "refine",  # a room that can be called, because Python gives its name to the room anyway
     "replay": "commands.replay",
+    "solve": "refine.user_flow",
     "report": "commands.report",
 }
 __all__ = list(_MODULES)
@@ -59,7 +63,8 @@ __all__ = list(_MODULES)
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'flowrec' has no attribute {name!r}")
-    found = globals()[name] = getattr(importlib.import_module(f"flowrec.{_MODULES[name]}"), name)
+    module = importlib.import_module(f"flowrec.{_MODULES[name]}")
+    found = globals()[name] = module if _MODULES[name] == name else getattr(module, name)
     return found
 
 

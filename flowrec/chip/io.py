@@ -84,13 +84,18 @@ _OF_BLOOD = {"viscosity_mpa_s": BLOOD_MPA_S, "density_kg_m3": BLOOD_KG_M3}  # wh
 _OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
 
 
-def load_chip(settings: ChipSettings) -> Chip:
-    """The chip that the settings name, with the values that they give instead of its own.
+def load_chip(settings: ChipSettings, mask: NDArray[np.bool_] | None = None) -> Chip:
+    """The chip that the settings name, or with that mask (h, w), with the values that they give instead of its own.
 
     Raises ChipError, in one line, if no flow can be computed on it.
     """
-    where = settings.path or settings.name
-    if settings.path:
+    where = "mask" if mask is not None else settings.path or settings.name
+    if mask is not None:
+        written, png = cv2.imencode(".png", np.where(mask, 255, 0).astype(np.uint8)) if mask.size else (False, mask)
+        if not written:
+            raise ChipError(f"{where}: no image can have {mask.shape} pixels")
+        chip = chip_from_files(png.tobytes(), "", where, settings.um_per_px)
+    elif settings.path:
         chip = _read_chip(Path(settings.path), settings.um_per_px)
     elif settings.name in BUILT_IN:
         chip = BUILT_IN[settings.name](settings)

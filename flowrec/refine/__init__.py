@@ -7,7 +7,13 @@ the observations say of it; mask_variants, obstacles: other walls; findings, rep
 local_viscosity, residuals, gauss_newton: a case without dimensions, its equations and their direct solution. network,
 network_inputs, network_fit, weights: what pi_unet, ni and unet share. pinn, collocation: the network of coordinates and
 its case. training: makes the shipped weights. torch is imported when a method that needs it runs.
+
+The room is also the function `flowrec.refine(chip, observations)` (user_flow.py): calling it refines measurements.
 """
+
+import sys
+from types import ModuleType
+from typing import Any
 
 from flowrec.refine.assimilate import Assimilate
 from flowrec.refine.ni import Ni
@@ -17,3 +23,15 @@ from flowrec.refine.refiner import REFINERS, Refiner
 from flowrec.refine.unet import Unet
 
 __all__ = ["REFINERS", "Assimilate", "Ni", "PiUnet", "Pinn", "Refiner", "Unet"]
+
+
+class _Room(ModuleType):
+    """A package that is a function, too: `flowrec.refine` is the name of both."""
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        from flowrec.refine.user_flow import refine
+
+        return refine(*args, **options)
+
+
+sys.modules[__name__].__class__ = _Room

@@ -10,19 +10,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from flowrec.messages import FlowField, Observations
+from flowrec.tables.observed import OBSERVED
 from flowrec.units import unit_of
 
-# Columns of observations in the order of a user's file; the first four are needed, the others may be left out.
-OBSERVED = {
-    "x_um": "place of the observation, x in the chip frame",
-    "y_um": "place of the observation, y in the chip frame",
-    "u_um_s": "measured flow along x",
-    "v_um_s": "measured flow along y",
-    "std_um_s": "one standard deviation of each component of the measured flow",
-    "own_u_um_s": "the robot's own motion through the fluid as assumed, along x; it is subtracted already",
-    "own_v_um_s": "the robot's own motion through the fluid as assumed, along y; it is subtracted already",
-    "time_s": "middle of the time that the flow is a mean over, on the session clock",
-}
 _FIELD = {
     "x_um": "centre of the pixel, x in the chip frame",
     "y_um": "centre of the pixel, y in the chip frame",
