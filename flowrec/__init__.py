@@ -5,7 +5,9 @@
     session = flowrec.open("a.mcap")          # only reads; nothing is loaded before it is used
     session.outcome, session.at(3.0), session.fields["refined"]
     flowrec.record(flowrec.load_config("my.toml"), "b.mcap")
-    flowrec.replay(session, flowrec.Change(refine="assimilate"))
+    session.table("track").to_pandas()        # every topic as a table, units in the names of the columns
+    flowrec.replay(session, refine="assimilate").before_after
+    flowrec.refine("chip.png", "measured.csv").plot()
 
 Every name is imported when it is first used: `import flowrec` takes milliseconds.
 """
@@ -25,7 +27,8 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.commands.info import info as info
     from flowrec.commands.record import record as record
     from flowrec.commands.replay import Change as Change
-    from flowrec.commands.replay import replay as replay
+    from flowrec.commands.replay_api import Replay as Replay
+    from flowrec.commands.replay_api import replay as replay
     from flowrec.commands.replay_report import before_after as before_after
     from flowrec.commands.report import report as report
     from flowrec.config import Config as Config
@@ -41,6 +44,7 @@ _MODULES = {
     "Change": "commands.replay",
     "Config": "config",
     "FlowrecError": "errors",
+    "Replay": "commands.replay_api",
     "Session": "session",
     "before_after": "commands.replay_report",
     "check": "commands.check",
@@ -53,7 +57,7 @@ _MODULES = {
     "record": "commands.record",
     "recover": "store.recovery",
     "refine": "refine",  # a room that can be called, because Python gives its name to the room anyway
-    "replay": "commands.replay",
+    "replay": "commands.replay_api",
     "solve": "refine.user_flow",
     "report": "commands.report",
 }

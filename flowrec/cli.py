@@ -193,7 +193,9 @@ def replay(
     if verify:
         if refly:
             raise typer.BadParameter("--verify only compares; it goes without --refly")
-        done = flowrec.replay(session, change, from_s, True, out, overwrite, frames, AtTerminal())
+        from flowrec.commands.replay import replay as replay_verb
+
+        done = replay_verb(session, change, from_s, True, out, overwrite, frames, AtTerminal())
         if as_json:
             typer.echo(json.dumps({"session": str(session), **done.as_json()}))
         else:
