@@ -29,13 +29,13 @@ if TYPE_CHECKING:  # the same names as in the table below, for type checkers and
     from flowrec.commands.replay import Change as Change
     from flowrec.commands.replay_api import Replay as Replay
     from flowrec.commands.replay_api import replay as replay
-    from flowrec.commands.replay_report import before_after as before_after
     from flowrec.commands.report import report as report
     from flowrec.config import Config as Config
     from flowrec.config import load_config as load_config
     from flowrec.errors import FlowrecError as FlowrecError
     from flowrec.refine.user_flow import refine as refine
     from flowrec.refine.user_flow import solve as solve
+    from flowrec.replay_figures import before_after as before_after
     from flowrec.session import Session as Session
     from flowrec.session import open as open  # noqa: A004 - flowrec.open
     from flowrec.store.recovery import recover as recover
@@ -46,7 +46,7 @@ _MODULES = {
     "FlowrecError": "errors",
     "Replay": "commands.replay_api",
     "Session": "session",
-    "before_after": "commands.replay_report",
+    "before_after": "replay_figures",
     "check": "commands.check",
     "compare": "commands.compare",
     "export": "commands.export",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flowrec import topics
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.replay_result import CommandDifference, Replayed, WorkerCheck, digest_lines
+from flowrec.commands.replay_result import Replayed, WorkerCheck, digest_lines
 from flowrec.commands.run_summary import figures_of
 from flowrec.config import ResolvedConfig, with_sets
 from flowrec.control.controller import CONTROLLERS
@@ -27,6 +27,7 @@ from flowrec.estimation.smoother import observe, smooth
 from flowrec.messages import Applied, Mission, Observations, Track
 from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.planner import PLANNERS
+from flowrec.replay_figures import CommandDifference
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run.loop import Sink, run
 from flowrec.run.workers import LockstepWorker, work

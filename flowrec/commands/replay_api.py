@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay import Change
 from flowrec.commands.replay import replay as replay_verb
-from flowrec.commands.replay_report import before_after
 from flowrec.commands.replay_result import Replayed
 from flowrec.errors import UsageError
+from flowrec.replay_figures import before_after
 from flowrec.session import Session
 from flowrec.summary import Row, comparison_for_people
 

@@ -3,99 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Self
 
 import numpy as np
 
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay import Change, planned_from, replay
-from flowrec.commands.replay_result import CommandDifference, Replayed
-from flowrec.commands.run_summary import flow_error, length_um
-from flowrec.config import ResolvedConfig
+from flowrec.commands.replay_result import Replayed
 from flowrec.enums import Phase
 from flowrec.errors import SessionError, UsageError
-from flowrec.flow import sample
-from flowrec.messages import FlowField, Observations, Route
+from flowrec.messages import FlowField
 from flowrec.pipeline import assemble
-from flowrec.planning import travel_time
+from flowrec.replay_figures import ReplayPair, before_after
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import RunReport, Sink, run
-from flowrec.run.route_orders import no_observations
 from flowrec.run.workers import LockstepWorker, Preloaded
-from flowrec.session import Session, files_behind
+from flowrec.session import files_behind
 from flowrec.session_writer import session_writer
-from flowrec.summary import Row, Value, finite
+from flowrec.summary import Row
 from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.terminal import say
-from flowrec.topics import FLOW_FIELDS, Tick
+from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
 _SAME_MAP = 1e-3  # of the largest speed: smaller changes are not visible in any table
-
-
-class ReplayPair(Protocol):
-    """What two runs of one recording are compared by: a `Replayed`, or two session files.
-
-    Attributes
-    ----------
-    session : what was replayed, with the recorded configuration.
-    config : the configuration of the replay.
-    recorded, replayed : the last tick of both.
-    commands : the difference of the demands of both.
-    """
-
-    @property
-    def session(self) -> Session: ...
-    @property
-    def config(self) -> ResolvedConfig: ...
-    @property
-    def recorded(self) -> Tick: ...
-    @property
-    def replayed(self) -> Tick: ...
-    @property
-    def commands(self) -> CommandDifference: ...
-
-
-def before_after(done: ReplayPair) -> list[Row]:
-    """Key, recorded and replayed value of every figure that a replay may change, both on the map of the replay.
-
-    Flow errors are relative to the true flow, where it is known. A route that can not be followed on that map has no
-    travel time.
-    """
-    was, now = done.recorded, done.replayed
-    rows: list[Row] = []
-
-    def add(key: str, value: Callable[[Tick], Value]) -> None:
-        rows.append((key, value(was), value(now)))
-
-    add("map", lambda tick: tick.field.method if tick.field is not None else "none")
-    if was.true_field is not None:
-        add("assumed_flow_error", lambda tick: flow_error(done.session.chip, tick.assumed, was.true_field))
-        add("refined_flow_error", lambda tick: flow_error(done.session.chip, tick.refined, was.true_field))
-    observations = now.observations or was.observations or no_observations(0)
-    if len(observations.position_um) and was.field is not None and now.field is not None:
-        add("observations", lambda _: len(observations.position_um))
-        add("residual_um_s", lambda tick: _residual_um_s(tick.field, observations))
-    if was.route is not None or now.route is not None:
-        add("planner", lambda tick: _planner(tick.route))
-        add("route_length_um", lambda tick: _length_um(tick.route))
-        limit_um_s = done.config.plan.speed_share * done.config.robot.speed_limit_um_s
-        if now.field is not None:
-            add("travel_time_on_replayed_map_s", lambda tick: _travel_time_s(tick.route, now.field, limit_um_s))
-    controllers = done.session.config.control.method, done.config.control.method
-    if controllers[0] != controllers[1]:
-        rows.append(("controller", *controllers))
-    commands = done.commands
-    rows.append(("commands_compared", None, commands.compared))
-    rows.append(("commands_changed", None, commands.changed))
-    if commands.first_ns is not None:
-        rows.append(("commands_difference_rms_um_s", None, commands.rms_um_s))
-        rows.append(("first_changed_command_s", None, seconds(commands.first_ns)))
-    return rows
 
 
 def refinement_remarks(done: ReplayPair) -> list[str]:
@@ -229,30 +163,6 @@ def _largest_change(was: FlowField, now: FlowField) -> float:
     """Largest change of a velocity component relative to the largest component."""
     largest = float(np.abs(was.velocity_um_s).max())
     return float(np.abs(now.velocity_um_s - was.velocity_um_s).max()) / largest if largest else math.inf
-
-
-def _residual_um_s(flow: FlowField | None, observations: Observations) -> float | None:
-    """Root mean square of observed minus mapped flow, um/s, both components together."""
-    if flow is None:
-        return None
-    miss = observations.flow_um_s - sample(flow, observations.position_um)
-    return finite(float(np.sqrt((miss**2).sum(axis=1).mean())))
-
-
-def _planner(route: Route | None) -> str:
-    return "none" if route is None else route.method if route.reachable else f"{route.method}: unreachable"
-
-
-def _length_um(route: Route | None) -> float | None:
-    return length_um(route) if route is not None and route.reachable else None
-
-
-def _travel_time_s(route: Route | None, flow: FlowField | None, limit_um_s: float) -> float | None:
-    """None where there is no map or route, or it can not be followed."""
-    if flow is None or route is None or not route.reachable:
-        return None
-    arrival_s, feasible = travel_time(flow, route.waypoints_um, limit_um_s)
-    return float(arrival_s[-1]) if feasible else None
 
 
 def _navigation_s(flight: RunReport) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,15 +11,14 @@ from flowrec.commands.compare import Comparison
 from flowrec.config import ResolvedConfig
 from flowrec.enums import WorkOrder
 from flowrec.errors import printable
-from flowrec.messages import Demand, FlowField, Mission, Route
+from flowrec.messages import FlowField, Mission, Route
 from flowrec.pipeline import Pipeline
+from flowrec.replay_figures import CommandDifference
 from flowrec.run.loop import RunReport
 from flowrec.run.workers import work
 from flowrec.session import Session
 from flowrec.store.audit import digest_faults
 from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS, Tick
-
-_SAME_COMMAND_UM_S = 1.0  # smaller differences of the demanded velocity are not visible
 
 
 class WorkerCheck:
@@ -95,39 +93,6 @@ def digest_lines(path: Path) -> tuple[bool, list[str]]:
             intact = False
             lines += [printable(f"{file.name}: DIFFERENT from its digest: {fault}") for fault in faults]
     return intact, lines or ["all messages and the header match the digest"]
-
-
-@dataclass(slots=True)
-class CommandDifference:
-    """Difference of the replayed demand from the recorded one.
-
-    Attributes
-    ----------
-    compared, changed : number of ticks.
-    first_ns : stamp of the first changed demand.
-    rms_um_s : root mean square difference of the demanded velocity, um/s.
-    """
-
-    compared: int = 0
-    changed: int = 0
-    first_ns: int | None = None
-    _square: float = 0.0
-
-    def add(self, was: Demand | None, now: Demand | None) -> None:
-        """Compare one pair of demands."""
-        if was is None or now is None:
-            return
-        self.compared += 1
-        difference = math.dist(was.velocity_um_s, now.velocity_um_s)
-        self._square += difference**2
-        if difference > _SAME_COMMAND_UM_S:
-            self.changed += 1
-            self.first_ns = now.stamp_ns if self.first_ns is None else self.first_ns
-
-    @property
-    def rms_um_s(self) -> float:
-        """Root mean square difference of the demanded velocity."""
-        return math.sqrt(self._square / self.compared) if self.compared else 0.0
 
 
 @dataclass(slots=True)

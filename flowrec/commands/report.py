@@ -6,24 +6,21 @@ import importlib.util
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flowrec.commands.check import check
 from flowrec.commands.info import facts_for_people, info
-from flowrec.commands.replay_report import before_after, refinement_remarks
-from flowrec.commands.replay_result import CommandDifference
+from flowrec.commands.replay_report import refinement_remarks
 from flowrec.commands.verdict import Verdict
-from flowrec.config import ResolvedConfig
 from flowrec.enums import Outcome
 from flowrec.errors import UsageError
+from flowrec.replay_figures import ReplayFiles, before_after
 from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
 from flowrec.summary import comparison_for_people, name_of, shown
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
-from flowrec.topics import Tick
 
 if TYPE_CHECKING:
     from flowrec.reporting.page import Page, ReplayPart, ReportFigure, Table
@@ -36,43 +33,6 @@ _LINES = 600  # of settings or local changes on the page
 _EVENTS = 60  # rows of the table of events
 _OF_RECORDING = ("content", "length", "images", "losses", "clocks", "windows", "digest", "replay")
 _OF_CODE = ("flowrec", "numerics_version", "git_commit", "git_changed")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ReplayFiles:
-    """A session and the file of a replay of it; implements replay_report.ReplayPair.
-
-    Attributes
-    ----------
-    replay : the session of the replay.
-    recorded : the last tick of the session that the replay covers.
-    """
-
-    session: Session
-    replay: Session
-    recorded: Tick
-    replayed: Tick
-    commands: CommandDifference
-
-    @classmethod
-    def of(cls, session: Session, replay: Session) -> ReplayFiles:
-        """Read both; SessionError where a message is damaged."""
-        commands = CommandDifference()
-        replayed = iter(replay.messages("demand"))
-        now = next(replayed, None)
-        for was in session.messages("demand"):
-            while now is not None and now.stamp_ns < was.stamp_ns:
-                now = next(replayed, None)
-            if now is not None and now.stamp_ns == was.stamp_ns:
-                commands.add(was, now)
-        end_ns = min(session.run.last_ns, replay.run.last_ns)
-        recorded = session.reader.tick_before(end_ns, with_frames=False)
-        return cls(session, replay, recorded, replay.reader.tick_before(replay.run.last_ns), commands)
-
-    @property
-    def config(self) -> ResolvedConfig:
-        """The configuration of the replay."""
-        return self.replay.config
 
 
 def report(

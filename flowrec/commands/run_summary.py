@@ -7,15 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from flowrec.chip.chip import Chip
 from flowrec.enums import Outcome, Phase
-from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import Demand, FlowField, Route
+from flowrec.messages import Demand, FlowField
+from flowrec.replay_figures import flow_error, length_um
 from flowrec.run.loop import RunReport
 from flowrec.store.run_files import is_snapshot
-from flowrec.summary import Figures, finite, rows_for_people
+from flowrec.summary import Figures, rows_for_people
 from flowrec.terminal import say, table
 from flowrec.topics import FLOW_FIELDS, Tick
 from flowrec.units import seconds
@@ -116,18 +114,6 @@ def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> F
     if last.observations is not None:
         figures["observations"] = len(last.observations.position_um)
     return figures
-
-
-def flow_error(chip: Chip, flow: FlowField | None, true_field: FlowField | None) -> float | None:
-    """Relative RMSE of a flow over the fluid pixels; None where one is not known, or not comparable."""
-    if flow is None or true_field is None or (flow.wall_px is None) != (true_field.wall_px is None):
-        return None  # means over pixels, of numerics 1, are not compared with values at their centres
-    return finite(float(relative_rmse(flow, true_field, chip.mask).v))
-
-
-def length_um(route: Route) -> float:
-    """Length of a route in um."""
-    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
 
 
 def files_text(path: Path, files: tuple[Path, ...]) -> str:

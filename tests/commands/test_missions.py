@@ -10,9 +10,10 @@ import pytest
 
 from flowrec.commands import replay as verb
 from flowrec.commands.record import record
-from flowrec.commands.replay_report import before_after, refly
+from flowrec.commands.replay_report import refly
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded
 from flowrec.config import load_config
+from flowrec.replay_figures import before_after
 from flowrec.store.reader import SessionReader
 from flowrec.system.outputs import MCAP, Output
 from tests.conftest import SMALL, made_once
