@@ -96,6 +96,18 @@ def test_where_nothing_is_blocked_the_map_is_that_of_the_assimilation(chip, assu
     assert "blocked" not in corrected.note
 
 
+def test_three_observations_that_something_else_spoils_are_not_taken_for_an_obstacle(chip, assumed):
+    # They are neighbours and eight standard deviations off: an obstacle is likelier by more than its prior says.
+    truth = SOLVER.solve(chip.with_boundary(chip.boundary_values * np.array([1.2, 1.0])))
+    observations = observed(truth, chip)
+    flow = observations.flow_um_s.copy()
+    flow[20:23] += 8.4 * observations.std_um_s[0] * np.array([-1.0, 0.6])
+    observations = replace(observations, flow_um_s=flow)
+    plain, corrected = (method.refine(assumed, observations, chip, SOLVER) for method in (PLAIN, CORRECTED))
+    assert "blocked" not in corrected.note
+    assert relative_rmse(corrected, truth, chip.mask).v < 2.0 * relative_rmse(plain, truth, chip.mask).v
+
+
 def test_an_obstacle_closes_the_side_of_the_flow_that_it_names(chip):
     left = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, -1, 1.0, 1.5, 100.0).friction_per_um2(chip)
     whole = Obstacle(85.0, 80.0, (1.0, 0.0), 4.0, 0, 1.0, 1.5, 100.0).friction_per_um2(chip)
