@@ -211,7 +211,10 @@ class Observed:
 
     def _carried(self, v: Floats, flow: Floats) -> list[Effect]:
         """How a flow (n, 2), which is v (n, 2) at the observations, carries a robot of finite size."""
-        laplacian = self.operator.predict(curvature(self.model.chip.mask, flow))
+        pixels = np.unique(self.operator.pixels)
+        bent = np.zeros_like(flow)
+        bent[pixels] = curvature(self.model.chip.mask, flow, pixels)
+        laplacian = self.operator.predict(bent)
         if self.sphere is not None:
             return [_effect("sphere", SPHERE, self.sphere.carried(v, laplacian)[None])]
         return [

@@ -20,7 +20,6 @@ from scipy.sparse.csgraph import dijkstra
 from flowrec.chip.chip import Chip
 from flowrec.chip.clearance import clearance_um, median_width_um
 from flowrec.flow.linear_solver import cached
-from flowrec.flow.sampling import fluid_image
 from flowrec.flow.sensitivities import Sensitivities
 from flowrec.refine.observation_operator import Floats
 
@@ -64,29 +63,35 @@ def cell_widening(chip: Chip, cells: Any) -> Floats:
 
 def steepness(mask: NDArray[np.bool_], velocity: Floats) -> Floats:
     """(n, 2) size of the gradient of each component of a compact velocity (n, 2), per pixel."""
-    image = fluid_image(mask, velocity)
-    slopes = [0.5 * (ahead - behind) for ahead, behind in _neighbours(mask, image)]
-    return np.asarray(np.hypot(*slopes)[mask])
+    slopes = [0.5 * (ahead - behind) for ahead, behind in _neighbours(mask, velocity, np.arange(len(velocity)))]
+    return np.asarray(np.hypot(*slopes))
 
 
-def curvature(mask: NDArray[np.bool_], velocity: Floats) -> Floats:
-    """(n, 2) Laplacian of each component of a compact velocity (n, 2), per square pixel."""
-    image = fluid_image(mask, velocity)
-    return np.asarray(sum(ahead + behind for ahead, behind in _neighbours(mask, image)) - 4.0 * image)[mask]
+def curvature(mask: NDArray[np.bool_], velocity: Floats, pixels: NDArray[np.intp]) -> Floats:
+    """(k, 2) Laplacian of each component of a compact velocity (n, 2) in some of its pixels (k,), per square pixel."""
+    both = (ahead + behind for ahead, behind in _neighbours(mask, velocity, pixels))
+    return np.asarray(sum(both) - 4.0 * velocity[pixels])
 
 
-def _neighbours(mask: NDArray[np.bool_], image: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """Along each axis, the values (h, w, 2) of an image at the next and at the previous pixel.
+def _neighbours(mask: NDArray[np.bool_], values: Floats, pixels: NDArray[np.intp]) -> Iterator[tuple[Floats, Floats]]:
+    """Along each axis, the compact values (n, 2) at the next and at the previous pixel of some pixels (k,).
 
     The flow vanishes on a wall, half a pixel beyond the last fluid pixel: beyond it is minus that before it. Across the
     border of the image a channel goes on.
     """
-    for axis in (0, 1):
+    number = np.full(mask.shape, -1, np.intp)
+    number[mask] = np.arange(len(values))
+    number = np.pad(number, 1, constant_values=-2)
+    place = np.flatnonzero(number >= 0)[pixels]
+    here = values[pixels]
+    for stride in (number.shape[1], 1):
         sides = []
-        for step, last in ((-1, -1), (1, 0)):
-            beyond = np.where(np.roll(mask, step, axis=axis)[..., None], np.roll(image, step, axis=axis), -image)
-            np.moveaxis(beyond, axis, 0)[last] = np.moveaxis(image, axis, 0)[last]
-            sides.append(beyond)
+        for step in (stride, -stride):
+            other = number.ravel()[place + step]
+            side = values[np.maximum(other, 0)]
+            side[other == -1] = -here[other == -1]
+            side[other == -2] = here[other == -2]
+            sides.append(side)
         yield sides[0], sides[1]
 
 
