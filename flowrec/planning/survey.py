@@ -96,6 +96,11 @@ class SurveyPlanner:
     # 28 s with 3 and with 4, and the mean errors were .092, .096, .093, .091.
     memory_stretches: Annotated[int, Range(0, 1000)] = 3
 
+    @property
+    def needs_uncertainty(self) -> bool:
+        """Whether the method asks how wrong the flow may be, which takes as long to compute as a refinement."""
+        return "uncertainty" in SURVEYS[self.method].needs
+
     def plan(self, order: SurveyOrder) -> Route:
         """The route (stamp and request 0) of the survey as far as it is decided, or no route with the reason.
 
@@ -109,7 +114,7 @@ class SurveyPlanner:
             If the field is not finite.
         """
         row, remark = SURVEYS[self.method], ""
-        if "uncertainty" in row.needs and order.uncertainty is None:
+        if self.needs_uncertainty and order.uncertainty is None:
             remark = f"survey {_NO_PRIOR}: nothing says how wrong the assumed flow may be"
             row = SURVEYS[_NO_PRIOR]
         method: SurveyMethod = row.load()(**{option: getattr(self, option) for option in row.options})

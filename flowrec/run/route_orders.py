@@ -50,7 +50,7 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
             pipeline.chip,
             _robot(pipeline, order),
             mission.goal_um,
-            _uncertainty(pipeline, order),
+            _uncertainty(pipeline, order) if pipeline.survey.needs_uncertainty else None,
             _sampling(pipeline, order),
             observations_of(pipeline, order),
             present,
