@@ -22,6 +22,7 @@ from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import load_config
 from flowrec.system.numba_setup import _cache_folder
+from tests.short_missions import SMALL
 
 Made = TypeVar("Made")
 
@@ -36,18 +37,6 @@ settings.register_profile("flowrec", deadline=None)
 settings.load_profile("flowrec")
 
 HANG_S = 120.0  # a wait as long as this one hangs; no test asserts how quick something is
-# A short survey: most tests are about something else.
-SMALL = [
-    "camera.width_px=320",
-    "camera.height_px=256",
-    "simulated.seed=1",
-    "simulated.world=kind",
-    "survey.method=downstream",
-]
-
-# In real time, and still under way however long a busy machine takes for what a test does meanwhile.
-LONG = [*SMALL, "mission.hold_start_s=100", "safety.guard_timeout_s=20"]
-
 # For tests of what happens in real time: other tests beside them would be the cause of their failures.
 needs_quiet = pytest.mark.skipif(
     "PYTEST_XDIST_WORKER" in os.environ, reason="needs a quiet machine: pytest -n 0 tests/rigs/lab"

@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 
 from flowrec.cli import main, with_default_refine
-from tests.conftest import HANG_S, LONG, until
+from tests.conftest import HANG_S, until
+from tests.short_missions import LONG
 
 
 def flowrec(*words: object) -> subprocess.CompletedProcess[str]:

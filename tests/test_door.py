@@ -15,7 +15,8 @@ import pytest
 import flowrec
 from flowrec.errors import SessionError, UsageError
 from flowrec.topics import Tick
-from tests.conftest import HANG_S, LONG, SMALL, until
+from tests.conftest import HANG_S, until
+from tests.short_missions import LONG, SMALL
 
 ROOT = Path(__file__).parents[1]
 GOLDEN = ROOT / "sessions" / "golden.mcap"

@@ -14,7 +14,7 @@ from flowrec.cli import main
 from flowrec.session import Session
 from flowrec.store.reader import SessionReader
 from flowrec.summary import of_text
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 GOLDEN = Path(__file__).parents[1] / "sessions" / "golden.mcap"
 

@@ -28,7 +28,8 @@ from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.system.outputs import MCAP, Output
-from tests.conftest import SMALL, until
+from tests.conftest import until
+from tests.short_missions import SMALL
 
 S = 1_000_000_000
 SHORT = [*SMALL, "duration_s=2.0", "camera.debris=0"]

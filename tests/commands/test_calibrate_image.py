@@ -19,7 +19,7 @@ from flowrec.commands.record import record
 from flowrec.config import load_config, with_sets
 from flowrec.errors import UsageError
 from flowrec.rig_settings import CameraSettings
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 POSE = ("angle_deg=182", "mirror=true", "centre_um=[3340,2350]", "um_per_px=20.4")
 TRUE = [f"simulated.{each}" for each in POSE]

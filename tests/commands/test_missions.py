@@ -16,7 +16,8 @@ from flowrec.config import load_config
 from flowrec.replay_figures import before_after
 from flowrec.store.reader import SessionReader
 from flowrec.system.outputs import MCAP, Output
-from tests.conftest import SMALL, made_once
+from tests.conftest import made_once
+from tests.short_missions import SMALL
 
 SESSIONS = Path(__file__).parents[2] / "sessions"
 # The island between the branches of the bifurcation: above it runs the long slow branch, below it the short fast one.

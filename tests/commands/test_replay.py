@@ -19,7 +19,7 @@ from flowrec.estimation import Observer
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Estimate
 from flowrec.store.reader import SessionReader
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 
 def test_the_mission_reaches_its_goal_without_touching_a_wall(mission: Recorded) -> None:

@@ -25,8 +25,8 @@ from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
 from flowrec.topics import TOPICS, Tick
-from tests.conftest import SMALL
 from tests.rewritten import leaves_of, parser_of, rewrite
+from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"

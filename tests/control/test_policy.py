@@ -16,9 +16,9 @@ from flowrec.planning import Planner
 from flowrec.planning.time_field import TimeField
 from flowrec.robot import Robot
 from flowrec.store.reader import SessionReader
-from tests.conftest import SMALL
 from tests.control.plant import field_of, fly, mission, straight
 from tests.planning import worlds
+from tests.short_missions import SMALL
 
 PX_UM = 50.0
 GOAL_UM = np.array([2500.0, 2500.0])

@@ -20,7 +20,7 @@ from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.robot import Robot
 from flowrec.store.reader import SessionReader
 from flowrec.topics import Tick
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=28.8)
 DT_S = 1 / 30

@@ -27,7 +27,7 @@ from flowrec.pipeline import Inputs
 from flowrec.rigs.simulated import rig as simulated
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run import loop
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 AT = 40
 SETS = [*SMALL, "camera.rate_hz=60"]

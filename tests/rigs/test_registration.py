@@ -10,7 +10,7 @@ from flowrec.config import calibration_of, load_config
 from flowrec.interpolation import bilinear
 from flowrec.resolve import resolve
 from flowrec.vision.walls import walls_in_view
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 SURVEY = [*SMALL, "mission.phases=survey,refine"]
 TURNED = {

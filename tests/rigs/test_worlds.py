@@ -26,7 +26,7 @@ from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
 from flowrec.rigs.simulated.world import Shake, misregistered, true_chip, true_depth_um, true_pump, true_robot
 from flowrec.robot import Robot
 from flowrec.simulated_settings import WORLDS, Simulated
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 CHIP = load_chip(ChipSettings("bifurcation"))
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=28.8)

@@ -15,7 +15,7 @@ from flowrec.messages import Estimate
 from flowrec.pipeline import assemble
 from flowrec.store.reader import SessionReader
 from flowrec.units import NS_PER_S
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 BREAKS_NS = NS_PER_S // 2
 

@@ -20,7 +20,7 @@ from flowrec.pipeline import Inputs
 from flowrec.rigs.rig import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.store.reader import SessionReader
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 
 AT_S = 1.2  # a moment while it navigates
 FRAME_S = 1 / 30

@@ -27,7 +27,8 @@ from flowrec.run.keyboard import Keyboard
 from flowrec.store.reader import SessionReader
 from flowrec.topics import Tick
 from flowrec.units import seconds
-from tests.conftest import HANG_S, SMALL
+from tests.conftest import HANG_S
+from tests.short_missions import SMALL
 
 
 class Scripted(RunControl):

@@ -23,9 +23,10 @@ from flowrec.run.control import RunControl
 from flowrec.run.signals import Signals
 from flowrec.run.watchdog import Watchdog
 from flowrec.store.reader import SessionReader
-from tests.conftest import SMALL, until
+from tests.conftest import until
 from tests.perf.stop_trial import LoggedRig
 from tests.perf.stops import KINDS, Ended, Kind, stop
+from tests.short_missions import SMALL
 
 PATIENT = "safety.guard_timeout_s=20"  # where the guard's timer has no part
 

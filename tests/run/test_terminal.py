@@ -17,7 +17,8 @@ from pathlib import Path
 import pytest
 
 from flowrec.store.reader import SessionReader
-from tests.conftest import LONG, until
+from tests.conftest import until
+from tests.short_missions import LONG
 
 WORDS = [word for setting in LONG for word in ("--set", setting)]
 

@@ -24,7 +24,8 @@ from flowrec.pipeline import Pipeline
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import work
 from flowrec.topics import Tick
-from tests.conftest import HANG_S, SMALL, until
+from tests.conftest import HANG_S, until
+from tests.short_missions import SMALL
 
 # Found by this process and by its child: stages that fail in every way in which an answer can fail.
 HURDLES = """

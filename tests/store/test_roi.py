@@ -18,7 +18,7 @@ from flowrec.store.recovery import recover
 from flowrec.store.roi import Region, WindowSelector, nonzero_window
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
 EVERYWHERE = (0, 0, 200, 160)

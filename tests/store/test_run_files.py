@@ -31,7 +31,7 @@ from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import Part
 from flowrec.store.writer import SessionWriter
 from flowrec.topics import BY_FIELD, Tick
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
 
 CONFIG = load_config(None, ["camera.rate_hz=60"])

@@ -23,7 +23,8 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import is_growing, open_new, remove_idle
-from tests.conftest import LONG, SMALL, until
+from tests.conftest import until
+from tests.short_missions import LONG, SMALL
 from tests.store.made_up import HEADER, ticks_of
 
 BRIEF = ["--duration", "0.3", *(word for setting in SMALL for word in ("--set", setting))]

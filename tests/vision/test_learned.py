@@ -24,7 +24,7 @@ from flowrec.robot import Robot
 from flowrec.store.reader import SessionReader
 from flowrec.vision import Tracker
 from flowrec.vision.learned import Candidates, Motion, assigned
-from tests.conftest import SMALL
+from tests.short_missions import SMALL
 from tests.vision.test_tracker import CHIP, ROBOT, WALLS, Scene
 
 LOOKS = judges(30)

@@ -1,0 +1,15 @@
+"""Settings of short missions: without what conftest loads, for processes that tests start."""
+
+# A short survey, and no doubt about the depth of the chip, which makes a refinement three times as long: most tests are
+# about something else. The recorded sessions in `sessions/` have both.
+SMALL = [
+    "camera.width_px=320",
+    "camera.height_px=256",
+    "simulated.seed=1",
+    "simulated.world=kind",
+    "survey.method=downstream",
+    "refine.assimilate.doubt_depth=false",
+]
+
+# In real time, and still under way however long a busy machine takes for what a test does meanwhile.
+LONG = [*SMALL, "mission.hold_start_s=100", "safety.guard_timeout_s=20"]
