@@ -84,7 +84,7 @@ def _neighbours(mask: NDArray[np.bool_], values: Floats, pixels: NDArray[np.intp
     number = np.pad(number, 1, constant_values=-2)
     place = np.flatnonzero(number >= 0)[pixels]
     here = values[pixels]
-    for stride in (number.shape[1], 1):
+    for stride in (mask.shape[1] + 2, 1):
         sides = []
         for step in (stride, -stride):
             other = number.ravel()[place + step]

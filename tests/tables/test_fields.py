@@ -73,7 +73,7 @@ def test_xarray_reads_images_fields_and_stamps_back_from_zarr(tmp_path: Path) ->
     import xarray
 
     from flowrec.config import load_config
-    from tests.conftest import SMALL
+    from tests.short_missions import SMALL
 
     path = flowrec.record(load_config(None, [*SMALL, "duration_s=0.3"]), tmp_path / "a.mcap").path
     session = flowrec.open(path)

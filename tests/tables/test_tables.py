@@ -123,7 +123,7 @@ def test_a_message_that_makes_no_sense_is_an_error_in_a_table_too(tmp_path: Path
 
 def test_a_run_in_parts_has_the_table_of_the_whole(tmp_path: Path) -> None:
     from flowrec.config import load_config
-    from tests.conftest import SMALL
+    from tests.short_missions import SMALL
 
     whole = flowrec.record(load_config(None, [*SMALL, "duration_s=0.4", "recording.split_s=0.1"]), tmp_path / "a.mcap")
     session = flowrec.open(whole.path)
