@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 Shown = Literal["speed", "error"]
 _ARROWS = 24  # along the longer side
+_LENGTH = 1.6  # of the fastest arrow, in spaces between arrows
+_SOLID, _PATH = "0.85", "tab:red"
 _PLACE = ("y_um", "x_um")
 _DIMS = {"velocity_um_s": (*_PLACE, "component"), "std_um_s": (*_PLACE, "component"), "pressure_pa": _PLACE}
 _NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "error_share", "stamp_ns")
@@ -118,15 +120,17 @@ def plot(field: Field, ax: Axes | None = None, show: Shown = "speed", path_um: A
         values, extent=(-0.5 * px, (w - 0.5) * px, (h - 0.5) * px, -0.5 * px), vmin=0.0, interpolation="nearest"
     )
     label = {"speed": "speed (um/s)", "error": "one standard deviation (um/s)"}[show]
-    axes.figure.colorbar(drawn, ax=axes, label=label)
+    axes.figure.colorbar(drawn, ax=axes, label=label, fraction=0.046 * h / w, pad=0.03)
+    axes.set_facecolor(_SOLID)
     if show == "speed":
         _arrows(axes, field, fluid)
     if path_um is not None:
         path = np.asarray(path_um, np.float64)
         if path.ndim != 2 or path.shape[1] != 2:
             raise UsageError(f"path_um has the shape {path.shape}; it must be (n, 2): x and y in um")
-        axes.plot(path[:, 0], path[:, 1], color="white", linewidth=1.5)
-    axes.set(xlabel="x (um)", ylabel="y (um)", title=f"{field.method} flow", aspect="equal")
+        axes.plot(path[:, 0], path[:, 1], color="white", linewidth=3.0)
+        axes.plot(path[:, 0], path[:, 1], color=_PATH, linewidth=1.5)
+    axes.set(xlabel="x (um)", ylabel="y (um)", title=f"flow by {field.method}", aspect="equal")
     return axes
 
 
@@ -136,6 +140,15 @@ def _arrows(axes: Axes, field: Field, fluid: NDArray[np.bool_]) -> None:
     inside = fluid[rows, columns]
     rows, columns = rows[inside], columns[inside]
     velocity = field.velocity_um_s[rows, columns]
-    axes.quiver(
-        columns * field.um_per_px, rows * field.um_per_px, velocity[:, 0], velocity[:, 1], color="white", angles="xy"
-    )
+    fastest = float(np.hypot(velocity[:, 0], velocity[:, 1]).max(initial=0.0))
+    if fastest > 0.0:
+        axes.quiver(
+            *(columns * field.um_per_px, rows * field.um_per_px, velocity[:, 0], velocity[:, 1]),
+            color="black",
+            angles="xy",
+            scale_units="xy",
+            scale=fastest / (_LENGTH * step * field.um_per_px),  # the longest arrow is so many spaces long
+            units="width",
+            width=0.004,
+            headwidth=4.0,
+        )

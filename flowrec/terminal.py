@@ -19,7 +19,7 @@ from flowrec.system.stderr import Outlet
 _STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
 
 outlet = Outlet()
-console = Console(file=cast(TextIO, outlet), highlight=False)
+console = Console(file=cast(TextIO, outlet), highlight=False, force_jupyter=False)
 
 
 def say(text: str) -> None:
