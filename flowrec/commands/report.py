@@ -13,25 +13,27 @@ from flowrec.commands.check import check
 from flowrec.commands.info import facts_for_people, info
 from flowrec.commands.replay_report import refinement_remarks
 from flowrec.commands.verdict import Verdict
-from flowrec.enums import Outcome
+from flowrec.enums import Level, Outcome
 from flowrec.errors import UsageError
 from flowrec.replay_figures import ReplayFiles, before_after
 from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
-from flowrec.summary import comparison_for_people, name_of, shown
+from flowrec.summary import Row, name_of, shown
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
 
 if TYPE_CHECKING:
+    from flowrec.reporting.history import Remark
     from flowrec.reporting.page import Page, ReplayPart, ReportFigure, Table
     from flowrec.reporting.story import Story
 
 HTML = (".html", ".htm")
 _PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
-_HIDDEN = frozenset({"outcome", "note", "reason", "wall_s", "wall_ns", "monotonic_ns", "clocks", "recovered_from"})
+_HIDDEN = frozenset(  # of the outcome: shown elsewhere
+    {"outcome", "note", "reason", "wall_s", "wall_ns", "monotonic_ns", "clocks", "recovered_from", "frames_windows"}
+)
 _LINES = 600  # of settings or local changes on the page
 _EVENTS = 60  # rows of the table of events
-_OF_RECORDING = ("content", "length", "images", "losses", "clocks", "windows", "digest", "replay")
 _OF_CODE = ("flowrec", "numerics_version", "git_commit", "git_changed")
 
 
@@ -157,7 +159,7 @@ def _files(kinds: Sequence[ReportFigure], story: Story) -> Iterator[tuple[str, b
         for width_mm in style.WIDTHS_MM:
             figure = kind.draw(story, width_mm)
             name = f"{kind.name}_{width_mm:.0f}mm"
-            yield f"{name}.svg", style.as_svg(figure, kind.title, text="none")
+            yield f"{name}.svg", style.as_svg(figure, kind.title, style.PAPER_DPI, text="none")
             yield f"{name}.pdf", style.as_pdf(figure, kind.title)
 
 
@@ -177,14 +179,16 @@ def _page(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: S
         outcome=outcome,
         good=any(outcome == each and each.completes_mission for each in Outcome),
         sentence=sentence(outcome),
-        note=str(facts["note"] or ""),
+        note=_sentence(str(facts["note"] or "")),
         about=_about(facts, session),
+        notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],
         key_figures=_key_figures(story),
         figures=done,
+        refined=story.refined is not None,
         refinement=story.refined.note.split("; ") if story.refined is not None and story.refined.note else [],
         boundary=_boundary(story),
         events=_events(story),
-        recording=Table("", [(name, verdict.facts[name]) for name in _OF_RECORDING if name in verdict.facts]),
+        recording=Table("", [fact for fact in verdict.facts.items() if fact[0] not in ("written", "outcome")]),
         findings=[judgement, *(finding.text for finding in verdict.findings)],
         replays=[_replay_part(pair, done[f"replay_{number}"]) for number, pair in enumerate(pairs, 1)],
         provenance=[Table("", _provenance(facts, session))],
@@ -197,6 +201,11 @@ def _page(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: S
     )
 
 
+def _sentence(text: str) -> str:
+    end = "" if not text or text.endswith((".", "!", "?")) else "."
+    return text[:1].upper() + text[1:] + end
+
+
 def _about(facts: dict[str, Any], session: Session) -> str:
     """When, where, with what, in one line."""
     rig = {"simulated": "in simulation", "movie": "from a movie", "lab": "in the laboratory"}
@@ -207,7 +216,7 @@ def _about(facts: dict[str, Any], session: Session) -> str:
     parts.append(f"{session.duration_s:.1f} s")
     for key in ("operator", "sample"):
         if facts.get(key):
-            parts.append(f"{key} {facts[key]}")
+            parts.append(f"{key}: {facts[key]}")
     return ", ".join(parts)
 
 
@@ -223,7 +232,7 @@ def _key_figures(story: Story) -> Table:
     for name, field in (("assumed", story.assumed), ("refined", story.refined)):
         if field is not None and field.error_share is not None:
             text = shown("_error", field.error_share)
-            rows.append((f"{name} flow: stated error", text, f"that the {name} map expects of itself"))
+            rows.append((f"{name} flow, stated error", text, f"what the {name} map expects its error to be"))
     if story.truth is None:
         rows.append(("error of the flow", "-", "not known: only a simulation knows the true flow"))
     return Table("In numbers", rows, ("", "", ""))
@@ -249,8 +258,8 @@ def _boundary(story: Story) -> Table | None:
         values = [float(field.boundary_values[number]) for field in fields.values()]
         texts = [f"{value:.0f} µm/s" if inlet else f"{value:.3g} Pa" for value in values]
         what = "mean inward speed" if inlet else "pressure"
-        rows.append((f"{opening.kind} on the {opening.side}", what, *texts))
-    return Table("At the openings of the chip", rows, ("opening", "", *fields))
+        rows.append((f"{opening.kind} on the {opening.side}, {what}", *texts))
+    return Table("At the openings of the chip", rows, ("", *fields))
 
 
 def _events(story: Story) -> list[Table]:
@@ -263,14 +272,18 @@ def _events(story: Story) -> list[Table]:
     if actions:
         columns = ("number", "time", "action", "text")
         tables.append(Table("The operator", actions[:_EVENTS], columns, _more(len(actions), 0)))
-    events = [(f"{each.time_s:.2f} s", each.level, each.text) for each in history.remarks if not each.action]
+    events = [(f"{each.time_s:.2f} s", _event(each)) for each in history.remarks if not each.action]
     if events:
         note = _more(len(events), history.remarks_left_out)
-        tables.append(Table("Events", events[:_EVENTS], ("time", "level", "event"), note))
+        tables.append(Table("Events", events[:_EVENTS], ("time", "event"), note))
     phases = [(span.name, f"{span.from_s:.2f} s", f"{span.to_s - span.from_s:.2f} s") for span in history.phases.spans]
     if phases:
         tables.append(Table("Phases of the mission", phases[:_EVENTS], ("phase", "from", "for"), _more(len(phases), 0)))
     return tables
+
+
+def _event(remark: Remark) -> str:
+    return remark.text if remark.level == Level.INFO else f"{remark.level}: {remark.text}"
 
 
 def _more(count: int, left_out: int) -> str:
@@ -289,13 +302,23 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
     from flowrec.reporting.page import ReplayPart, Table
+    from flowrec.reporting.words import MEANINGS
 
-    rows = [tuple(map(_micro, row)) for row in comparison_for_people(before_after(pair))]
-    tables = [Table("Before and after", rows, ("", "recorded", "replayed"), "Both on the map of the replay.")]
+    stated: Row = ("stated_flow_error", _stated(pair.recorded), _stated(pair.replayed))
+    texts = [
+        (name_of(key), _micro(shown(key, was)), _micro(shown(key, now)), MEANINGS.get(key, ""))
+        for key, was, now in [*before_after(pair), stated]
+    ]
+    tables = [Table("Before and after", texts, ("", "recorded", "replayed", ""))]
     changed = _changed_settings(pair)
     note = "" if changed else "The replay has the settings and the code of the recording."
     tables.append(Table("What was changed", changed, ("setting", "recorded", "replayed") if changed else (), note))
     return ReplayPart(pair.replay.path.name, tables, refinement_remarks(pair), figure)
+
+
+def _stated(tick: Tick) -> float | None:
+    """The error that the best map states for itself."""
+    return tick.field.error_share if tick.field is not None else None
 
 
 def _changed_settings(pair: ReplayFiles) -> list[tuple[str, str, str]]:

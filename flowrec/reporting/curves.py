@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flowrec.units import seconds
 
-BUCKETS = 1200  # four for each mm of the widest figure
+BUCKETS = 600  # of 0.3 mm in the widest figure
 _GAP = 4.0  # of the usual interval of values: a longer one interrupts the line
 
 Floats = NDArray[np.float64]

@@ -77,6 +77,7 @@ class History:
         self.phases, self.unseen, self.held = SpanBuilder(), SpanBuilder(), SpanBuilder()
         self.alarms: dict[str, SpanBuilder] = {}
         self._builders: dict[str, CurveBuilder] = {}
+        self._seen = False  # ever; before, the position is only where the tracker begins to search
         self._position: tuple[int, NDArray[np.float64]] | None = None
         self._by_field: dict[str, Callable[[Any], None]] = {
             "event": self._event,
@@ -158,9 +159,12 @@ class History:
         self.held.add(now_s, "held" if mission.held_since_ns is not None and not mission.finished else "")
 
     def _track(self, track: Track) -> None:
+        self._seen |= track.seen
         self.unseen.add(seconds(track.stamp_ns), "" if track.seen else "not seen")
 
     def _estimate(self, estimate: Estimate) -> None:
+        if not self._seen and self.last.track is not None:
+            return
         stamp_ns, position_um, tick = estimate.stamp_ns, estimate.position_um, self.last
         self._put(stamp_ns, x_um=position_um[0], y_um=position_um[1])
         before_ns, before_um = self._position or (stamp_ns, position_um)

@@ -66,7 +66,7 @@ class MapFigure:
     """The flow that was assumed, the flow after the refinement, and how well it is known."""
 
     name = "maps"
-    title = "Flow map before and after the refinement"
+    title = "Maps of the flow"
 
     def why_not(self, story: Story) -> str:
         if story.assumed is None and story.refined is None:
@@ -182,7 +182,6 @@ def draw_panels(panels: list[Panel], story: Story, width_mm: float) -> Figure:
         sign = "+" if panel.scale.table == "change" else ""
         bar = figure.colorbar(shown, ax=ax, shrink=0.9, aspect=16, pad=0.02, ticks=panel.scale.ticks)
         bar.ax.set_yticklabels([f"{tick:{sign}g}" if tick else "0" for tick in np.round(panel.scale.ticks, 9)])
-        bar.ax.set_title("µm/s", fontsize=style.FONT_PT - 1.0, loc="left")
         bar.outline.set_visible(False)
     scale_bar(axes[0], style_px_per_mm(um_per_px))
     return figure
@@ -208,5 +207,5 @@ def _show(ax: Axes, panel: Panel, box: tuple[slice, slice]) -> AxesImage:
         area = panel.hatched[box].astype(np.float64)
         ax.contourf(area, levels=[0.5, 1.5], colors="none", hatches=["//////"])
         ax.contour(area, levels=[0.5], colors=style.INK, linewidths=0.4)
-    ax.set_title(panel.title)
+    ax.set_title(f"{panel.title} (µm/s)")
     return shown

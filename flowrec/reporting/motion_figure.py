@@ -27,9 +27,10 @@ class MotionFigure:
         return ""
 
     def caption(self, story: Story) -> str:
+        demanded = "the speed through the fluid that the controller demands, " if _demanded(story) else ""
         parts = [
-            "Above: speed of the robot over ground, the speed through the fluid that the controller demands, and the "
-            "speed of the flow at the robot, as the observer estimates it.",
+            f"Above: speed of the robot over ground, {demanded}and the speed of the flow at the robot, as the observer "
+            "estimates it.",
         ]
         if story.history.curve("error_um"):
             parts.append("Below: distance of the robot to the point of its route where it should be at that time.")
@@ -55,7 +56,8 @@ class MotionFigure:
         narrow = width_mm <= style.NARROW_MM
         figure, axes = panels(history, width_mm, [34.0, 26.0] if below else [38.0])
         line(axes[0], history.curve("speed_um_s"), style.VERMILLION, "robot over ground", zorder=3)
-        line(axes[0], history.curve("demand_um_s"), style.QUIET, "demanded through fluid", lw=0.8)
+        if _demanded(story):
+            line(axes[0], history.curve("demand_um_s"), style.QUIET, "demanded through fluid", lw=0.8)
         line(axes[0], speed_of(story, "flow"), style.BLUE, "flow at the robot")
         axes[0].set_ylabel("speed (µm/s)")
         axes[0].set_ylim(bottom=0.0)
@@ -67,6 +69,11 @@ class MotionFigure:
             axes[1].set_ylim(bottom=0.0)
             style.legend_above(axes[1], 2)
         return figure
+
+
+def _demanded(story: Story) -> bool:
+    """Whether the controller ever demanded a motion: not in a movie."""
+    return story.history.curve("demand_um_s").largest > 0.0
 
 
 def speed_of(story: Story, name: str) -> Curve:

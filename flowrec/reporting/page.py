@@ -93,9 +93,11 @@ class Page:
     sentence: str
     note: str
     about: str  # when, where, with what, in one line
+    notes: Sequence[str]  # of people
     key_figures: Table
     figures: dict[str, Drawn] = field(default_factory=dict)
-    refinement: Sequence[str] = ()
+    refined: bool = False
+    refinement: Sequence[str] = ()  # what it found
     boundary: Table | None = None
     events: Sequence[Table] = ()
     recording: Table | None = None

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _MARGIN = 0.06  # around the fluid, of its width
 _OVER_PICTURE = 0.72  # opacity of the flow over the camera's picture
 _TALLEST_MM = 200.0
+_BAR_MM, _BELOW_MM = 17.0, 6.0  # beside the picture: the colour bar; below it: the scale bar
 _SAME_PLACE = 4.0  # radii of the robot: an end this near to the goal has no name of its own
 _NEAR_EDGE = 0.08  # of the width: a name beside the edge begins or ends at its place
 _HEAD_SHARE = 0.004  # of the path, half of what an arrow head points along
@@ -49,11 +50,13 @@ class PathFigure:
             parts.append(f"Colours and arrows: speed and direction of the flow by the {kind} map.")
         if story.picture is None:
             parts.append("The session holds no camera image: the mask of the chip is shown, walls in grey.")
-        else:
+        elif story.picture.images > 1:
             parts.append(
                 f"Beneath: the camera's picture, median of {story.picture.images} images, in which what moves is not "
                 "visible."
             )
+        else:
+            parts.append("Beneath: the one image of the camera that was found whole.")
         return " ".join(parts)
 
     def alt(self, story: Story) -> str:
@@ -64,7 +67,8 @@ class PathFigure:
     def draw(self, story: Story, width_mm: float) -> Figure:
         left, top, right, bottom = _bounds(story)
         aspect = (bottom - top) / (right - left)
-        figure = style.new_figure(width_mm, min(0.86 * width_mm * aspect + 10.0, _TALLEST_MM))
+        picture_mm = width_mm - (_BAR_MM if story.history.last.field is not None else 2.0)
+        figure = style.new_figure(width_mm, min(picture_mm * aspect + _BELOW_MM, _TALLEST_MM))
         ax = figure.subplots()
         style.bare(ax)
         _background(ax, story)
@@ -143,7 +147,7 @@ def _flow(figure: Figure, ax: Axes, story: Story) -> None:
     values = speed(field, scene.chip.mask)
     how = {"cmap": style.SPEEDS, "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
     speeds = _on_mask(ax, story, values, **how)
-    bar = figure.colorbar(speeds, ax=ax, shrink=0.75, aspect=22, pad=0.01, ticks=scale.ticks)
+    bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
     bar.set_label("speed of the flow (µm/s)")
     bar.outline.set_visible(False)
     origins, vectors, _ = flow_arrows(scene, field, arrow_grid(scene))

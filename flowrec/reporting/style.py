@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ INK, QUIET, FAINT, SOLID = "#222222", "#767676", "#dddddd", "#c8c8c8"
 ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = "#e69f00", "#56b4e9", "#009e73", "#0072b2", "#d55e00", "#cc79a7"
 SPEEDS, DEVIATIONS, CHANGES = "YlGnBu", "Purples", "PuOr"
 FONT_PT = 7.0
-_DPI = 200  # of images inside of a figure
+PAGE_DPI, PAPER_DPI = 140, 300  # of images inside of a figure
 _RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib
     "font.size": FONT_PT,
@@ -60,6 +61,7 @@ _RC: dict[str, Any] = {
     "figure.constrained_layout.h_pad": 0.03,
     "figure.constrained_layout.w_pad": 0.03,
 }
+_PATH, _DECIMALS = re.compile(rb' d="[^"]+"'), re.compile(rb"(\.\d\d)\d+")  # coordinates in pt to 0.01 pt
 _lock = threading.Lock()
 
 
@@ -83,7 +85,7 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
     from matplotlib.figure import Figure
 
     size = (width_mm / MM_PER_INCH, height_mm / MM_PER_INCH)
-    figure = Figure(figsize=size, layout="constrained", dpi=_DPI)
+    figure = Figure(figsize=size, layout="constrained", dpi=PAGE_DPI)
     FigureCanvasAgg(figure)
     return figure
 
@@ -110,14 +112,15 @@ def legend_above(ax: Axes, columns: int = 4) -> None:
         )
 
 
-def as_svg(figure: Figure, title: str, text: Literal["none", "path"] = "path") -> bytes:
+def as_svg(figure: Figure, title: str, dpi: int = PAGE_DPI, text: Literal["none", "path"] = "path") -> bytes:
     """The figure as SVG with a title for screen readers; its text as outlines, or as text that can be edited."""
     import matplotlib as mpl
 
     file = io.BytesIO()
     with mpl.rc_context({"svg.fonttype": text}):
-        figure.savefig(file, format="svg", metadata={"Title": title, "Date": None})
-    head, root, rest = file.getvalue().partition(b"<svg ")
+        figure.savefig(file, format="svg", dpi=dpi, metadata={"Title": title, "Date": None})
+    svg = _PATH.sub(lambda path: _DECIMALS.sub(rb"\1", path[0]), file.getvalue())
+    head, root, rest = svg.partition(b"<svg ")
     attributes, closing, content = rest.partition(b">")
     label = f"<title>{escape(title)}</title>".encode()
     return head + root + b'role="img" ' + attributes + closing + label + content
@@ -126,5 +129,5 @@ def as_svg(figure: Figure, title: str, text: Literal["none", "path"] = "path") -
 def as_pdf(figure: Figure, title: str) -> bytes:
     """The figure as PDF, its fonts embedded as TrueType."""
     file = io.BytesIO()
-    figure.savefig(file, format="pdf", metadata={"Title": title, "CreationDate": None})
+    figure.savefig(file, format="pdf", dpi=PAPER_DPI, metadata={"Title": title, "CreationDate": None})
     return file.getvalue()

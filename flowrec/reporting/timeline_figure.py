@@ -52,7 +52,7 @@ class TimelineFigure:
     def caption(self, story: Story) -> str:
         drawn = {lane.name for lane in self._lanes(story.history)}
         parts = []
-        if any(remark.action for remark in story.history.remarks):
+        if numbered(story.history.remarks):
             parts.append("Numbers: actions of the operator in the table below.")
         absent = [
             words

@@ -24,7 +24,7 @@ class WayFigure:
     """What both maps say of the places where the robot was, and what was observed there."""
 
     name = "before_after"
-    title = "Flow at the robot's places, before and after the refinement"
+    title = "Flow at the places of the robot"
 
     def why_not(self, story: Story) -> str:
         if story.assumed is None and story.refined is None:
@@ -47,10 +47,11 @@ class WayFigure:
             parts.append("The observations do not state their times and are not drawn.")
         else:
             count = len(story.observations.position_um)
+            points = f"{count} observations" if count > 1 else "one observation"
             parts.append(
-                f"Points: {count} observations with one standard deviation. An observation is the robot's motion over "
-                "ground less the motion that it was driven to; so it holds the robot's own errors, too, which a "
-                "refinement tells from the flow."
+                f"Points: {points} with one standard deviation. An observation is the robot's motion over ground less "
+                "the motion that it was driven to; so it holds the robot's own errors, too, which a refinement tells "
+                "from the flow."
             )
         return " ".join(parts)
 

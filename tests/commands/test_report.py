@@ -149,7 +149,7 @@ def test_figures_have_the_width_of_a_column_and_their_fonts_with_them(tmp_path: 
         with style.drawing():
             figure = style.new_figure(width_mm, 40.0)
             figure.subplots().set_xlabel("flow (µm/s) & <more>")
-            svg, pdf = style.as_svg(figure, "a < b", "none"), style.as_pdf(figure, "a < b")
+            svg, pdf = style.as_svg(figure, "a < b", text="none"), style.as_pdf(figure, "a < b")
         root = ElementTree.fromstring(svg)
         assert float(root.attrib["width"].removesuffix("pt")) * 25.4 / 72.0 == pytest.approx(width_mm, abs=1e-3)
         assert "flow (µm/s) & <more>" in [element.text for element in root.iter() if element.tag.endswith("text")]
