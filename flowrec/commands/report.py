@@ -15,12 +15,13 @@ from flowrec.commands.replay_report import refinement_remarks
 from flowrec.commands.verdict import Verdict
 from flowrec.enums import Level, Outcome
 from flowrec.errors import UsageError
-from flowrec.replay_figures import ReplayFiles, before_after
+from flowrec.replay_figures import ReplayFiles, before_after, flow_error
 from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
 from flowrec.summary import Row, name_of, shown
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
+from flowrec.topics import Tick
 
 if TYPE_CHECKING:
     from flowrec.reporting.history import Remark
@@ -228,6 +229,10 @@ def _key_figures(story: Story) -> Table:
     figures = {"duration_s": session.duration_s} | {
         key: value for key, value in session.outcome.items() if key not in _HIDDEN and value not in (None, "")
     }
+    for name, field in (("assumed", story.assumed), ("refined", story.refined)):
+        error = flow_error(story.scene.chip, field, story.truth)
+        if error is not None:  # of a run that was cut off, its last tick instead of its figures
+            figures.setdefault(f"{name}_flow_error", error)
     rows = [(name_of(key), _micro(shown(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
     for name, field in (("assumed", story.assumed), ("refined", story.refined)):
         if field is not None and field.error_share is not None:
@@ -309,7 +314,7 @@ def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
         (name_of(key), _micro(shown(key, was)), _micro(shown(key, now)), MEANINGS.get(key, ""))
         for key, was, now in [*before_after(pair), stated]
     ]
-    tables = [Table("Before and after", texts, ("", "recorded", "replayed", ""))]
+    tables = [Table("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3)]
     changed = _changed_settings(pair)
     note = "" if changed else "The replay has the settings and the code of the recording."
     tables.append(Table("What was changed", changed, ("setting", "recorded", "replayed") if changed else (), note))

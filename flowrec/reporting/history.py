@@ -21,6 +21,7 @@ from flowrec.units import seconds
 
 _MOST_REMARKS = 300  # events and actions of the operator; of more, the first
 _SPEED_OVER_S = 0.25  # the speed over ground is a mean over at least this time
+_MOST_ALARMS = 8  # different ones; flowrec has three
 _LONGEST_NAME = 24  # letters of a phase or an alarm
 _REPORT_EVERY = 200  # ticks
 
@@ -136,6 +137,9 @@ class History:
                 take(message)
 
     def _put(self, stamp_ns: int, **values: float) -> None:
+        """Values that belong together: all of them, or none where one is not finite."""
+        if not all(map(math.isfinite, values.values())):
+            return
         for name, value in values.items():
             if name not in self._builders:
                 self._builders[name] = CurveBuilder(self.first_ns, self.last_ns)
@@ -166,6 +170,8 @@ class History:
         if not self._seen and self.last.track is not None:
             return
         stamp_ns, position_um, tick = estimate.stamp_ns, estimate.position_um, self.last
+        if not np.isfinite(position_um).all():
+            return
         self._put(stamp_ns, x_um=position_um[0], y_um=position_um[1])
         before_ns, before_um = self._position or (stamp_ns, position_um)
         moved_s = seconds(stamp_ns - before_ns)
@@ -175,9 +181,8 @@ class History:
             self._position = (stamp_ns, position_um)
         variance = np.diagonal(estimate.covariance)[2:4]
         flow_std = math.sqrt(max(float(variance.mean()), 0.0)) if variance.size else math.nan
-        self._put(
-            stamp_ns, flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1], flow_std_um_s=flow_std
-        )
+        self._put(stamp_ns, flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
+        self._put(stamp_ns, flow_std_um_s=flow_std)
         if tick.field is not None:
             on_map = sample(tick.field, position_um)
             self._put(stamp_ns, map_x_um_s=on_map[0], map_y_um_s=on_map[1])
@@ -186,12 +191,15 @@ class History:
             self._put(stamp_ns, estimate_error_um=math.dist(position_um, tick.truth.position_um))
 
     def _demand(self, demand: Demand) -> None:
-        self._put(demand.stamp_ns, demand_um_s=math.hypot(*demand.velocity_um_s), error_um=demand.error_um)
+        self._put(demand.stamp_ns, demand_um_s=math.hypot(*demand.velocity_um_s))
+        self._put(demand.stamp_ns, error_um=demand.error_um)
 
     def _health(self, health: Health) -> None:
         self._put(health.stamp_ns, nis=health.nis)
-        now = set(map(_name, health.alarm.split("; "))) - {""}
+        now = set(map(_name, health.alarm.split("; ")[:_MOST_ALARMS])) - {""}
         for name in now | self.alarms.keys():
+            if name not in self.alarms and len(self.alarms) >= _MOST_ALARMS:
+                continue
             spans = self.alarms.setdefault(name, SpanBuilder())
             spans.add(seconds(health.stamp_ns), name if name in now else "")
 

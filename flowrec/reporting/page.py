@@ -63,6 +63,7 @@ class Table:
     rows: Sequence[Sequence[str]]
     columns: Sequence[str] = ()
     note: str = ""
+    narrow_columns: int = 0  # that a narrow screen has room for; 0: all
 
 
 @dataclass(frozen=True, slots=True)

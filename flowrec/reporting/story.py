@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.declarations import Image
+from flowrec.errors import SessionError
 from flowrec.messages import FlowField, Observations, Route
 from flowrec.reporting.history import History
 from flowrec.session import Session
@@ -57,7 +58,17 @@ class Story:
         config = session.config
         size_px = (config.camera.width_px, config.camera.height_px)
         scene = Scene(session.chip, session.calibration, config.robot, session.path.stem, image_px=size_px)
-        return cls(session, scene, History.of(session, progress), picture_of(session))
+        story = cls(session, scene, History.of(session, progress), picture_of(session))
+        shape = scene.chip.mask.shape
+        for name, field in (("assumed", story.assumed), ("refined", story.refined), ("true", story.truth)):
+            if field is not None and field.velocity_um_s.shape[:2] != shape:
+                sizes = (" x ".join(map(str, size)) for size in (field.velocity_um_s.shape[:2], shape))
+                raise SessionError(
+                    "{}: the {} flow has {} pixels and the mask of the chip {}; the file was edited: flowrec check {}".format(
+                        session.path, name, *sizes, session.path
+                    )
+                )
+        return story
 
     @property
     def assumed(self) -> FlowField | None:
@@ -76,9 +87,13 @@ class Story:
 
     @property
     def observations(self) -> Observations | None:
-        """The observations of the flow; None where there is none."""
+        """The observations of the flow, without those that hold NaN or infinity; None where there is none."""
         found = self.history.last.observations
-        return found if found is not None and len(found.position_um) else None
+        if found is None:
+            return None
+        table = np.column_stack([found.position_um, found.flow_um_s, found.std_um_s])
+        known = found.only(np.isfinite(table).all(axis=1) & (found.std_um_s >= 0.0))
+        return known if len(known.position_um) else None
 
     @property
     def route(self) -> Route | None:
