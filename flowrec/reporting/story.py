@@ -62,11 +62,10 @@ class Story:
         shape = scene.chip.mask.shape
         for name, field in (("assumed", story.assumed), ("refined", story.refined), ("true", story.truth)):
             if field is not None and field.velocity_um_s.shape[:2] != shape:
-                sizes = (" x ".join(map(str, size)) for size in (field.velocity_um_s.shape[:2], shape))
+                found, wanted = (" x ".join(map(str, size)) for size in (field.velocity_um_s.shape[:2], shape))
                 raise SessionError(
-                    "{}: the {} flow has {} pixels and the mask of the chip {}; the file was edited: flowrec check {}".format(
-                        session.path, name, *sizes, session.path
-                    )
+                    f"{session.path}: the {name} flow has {found} pixels and the mask of the chip {wanted}; the file was "
+                    f"edited or damaged, see flowrec check {session.path}"
                 )
         return story
 

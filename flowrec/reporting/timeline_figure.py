@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _LANE_MM = 5.0
 _LEAST_WIDTH = 0.004  # of the time axis: shorter spans are drawn this long
-_NUMBERED = 12  # remarks with their number in the figure: more would hide each other
+_LABEL_MM = 6.0  # width of a number: moments that are nearer to each other share a label
 ALARMS: dict[str, str] = {
     Alarm.NIS: "motion not explained",
     Alarm.PULSATION: "flow pulsates",
@@ -81,10 +81,11 @@ class TimelineFigure:
         least_s = _LEAST_WIDTH * (history.last_s - history.first_s)
         for y, lane in enumerate(lanes):
             spans(ax, list(lane.spans), y, 0.55, lane.colour, least_s)
-            for number, (time_s, name) in enumerate(lane.moments):
+            for time_s, _ in lane.moments:
                 ax.plot(time_s, y, marker="|", ms=7, mew=1.2, color=lane.colour)
-                if name and number < _NUMBERED:
-                    ax.annotate(name, (time_s, y), (2.0, 0.0), textcoords="offset points", va="center")
+            apart_s = _LABEL_MM / width_mm * (history.last_s - history.first_s)
+            for time_s, name in _labels([moment for moment in lane.moments if moment[1]], apart_s):
+                ax.annotate(name, (time_s, y), (2.0, 0.0), textcoords="offset points", va="center")
         ax.set_yticks(range(len(lanes)), [lane.name for lane in lanes])
         ax.set_ylim(max(len(lanes), 1) - 0.5, -0.5)
         ax.tick_params(axis="y", length=0)
@@ -110,6 +111,17 @@ def numbered(remarks: Sequence[Remark]) -> list[tuple[str, Remark]]:
     """The actions of the operator with their numbers; the end of a movie is none."""
     actions = [remark for remark in remarks if remark.action and remark.action != Action.END]
     return [(str(number), remark) for number, remark in enumerate(actions, 1)]
+
+
+def _labels(moments: Sequence[tuple[float, str]], apart_s: float) -> list[tuple[float, str]]:
+    """Numbers and where to put them; those of moments that are near to each other are one label, as in 2-4."""
+    groups: list[list[tuple[float, str]]] = []
+    for moment in moments:
+        if groups and moment[0] - groups[-1][-1][0] < apart_s:
+            groups[-1].append(moment)
+        else:
+            groups.append([moment])
+    return [(group[-1][0], group[0][1] if len(group) == 1 else f"{group[0][1]}-{group[-1][1]}") for group in groups]
 
 
 def _warns(remark: Remark) -> bool:
