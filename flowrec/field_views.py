@@ -12,6 +12,7 @@ from flowrec.meanings import meanings
 from flowrec.units import unit_of
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.axes import Axes
 
@@ -22,6 +23,17 @@ _SOLID, _PATH = "0.85", "tab:red"
 _PLACE = ("y_um", "x_um")
 _DIMS = {"velocity_um_s": (*_PLACE, "component"), "std_um_s": (*_PLACE, "component"), "pressure_pa": _PLACE}
 _NUMBERS = ("um_per_px", "viscosity_mpa_s", "density_kg_m3", "error_share", "stamp_ns")
+
+# Columns of a field with a row a pixel.
+VALUES = {
+    "x_um": "centre of the pixel, x in the chip frame",
+    "y_um": "centre of the pixel, y in the chip frame",
+    "u_um_s": "flow velocity along x",
+    "v_um_s": "flow velocity along y",
+    "std_u_um_s": "one standard deviation of u_um_s; empty if the method states none",
+    "std_v_um_s": "one standard deviation of v_um_s; empty if the method states none",
+    "pressure_pa": "pressure above that of an outlet at 0 Pa",
+}
 
 
 class Field(Protocol):
@@ -41,6 +53,8 @@ class Field(Protocol):
     def std_um_s(self) -> NDArray[np.float32] | None: ...
     @property
     def wall_px(self) -> NDArray[np.float32] | None: ...
+    @property
+    def pressure_pa(self) -> NDArray[np.float32]: ...
     @property
     def boundary_values(self) -> NDArray[np.float64]: ...
 
@@ -77,6 +91,23 @@ def to_xarray(field: Field) -> xarray.Dataset:
     facts = {name: value for name in _NUMBERS if (value := getattr(field, name)) is not None}
     facts |= {"method": field.method, "note": field.note, "boundary_values": field.boundary_values.tolist()}
     return xr.Dataset(variables, coordinates | {"component": ["x", "y"]}, facts)
+
+
+def values_of(field: Field, fluid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(n, 7) the columns VALUES, a row for each pixel of fluid (h, w); NaN where no standard deviation is stated."""
+    rows, columns = np.nonzero(fluid)
+    places = np.column_stack([columns, rows]) * field.um_per_px
+    std = field.std_um_s[fluid] if field.std_um_s is not None else np.full((len(rows), 2), np.nan)
+    return np.hstack([places, field.velocity_um_s[fluid], std, field.pressure_pa[fluid][:, None]])
+
+
+def to_pandas(field: Field) -> pandas.DataFrame:
+    """The columns VALUES with a row for each pixel of fluid; UsageError if pandas is not installed."""
+    try:
+        import pandas
+    except ModuleNotFoundError as error:
+        raise UsageError("to_pandas needs pandas, which is not installed: pip install 'flowrec[export]'") from error
+    return pandas.DataFrame(values_of(field, fluid_of(field)), columns=list(VALUES))
 
 
 def fluid_of(field: Field) -> NDArray[np.bool_]:

@@ -30,6 +30,7 @@ from flowrec.declarations import (
 from flowrec.errors import RigError
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.axes import Axes
 
@@ -168,6 +169,12 @@ class FlowField(Message):
         from flowrec.field_views import to_xarray
 
         return to_xarray(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """The field as a DataFrame with a row for each pixel of fluid; see field_views.py."""
+        from flowrec.field_views import to_pandas
+
+        return to_pandas(self)
 
     def plot(self, ax: Axes | None = None, show: Shown = "speed", path_um: ArrayLike | None = None) -> Axes:
         """Draw speed and arrows, or with `show="error"` the stated error, with Matplotlib; see field_views.py."""

@@ -13,7 +13,7 @@ from flowrec.errors import FlowrecError, SessionError, UsageError
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run, files_of, run_files
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
-from flowrec.summary import Figures, of_text
+from flowrec.summary import Figures, of_text, rows_for_people
 from flowrec.system.toml_file import parse_toml
 from flowrec.units import nanoseconds, seconds
 
@@ -255,6 +255,18 @@ class Session:
 
     def __repr__(self) -> str:
         return f"Session({str(self.path)!r})"
+
+    def _repr_html_(self) -> str:
+        """A card for notebooks: how the run ended, with what, and the image in its middle, or the chip without one."""
+        from flowrec.session_card import card
+
+        frames = self.frames
+        image = frames[len(frames) // 2].image if len(frames) else self.chip.mask.astype("uint8")
+        recorded = {name: self.provenance.get(name, "") for name in ("wall_time", "operator", "sample", "notes")}
+        rows = [("chip", self.chip.name), *rows_for_people(self.outcome)]
+        rows += [(name.replace("_", " "), value) for name, value in recorded.items() if value]
+        rows += [("topics", f"{len(self.topics)}, {sum(self.topics.values())} messages, {len(frames)} images")]
+        return card(self.path.name, rows, image)
 
 
 def open(path: Path | str) -> Session:  # noqa: A001 - flowrec.open

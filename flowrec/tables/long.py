@@ -9,19 +9,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from flowrec.field_views import VALUES, values_of
 from flowrec.messages import FlowField, Observations
 from flowrec.tables.observed import OBSERVED
 from flowrec.units import unit_of
-
-_FIELD = {
-    "x_um": "centre of the pixel, x in the chip frame",
-    "y_um": "centre of the pixel, y in the chip frame",
-    "u_um_s": "flow velocity along x",
-    "v_um_s": "flow velocity along y",
-    "std_u_um_s": "one standard deviation of u_um_s; empty if the method states none",
-    "std_v_um_s": "one standard deviation of v_um_s; empty if the method states none",
-    "pressure_pa": "pressure above that of an outlet at 0 Pa",
-}
 
 
 def observed_flow(observations: Observations) -> pa.Table:
@@ -46,11 +37,7 @@ def field_values(field: FlowField, fluid: NDArray[np.bool_]) -> pa.Table:
     ----------
     fluid : (h, w), where the chip holds fluid.
     """
-    rows, columns = np.nonzero(fluid)
-    places = np.column_stack([columns, rows]) * field.um_per_px
-    std = field.std_um_s[fluid] if field.std_um_s is not None else np.full((len(rows), 2), np.nan)
-    values = np.hstack([places, field.velocity_um_s[fluid], std, field.pressure_pa[fluid][:, None]])
-    return _table(_FIELD, values, dict.fromkeys(("std_u_um_s", "std_v_um_s"), field.std_um_s is None))
+    return _table(VALUES, values_of(field, fluid), dict.fromkeys(("std_u_um_s", "std_v_um_s"), field.std_um_s is None))
 
 
 def _table(columns: Mapping[str, str], values: NDArray[Any], empty: Mapping[str, bool]) -> pa.Table:

@@ -27,6 +27,10 @@ def test_a_field_is_a_dataset_with_places_in_um_units_and_error() -> None:
     assert data.velocity_um_s.attrs["units"] == "um/s" and "pixel centres" in data.velocity_um_s.attrs["description"]
     assert data.attrs["method"] == field.method and data.x_um.attrs["units"] == "um"
     assert "std_um_s" not in replace(field, std_um_s=None).to_xarray()
+    frame = field.to_pandas()
+    assert len(frame) == session.chip.mask.sum()
+    at = frame[(frame.x_um == 400.0) & (frame.y_um == 2700.0)]
+    assert float(at.u_um_s.iloc[0]) == field.velocity_um_s[135, 20, 0]
 
 
 def test_a_field_and_its_error_are_drawn_without_the_true_flow() -> None:
