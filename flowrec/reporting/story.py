@@ -64,8 +64,8 @@ class Story:
             if field is not None and field.velocity_um_s.shape[:2] != shape:
                 found, wanted = (" x ".join(map(str, size)) for size in (field.velocity_um_s.shape[:2], shape))
                 raise SessionError(
-                    f"{session.path}: the {name} flow has {found} pixels and the mask of the chip {wanted}; the file was "
-                    f"edited or damaged, see flowrec check {session.path}"
+                    f"{session.path}: the {name} flow has {found} pixels, and the mask of the chip {wanted}; the file "
+                    f"was edited or damaged, see flowrec check {session.path}"
                 )
         return story
 
