@@ -9,7 +9,7 @@ import numpy as np
 from flowrec.reporting import style
 from flowrec.reporting.curves import Curve
 from flowrec.reporting.story import Story
-from flowrec.reporting.time_axis import line, panels
+from flowrec.reporting.time_axis import line, panels, shown_observations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,8 +38,7 @@ class ObserverFigure:
             parts.append("Map: the best flow map known at that time, at the same place; it jumps when a map is new.")
         else:
             parts.append("No map of the flow was known in this session.")
-        if story.observations is not None and story.observations.time_s is not None:
-            parts.append("Points: the observations that a refinement is given, with one standard deviation.")
+        parts.append(shown_observations(story)[1])
         if story.history.curve("nis"):
             parts.append(
                 "Below: consistency of the observer (normalised innovation squared, mean); 2 is expected, and much "
@@ -55,7 +54,7 @@ class ObserverFigure:
         return text + (f", map up to {_largest(on_map):.0f} µm/s." if len(on_map) else "; no map.")
 
     def draw(self, story: Story, width_mm: float) -> Figure:
-        history, observations = story.history, story.observations
+        history, (observations, _) = story.history, shown_observations(story)
         nis = history.curve("nis")
         narrow = width_mm <= style.NARROW_MM
         figure, axes = panels(history, width_mm, [28.0, 28.0, 16.0] if nis else [28.0, 28.0])
@@ -77,6 +76,7 @@ class ObserverFigure:
                     lw=0.6,
                     color=style.PURPLE,
                     label="observations",
+                    zorder=1.5,  # behind the curves
                 )
             _limit(ax, [flow, history.curve(f"map_{axis}_um_s"), history.curve(f"true_{axis}_um_s")])
             ax.axhline(0.0, color=style.FAINT, lw=0.6, zorder=0)

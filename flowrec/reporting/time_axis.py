@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flowrec.enums import Phase
+from flowrec.messages import Observations
 from flowrec.reporting import style
 from flowrec.reporting.curves import Curve, Span
 from flowrec.reporting.history import History
+from flowrec.reporting.story import Story
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,6 +26,8 @@ PHASE_COLOURS: dict[str, str] = {
     Phase.OBSERVE: "#cfe3f3",
     Phase.DONE: "#e8e8e8",
 }
+_MOST_POINTS = 80  # observations in a figure: more would hide the curves
+_ORDINALS = {2: "2nd", 3: "3rd"}
 _STRIP_MM = 4.0
 _LETTER_MM = 1.35  # width of a letter at the size of all figures
 _AXIS_MM = 14.0  # of the width, beside the panels: labels and numbers
@@ -70,6 +74,24 @@ def line(ax: Axes, curve: Curve, colour: str, label: str, **how: object) -> None
     if not np.array_equal(curve.low, curve.high, equal_nan=True):
         ax.fill_between(curve.time_s, curve.low, curve.high, color=colour, alpha=0.25, lw=0.0)
     ax.plot(curve.time_s, curve.mean, color=colour, label=label, **how)  # type: ignore[arg-type]
+
+
+def shown_observations(story: Story) -> tuple[Observations | None, str]:
+    """The observations that curves over time show, at most _MOST_POINTS of them, and what they are in words.
+
+    None where there are none, or where they do not state their times.
+    """
+    found = story.observations
+    if found is None:
+        return None, "No observation of the flow was taken."
+    count = len(found.position_um)
+    if found.time_s is None:
+        return None, f"The {count} observations do not state their times and are not drawn."
+    step = -(-count // _MOST_POINTS)
+    which = f"{count} observations" if count > 1 else "one observation"
+    if step > 1:
+        which = f"every {_ORDINALS.get(step, f'{step}th')} of {count} observations"
+    return found.only(slice(None, None, step)), f"Points: {which}, with one standard deviation."
 
 
 def spans(ax: Axes, found: list[Span], y: float, height: float, colour: str, least_s: float) -> None:

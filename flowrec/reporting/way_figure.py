@@ -12,7 +12,7 @@ from flowrec.reporting import style
 from flowrec.reporting.history import std_at
 from flowrec.reporting.motion_figure import speed_of
 from flowrec.reporting.story import Story
-from flowrec.reporting.time_axis import line, panels
+from flowrec.reporting.time_axis import line, panels, shown_observations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,17 +41,12 @@ class WayFigure:
             parts.append(f"The method {story.refined.method} states no standard deviation, so there is no band.")
         else:
             parts.append("Band: one standard deviation that the refined map states for itself.")
-        if story.observations is None:
-            parts.append("No observation of the flow was taken.")
-        elif story.observations.time_s is None:
-            parts.append("The observations do not state their times and are not drawn.")
-        else:
-            count = len(story.observations.position_um)
-            points = f"{count} observations" if count > 1 else "one observation"
+        shown, words = shown_observations(story)
+        parts.append(words)
+        if shown is not None:
             parts.append(
-                f"Points: {points} with one standard deviation. An observation is the robot's motion over ground less "
-                "the motion that it was driven to; so it holds the robot's own errors, too, which a refinement tells "
-                "from the flow."
+                "An observation is the robot's motion over ground less the motion that it was driven to; so it holds "
+                "the robot's own errors, too, which a refinement tells from the flow."
             )
         return " ".join(parts)
 
@@ -73,7 +68,7 @@ class WayFigure:
             ax.fill_between(time_s, np.maximum(speed - std, 0.0), speed + std, color=style.ORANGE, alpha=0.3, lw=0.0)
             ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
             top = float(np.nanmax(speed, initial=0.0))
-        observations = story.observations
+        observations, _ = shown_observations(story)
         if observations is not None and observations.time_s is not None:
             observed = np.hypot(*observations.flow_um_s.T)
             ax.errorbar(
