@@ -24,8 +24,8 @@ def export(
 
     Parameters
     ----------
-    out : the file or folder; by default beside the session, named like it. A format of one file is also written into an
-        existing folder, under the session's name. By default an earlier export of the same session is replaced, of
+    out : the file or folder; by default beside the session, named like it. A format whose name has a suffix is also
+        written into an existing folder, under the session's name. By default an earlier export of the same session is replaced, of
         a format that is a folder under any name. Anything else that exists is refused.
     overwrite : any existing file, and any folder that an export made, may be replaced, but nothing that is read.
     file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
@@ -54,11 +54,11 @@ def export(
 
 def _target(session: Session, exporter: Exporter, file_format: str, out: Path | None) -> Path:
     suffix = exporter.suffixes[0]
-    if exporter.folder:
-        return out if out is not None else session.path.with_name(session.path.stem + (suffix or f"_{file_format}"))
+    name = session.path.stem + (suffix or f"_{file_format}")
     if out is None:
-        return session.path.with_suffix(suffix)
-    return out / (session.path.stem + suffix) if out.is_dir() else out
+        return session.path.with_name(name)
+    within = suffix and out.is_dir() and out.suffix not in exporter.suffixes
+    return out / name if within else out
 
 
 def _output(

@@ -126,6 +126,14 @@ def test_a_disk_that_is_full_halfway_leaves_nothing(tmp_path: Path, monkeypatch:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_format_with_a_suffix_is_written_into_an_existing_folder(tmp_path: Path) -> None:
+    assert flowrec.export(GOLDEN, tmp_path, file_format="zarr") == tmp_path / "golden.zarr"
+    assert flowrec.export(GOLDEN, tmp_path, file_format="zarr") == tmp_path / "golden.zarr"
+    with pytest.raises(OutputError, match="is a folder that flowrec export did not make"):
+        flowrec.export(GOLDEN, tmp_path, file_format="csv", overwrite=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["golden.zarr"]
+
+
 def test_the_verb_takes_the_folder_as_a_word_and_says_what_it_made(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["export", str(GOLDEN), str(tmp_path / "t"), "--format", "parquet", "--json"])
     facts = json.loads(done.stdout)
