@@ -6,7 +6,6 @@ No assertion is on wall time: `python -m tests.perf.stops` measures.
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import cast
 
 import pytest
 
+from flowrec.cli import main
 from flowrec.commands import record as verb
 from flowrec.commands.replay import Change, replay
 from flowrec.config import load_config
@@ -200,13 +200,17 @@ def test_record_as_a_function_leaves_signals_alone_and_zeroes_on_ctrl_c(
     assert SessionReader(tmp_path / "cut.mcap").outcome["outcome"] == "stopped"
 
 
-def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "flowrec", "record", "--realtime", "--out", str(tmp_path / "x.mcap")]
+def test_a_guard_shorter_than_the_frames_is_refused_before_anything_is_driven(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["flowrec", "record", "--realtime", "--out", str(tmp_path / "x.mcap")]
     words += ["--set", "camera.rate_hz=60", "--set", "safety.guard_timeout_s=0.04"]
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
     assert (
         "safety.guard_timeout_s = 0.04: shorter than 3 frames at camera.rate_hz = 60; the nearest that works is 0.05"
-        in done.stderr
+        in capsys.readouterr().err
     )
     assert list(tmp_path.iterdir()) == []
