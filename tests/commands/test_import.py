@@ -71,6 +71,7 @@ def lab(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Laboratory:
         rows.append((f"{tick.stamp_ns / 1e9:.4f}", c.frequency_hz, np.degrees(c.heading_rad), c.amplitude_mt))
     known = [f"robot.{key}={getattr(truth.config.robot, key)}" for key in ("radius_um", "um_per_rev", "delay_s")]
     known += [f"camera.um_per_px={truth.config.camera.um_per_px}", f"chip.path={folder / 'chip.toml'}"]
+    known += ["refine.assimilate.doubt_depth=false"]  # as the run
     images, stamps = [tick.frame.image for tick in ticks], [tick.stamp_ns for tick in ticks]
     made = Laboratory(folder, load_config(None, known), folder, images, stamps, truth)
     made.log = made.table("log.csv", rows)

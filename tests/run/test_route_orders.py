@@ -7,18 +7,18 @@ import pytest
 
 from flowrec.enums import Phase
 from flowrec.estimation import Sampler
+from flowrec.planning.survey import SurveyPlanner
 from flowrec.run.route_orders import route, survey_route
 from tests.planning.worlds import robot
 
 
-@pytest.mark.parametrize("limit_hz", [None, 5.0])
-def test_a_survey_and_a_plan_count_on_a_robot_as_slow_as_it_has_stepped_out(limit_hz):
-    given = []
+def ordered(survey, planner, limit_hz=None):
+    """A survey and a plan are asked for, of a pipeline that hands them on."""
     pipeline = SimpleNamespace(
-        survey=SimpleNamespace(plan=lambda order: given.append(order.robot)),
-        planner=SimpleNamespace(plan=lambda field, start, goal, chip, able: given.append(able)),
+        survey=survey,
+        planner=planner,
         mission=SimpleNamespace(survey_limit_s=10.0, lead_s=2.0),
-        refiner=SimpleNamespace(uncertainty=lambda *_: None),
+        refiner=SimpleNamespace(uncertainty=lambda *_: "how wrong the flow may be"),
         **{"robot": robot(600.0), "sampler": Sampler(), "hindsight": None, "solver": None, "chip": None},
     )
     tick = SimpleNamespace(
@@ -29,6 +29,22 @@ def test_a_survey_and_a_plan_count_on_a_robot_as_slow_as_it_has_stepped_out(limi
     mission = SimpleNamespace(phase=Phase.START, start_um=np.zeros(2), goal_um=np.ones(2))
     survey_route(pipeline, tick, mission)
     route(pipeline, tick, mission)
+
+
+@pytest.mark.parametrize("limit_hz", [None, 5.0])
+def test_a_survey_and_a_plan_count_on_a_robot_as_slow_as_it_has_stepped_out(limit_hz):
+    given = []
+    survey = SimpleNamespace(needs_uncertainty=True, plan=lambda order: given.append(order.robot))
+    ordered(survey, SimpleNamespace(plan=lambda field, start, goal, chip, able: given.append(able)), limit_hz)
     able = robot(600.0).limited_to(limit_hz)
     assert [one.speed_limit_um_s for one in given] == [able.speed_limit_um_s] * 2
     assert (able.speed_limit_um_s < robot(600.0).speed_limit_um_s) is (limit_hz is not None)
+
+
+def test_how_wrong_the_flow_may_be_is_computed_for_a_survey_that_asks_for_it_alone():
+    given = []
+    for needed in (True, False):
+        survey = SimpleNamespace(needs_uncertainty=needed, plan=lambda order: given.append(order.uncertainty))
+        ordered(survey, SimpleNamespace(plan=lambda *_: None))
+    assert given == ["how wrong the flow may be", None]
+    assert [SurveyPlanner(method).needs_uncertainty for method in ("information", "downstream")] == [True, False]
