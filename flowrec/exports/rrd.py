@@ -5,16 +5,41 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig
 from flowrec.errors import SessionError
 from flowrec.pipeline import Pipeline, assemble
+from flowrec.replay_figures import ReplayFiles, before_after
 from flowrec.session import Session
 from flowrec.store.run_files import files_of
+from flowrec.summary import Row
 from flowrec.system.outputs import RRD, Output
+from flowrec.topics import Tick
 from flowrec.view.rrd_file import is_made_from, write_rrd
 from flowrec.view.scene import Scene
+from flowrec.view.summary_text import registration_remark, summary_document
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+# Figures of the end of a run in the text panel, in this order.
+_FIGURES = (
+    "outcome",
+    "note",
+    "duration_s",
+    "assumed_flow_error",
+    "refined_flow_error",
+    "planned_s",
+    "navigation_s",
+    "tracking_error_um",
+    "contacts",
+    "observations",
+    "frames_dropped",
+)
 
 
 class RrdExport:
@@ -32,10 +57,38 @@ class RrdExport:
         scene = replace(scene_of(config, session.chip, assemble(config, session.chip), path), key=session.key)
         parent = _parent_of(session)
         if parent is not None:
-            ticks, replayed = Session(parent).ticks(), session.ticks(with_frames=False)
+            recorded = Session(parent)
+            ticks, replayed = recorded.ticks(), session.ticks(with_frames=False)
+            summary = _comparison(ReplayFiles.of(recorded, session))
         else:
-            ticks, replayed = session.ticks(), None
-        write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress)
+            ticks, replayed, summary = session.ticks(), None, _summary(session)
+        write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress, summary=summary)
+
+
+def _summary(session: Session) -> rr.TextDocument:
+    return summary_document([session.path.stem], _rows(session), _remarks(session.last))
+
+
+def _rows(session: Session) -> list[Row]:
+    figures = session.outcome
+    start_goal: list[Row] = [("goal", _place(session.last), None)]
+    return start_goal + [(key, figures[key], None) for key in _FIGURES if figures.get(key) not in (None, "")]
+
+
+def _comparison(pair: ReplayFiles) -> rr.TextDocument:
+    return summary_document(["recorded", "replayed"], before_after(pair), _remarks(pair.replayed))
+
+
+def _place(last: Tick) -> str:
+    goal = last.mission.goal_um if last.mission is not None else None
+    if goal is None or not np.isfinite(goal).all():
+        return "none"
+    return f"({goal[0]:.0f}, {goal[1]:.0f}) um"
+
+
+def _remarks(last: Tick) -> list[str]:
+    remark = registration_remark(last.refined)
+    return [remark] if remark else []
 
 
 def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Rgb = tuple[int, int, int]
-Table = Literal["speed", "uncertainty", "change", "time"]
+Table = Literal["speed", "uncertainty", "change", "time", "arrows"]
 
 SOLID: Rgb = (48, 48, 54)  # walls, and what is not known
 UNREACHABLE: Rgb = (110, 40, 44)  # fluid from which the goal can not be reached
@@ -25,8 +25,17 @@ PURPLE: Rgb = (196, 140, 255)
 GREY: Rgb = (150, 150, 158)
 PALE: Rgb = (206, 206, 212)
 WHITE: Rgb = (236, 236, 240)
+# Of arrows over a camera's grey image: all of them light.
+_LIGHT = np.array([(222, 236, 255), (255, 252, 214), (255, 236, 96)], np.float64)
 # Of a change: blue, almost white at zero, red.
 _DIVERGING = np.array([(24, 78, 190), (116, 173, 240), (238, 238, 238), (244, 140, 96), (190, 24, 40)], np.float64)
+
+
+def _between(knots: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(256, 3) colours between evenly spaced knots (n, 3)."""
+    at, places = np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, len(knots))
+    return np.stack([np.interp(at, places, channel) for channel in knots.T], 1).astype(np.uint8)
+
 
 # Viridis for speeds: its brightness increases with speed, also for the colour-blind. Other quantities have other
 # tables, so that no map is mistaken for another.
@@ -35,9 +44,8 @@ _TABLES: dict[Table, NDArray[Any]] = {
     "speed": cv2.applyColorMap(_LEVELS, cv2.COLORMAP_VIRIDIS)[:, 0, ::-1],
     "uncertainty": cv2.applyColorMap(_LEVELS, cv2.COLORMAP_INFERNO)[:, 0, ::-1],
     "time": cv2.applyColorMap(_LEVELS, cv2.COLORMAP_CIVIDIS)[:, 0, ::-1],
-    "change": np.stack(
-        [np.interp(np.linspace(0.0, 1.0, 256), np.linspace(0.0, 1.0, 5), knots) for knots in _DIVERGING.T], 1
-    ).astype(np.uint8),
+    "change": _between(_DIVERGING),
+    "arrows": _between(_LIGHT),
 }
 
 
@@ -60,13 +68,14 @@ class Scale:
         """From zero (a change: from its negative) to a round number that is not below `largest`."""
         largest = max(largest, 1e-9)
         step = _round_step(largest / (3.0 if table == "change" else 6.0))
-        high = step * math.ceil(largest / step - 1e-9)
+        high = 0.5 * step * math.ceil(2.0 * largest / step - 1e-9)
         return cls(table, -high if table == "change" else 0.0, high, step)
 
     @property
     def ticks(self) -> list[float]:
-        """Round values from low to high."""
-        return [self.low + self.step * i for i in range(round((self.high - self.low) / self.step) + 1)]
+        """The multiples of the step from low to high."""
+        first, last = (math.floor(abs(end) / self.step + 1e-9) for end in (self.low, self.high))
+        return [self.step * i for i in range(-first, last + 1)]
 
     def paint(self, values: ArrayLike) -> NDArray[np.uint8]:
         """Colours (..., 3) of values (...); NaN becomes the colour of solid."""

@@ -15,11 +15,11 @@ from flowrec.view.colours import Rgb
 SESSION_TIME = "session time"
 FRAME = "frame"
 
-IMAGE = "camera/image"
+MEASURED = "camera/measured"  # what is moved by the registration that a refinement found
+IMAGE = "camera/measured/image"
 OUTLINE = "camera/chip outline"
 ARROWS = "camera/flow arrows"
 PATH = "camera/path"
-PATH_LABEL = "camera/path label"
 GOAL = "camera/goal"
 REFERENCE = "camera/reference"
 TRAIL = "camera/trail"
@@ -39,7 +39,7 @@ UNCERTAINTY_SCALE = "flow/uncertainty/scale"
 TIME_TO_GO = "plan/time to go/map"
 TIME_TO_GO_SCALE = "plan/time to go/scale"
 
-CURRENT = "coils/current"
+AMPLITUDE = "coils/amplitude"
 FREQUENCY = "coils/frequency"
 HEADING = "coils/heading"
 TRACKING_ERROR = "robot/tracking error"
@@ -49,10 +49,15 @@ FLOW_SPEED = "robot/flow speed"
 NIS = "robot/observer NIS"
 NIS_MEAN = "robot/observer NIS, mean"
 PULSATION = "robot/pulsation"
-VOLTAGE = "coils/voltage"
 TIMING = "run/timing"
-PHASE = "run/phase"
-SIGHT = "run/sight"
+# Lanes of the timeline of states, which shows these names.
+PHASE = "Mission"
+SIGHT = "Robot"
+ALARM = "Alarm"
+MARKS = "Marks"
+LOSSES = "Losses"
+LANES = (PHASE, SIGHT, ALARM, MARKS, LOSSES)
+SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"
 
@@ -66,24 +71,35 @@ class Style:
     word: str
     path: Rgb
     robot: Rgb
-    width: float  # the recorded one is wide and below, so that both are visible where they coincide
-    label_fraction: float  # position of the label along the path
+    width: float  # of the path; the first session's is wide and below: both are visible where they coincide
+    second: bool = False
+
+    @property
+    def line_points(self) -> float:
+        """Width of a line in a plot."""
+        return 1.5 if self.width < _WIDE else self.width
 
 
+_WIDE = 3.0
 _STYLES = {
-    "": Style("", colours.CYAN, colours.ORANGE, 1.4, 0.06),
-    "recorded": Style("recorded ", colours.ORANGE, colours.ORANGE, 2.6, 0.06),
-    "replayed": Style("replayed ", colours.CYAN, colours.CYAN, 1.2, 0.25),
+    "": Style("", colours.CYAN, colours.ORANGE, 1.4),
+    "recorded": Style("recorded ", colours.ORANGE, colours.ORANGE, 3.2),
+    "replayed": Style("replayed ", colours.CYAN, colours.CYAN, 1.2, second=True),
+    "A": Style("A: ", colours.ORANGE, colours.ORANGE, 3.2),
+    "B": Style("B: ", colours.CYAN, colours.CYAN, 1.2, second=True),
 }
 
 
+REPLAY, PAIR = ("recorded", "replayed"), ("A", "B")  # prefixes of two sessions in one view
+
+
 def entity_path(prefix: str, entity: str) -> str:
-    """The entity's full path, escaped for Rerun; `prefix` is '', 'recorded' or 'replayed'."""
+    """The entity's full path, escaped for Rerun; `prefix` is '' or one of REPLAY or PAIR."""
     return new_entity_path([part for part in (prefix, *entity.split("/")) if part])
 
 
 class EntityLogger:
-    """Logs the entities of one session below `prefix`: '', 'recorded' or 'replayed'."""
+    """Logs the entities of one session below `prefix`: '', or one of REPLAY or PAIR."""
 
     def __init__(self, stream: rr.RecordingStream, prefix: str) -> None:
         self.stream = stream
@@ -100,8 +116,7 @@ class EntityLogger:
 
     def log_styles(self) -> None:
         """Log what never changes of moving entities, so that each tick logs only their positions."""
-        style, replayed = self.style, self.prefix == "replayed"
-        colour = style.robot if self.prefix else colours.WHITE
+        style, replayed = self.style, self.style.second
         name = [f"{style.word}reference"]
         for entity, components in (
             (TRAIL, rr.LineStrips2D.from_fields(colors=(*style.robot, 150), radii=points(1.0), draw_order=24.0)),
@@ -113,18 +128,18 @@ class EntityLogger:
                     colors=colours.YELLOW, radii=points(3.5), labels=name, show_labels=False, draw_order=28.0
                 ),
             ),
-            (COMMAND, rr.Arrows2D.from_fields(colors=colour, radii=points(1.6), draw_order=29.0)),
+            (COMMAND, rr.Arrows2D.from_fields(colors=style.robot, radii=points(1.6), draw_order=29.0)),
         ):
             self.log(entity, components, static=True)
 
     def log_series(self) -> None:
         """Log names and colours of all plotted lines. A single line of two sessions is named after its session."""
-        replayed = self.prefix == "replayed"
+        replayed = self.style.second
         own = self.style.path if self.prefix else colours.YELLOW
         pale = colours.BLUE if replayed else colours.YELLOW
         truth = {} if replayed else {"truth": colours.GREEN}  # the same in both
         lines: dict[str, dict[str, Rgb]] = {
-            CURRENT: {"x (A)": colours.RED, "y (A)": colours.GREEN, "z (A)": colours.BLUE},
+            AMPLITUDE: {"amplitude (mT)": own},
             FREQUENCY: {"frequency (Hz)": own},
             HEADING: {"heading (°)": own},
             TRACKING_ERROR: {"tracking error (µm)": own},
@@ -132,7 +147,6 @@ class EntityLogger:
             NIS: {"NIS": own},
             NIS_MEAN: {"mean NIS (2: all noise is stated right)": colours.WHITE},
             PULSATION: {"pulsation (% of the flow)": own},
-            VOLTAGE: {"x (V)": colours.RED, "y (V)": colours.GREEN, "z (V)": colours.BLUE},
             FLOW_SPEED: {"observer": self.style.path, "map": pale} | truth,
             FLOW_COMPONENTS: {
                 "vx observer": colours.CYAN,
@@ -150,8 +164,10 @@ class EntityLogger:
         }
         for entity, named in lines.items():
             single = bool(self.prefix) and len(named) == 1
-            names = [self.prefix] if single else [self.style.word + name for name in named]
-            series = rr.SeriesLines(names=names, colors=list(named.values()), widths=[1.5] * len(named))
+            names = [self.prefix] if single else list(named)
+            series = rr.SeriesLines(
+                names=names, colors=list(named.values()), widths=[self.style.line_points] * len(named)
+            )
             self.log(entity, series, static=True)
 
 

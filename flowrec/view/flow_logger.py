@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import rerun as rr
 
@@ -9,9 +11,10 @@ from flowrec.messages import FlowField, Route
 from flowrec.topics import Tick
 from flowrec.view import colours, flow_values, maps
 from flowrec.view import entities as e
-from flowrec.view.entities import EntityLogger, label
+from flowrec.view.entities import EntityLogger, label, points
 from flowrec.view.scene import Scene
 
+_ARROW_POINTS = 1.6  # half the width of the shaft; Rerun draws a head in proportion
 _MAPS = (e.ASSUMED, e.REFINED, e.TRUE, e.CHANGE, e.UNCERTAINTY, e.TIME_TO_GO)
 
 
@@ -28,7 +31,7 @@ class FlowLogger:
         self._speeds = speeds
         self._present = present
         self._painted = 0  # version of the scale with which the maps were painted
-        self._grid = flow_values.arrow_grid(scene)
+        self._grid = flow_values.arrow_grid(scene, flow_values.ARROWS_ACROSS_VIEW)
         self._bar = maps.ColourBar.beside(scene)
         for entity in _MAPS:
             self._log(entity, maps.placed(scene.mask_placement()), static=True)
@@ -36,7 +39,7 @@ class FlowLogger:
     def log_not_yet(self, refined: FlowField | None, last: Tick) -> None:
         """Label the maps that wait for a refinement, and remove the label when it has arrived."""
         if refined is None and last.stamp_ns < 0:
-            left, top, right, bottom = self._scene.chip_bounds()
+            left, top, right, bottom = self._scene.fluid_bounds()
             centre = np.array([0.5 * (left + right), 0.5 * (top + bottom)])
             for entity in (e.REFINED, e.CHANGE):
                 self._log(_label_of(entity), label(centre, "not refined yet", colours.PALE))
@@ -90,8 +93,10 @@ class FlowLogger:
 
     def _log_arrows(self, field: FlowField, scale: colours.Scale) -> None:
         origins, vectors, speed = flow_values.flow_arrows(self._scene, field, self._grid)
-        radius = 0.08 * self._scene.length_px(self._grid[1])
-        arrows = rr.Arrows2D(origins=origins, vectors=vectors, colors=scale.paint(speed), radii=radius, draw_order=5.0)
+        light = replace(scale, table="arrows").paint(speed)
+        arrows = rr.Arrows2D(
+            origins=origins, vectors=vectors, colors=light, radii=points(_ARROW_POINTS), draw_order=5.0
+        )
         self._log(e.ARROWS, arrows)
 
     def log_time_to_go(self, route: Route) -> None:

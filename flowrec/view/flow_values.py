@@ -14,6 +14,7 @@ from flowrec.view.scene import Scene
 Floats = NDArray[np.float64]
 # Lengths in arrow spacings, unless stated otherwise.
 _ARROWS_ACROSS_IMAGE = (28.0, 45.0)  # along its width: for wide channels, and for narrow ones
+ARROWS_ACROSS_VIEW = (16.0, 26.0)  # the same in a view with other panels beside it
 _ARROWS_ACROSS_CHANNEL = 2.5  # in a typical channel, within these limits
 _LONGEST = 0.9  # the fastest arrow: a row of longer ones would look like one line
 _FROM_WALL = 0.3  # least distance of an arrow from a wall, except in the middle of a narrow channel
@@ -48,7 +49,7 @@ def scale_of(values: Floats, table: Table) -> Scale:
     return Scale.up_to(float(np.quantile(known, 0.995)) if known.size else 1.0, table)
 
 
-def arrow_grid(scene: Scene) -> tuple[Floats, float]:
+def arrow_grid(scene: Scene, across: tuple[float, float] = _ARROWS_ACROSS_IMAGE) -> tuple[Floats, float]:
     """Points (n, 2) in um inside the fluid, at least one spacing apart, and the spacing in um.
 
     Points well away from the walls are chosen first, so a narrow channel has a row of arrows along its middle and a
@@ -60,7 +61,7 @@ def arrow_grid(scene: Scene) -> tuple[Floats, float]:
     ridge = (wall_px >= cv2.dilate(wall_px, np.ones((5, 5), np.uint8))) & (wall_px > 1.5)
     width_px = 2.0 * float(np.median(wall_px[ridge])) if ridge.any() else 1.0
     image_px = (image_right - image_left) * scene.calibration.um_per_px / chip.um_per_px  # of the mask
-    few, many = _ARROWS_ACROSS_IMAGE
+    few, many = across
     spacing = float(np.clip(width_px / _ARROWS_ACROSS_CHANNEL, image_px / many, image_px / few))
     allowed = ridge | (wall_px >= _FROM_WALL * spacing)
     pitch = max(1, int(_PITCH * spacing))

@@ -216,7 +216,7 @@ def serve() -> None:
             sys.exit(f"port {port} is taken by another program")
     stream.set_sinks(
         rr.GrpcServerSink(bind_ip=viewer.LOOPBACK, port=port, server_memory_limit=_SERVER_MEMORY),
-        default_blueprint=blueprint(scene, present=present),
+        default_blueprint=blueprint(scene, ("",), present),
     )
     describe(stream, scene)
     if window:
@@ -235,7 +235,7 @@ def serve() -> None:
         if logger.present != present:
             # Something is shown for the first time: its view is added to the layout.
             present = frozenset(logger.present)
-            stream.send_blueprint(blueprint(scene, present=present))
+            stream.send_blueprint(blueprint(scene, ("",), present))
     stream.flush(timeout_sec=1.0)
     time.sleep(_FLUSH_S)
     stream.disconnect()

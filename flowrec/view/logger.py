@@ -12,17 +12,19 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from flowrec.declarations import Matrix
 from flowrec.diagnostics import Timing
-from flowrec.enums import Level, Phase
+from flowrec.enums import Level
 from flowrec.flow import sample
 from flowrec.messages import Currents, Demand, Estimate, Event, Frame, Health, Mission, OperatorEvent, Route, Track
 from flowrec.topics import Tick
-from flowrec.units import NS_PER_S
+from flowrec.units import NS_PER_S, seconds
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label, points
 from flowrec.view.flow_logger import FlowLogger
 from flowrec.view.scene import Scene
+from flowrec.view.state_logger import StateLogger
 from flowrec.view.window_images import WindowCompleter
 
 _JPEG_QUALITY = 85
@@ -31,20 +33,11 @@ _TRAIL_S = 4.0
 _TRAIL_STEP_PX = 1.0
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
-_PHASES: dict[str, colours.Rgb] = {
-    Phase.START.value: colours.GREY,
-    Phase.SURVEY.value: colours.PURPLE,
-    Phase.REFINE.value: colours.BLUE,
-    Phase.PLAN.value: colours.YELLOW,
-    Phase.NAVIGATE.value: colours.ORANGE,
-    Phase.OBSERVE.value: colours.PURPLE,
-    Phase.DONE.value: colours.GREEN,
-}
 _CROSS = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
 class TickLogger:
-    """Logs the ticks of one session into a recording stream, below `prefix` ('', 'recorded' or 'replayed').
+    """Logs the ticks of one session into a recording stream, below `prefix` ('' or one of entities.REPLAY or PAIR).
 
     Parameters
     ----------
@@ -85,6 +78,8 @@ class TickLogger:
         self._robot_px = scene.length_px(scene.robot.radius_um)
         angle = np.linspace(0.0, 2.0 * np.pi, 33)
         self._ring = np.stack([np.cos(angle), np.sin(angle)], 1)
+        self._states = StateLogger(self._entities, self.present)
+        self._moved = scene.measured_to_plane(None)  # of what was measured, by the registration of the refined field
         self._log_static()
         self._by_field: dict[str, Callable[[Any], None]] = {
             "route": self._log_route,
@@ -97,6 +92,8 @@ class TickLogger:
             "timing": self._log_timing,
             "event": self._log_event,
             "operator": self._log_operator,
+            "drops": self._states.log_drops,
+            "losses": self._states.log_losses,
         }
 
     def log(self, tick: Tick, frame_index: int | None = None) -> None:
@@ -108,6 +105,10 @@ class TickLogger:
             self._stream.set_time(e.FRAME, sequence=index)
         else:
             self._stream.disable_timeline(e.FRAME)
+        refined = tick.refined
+        if refined is not None and refined is not self._last.refined:
+            self._log_registration(refined.registration)
+        self._states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
         self._flow.log_not_yet(tick.refined, self._last)
@@ -124,13 +125,6 @@ class TickLogger:
         self._log(e.OUTLINE, rr.LineStrips2D(strips, colors=colours.GREY, radii=points(0.6)), static=True)
         self._entities.log_styles()
         self._entities.log_series()
-        self._log_states(e.PHASE, _PHASES)
-        self._log_states(e.SIGHT, {"seen": colours.GREEN, "lost": colours.RED})
-
-    def _log_states(self, entity: str, colour_of: dict[str, colours.Rgb]) -> None:
-        """The colours of a state timeline."""
-        states = rr.StateConfiguration(values=list(colour_of), colors=list(colour_of.values()))
-        self._log(entity, states, static=True)
 
     def _log_image(self, frame: Frame) -> None:
         if not self._images or frame.image.size == 0:
@@ -150,23 +144,16 @@ class TickLogger:
         self._flow.log_time_to_go(route)
         if not route.reachable or len(route.waypoints_um) < 2:
             self._log(e.PATH, rr.LineStrips2D([]))
-            self._log(e.PATH_LABEL, rr.Points2D([]))
             return
         path, style = self._scene.to_plane(route.waypoints_um), self._style
-        order = 20.0 + (self._prefix == "replayed")
+        order = 20.0 + self._style.second
         self._log(e.PATH, rr.LineStrips2D([path], colors=style.path, radii=points(style.width), draw_order=order))
-        at = path[int(style.label_fraction * (len(path) - 1))]
-        self._log(e.PATH_LABEL, label(at, f"{style.word}path", style.path))
 
     def _log_mission(self, mission: Mission) -> None:
         last = self._last.mission
         if last is None or not np.array_equal(mission.goal_um, last.goal_um, equal_nan=True):
             self._log_goal(mission.goal_um)
-        state = _state(mission)
-        if last is None or state != _state(last):
-            self._log(e.PHASE, rr.StateChange(state=state))
-            if state not in _PHASES:
-                self._log_states(e.PHASE, _PHASES | {state: colours.GREEN})
+        self._states.log_mission(mission)
 
     def _log_goal(self, goal_um: NDArray[np.float64]) -> None:
         if not np.isfinite(goal_um).all():
@@ -182,29 +169,29 @@ class TickLogger:
         )
 
     def _log_track(self, track: Track) -> None:
-        if self._last.track is None or track.seen != self._last.track.seen:
-            self._log(e.SIGHT, rr.StateChange(state="seen" if track.seen else "lost"))
+        self._states.log_sight(track.seen)
 
     def _log_estimate(self, estimate: Estimate) -> None:
         field, truth = self._tick.field, self._tick.truth
-        centre = self._scene.to_plane(estimate.position_um)
+        centre = self._on_chip(self._scene.to_plane(estimate.position_um))
         colour = self._style.robot if estimate.seen else colours.PALE
         ring = [centre + self._robot_px * self._ring]
         self._log(e.ROBOT, rr.LineStrips2D.from_fields(strips=ring, colors=colour))
-        # Recorded and replayed robots mostly coincide: their labels are above and below.
-        offset = self._robot_px + 2.0 * self._unit_px
-        if self._prefix == "recorded":
-            offset = -self._robot_px - 24.0 * self._unit_px
-        word = f"{self._style.word}robot" + ("" if estimate.seen else " (not seen)")
-        position = [centre + np.array([0.0, offset])]
-        self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=position, labels=[word], colors=colour))
+        # A word only where something is wrong: the title of the view states the colours, and words hide each other.
+        last = self._last.estimate
+        if not estimate.seen:
+            position = [centre + np.array([0.0, self._robot_px + 2.0 * self._unit_px])]
+            word = f"{self._style.word}robot not seen"
+            self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=position, labels=[word], colors=colour))
+        elif last is not None and not last.seen:
+            self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=[], labels=[]))
         self._log_trail(estimate.stamp_ns, centre)
         flow = estimate.flow_um_s
-        on_map = sample(field, estimate.position_um) if field is not None else np.full(2, np.nan)
+        on_map = sample(field, self._chip_um(estimate.position_um)) if field is not None else np.full(2, np.nan)
         self._log(e.FLOW_COMPONENTS, rr.Scalars([flow[0], on_map[0], flow[1], on_map[1]]))
         speeds = [math.hypot(*flow), math.hypot(*on_map)]
         if truth is not None:
-            if self._prefix != "replayed":
+            if not self._style.second:
                 speeds.append(math.hypot(*truth.flow_um_s))
             self._log(e.ESTIMATE_ERROR, rr.Scalars(math.dist(estimate.position_um, truth.position_um)))
             self.present.add("true robot")
@@ -222,6 +209,8 @@ class TickLogger:
             self._log(e.TRAIL, rr.LineStrips2D.from_fields(strips=[np.array([point for _, point in trail])]))
 
     def _log_demand(self, demand: Demand) -> None:
+        if self._tick.mission is not None and self._tick.mission.finished:
+            return
         # Without a reference nothing is logged, not NaN: the plot shows a gap either way, but statistics differ.
         if math.isfinite(demand.error_um):
             if demand.error_um > 0.0:  # a policy has no reference
@@ -231,19 +220,18 @@ class TickLogger:
         if self._tick.estimate is not None:
             length = _COMMAND_PX * self._unit_px / self._scene.robot.speed_limit_um_s
             vector = self._scene.directions(demand.velocity_um_s * length)
-            position = self._scene.to_plane(self._tick.estimate.position_um)
+            position = self._on_chip(self._scene.to_plane(self._tick.estimate.position_um))
             self._log(e.COMMAND, rr.Arrows2D.from_fields(origins=[position], vectors=[vector]))
 
     def _log_currents(self, currents: Currents) -> None:
-        self._log(e.CURRENT, rr.Scalars(currents.currents_a))
-        if len(currents.voltages_v):
-            self.present.add("voltages")
-            self._log(e.VOLTAGE, rr.Scalars(currents.voltages_v))
+        # The currents themselves oscillate at this frequency, too fast to be drawn from a sample a frame.
+        self._log(e.AMPLITUDE, rr.Scalars(currents.amplitude_mt))
         self._log(e.FREQUENCY, rr.Scalars(currents.frequency_hz))
         self._log(e.HEADING, rr.Scalars(math.degrees(currents.heading_rad)))
 
     def _log_health(self, health: Health) -> None:
         self.present.add("health")
+        self._states.log_alarm(health.alarm)
         if math.isfinite(health.nis):
             self._log(e.NIS_MEAN, rr.Scalars(health.nis))
         self._log(e.PULSATION, rr.Scalars(100.0 * health.pulsation_share))
@@ -257,12 +245,31 @@ class TickLogger:
         self._log_text(e.EVENTS, event.text, _LEVELS.get(event.level, "INFO"))
 
     def _log_operator(self, event: OperatorEvent) -> None:
+        self._states.log_mark(event)
         self._log_text(e.OPERATOR, f"operator: {event.action}" + (f": {event.text}" if event.text else ""), "INFO")
 
     def _log_text(self, entity: str, text: str, level: str) -> None:
-        self._log(entity, rr.TextLog(f"{self._prefix}: {text}" if self._prefix else text, level=level))
+        # The time is in the text: a column of the view shows it to the nanosecond.
+        whose = f"{self._prefix}: " if self._prefix else ""
+        self._log(entity, rr.TextLog(f"{seconds(self._tick.stamp_ns):.1f} s  {whose}{text}", level=level))
 
+    def _log_registration(self, registration: Matrix | None) -> None:
+        """Move the image, and from now on what was measured."""
+        moved = self._scene.measured_to_plane(registration)
+        if not np.array_equal(moved, self._moved):
+            self._moved = moved
+            matrix = np.eye(3)
+            matrix[:2, :2] = moved[:, :2]
+            self._log(e.MEASURED, rr.Transform3D(translation=[*moved[:, 2], 0.0], mat3x3=matrix))
 
-def _state(mission: Mission) -> str:
-    """The state that the timeline of phases shows."""
-    return f"{mission.phase}: {mission.outcome}" if mission.finished and mission.outcome else mission.phase
+    def _on_chip(self, plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A measured point (2,) of the picture plane, moved by the registration of the refined field."""
+        return self._moved[:, :2] @ plane + self._moved[:, 2]
+
+    def _chip_um(self, measured_um: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same of a point (2,) in um."""
+        refined = self._tick.refined
+        if refined is None or refined.registration is None:
+            return measured_um
+        moved: NDArray[np.float64] = refined.registration[:, :2] @ measured_um + refined.registration[:, 2]
+        return moved

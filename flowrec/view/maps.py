@@ -14,8 +14,9 @@ from flowrec.view.colours import Scale
 from flowrec.view.entities import points
 from flowrec.view.scene import Placement, Scene
 
-_HEADROOM = 1.3  # of the scale above the first field: a refined one is often faster
 _BAR_ROWS = 256
+_BAR_SHARE = 0.74  # of the height of the channels: words need room above and below
+_LEAST_BAR = 0.3  # height of a colour bar over the width of the channels
 
 
 @dataclass(slots=True)
@@ -28,7 +29,7 @@ class SpeedScale:
     def include(self, peak_um_s: float) -> None:
         """Extend the scale to a speed."""
         if self.scale is None or peak_um_s > self.scale.high:
-            self.scale = Scale.up_to(peak_um_s * (_HEADROOM if self.scale is None else 1.0), "speed")
+            self.scale = Scale.up_to(peak_um_s, "speed")
             self.version += 1
 
 
@@ -70,16 +71,18 @@ class ColourBar:
 
     @classmethod
     def beside(cls, scene: Scene) -> ColourBar:
-        """To the right of the chip, a little lower."""
-        _, top, right, bottom = scene.chip_bounds()
-        height = bottom - top
-        return cls(right + 0.035 * height, top + 0.13 * height, 0.045 * height, 0.82 * height)
+        """To the right of the channels, a little lower; of a very flat chip not shorter than a third of its width."""
+        left, top, right, bottom = scene.fluid_bounds()
+        size = max(bottom - top, _LEAST_BAR * (right - left))
+        top = 0.5 * (top + bottom) - 0.5 * size
+        return cls(right + 0.06 * size, top + 0.16 * size, 0.05 * size, _BAR_SHARE * size)
 
     def bounds_with(self, scene: Scene) -> tuple[float, float, float, float]:
-        """Left, top, right, bottom of the chip together with its bar and numbers."""
-        left, top, _, bottom = scene.chip_bounds()
-        margin = 0.02 * (bottom - top)
-        return left - margin, top - margin, self.left + self.width + 0.26 * (bottom - top), bottom + margin
+        """Left, top, right, bottom of the channels together with the bar and its numbers."""
+        left, _, _, _ = scene.fluid_bounds()
+        size = self.height / _BAR_SHARE
+        top = self.top - 0.16 * size
+        return left - 0.03 * size, top - 0.02 * size, self.left + self.width + 0.3 * size, top + 1.02 * size
 
     def strip(self, scale: Scale) -> tuple[rr.Image, rr.Transform3D]:
         """The colours, the highest value on top."""

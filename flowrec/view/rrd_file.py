@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import secrets
 from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import rerun as rr
@@ -13,6 +14,7 @@ from flowrec.system.outputs import Output
 from flowrec.topics import Tick
 from flowrec.units import seconds
 from flowrec.view.blueprint import blueprint
+from flowrec.view.entities import REPLAY, SUMMARY
 from flowrec.view.logger import TickLogger
 from flowrec.view.maps import SpeedScale
 from flowrec.view.scene import Scene
@@ -27,13 +29,18 @@ def write_rrd(
     output: Output,
     scene: Scene,
     ticks: Iterable[Tick],
-    replayed_ticks: Iterable[Tick] | None = None,
+    second_ticks: Iterable[Tick] | None = None,
     progress: Callable[[float], None] | None = None,
+    prefixes: tuple[str, str] = REPLAY,
+    summary: rr.TextDocument | None = None,
 ) -> None:
-    """Write ticks, and replayed ones beside them if given; a file of this name appears when it is complete.
+    """Write ticks, and those of a second session beside them; a file of this name appears when it is complete.
 
     Parameters
     ----------
+    second_ticks : on the same chip, of a replay or of another session.
+    prefixes : of the entities of both.
+    summary : shown beside the pictures.
     progress : called from time to time with the session time in s since the first tick.
 
     Raises
@@ -44,7 +51,10 @@ def write_rrd(
         stream = open_stream(scene)
         try:
             stream.save(part)
-            _log_all(stream, scene, ticks, replayed_ticks, progress)
+            if summary is not None:
+                stream.log(SUMMARY, summary, static=True)
+            shown = frozenset({SUMMARY} if summary is not None else ())
+            _log_all(stream, scene, ticks, second_ticks, progress, prefixes, shown)
             stream.flush()
         finally:
             stream.disconnect()
@@ -80,38 +90,41 @@ def _log_all(
     stream: rr.RecordingStream,
     scene: Scene,
     ticks: Iterable[Tick],
-    replayed_ticks: Iterable[Tick] | None,
+    second_ticks: Iterable[Tick] | None,
     progress: Callable[[float], None] | None,
+    prefixes: tuple[str, str],
+    shown: AbstractSet[str],
 ) -> None:
     describe(stream, scene)
-    replay = replayed_ticks is not None
+    both = second_ticks is not None
     speeds = SpeedScale()
-    recorded = TickLogger(stream, scene, "recorded" if replay else "", speeds=speeds)
-    replayed = TickLogger(stream, scene, "replayed", images=False, speeds=speeds) if replay else None
+    first = TickLogger(stream, scene, prefixes[0] if both else "", speeds=speeds)
+    second = TickLogger(stream, scene, prefixes[1], images=False, speeds=speeds) if both else None
     first_ns: int | None = None
+    stamp_ns = 0
     index: int | None = None
-    for count, (stamp_ns, again, tick) in enumerate(_merged(ticks, replayed_ticks or ())):
+    for count, (stamp_ns, again, tick) in enumerate(_merged(ticks, second_ticks or ())):
         first_ns = stamp_ns if first_ns is None else first_ns
         if again:
-            assert replayed is not None
+            assert second is not None
             # Replayed ticks may have no frame, but belong to a recorded one.
-            replayed.log(tick, frame_index=index)
+            second.log(tick, frame_index=index)
         else:
             index = tick.frame.index if tick.frame is not None else index
-            recorded.log(tick)
+            first.log(tick)
         if progress is not None and count % _PROGRESS_EVERY == 0:
             progress(seconds(stamp_ns - first_ns))
-    present = set(recorded.present)
-    if replayed is not None:
-        present |= {f"replayed {what}" for what in replayed.present}
+    present = first.present | shown
+    if second is not None:
+        present |= {f"{prefixes[1]} {what}" for what in second.present}
     # Last, when it is known which views are not empty. Rerun accepts it anywhere in the file.
-    stream.send_blueprint(blueprint(scene, replay, present))
+    stream.send_blueprint(blueprint(scene, prefixes if both else ("",), present, seconds(stamp_ns)))
 
 
-def _merged(ticks: Iterable[Tick], replayed: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
-    """Both in the order of their stamps, the recorded tick before the replayed one."""
+def _merged(ticks: Iterable[Tick], second: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
+    """Both in the order of their stamps, the first session's tick before the second's."""
 
     def named(source: Iterable[Tick], again: bool) -> Iterator[tuple[int, bool, Tick]]:
         return ((tick.stamp_ns, again, tick) for tick in source)
 
-    return heapq.merge(named(ticks, False), named(replayed, True), key=lambda item: item[:2])
+    return heapq.merge(named(ticks, False), named(second, True), key=lambda item: item[:2])

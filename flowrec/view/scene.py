@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
+from flowrec.declarations import Matrix
 from flowrec.robot import Robot
 
 _HALF_PX = 0.5
+_MARGIN = 0.03  # around the channels, of their longer side
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,18 @@ class Scene:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""
         return self.calibration.to_px(points_um) + _HALF_PX
 
+    def measured_to_plane(self, registration: Matrix | None) -> NDArray[np.float64]:
+        """(2, 3): where a point (x, y, 1) of the camera's image, as measured, lies in the picture plane.
+
+        `registration` (2, 3) is that of a FlowField: of a measured place in um to the chip. None: as stated.
+        """
+        if registration is None:
+            return np.eye(2, 3)
+        corners = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+        measured_um = self.calibration.to_um(corners - _HALF_PX)
+        moved = self.to_plane(measured_um @ registration[:, :2].T + registration[:, 2])
+        return np.column_stack((moved[1] - moved[0], moved[2] - moved[0], moved[0]))
+
     def directions(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
         """Vectors (..., 2) along the chip's axes as vectors of the same length in the picture plane."""
         return vectors @ self.calibration.axes.T
@@ -69,6 +83,22 @@ class Scene:
         corners = (np.array([(0, 0), (w, 0), (0, h), (w, h)]) - _HALF_PX) * self.chip.um_per_px
         (left, top), (right, bottom) = (edge(self.to_plane(corners), axis=0).tolist() for edge in (np.min, np.max))
         return left, top, right, bottom
+
+    def fluid_bounds(self) -> tuple[float, float, float, float]:
+        """The same of the channels of the chip, inside the box of the mask."""
+        rows, columns = (np.flatnonzero(self.chip.mask.any(axis=axis)) for axis in (1, 0))
+        if not rows.size:
+            return self.chip_bounds()
+        (top, bottom), (left, right) = ((line[0] - _HALF_PX, line[-1] + _HALF_PX) for line in (rows, columns))
+        corners = np.array([(left, top), (right, top), (left, bottom), (right, bottom)]) * self.chip.um_per_px
+        (x0, y0), (x1, y1) = (edge(self.to_plane(corners), axis=0).tolist() for edge in (np.min, np.max))
+        return x0, y0, x1, y1
+
+    def shown_bounds(self) -> tuple[float, float, float, float]:
+        """The channels with a margin: what a view of the chip or of the camera shows."""
+        left, top, right, bottom = self.fluid_bounds()
+        margin = _MARGIN * max(right - left, bottom - top)
+        return left - margin, top - margin, right + margin, bottom + margin
 
     def image_bounds(self) -> tuple[float, float, float, float]:
         """Left, top, right, bottom of the camera's image in the picture plane."""

@@ -117,7 +117,7 @@ def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
         batch = chunk.to_record_batch()
         if chunk.entity_path == "/camera/robot" and not chunk.is_static:
             robot += batch.column("frame").to_pylist()
-        if chunk.entity_path == "/camera/image":
+        if chunk.entity_path == "/camera/measured/image":
             if chunk.is_static:
                 scale += batch.column("Transform3D:mat3x3").to_pylist()
             else:

@@ -7,15 +7,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from rerun.chunk import RrdReader
 
+from flowrec.diagnostics import Drops
 from flowrec.errors import SessionError
+from flowrec.messages import Health, OperatorEvent
 from flowrec.system.outputs import RRD, Output
 from flowrec.topics import Tick
 from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene
+from flowrec.view.summary_text import summary_document
+
+NONE, TWO = np.zeros(0), np.zeros(2)
 
 
 class File:
@@ -44,6 +50,11 @@ class File:
             for name in batch.schema.names:
                 if name.startswith(("ViewBlueprint:", "ViewContents:query")):
                     found[view][name.split(":")[1]] = batch.column(name).to_pylist()[-1]
+        self.panels = [
+            chunk.to_record_batch().column("TimePanelBlueprint:play_state").to_pylist()[-1]
+            for chunk in reader.stream(store=layout)
+            if "TimePanelBlueprint:play_state" in chunk.to_record_batch().schema.names
+        ]
         self.views = {
             view["display_name"][0]: [
                 term.removeprefix("+ ").replace("$origin", view["space_origin"][0])
@@ -79,16 +90,16 @@ def double(
 
 
 def test_everything_that_a_view_asks_for_is_in_the_file(single: File) -> None:
-    assert {"Camera: path, robot, goal, flow", "Flow speed: assumed", "Flow speed: refined", "Events"} < set(
-        single.views
-    )
+    camera = "Robot (orange), route (cyan), goal (green), flow"
+    assert {camera, "Assumed flow", "Refined flow", "Uncertainty (1 σ)", "Events"} < set(single.views)
+    assert single.views["Mission, alarms, marks"] == ["/Mission", "/Robot"]
     empty = {(name, query) for name, queries in single.views.items() for query in queries if not single.holds(query)}
     # Nobody intervened in this run; the operator's words would stand in the same view as the events.
     assert empty == {("Events", "/run/operator")}
 
 
 def test_everything_that_a_view_of_a_replay_asks_for_is_in_the_file(double: File) -> None:
-    assert {"Recorded: refined speed", "Replayed: refined speed", "Command: field heading (°)"} < set(double.views)
+    assert {"Refined, recorded", "Refined, replayed", "Heading (°)"} < set(double.views)
     empty = {query for queries in double.views.values() for query in queries if not double.holds(query)}
     assert empty == {"/recorded/run/operator", "/replayed/run/operator"}
 
@@ -97,9 +108,9 @@ def test_a_view_that_would_stay_empty_is_left_out(tmp_path: Path, scene: Scene, 
     bare = [replace(tick, true_field=None, truth=None, refined=None) for tick in ticks[:5]]
     write_rrd(Output(tmp_path / "bare.rrd", RRD), scene, bare)
     views = File(tmp_path / "bare.rrd").views
-    assert "Flow speed: assumed" in views
+    assert "Assumed flow" in views
     assert not {
-        name for name in views if "truth" in name or "efined" in name or "ncertain" in name or "Estimate" in name
+        name for name in views if "True" in name or "efined" in name or "ncertain" in name or "Estimate" in name
     }
 
 
@@ -111,9 +122,9 @@ def test_the_timelines_are_session_time_to_the_nanosecond_and_frame(
     write_rrd(Output(tmp_path / "late.rrd", RRD), scene, [tick])
     file = File(tmp_path / "late.rrd")
     assert set().union(*file.times.values()) == {"session time", "frame"}
-    stamps = [stamp for stamp in file.columns["/camera/image"]["session time"] if stamp is not None]
+    stamps = [stamp for stamp in file.columns["/camera/measured/image"]["session time"] if stamp is not None]
     assert stamps == [late]
-    assert file.columns["/camera/image"]["frame"] == [7]
+    assert file.columns["/camera/measured/image"]["frame"] == [7]
 
 
 def test_a_replay_without_frames_lies_on_the_frames_of_the_recording(double: File) -> None:
@@ -125,7 +136,7 @@ def test_what_is_not_new_is_not_logged_again(single: File) -> None:
     static = 1  # where the map lies
     assert single.rows["/flow/assumed/speed"] == single.rows["/flow/refined/speed"] == 1 + static
     assert single.rows["/camera/flow\\ arrows"] == 2  # assumed, then refined
-    assert single.rows["/camera/image"] == 120 + static
+    assert single.rows["/camera/measured/image"] == 120 + static
 
 
 def test_title_and_properties_are_those_of_the_scene(single: File) -> None:
@@ -147,3 +158,53 @@ def test_a_file_that_breaks_off_does_not_appear(tmp_path: Path, scene: Scene, ti
 def test_a_place_that_cannot_be_written_is_said_in_one_line(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
     with pytest.raises(SessionError, match=r"nowhere: no such directory; .*choose another place"):
         write_rrd(Output(tmp_path / "nowhere" / "session.rrd", RRD), scene, ticks)
+
+
+def test_the_view_opens_at_the_start_and_plays(single: File) -> None:
+    assert single.panels == [["Playing"]] or single.panels == [[2]]
+
+
+def test_marks_alarms_and_losses_have_lanes_with_words_and_the_error_ends_with_the_mission(
+    tmp_path: Path, scene: Scene, ticks: list[Tick]
+) -> None:
+    mark = OperatorEvent(ticks[10].stamp_ns, "mark", "bubble <b>")
+    drops = Drops(ticks[40].stamp_ns, "/camera/frame", 3, 0, 2)
+
+    def eventful() -> Iterator[Tick]:
+        for i, tick in enumerate(ticks[:90]):
+            assert tick.mission is not None
+            now = tick.stamp_ns
+            mission = replace(tick.mission, finished=i >= 60, outcome="reached" if i >= 60 else "")
+            health = Health(now, "nis; pulsation" if 20 <= i < 30 else "", 2.0, 0, 0, 0, 0, 0, NONE, NONE, NONE, TWO, 0)
+            yield replace(
+                tick,
+                mission=mission,
+                health=health,
+                operator=mark if i >= 10 else None,
+                drops=drops if i >= 40 else None,
+            )
+
+    write_rrd(Output(tmp_path / "eventful.rrd", RRD), scene, eventful())
+    file = File(tmp_path / "eventful.rrd")
+
+    def states(lane: str) -> list[object]:
+        return [value[0] for value in file.columns[lane]["StateChange:state"] if value]  # type: ignore[index]
+
+    assert file.views["Mission, alarms, marks"] == ["/Mission", "/Robot", "/Alarm", "/Marks", "/Losses"]
+    assert states("/Mission") == ["Survey the flow", "Refine the map", "Navigate to the goal", "Reached"]
+    assert states("/Marks") == ["bubble <b>", ""]
+    assert states("/Alarm") == ["observer inconsistent (NIS), flow pulsates", ""]
+    assert states("/Losses") == ["3 lost, every 2. kept"]
+    stamps = [at for at in file.columns["/robot/tracking\\ error"]["session time"] if isinstance(at, int)]
+    assert max(stamps) < ticks[60].stamp_ns <= max(file.columns["/camera/robot"]["session time"][1:])  # type: ignore[type-var]
+
+
+def test_text_of_a_session_is_no_markdown_in_the_summary(tmp_path: Path, scene: Scene, ticks: list[Tick]) -> None:
+    summary = summary_document(["a|b"], [("outcome", "[x](http://x) <script> | \x1b[31m", None)], ["*remark*"])
+    write_rrd(Output(tmp_path / "s.rrd", RRD), scene, ticks[:2], summary=summary)
+    (text,) = File(tmp_path / "s.rrd").columns["/summary"]["TextDocument:text"][-1]  # type: ignore[misc]
+    assert "a\\|b" in text
+    assert "\\[x\\]\\(http" in text
+    assert "\\<script\\>" in text
+    assert "\x1b" not in text
+    assert "\\*remark\\*" in text

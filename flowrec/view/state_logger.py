@@ -1,0 +1,102 @@
+"""Logs the lanes of the timeline of states: mission, sight of the robot, alarms, marks and losses of images."""
+
+from __future__ import annotations
+
+import rerun as rr
+
+from flowrec.diagnostics import CameraLosses, Drops
+from flowrec.enums import Action, Alarm, Outcome, Phase
+from flowrec.messages import Mission, OperatorEvent
+from flowrec.units import NS_PER_S
+from flowrec.view import colours
+from flowrec.view import entities as e
+from flowrec.view.colours import Rgb
+from flowrec.view.entities import EntityLogger
+
+_MARK_NS = NS_PER_S // 2  # a mark is drawn this long: it has no duration
+_STATES = 200  # of a lane that have a colour of their own: a session of hours may have many marks
+_LETTERS = 40  # of a mark's text
+_PHASES: dict[str, tuple[str, Rgb]] = {
+    Phase.START.value: ("Start", colours.GREY),
+    Phase.SURVEY.value: ("Survey the flow", colours.PURPLE),
+    Phase.REFINE.value: ("Refine the map", colours.BLUE),
+    Phase.PLAN.value: ("Plan the route", colours.YELLOW),
+    Phase.NAVIGATE.value: ("Navigate to the goal", colours.ORANGE),
+    Phase.OBSERVE.value: ("Observe", colours.PURPLE),
+    Phase.DONE.value: ("Done", colours.GREEN),
+}
+_ALARMS = {
+    Alarm.NIS.value: "observer inconsistent (NIS)",
+    Alarm.PULSATION.value: "flow pulsates",
+    Alarm.TRACKING.value: "robot not seen",
+}
+_NONE = ""  # a state that is not drawn
+
+
+class StateLogger:
+    """Logs changes of state only; a lane that never had a state is not logged and not in `present`."""
+
+    def __init__(self, entities: EntityLogger, present: set[str]) -> None:
+        self._log = entities.log
+        self._present = present
+        self._now: dict[str, str] = {}
+        self._colours: dict[str, dict[str, Rgb]] = {}  # of the states of each lane so far
+        self._mark_ends_ns: int | None = None
+
+    def log_mission(self, mission: Mission) -> None:
+        """The phase, and at the end the outcome."""
+        if mission.finished and mission.outcome:
+            done = mission.outcome in set(Outcome) and Outcome(mission.outcome).completes_mission
+            self._log_state(e.PHASE, mission.outcome.capitalize(), colours.GREEN if done else colours.RED)
+        else:
+            self._log_state(e.PHASE, *_PHASES.get(mission.phase, (mission.phase, colours.GREY)))
+
+    def log_sight(self, seen: bool) -> None:
+        """The robot is not seen: nothing is drawn while it is."""
+        self._log_state(e.SIGHT, _NONE if seen else "Not seen", colours.RED)
+
+    def log_alarm(self, alarm: str) -> None:
+        """Alarms of the observer: words of enums.Alarm, separated by "; "."""
+        words = [_ALARMS.get(word, word) for word in alarm.split("; ") if word]
+        self._log_state(e.ALARM, ", ".join(words), colours.RED)
+
+    def log_mark(self, event: OperatorEvent) -> None:
+        """A mark or another action of the operator."""
+        text = event.text[:_LETTERS] if event.action in (Action.MARK, Action.NOTE) and event.text else event.action
+        self._mark_ends_ns = event.stamp_ns + _MARK_NS
+        self._log_state(e.MARKS, text, colours.CYAN)
+
+    def log_drops(self, drops: Drops) -> None:
+        """Images that are not recorded."""
+        if drops.by_backlog or drops.by_camera or drops.kept_every > 1:
+            thinned = f", every {drops.kept_every}. kept" if drops.kept_every > 1 else ""
+            self._log_state(e.LOSSES, f"{drops.by_backlog + drops.by_camera} lost{thinned}", colours.RED)
+
+    def log_losses(self, losses: CameraLosses) -> None:
+        """Images that the camera made and the loop did not get."""
+        lost = losses.ids - losses.frames
+        if lost > 0:
+            self._log_state(e.LOSSES, f"{lost} lost before the loop", colours.RED)
+
+    def end_marks(self, stamp_ns: int) -> None:
+        """End a mark whose time is over."""
+        if self._mark_ends_ns is not None and stamp_ns >= self._mark_ends_ns:
+            self._mark_ends_ns = None
+            self._log_state(e.MARKS, _NONE, colours.CYAN)
+
+    def _log_state(self, lane: str, state: str, colour: Rgb) -> None:
+        if state == self._now.get(lane, _NONE):
+            return
+        self._now[lane] = state
+        self._present.add(lane)
+        known = self._colours.setdefault(lane, {})
+        if state not in known and len(known) < _STATES:
+            known.setdefault(_NONE, colour)
+            known[state] = colour
+            shown = rr.StateConfiguration(
+                values=list(known),
+                colors=list(known.values()),
+                visible=[value != _NONE for value in known],
+            )
+            self._log(lane, shown, static=True)
+        self._log(lane, rr.StateChange(state=state))
