@@ -31,7 +31,7 @@ def registration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of a picture by a camera that is turned, mirrored, shifted and of another scale than a person would say."""
     folder = tmp_path_factory.mktemp("registration")
     sets = [*CHIP, *TRUE, *SMALL, "camera.um_per_px=20", "duration_s=0.1"]
-    picture = next(flowrec.open(record(load_config(None, sets), folder / "short.mcap").path).frames).image
+    picture = next(iter(flowrec.open(record(load_config(None, sets), folder / "short.mcap").path).frames)).image
     cv2.imwrite(str(folder / "picture.png"), picture)
     words = ["calibrate", "image", str(folder / "picture.png"), "-o", str(folder / "registration.toml"), "--mirror"]
     done = CliRunner().invoke(
@@ -92,7 +92,7 @@ def test_the_state_of_a_registration_is_told():
 
 def test_several_poses_are_listed_and_nothing_is_written(tmp_path):
     config = load_config(None, [*SMALL, "duration_s=0.1"])
-    picture = next(flowrec.open(record(config, tmp_path / "short.mcap").path).frames).image
+    picture = next(iter(flowrec.open(record(config, tmp_path / "short.mcap").path).frames)).image
     cv2.imwrite(str(tmp_path / "picture.png"), picture)
     words = ["calibrate", "image", str(tmp_path / "picture.png"), "--set", "camera.um_per_px=20"]
     done = CliRunner().invoke(app, [*words, "-o", str(tmp_path / "out.toml"), "--json"])
