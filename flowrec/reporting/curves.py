@@ -104,7 +104,7 @@ class Span:
 class SpanBuilder:
     """Takes the states of successive ticks; '' is none. No more than `most` spans are kept."""
 
-    def __init__(self, most: int = 500) -> None:
+    def __init__(self, most: int = 200) -> None:
         self.spans: list[Span] = []
         self.left_out = 0
         self._most = most

@@ -28,6 +28,7 @@ PHASE_COLOURS: dict[str, str] = {
 }
 _MOST_POINTS = 80  # observations in a figure: more would hide the curves
 _ORDINALS = {2: "2nd", 3: "3rd"}
+_MOST_LINES = 60  # begins of phases: more are in the strip only
 _STRIP_MM = 4.0
 _LETTER_MM = 1.35  # width of a letter at the size of all figures
 _AXIS_MM = 14.0  # of the width, beside the panels: labels and numbers
@@ -39,9 +40,10 @@ def panels(history: History, width_mm: float, heights_mm: list[float]) -> tuple[
     heights = [_STRIP_MM, *heights_mm]
     strip, *axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     _draw_phases(strip, history, width_mm)
+    begins = [span.from_s for span in history.phases.spans[1:]]
     for ax in axes:
-        for span in history.phases.spans[1:]:
-            ax.axvline(span.from_s, color=style.FAINT, lw=0.6, zorder=0)
+        for at_s in begins if len(begins) <= _MOST_LINES else ():
+            ax.axvline(at_s, color=style.FAINT, lw=0.6, zorder=0)
     axes[-1].set_xlabel("session time (s)")
     axes[-1].set_xlim(history.first_s, history.last_s)
     for ax in axes[:-1]:

@@ -81,8 +81,8 @@ class TimelineFigure:
         least_s = _LEAST_WIDTH * (history.last_s - history.first_s)
         for y, lane in enumerate(lanes):
             spans(ax, list(lane.spans), y, 0.55, lane.colour, least_s)
-            for time_s, _ in lane.moments:
-                ax.plot(time_s, y, marker="|", ms=7, mew=1.2, color=lane.colour)
+            times_s = [time_s for time_s, _ in lane.moments]
+            ax.plot(times_s, [y] * len(times_s), ls="none", marker="|", ms=7, mew=1.2, color=lane.colour)
             apart_s = _LABEL_MM / width_mm * (history.last_s - history.first_s)
             for time_s, name in _labels([moment for moment in lane.moments if moment[1]], apart_s):
                 ax.annotate(name, (time_s, y), (2.0, 0.0), textcoords="offset points", va="center")

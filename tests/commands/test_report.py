@@ -32,6 +32,7 @@ from flowrec.reporting.timeline_figure import TimelineFigure
 from flowrec.reporting.words import MEANINGS, OUTCOMES
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
+from flowrec.summary import Row
 from flowrec.system.outputs import OutputError
 from tests.conftest import made_once
 
@@ -161,7 +162,7 @@ def test_figures_have_the_width_of_a_column_and_their_fonts_with_them(tmp_path: 
 def test_texts_of_a_session_are_escaped_and_shown_without_control_and_bidi_characters(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(style, "WIDTHS_MM", (88.0, 88.0))
+    monkeypatch.setattr(style, "as_svg", lambda *_: b"<svg/>")  # drawn, but not rendered
     mark = OperatorEvent(1_000_000, "mark", f"{HOSTILE} at $x^2$ ")
     texts = {
         "notes": HOSTILE + "x" * 1_000_000,
@@ -192,21 +193,22 @@ def test_a_session_that_lacks_parts_shows_no_empty_figure_and_says_why(tmp_path:
 
 
 @pytest.fixture(scope="session")
-def replayed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A replay of the first golden session with another planner."""
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Row]]:
+    """A replay of the first golden session with another planner, and what the verb says of it."""
 
-    def make(folder: Path) -> Path:
-        flowrec.replay(GOLDEN, flowrec.Change(plan="astar_length"), out=folder / "replay.mcap")
-        return folder / "replay.mcap"
+    def make(folder: Path) -> tuple[Path, list[Row]]:
+        done = flowrec.replay(GOLDEN, flowrec.Change(plan="astar_length"), out=folder / "replay.mcap")
+        return folder / "replay.mcap", flowrec.before_after(done)
 
     return made_once(tmp_path_factory, "report_replay", make)
 
 
-def test_a_replay_is_compared_as_the_verb_compares_it_and_what_changed_is_listed(replayed: Path) -> None:
-    session, replay = flowrec.open(GOLDEN), flowrec.open(replayed)
-    pair = command.ReplayFiles.of(session, replay)
-    done = flowrec.replay(GOLDEN, flowrec.Change(plan="astar_length"))
-    assert flowrec.before_after(pair) == flowrec.before_after(done)
+def test_a_replay_is_compared_as_the_verb_compares_it_and_what_changed_is_listed(
+    replayed: tuple[Path, list[Row]],
+) -> None:
+    path, rows = replayed
+    pair = command.ReplayFiles.of(flowrec.open(GOLDEN), flowrec.open(path))
+    assert flowrec.before_after(pair) == rows
     changed = {row[0]: row[1:] for row in command._changed_settings(pair)}
     assert changed["plan.method"] == ("time_field", "astar_length")
     assert "sampler.capacity" not in changed
