@@ -33,6 +33,7 @@ _PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `re
 _HIDDEN = frozenset(  # of the outcome: shown elsewhere
     {"outcome", "note", "reason", "wall_s", "wall_ns", "monotonic_ns", "clocks", "recovered_from", "frames_windows"}
 )
+_NEUTRAL = (Outcome.REPLAYED, Outcome.ENDED, Outcome.CONTINUED, Outcome.SNAPSHOT)  # of a file, not of a run
 _LINES = 600  # of settings or local changes on the page
 _EVENTS = 60  # rows of the table of events
 _OF_CODE = ("flowrec", "numerics_version", "git_commit", "git_changed")
@@ -178,7 +179,7 @@ def _page(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: S
     return Page(
         name=session.path.name,
         outcome=outcome,
-        good=any(outcome == each and each.completes_mission for each in Outcome),
+        good=any(outcome == each and each.completes_mission for each in Outcome) or outcome in _NEUTRAL,
         sentence=sentence(outcome),
         note=_sentence(str(facts["note"] or "")),
         about=_about(facts, session),

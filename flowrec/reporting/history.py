@@ -60,6 +60,7 @@ class History:
     ----------
     first_ns, last_ns : stamps of the first and the last tick.
     ticks : their number.
+    found : the robot was ever seen; before, its position is only where the tracker begins to search.
     last : the last tick.
     remarks : events and actions in order; `remarks_left_out` more are not listed.
     losses, clocks : the last message of each; drops : likewise, by topic.
@@ -78,7 +79,7 @@ class History:
         self.phases, self.unseen, self.held = SpanBuilder(), SpanBuilder(), SpanBuilder()
         self.alarms: dict[str, SpanBuilder] = {}
         self._builders: dict[str, CurveBuilder] = {}
-        self._seen = False  # ever; before, the position is only where the tracker begins to search
+        self.found = False
         self._position: tuple[int, NDArray[np.float64]] | None = None
         self._by_field: dict[str, Callable[[Any], None]] = {
             "event": self._event,
@@ -163,11 +164,11 @@ class History:
         self.held.add(now_s, "held" if mission.held_since_ns is not None and not mission.finished else "")
 
     def _track(self, track: Track) -> None:
-        self._seen |= track.seen
+        self.found |= track.seen
         self.unseen.add(seconds(track.stamp_ns), "" if track.seen else "not seen")
 
     def _estimate(self, estimate: Estimate) -> None:
-        if not self._seen and self.last.track is not None:
+        if not self.found and self.last.track is not None:
             return
         stamp_ns, position_um, tick = estimate.stamp_ns, estimate.position_um, self.last
         if not np.isfinite(position_um).all():

@@ -22,9 +22,9 @@ class MotionFigure:
     title = "Speed and error over time"
 
     def why_not(self, story: Story) -> str:
-        if not (story.history.curve("speed_um_s") or story.history.curve("error_um")):
-            return "the session holds neither the robot's motion nor its distance to a route"
-        return ""
+        if story.history.curve("speed_um_s") or story.history.curve("error_um"):
+            return ""
+        return story.no_position or "the session is too short for a speed"
 
     def caption(self, story: Story) -> str:
         demanded = "the speed through the fluid that the controller demands, " if _demanded(story) else ""

@@ -25,9 +25,9 @@ class ObserverFigure:
     title = "Observer against map"
 
     def why_not(self, story: Story) -> str:
-        if not story.history.curve("flow_x_um_s"):
-            return "the session holds no estimate of the flow at the robot"
-        return ""
+        if story.no_position or story.history.curve("flow_x_um_s"):
+            return story.no_position
+        return "the session holds no estimate of the flow at the robot"
 
     def caption(self, story: Story) -> str:
         parts = [

@@ -36,9 +36,7 @@ class PathFigure:
     title = "Path of the robot over the flow"
 
     def why_not(self, story: Story) -> str:
-        if not story.history.curve("x_um"):
-            return "the session holds no estimate of the robot's position"
-        return ""
+        return story.no_position
 
     def caption(self, story: Story) -> str:
         parts = ["Line: the way of the robot (estimated position)."]

@@ -107,6 +107,14 @@ class Story:
         return mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
 
     @property
+    def no_position(self) -> str:
+        """Why there is no position of the robot; '' if there is."""
+        if self.history.curve("x_um"):
+            return ""
+        unseen = self.history.last.track is not None and not self.history.found
+        return "the robot was never seen" if unseen else "the session holds no estimate of the robot's position"
+
+    @property
     def path_um(self) -> NDArray[np.float64]:
         """(n, 2) the way of the robot; a row of NaN interrupts it."""
         curves = self.history.curve("x_um"), self.history.curve("y_um")

@@ -62,6 +62,7 @@ _RC: dict[str, Any] = {
     "figure.constrained_layout.w_pad": 0.03,
 }
 _PATH, _DECIMALS = re.compile(rb' d="[^"]+"'), re.compile(rb"(\.\d\d)\d+")  # coordinates in pt to 0.01 pt
+_ID = re.compile(rb'(?<=id=")[A-Za-z]+[0-9a-f]{10}(?=")')  # made of coordinates, whose last bit is not always the same
 _lock = threading.Lock()
 
 
@@ -120,6 +121,8 @@ def as_svg(figure: Figure, title: str, dpi: int = PAGE_DPI, text: Literal["none"
     with mpl.rc_context({"svg.fonttype": text}):
         figure.savefig(file, format="svg", dpi=dpi, metadata={"Title": title, "Date": None})
     svg = _PATH.sub(lambda path: _DECIMALS.sub(rb"\1", path[0]), file.getvalue())
+    for number, name in enumerate(dict.fromkeys(_ID.findall(svg))):
+        svg = svg.replace(name, b"i%d" % number)
     head, root, rest = svg.partition(b"<svg ")
     attributes, closing, content = rest.partition(b">")
     label = f"<title>{escape(title)}</title>".encode()

@@ -29,9 +29,7 @@ class WayFigure:
     def why_not(self, story: Story) -> str:
         if story.assumed is None and story.refined is None:
             return "the session holds no map of the flow"
-        if not story.history.curve("x_um"):
-            return "the session holds no estimate of the robot's position"
-        return ""
+        return story.no_position
 
     def caption(self, story: Story) -> str:
         parts = ["Speed of the flow at the place where the robot was at each time, by the last map of each kind."]
