@@ -25,8 +25,8 @@ def export(
     Parameters
     ----------
     out : the file or folder; by default beside the session, named like it. A format whose name has a suffix is also
-        written into an existing folder, under the session's name. By default an earlier export of the same session is replaced, of
-        a format that is a folder under any name. Anything else that exists is refused.
+        written into an existing folder, under the session's name. By default an earlier export of the same session is
+        replaced, of a format that is a folder under any name. Anything else that exists is refused.
     overwrite : any existing file, and any folder that an export made, may be replaced, but nothing that is read.
     file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
 
