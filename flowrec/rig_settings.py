@@ -103,6 +103,7 @@ class Columns:
     frequency_hz: Column | None = None
     heading_deg: Column | None = None  # 0 to the right of the chip, 90 downwards
     amplitude_mt: Column | None = None
+    heading_rad: Column | None = None  # or in rad, as in applied.csv of flowrec export --format csv
     i_x_a: Column | None = None  # or the currents
     i_y_a: Column | None = None
     i_z_a: Column | None = None

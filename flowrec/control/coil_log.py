@@ -3,7 +3,8 @@
 A row holds from its time until the time of the next row, the last one for as long as there are images. A log tells the
 time (time_s, or in another unit, or dates: `Table.times_s`) and, of these, the first that it has columns for:
 
-- frequency_hz, heading_deg, amplitude_mt: the rotating field. The heading is that in which the robot should travel.
+- frequency_hz, heading_deg or heading_rad, amplitude_mt: the rotating field. The heading is that in which the robot
+  should travel. `applied.csv` of `flowrec export --format csv` is such a log.
 - b_x_mt, b_y_mt, b_z_mt: the field, sampled so often that it turns by less than a third of a revolution between rows.
 - i_x_a, i_y_a, i_z_a: the currents, likewise; the field is coils.mt_per_a times the currents, plus coils.bias_mt.
 
@@ -29,10 +30,11 @@ from flowrec.system.table_file import DATES, TIME_UNITS, Table, read_table
 from flowrec.units import NS_PER_S
 
 _ROTATING = ("frequency_hz", "heading_deg", "amplitude_mt")
+_IN_RADIANS = ("frequency_hz", "heading_rad", "amplitude_mt")
 _OTHER_TIMES = (*list(TIME_UNITS)[1:], DATES)
 _CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
 _FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
-_KINDS = (_ROTATING, _FIELDS, _CURRENTS)
+_KINDS = (_ROTATING, _IN_RADIANS, _FIELDS, _CURRENTS)
 _LARGEST_STEP_RAD = 2.0 * math.pi / 3.0
 _OFF = 0.05  # of the largest amplitude: below it a sampled field is noise, and has no direction
 
@@ -68,9 +70,9 @@ def read_coil_log(
         )
     values = [_values(table, columns, name) for name in kind]
     currents: Vector | None = None
-    if kind == _ROTATING:
-        frequency, heading_deg, amplitude = values
-        heading = np.radians(heading_deg)
+    if kind in (_ROTATING, _IN_RADIANS):
+        frequency, heading, amplitude = values
+        heading = np.radians(heading) if kind == _ROTATING else heading
         # A negative frequency is the opposite direction; so is a negative amplitude of nothing.
         heading = np.where(frequency < 0.0, heading + math.pi, heading)
         frequency, amplitude = np.abs(frequency), np.abs(amplitude)

@@ -19,6 +19,7 @@ class Frames(Sequence[Frame]):
     Attributes
     ----------
     stamps_ns : (n,) stamps on the session clock; no image is read for them.
+    wall_times : (n,) the same as time of day, UTC; NaT where the file does not state when its clock was 0.
     """
 
     def __init__(self, reader: SessionReader, which: range | None = None) -> None:
@@ -28,6 +29,12 @@ class Frames(Sequence[Frame]):
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
         return np.array(self._reader.frame_stamps, np.int64)[list(self._which)]
+
+    @property
+    def wall_times(self) -> NDArray[np.datetime64]:
+        start_unix_ns = self._reader.header.start_unix_ns
+        times = (self.stamps_ns + start_unix_ns).view("datetime64[ns]")
+        return times if start_unix_ns else np.full(len(times), np.datetime64("NaT", "ns"))
 
     def __len__(self) -> int:
         return len(self._which)

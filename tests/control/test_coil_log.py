@@ -106,3 +106,19 @@ def test_a_log_that_can_not_be_used_is_refused_in_one_line(header, rows, columns
     with pytest.raises((MovieError, UsageError), match=why) as refused:
         read_coil_log(write(tmp_path / "log.csv", header.split(","), rows), columns, Coils())
     assert "\n" not in str(refused.value)
+
+
+def test_the_exported_coils_of_a_session_are_a_log_of_them(tmp_path):
+    from pathlib import Path
+
+    import flowrec
+
+    session = flowrec.open(Path(__file__).parents[2] / "sessions" / "golden.mcap")
+    folder = flowrec.export(session, tmp_path / "t", file_format="csv")
+    log = read_coil_log(folder / "applied.csv", Columns(), Coils())
+    applied = list(session.messages("applied"))
+    assert log.times_ns.tolist() == [each.stamp_ns for each in applied]
+    np.testing.assert_allclose(log.frequency_hz, [each.frequency_hz for each in applied])
+    heading = np.array([each.heading_rad for each in applied])
+    np.testing.assert_allclose(np.exp(1j * log.heading_rad), np.exp(1j * heading), atol=1e-12)
+    np.testing.assert_allclose(log.amplitude_mt, [each.amplitude_mt for each in applied])

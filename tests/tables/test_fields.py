@@ -69,6 +69,7 @@ def test_any_image_is_read_by_its_number_and_a_loop_reads_all_of_them() -> None:
     assert [frame.index for frame in frames[10:16:2]] == [every[number].index for number in (10, 12, 14)]
     assert frames[::-1][0].same_as(every[-1])
     assert frames.stamps_ns.tolist() == [frame.stamp_ns for frame in every]
+    assert np.isnat(frames.wall_times).all()  # this file does not state when its clock was 0
     with pytest.raises(IndexError, match="frame 107 of 107"):
         frames[107]
 
@@ -90,6 +91,7 @@ def test_xarray_reads_images_fields_and_stamps_back_from_zarr(tmp_path: Path) ->
     stamps = [frame.stamp_ns for frame in every]
     assert data.stamp_ns.values.tolist() == stamps
     start = session.header.start_unix_ns
+    assert np.array_equal(data.time.values, session.frames.wall_times)
     assert data.time.values.astype(np.int64).tolist() == [start + stamp for stamp in stamps]
     for name, field in session.fields.items():
         assert np.array_equal(xarray.open_zarr(folder, group=name).velocity_um_s.values, field.velocity_um_s)
