@@ -6,7 +6,7 @@ that is stopped or slow; then the queue drops its oldest ticks. The latest state
 tick is sent as the difference from the last one that was sent.
 
 The process hosts a server on the loopback interface to which any number of viewers connect, so a viewer that was closed
-can be opened again. It ends with the pipe, so it never outlives the run.
+can be opened again. It ends with the pipe, or with the window that it has opened.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ Batch = tuple[int, list[dict[str, Any]]]  # step of the preview image, and the c
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
+_START_S = 10.0  # for the server to accept viewers: importing Rerun takes a second
 _CLOSE_S = 2.5  # for the last ticks to be shown
+_POLL_S = 0.02
+_ALL_SHOWN = "all is shown"
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
 _FIELDS = tuple(field.name for field in fields(Tick))
 _SERVER_MEMORY = "256MB"  # kept for viewers that connect later
@@ -67,6 +70,8 @@ class LiveView:
         self._message = self._start(mode)
         self._thread = threading.Thread(target=self._send_all, name="live view", daemon=True)
         self._thread.start()
+        if not self._ended:
+            viewer.wait_for_server(self._port, _START_S, lambda: self._ended)
 
     def _start(self, mode: Mode) -> str:
         """Start the process; the message for the operator."""
@@ -134,12 +139,23 @@ class LiveView:
         self._thread.join(timeout_s)
         process = self._process
         if process is not None:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(max(end - time.monotonic(), 0.0))
-            process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
-            process.wait()
+            while process.poll() is None and not self._shows_all() and time.monotonic() < end:
+                time.sleep(_POLL_S)
+            if process.poll() is None and self._shows_all():
+                process.returncode = 0  # it serves its window on: not waited for, and no leak
+            else:
+                process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
+                process.wait()
             self._thread.join(1.0)
-        self._log.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # Windows, while the process has it open
+            self._log.unlink(missing_ok=True)
+
+    def _shows_all(self) -> bool:
+        """Whether the process has shown everything and only waits for its window to be closed."""
+        try:
+            return _ALL_SHOWN in self._log.read_text(errors="replace")
+        except OSError:
+            return False
 
     def __enter__(self) -> Self:
         return self
@@ -219,8 +235,10 @@ def serve() -> None:
         default_blueprint=blueprint(scene, ("",), present),
     )
     describe(stream, scene)
+    viewer_process = None
     if window:
-        viewer.open_window("--connect", viewer.url(port))
+        viewer.wait_for_server(port, _START_S)
+        viewer_process = viewer.open_window("--connect", viewer.url(port))
     logger = TickLogger(stream, scene)
     tick = Tick()
     while True:
@@ -238,6 +256,10 @@ def serve() -> None:
             stream.send_blueprint(blueprint(scene, ("",), present))
     stream.flush(timeout_sec=1.0)
     time.sleep(_FLUSH_S)
+    if viewer_process is not None:
+        # A viewer calls it an error when its server ends, so the server stays as long as its own window.
+        print(_ALL_SHOWN, flush=True)
+        viewer_process.wait()
     stream.disconnect()
 
 

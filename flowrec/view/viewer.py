@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import shutil
 import socket
 import subprocess
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 LOOPBACK = "127.0.0.1"  # Rerun's own default is every interface
+_POLL_S = 0.05
 _ENVIRONMENT = {
     "RERUN_APP_ONLY": "true",  # no questions on its first run
     # No report of its use to tel.rerun.io: CI turns the analytics off, whatever the user's own setting is.
@@ -54,6 +58,16 @@ def free_port() -> int:
         return int(trial.getsockname()[1])
 
 
+def wait_for_server(port: int, limit_s: float, given_up: Callable[[], bool] = lambda: False) -> bool:
+    """Wait until a server on this machine accepts connections; False if it does not within the time limit."""
+    end = time.monotonic() + limit_s
+    while time.monotonic() < end and not given_up():
+        with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=1.0):
+            return True
+        time.sleep(_POLL_S)
+    return False
+
+
 def url(port: int) -> str:
     """What a viewer on this machine connects to."""
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
@@ -86,10 +100,9 @@ def start(arguments: list[str], log: Path | None = None) -> subprocess.Popen[byt
             output.close()
 
 
-def open_window(*arguments: str) -> None:
-    """Start the viewer with a window that outlives this process; raises OSError as `start`."""
-    process = start(["--port", "auto", "--hide-welcome-screen", *arguments])
-    process.returncode = 0  # so that a process that is not waited for is not reported as a leak
+def open_window(*arguments: str) -> subprocess.Popen[bytes]:
+    """Start the viewer with a window that may outlive this process; raises OSError as `start`."""
+    return start(["--port", "auto", "--hide-welcome-screen", *arguments])
 
 
 def open_viewer(path: Path | str) -> str:
@@ -100,7 +113,8 @@ def open_viewer(path: Path | str) -> str:
     if not has_display():
         return f"{path}: no screen here; copy the file and open it with `rerun {path.name}`"
     try:
-        open_window(str(path.resolve()))
+        process = open_window(str(path.resolve()))
     except OSError as error:
         return f"{path}: Rerun's viewer does not start ({error.strerror or error}); try `rerun {path}`"
+    process.returncode = 0  # so that a process that is not waited for is not reported as a leak
     return ""

@@ -148,3 +148,23 @@ def test_a_port_that_is_taken_is_said(scene: Scene, ticks: list[Tick]) -> None:
             until(lambda: "the run goes on without" in live.message)
             assert f"port {port} is taken" in live.message
             live.write(ticks[0])
+
+
+def test_a_window_keeps_its_server_after_the_run_because_a_viewer_calls_its_end_an_error(
+    scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program, closed = tmp_path / "rerun", tmp_path / "closed"
+    program.write_text(f"#!/bin/sh\nuntil [ -e {closed} ]; do sleep 0.05; done\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(program))
+    monkeypatch.setenv("DISPLAY", ":0")
+    with LiveView(scene, "spawn") as live:
+        pid = live.pid
+        assert pid is not None
+        assert {address for address, _ in sockets(pid)} == {LOOPBACK}  # it accepts when its address is said
+        live.write(ticks[0])
+        live.close(HANG_S)
+    assert sockets(pid)
+    closed.touch()
+    until(lambda: "State:\tZ" in Path(f"/proc/{pid}/status").read_text())
+    os.waitpid(pid, 0)
