@@ -84,6 +84,9 @@ class HelpWithMethods(TyperCommand):
 
 def view(
     session: Annotated[Path, typer.Argument(help="Session (.mcap) or recording for Rerun (.rrd).")],
+    beside: Annotated[
+        Path | None, typer.Argument(metavar="[OTHER]", help="Another session of the same chip, in the same view.")
+    ] = None,
     out: RrdOut = None,
     screenshot: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
@@ -102,9 +105,11 @@ def view(
 
     if session.suffix == ".rrd" and not session.exists():
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
+    if beside is not None and ".rrd" in (session.suffix, beside.suffix):
+        raise UsageError(f"{session} and {beside}: two sessions (.mcap) are shown in one view, not .rrd files")
     if screenshot is not None:
         Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
-    rrd = session if session.suffix == ".rrd" else flowrec.export(session, out, overwrite)
+    rrd = session if session.suffix == ".rrd" else flowrec.export(session, out, overwrite, beside=beside)
     if as_json:
         typer.echo(_export_json(session, rrd))
     if screenshot is not None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+from flowrec.errors import UsageError
 from flowrec.exports.formats import EXPORTS, Exporter
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.system.output_folder import OutputFolder
@@ -19,6 +21,7 @@ def export(
     out: Path | str | None = None,
     overwrite: bool = False,
     file_format: str = "rrd",
+    beside: Session | Path | str | None = None,
 ) -> Path:
     """Write a session in another format; return the file or folder.
 
@@ -29,6 +32,7 @@ def export(
         replaced, of a format that is a folder under any name. Anything else that exists is refused.
     overwrite : any existing file, and any folder that an export made, may be replaced, but nothing that is read.
     file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
+    beside : of rrd: another session of the same chip and camera, shown on the same timeline and scale.
 
     Raises
     ------
@@ -37,8 +41,16 @@ def export(
     """
     exporter: Exporter = EXPORTS[file_format].load()()
     session = Session.of(session)
+    named = out is not None
+    second = None if beside is None else Session.of(beside)
+    if second is not None:
+        exporter = _beside(file_format, session, second)
+        if out is None:
+            out = session.path.with_name(f"{session.path.stem}_and_{second.path.stem}{exporter.suffixes[0]}")
     target = _target(session, exporter, file_format, None if out is None else Path(out))
-    output = _output(session, exporter, file_format, target, overwrite, named=out is not None)
+    output = _output(session, exporter, file_format, target, overwrite, named=named)
+    if second is not None and isinstance(output, Output):
+        output = replace(output, inputs=(*output.inputs, *files_behind(second.path)))
     output.check()
     config = session.config
     began_s = time.perf_counter()
@@ -50,6 +62,15 @@ def export(
         exporter.write(session, part, done)
     say(f"{target} written in {time.perf_counter() - began_s:.1f} s; {exporter.advice} {target}")
     return target
+
+
+def _beside(file_format: str, session: Session, second: Session) -> Exporter:
+    """The exporter of a pair; UsageError for a format that shows one session only."""
+    if file_format != "rrd":
+        raise UsageError(f"{session.path} and {second.path}: only rrd shows two sessions; export them one by one")
+    from flowrec.exports.rrd import RrdExport  # late: it imports Rerun
+
+    return RrdExport.of_pair(session, second)
 
 
 def _target(session: Session, exporter: Exporter, file_format: str, out: Path | None) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from flowrec.store.run_files import files_of
 from flowrec.summary import Row
 from flowrec.system.outputs import RRD, Output
 from flowrec.topics import Tick
+from flowrec.view.entities import PAIR, REPLAY
 from flowrec.view.rrd_file import is_made_from, write_rrd
 from flowrec.view.scene import Scene
 from flowrec.view.summary_text import registration_remark, summary_document
@@ -43,11 +44,28 @@ _FIGURES = (
 
 
 class RrdExport:
-    """Implements flowrec.exports.formats.Exporter."""
+    """Implements flowrec.exports.formats.Exporter.
 
-    suffixes = RRD
+    Parameters
+    ----------
+    second : a session that is shown beside the exported one; None: a replay is shown beside its parent.
+    """
+
+    suffixes: tuple[str, ...] = RRD
     folder = False
     advice = "open it with: rerun"
+
+    def __init__(self, second: Session | None = None) -> None:
+        self._second = second
+
+    @classmethod
+    def of_pair(cls, first: Session, second: Session) -> Self:
+        """The exporter of two sessions in one view; SessionError if they can not lie on each other."""
+        (a, b) = first.chip, second.chip
+        same = a.um_per_px == b.um_per_px and np.array_equal(a.mask, b.mask) and first.calibration == second.calibration
+        if not same:
+            raise SessionError(f"{second.path}: has another chip or camera than {first.path}; view them one by one")
+        return cls(second)
 
     def is_export_of(self, path: Path, session: Session) -> bool:
         return is_made_from(path, session.key)
@@ -56,13 +74,18 @@ class RrdExport:
         config, path = session.config, session.path
         scene = replace(scene_of(config, session.chip, assemble(config, session.chip), path), key=session.key)
         parent = _parent_of(session)
-        if parent is not None:
+        prefixes = REPLAY
+        if self._second is not None:
+            prefixes = PAIR
+            ticks, replayed = session.ticks(), self._second.ticks(with_frames=False)
+            summary = _pair(session, self._second)
+        elif parent is not None:
             recorded = Session(parent)
             ticks, replayed = recorded.ticks(), session.ticks(with_frames=False)
             summary = _comparison(ReplayFiles.of(recorded, session))
         else:
             ticks, replayed, summary = session.ticks(), None, _summary(session)
-        write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress, summary=summary)
+        write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress, prefixes, summary)
 
 
 def _summary(session: Session) -> rr.TextDocument:
@@ -77,6 +100,12 @@ def _rows(session: Session) -> list[Row]:
 
 def _comparison(pair: ReplayFiles) -> rr.TextDocument:
     return summary_document(["recorded", "replayed"], before_after(pair), _remarks(pair.replayed))
+
+
+def _pair(first: Session, second: Session) -> rr.TextDocument:
+    was, now = ({key: value for key, value, _ in _rows(each)} for each in (first, second))
+    rows = [(key, was.get(key), now.get(key)) for key in ("goal", *_FIGURES) if key in was or key in now]
+    return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, [])
 
 
 def _place(last: Tick) -> str:
