@@ -62,6 +62,7 @@ from flowrec.chip.openings import (
 from flowrec.chip.synthetic import bifurcation, straight, vessels
 from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import ChipError
+from flowrec.movies.notes import MovieNotes
 from flowrec.ranges import hints
 from flowrec.system.toml_file import parse_toml
 
@@ -79,6 +80,7 @@ _NUMBERS = {  # by key, the value where the TOML has none
     "depth_um": None,
     "inlet_speed_um_s": DEFAULT_INLET_UM_S,
 }
+_MOVIES = (".mp4", ".tif", ".tiff", ".btf")  # that flowrec made of a session hold its chip
 CHIP_KEYS = (*_NUMBERS, "walls", "fluid", "name", "viscosity", "opening")
 _OF_BLOOD = {"viscosity_mpa_s": BLOOD_MPA_S, "density_kg_m3": BLOOD_KG_M3}  # where nothing else is stated
 _OPENING_KEYS = ("side", "first", "last", "kind", "speed_um_s", "pressure_pa")
@@ -198,6 +200,8 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
     kind = path.suffix.lower()
     if kind == ".npz":
         return read_vessel_case(path)
+    if kind in _MOVIES and (notes := _movie_notes(path)) is not None:
+        return chip_from_files(*notes.chip_files(), str(path), um_per_px)
     if kind not in (".png", ".toml"):
         raise ChipError(
             f"{path}: a chip is a .png with a .toml beside it, or a vessel case .npz; convert it to one of these"
@@ -213,6 +217,14 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
     except (OSError, UnicodeDecodeError) as error:
         raise ChipError(f"{path}: can not be read ({error}); is it a chip?") from error
     return chip_from_files(data, text, str(path), um_per_px)
+
+
+def _movie_notes(path: Path) -> MovieNotes | None:
+    """What flowrec wrote into a movie of a session; None if another program made it."""
+    from flowrec.movies import open_movie  # with packages of an extra
+
+    with open_movie(path) as movie:
+        return movie.facts.notes
 
 
 def _mask(png_bytes: bytes, fluid: str, where: str) -> NDArray[np.bool_]:

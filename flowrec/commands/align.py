@@ -30,7 +30,7 @@ from flowrec.commands.calibrate_motion import (
 )
 from flowrec.commands.record import prepare
 from flowrec.config import Config
-from flowrec.control.coil_log import read_coil_log
+from flowrec.control.coil_log import is_of_session, read_coil_log
 from flowrec.control.field_log import FieldLog
 from flowrec.errors import UsageError
 from flowrec.estimation.motion_fit import MotionFit
@@ -97,6 +97,8 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     """
     if not asked.movie.coils:
         return asked, {}
+    if _on_one_clock(asked):  # what the coils did to the robot, without any latency: that of the rig is taken off
+        return replace(asked, movie=replace(asked.movie, clock_offset_s=asked.robot.delay_s or 0.0)), {}
     rough = _overlapping(asked)
     tracks = tracks_of(rough)
     assert tracks.log is not None, "there is a log"
@@ -122,6 +124,14 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     _tell(asked, fit, changed.clock_offset_s)
     facts = figures_of(fit) | {"um_per_rev_stated": stated, "um_per_rev_used": robot.um_per_rev}
     return replace(asked, movie=changed, robot=robot), {"alignment": json.dumps(facts)}
+
+
+def _on_one_clock(asked: Config) -> bool:
+    """Whether movie and log are exports of a session, whose clock both have."""
+    if not is_of_session(Path(asked.movie.coils)):
+        return False
+    with MovieSource(replace(asked.movie, coils=""), asked.coils) as source:
+        return source.facts.notes is not None
 
 
 def _refuted(um_per_rev: float, fit: MotionFit) -> bool:

@@ -4,8 +4,9 @@ A row holds from its time until the time of the next row, the last one for as lo
 time (time_s, or in another unit, or dates: `Table.times_s`) and, of these, the first that it has columns for:
 
 - frequency_hz, heading_deg or heading_rad, amplitude_mt: the rotating field. The heading is that in which the robot
-  should travel. `applied.csv` of `flowrec export --format csv` is such a log.
+  should travel.
 - b_x_mt, b_y_mt, b_z_mt: the field, sampled so often that it turns by less than a third of a revolution between rows.
+- turns_x, turns_y: revolutions since the row before, with amplitude_mt: applied.csv of `flowrec export --format csv`.
 - i_x_a, i_y_a, i_z_a: the currents, likewise; the field is coils.mt_per_a times the currents, plus coils.bias_mt.
 
 Of a sampled field the rotation from each row to the next is about the axis B1 x B2. A roller on the floor travels along
@@ -34,7 +35,8 @@ _IN_RADIANS = ("frequency_hz", "heading_rad", "amplitude_mt")
 _OTHER_TIMES = (*list(TIME_UNITS)[1:], DATES)
 _CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
 _FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
-_KINDS = (_ROTATING, _IN_RADIANS, _FIELDS, _CURRENTS)
+_TURNS = ("turns_x", "turns_y", "amplitude_mt")
+_KINDS = (_TURNS, _ROTATING, _IN_RADIANS, _FIELDS, _CURRENTS)
 _LARGEST_STEP_RAD = 2.0 * math.pi / 3.0
 _OFF = 0.05  # of the largest amplitude: below it a sampled field is noise, and has no direction
 
@@ -70,7 +72,9 @@ def read_coil_log(
         )
     values = [_values(table, columns, name) for name in kind]
     currents: Vector | None = None
-    if kind in (_ROTATING, _IN_RADIANS):
+    if kind == _TURNS:
+        frequency, heading, amplitude = _of_turns(times_s, *values)
+    elif kind in (_ROTATING, _IN_RADIANS):
         frequency, heading, amplitude = values
         heading = np.radians(heading) if kind == _ROTATING else heading
         # A negative frequency is the opposite direction; so is a negative amplitude of nothing.
@@ -95,7 +99,7 @@ def _kind_of(table: Table, columns: Columns) -> tuple[str, str, str]:
         if not lacks:
             return kind
         missing[kind] = lacks
-    nearest = min(_KINDS, key=lambda kind: len(missing[kind]))
+    nearest = min(_KINDS[1:], key=lambda kind: len(missing[kind]))
     lacks = missing[nearest]
     given = getattr(columns, lacks[0])
     if given is not None:
@@ -108,8 +112,27 @@ def _kind_of(table: Table, columns: Columns) -> tuple[str, str, str]:
     )
 
 
+def _of_turns(times_s: Vector, turns_x: Vector, turns_y: Vector, amplitude: Vector) -> tuple[Vector, Vector, Vector]:
+    """Mean frequency, heading and amplitude (n,) from each row to the next, which has the revolutions between the two.
+
+    The field lasts where it turned, also if it is switched on or off between the two rows.
+    """
+    frequency, heading, held = np.zeros(len(times_s)), np.zeros(len(times_s)), amplitude.copy()
+    lasts_s = np.diff(times_s)
+    frequency[:-1] = np.hypot(turns_x[1:], turns_y[1:]) / np.where(lasts_s > 0.0, lasts_s, np.inf)
+    heading[:-1] = np.arctan2(turns_y[1:], turns_x[1:])
+    held[:-1] = np.where(frequency[:-1] > 0.0, np.maximum(amplitude[:-1], amplitude[1:]), amplitude[:-1])
+    return frequency, heading, held
+
+
+def is_of_session(path: Path) -> bool:
+    """Whether a log is `applied.csv` of a session, on the session's clock."""
+    table = read_table(path)
+    return all(table.index(name) is not None for name in ("stamp_ns", "time_s", *_TURNS))
+
+
 def _has(table: Table, columns: Columns, name: str) -> bool:
-    column: Column | None = getattr(columns, name)
+    column: Column | None = getattr(columns, name, None)
     if isinstance(column, (int, float)):
         return True
     names = [_name(column)] if column is not None else [name, *(_OTHER_TIMES if name == "time_s" else ())]
@@ -133,7 +156,7 @@ def _name(column: Column | None) -> str:
 
 
 def _values(table: Table, columns: Columns, name: str) -> Vector:
-    column: Column | None = getattr(columns, name)
+    column: Column | None = getattr(columns, name, None)
     if isinstance(column, (int, float)):
         return np.full(len(table.rows), float(column))
     values = table.numbers(_name(column) or name)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flowrec.config_tree import without_none
 from flowrec.declarations import Image
 from flowrec.errors import SessionError, printable
-from flowrec.messages import Frame
+from flowrec.messages import Applied, Frame
 from flowrec.movies.notes import MovieNotes
 from flowrec.session import Session
 from flowrec.topics import Tick
@@ -39,11 +39,22 @@ def with_images(session: Session) -> Iterator[tuple[Tick, Frame]]:
         if frame is None or frame is last:
             continue
         last = frame
-        again = applied is not None and applied.stamp_ns == frame.stamp_ns and applied.repeats_image
-        if frame.image.size and not again:
+        if frame.image.size and not _repeats(applied, frame.stamp_ns):
             yield tick, frame
     if last is None:
         raise without_frames(session)
+
+
+def image_stamps(session: Session) -> list[int]:
+    """The stamps of what `with_images` yields, without reading images."""
+    applied = (tick.applied for tick in session.ticks(with_frames=False))
+    again = {each.stamp_ns for each in applied if each is not None and _repeats(each, each.stamp_ns)}
+    return [stamp for stamp in session.reader.frame_stamps if stamp not in again]
+
+
+def _repeats(applied: Applied | None, stamp_ns: int) -> bool:
+    """Whether the camera gave the image of that stamp before."""
+    return applied is not None and applied.stamp_ns == stamp_ns and applied.repeats_image
 
 
 def without_frames(session: Session) -> SessionError:

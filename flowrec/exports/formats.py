@@ -26,6 +26,12 @@ EXPORTS = Methods(
         "the camera's images alone, which flowrec import reads",
         extra="export",
     ),
+    Method(
+        "tiff",
+        "flowrec.exports.tiff:TiffExport",
+        "OME-TIFF, the camera's images without loss, which flowrec import reads",
+        extra="export",
+    ),
     Method("zarr", "flowrec.exports.zarr:ZarrExport", "images and flow fields in chunks, for xarray", extra="export"),
 )
 

@@ -18,6 +18,7 @@ from flowrec.declarations import Image
 from flowrec.errors import MovieError
 from flowrec.messages import PIXEL_BITS, pixel_type
 from flowrec.methods import Method, Methods
+from flowrec.movies.notes import MovieNotes
 from flowrec.units import NS_PER_S
 
 # A row's class is made with (path, options) and is a Movie.
@@ -91,7 +92,8 @@ class MovieFacts:
     frames : number of images; an estimate if `counted` is False.
     times_ns : (n,) time of each image on the clock of the file; None: the file tells no times.
     times : where these times come from, for people; '' without times.
-    um_per_px : as the file states it. It is shown, never used.
+    um_per_px : as the file states it. It is used only where flowrec has written the file, else shown.
+    notes : what flowrec wrote into the file that it exported; None: another program wrote it.
     """
 
     reader: str
@@ -107,6 +109,7 @@ class MovieFacts:
     times: str = ""
     um_per_px: float | None = None
     remarks: tuple[str, ...] = ()  # what was assumed, and what is unusual
+    notes: MovieNotes | None = None
 
     def describe(self) -> str:
         """One line for people."""

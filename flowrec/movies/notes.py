@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import MovieError
+from flowrec.system.toml_file import parse_toml
 
 _KEY, _VERSION = "flowrec_movie", 1
 _MOST_CHARACTERS = 32_000_000
@@ -59,6 +60,15 @@ class MovieNotes:
         """JSON, for the file."""
         return json.dumps({_KEY: _VERSION} | asdict(self))
 
+    @property
+    def radius_um(self) -> float | None:
+        """Radius of the robot; None: the settings do not state it."""
+        try:
+            radius = parse_toml(self.settings).get("robot", {}).get("radius_um")
+        except (ValueError, RecursionError, AttributeError):
+            return None
+        return float(radius) if isinstance(radius, (int, float)) and math.isfinite(radius) and radius > 0.0 else None
+
     def chip_files(self) -> tuple[bytes, str]:
         """PNG and TOML of the chip, see chip/io.py."""
         return base64.b64decode(self.chip_png), self.chip_toml
@@ -93,6 +103,20 @@ def notes_in(text: str, path: Path) -> MovieNotes | None:
     except (binascii.Error, ValueError) as error:
         raise _damaged(path, "chip_png is not base64") from error
     return notes
+
+
+def refuse_drawn(notes: MovieNotes | None, path: Path) -> None:
+    """MovieError for images that are not those of the camera."""
+    if notes is not None and notes.drawn:
+        raise MovieError(
+            f"{path}: robot, route and flow are drawn over its images; import what flowrec export makes of the session "
+            "with --format mp4_plain or tiff"
+        )
+    if notes is not None and notes.region != "whole":
+        raise MovieError(
+            f"{path}: its images are black but for the region around the robot; flowrec replay works on the session "
+            f"itself, {notes.session[:80]}"
+        )
 
 
 def _fits(name: str, value: Any) -> bool:

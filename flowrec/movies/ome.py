@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 _S_PER = {"s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _UM_PER = {"µm": 1.0, "μm": 1.0, "um": 1.0, "micron": 1.0, "nm": 1e-3, "mm": 1e3, "cm": 1e4, "m": 1e6}
 _LIMIT_CHARACTERS = 1 << 28
+NAMESPACE = "flowrec"  # of the annotation in which flowrec keeps movies/notes.py
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +39,15 @@ def ome_facts(xml: str, frames: int) -> OmeFacts:
         _scaled(given.get("PhysicalSizeX"), given.get("PhysicalSizeXUnit", "µm"), _UM_PER),
         int(bits) if bits is not None and 1 <= bits <= 16 else None,
     )
+
+
+def annotation_in(xml: str) -> str:
+    """The text that flowrec put into OME-XML; '' if there is none."""
+    root = _root(xml)
+    for each in root.iter() if root is not None else ():
+        if _name(each) == "CommentAnnotation" and each.get("Namespace") == NAMESPACE:
+            return "".join(child.text or "" for child in each)
+    return ""
 
 
 def declared_planes(xml: str) -> int:

@@ -16,7 +16,8 @@ from flowrec.declarations import Image
 from flowrec.errors import MovieError
 from flowrec.movies.grey import grey_image, refuse_other_type
 from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_count, checked_size, depth_of, whole_ns
-from flowrec.movies.ome import OmeFacts, declared_planes, ome_facts, um_per
+from flowrec.movies.notes import notes_in, refuse_drawn
+from flowrec.movies.ome import OmeFacts, annotation_in, declared_planes, ome_facts, um_per
 
 _LOSSY = ("JPEG", "JPEG_LOSSY", "OJPEG", "WEBP", "JPEGXR", "JPEGXL", "JPEG2000", "JETRAW")
 _MINISWHITE, _PALETTE = 0, 3
@@ -92,6 +93,8 @@ class TiffMovie(Movie):
         file, page, count = self._file, self._file.series[0].keyframe, len(self._pages)
         refuse_other_type(self.path, page.dtype)
         remarks = []
+        notes = notes_in(annotation_in(file.ome_metadata or ""), self.path) if file.is_ome else None
+        refuse_drawn(notes, self.path)
         ome = ome_facts(file.ome_metadata or "", count) if file.is_ome else OmeFacts()
         imagej: dict[str, Any] = dict(file.imagej_metadata or {})
         micromanager: dict[str, Any] = dict(file.micromanager_metadata or {}) if file.is_micromanager else {}
@@ -123,6 +126,7 @@ class TiffMovie(Movie):
             times=text,
             um_per_px=ome.um_per_px if ome.um_per_px is not None else _imagej_um_per_px(page, imagej),
             remarks=tuple(remarks),
+            notes=notes,
         )
 
     def image(self, index: int) -> Image:

@@ -22,6 +22,7 @@ from flowrec.errors import MovieError
 from flowrec.messages import pixel_type
 from flowrec.movies.grey import CHANNELS, grey_image, refuse_colour
 from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, ReadOptions, checked_size, depth_of
+from flowrec.movies.notes import notes_in, refuse_drawn
 from flowrec.units import NS_PER_S
 
 _LOSSLESS = {
@@ -81,7 +82,12 @@ class VideoMovie(Movie):
     def _facts(self) -> MovieFacts:
         path, stream, container = self.path, self._stream, self._container
         codec = stream.codec_context
+        notes = notes_in(container.metadata.get("description", ""), path)
+        refuse_drawn(notes, path)
         width, height = checked_size(path, codec.width, codec.height)
+        if notes is not None and width - notes.width_px in (0, 1) and height - notes.height_px in (0, 1):
+            width, height = notes.width_px, notes.height_px  # without the padding to even sizes
+        self._first_ns = notes.first_stamp_ns if notes is not None else 0
         if codec.pix_fmt is None:
             raise MovieError(f"{path}: no pixel format is known of {codec.name}; the file is damaged or was cut short")
         bits = av.VideoFormat(codec.pix_fmt).components[0].bits
@@ -119,7 +125,9 @@ class VideoMovie(Movie):
             counted=False,
             times_ns=times,
             times=text,
+            um_per_px=notes.um_per_px if notes is not None else None,
             remarks=tuple(self._unusual()),
+            notes=notes,
         )
 
     def _packets(self) -> tuple[list[int | None], int]:
@@ -156,9 +164,13 @@ class VideoMovie(Movie):
             yield f"it has {len(self._container.streams.video)} video streams; the best one is read"
 
     def _time_ns(self, pts: int) -> int:
-        """A presentation time since the first image: containers begin at times that the encoder's delay determines."""
+        """A presentation time since the first image: containers begin at times that the encoder's delay determines.
+
+        In a movie of a session it is the session stamp.
+        """
         base: Fraction = self._stream.time_base
-        return round(Fraction((pts - self._pts[0]) * base.numerator * NS_PER_S, base.denominator))
+        since_ns = round(Fraction((pts - self._pts[0]) * base.numerator * NS_PER_S, base.denominator))
+        return self._first_ns + since_ns
 
     def frames(self) -> Iterator[MovieFrame]:
         count = 0
@@ -211,7 +223,8 @@ class VideoMovie(Movie):
     def _grey(self, frame: Any, index: int) -> Image:
         """Grey levels (h, w) of a decoded image."""
         facts, channel, name = self.facts, self.options.channel, frame.format.name
-        if (frame.width, frame.height) != (facts.width_px, facts.height_px):
+        padded = facts.notes is not None and frame.width - facts.width_px in (0, 1)
+        if (frame.width, frame.height) != (facts.width_px, facts.height_px) and not padded:
             raise MovieError(
                 f"{self.path}: image {index} has {frame.width} x {frame.height} pixels, the first one "
                 f"{facts.width_px} x {facts.height_px}; cut the movie where its size changes"
@@ -224,7 +237,7 @@ class VideoMovie(Movie):
             return grey_image(array, channel, facts.bits, self.path, index)
         if channel is None and _coloured(frame):
             raise refuse_colour(self.path, index)
-        return grey_image(luma, channel, facts.bits, self.path, index)
+        return grey_image(luma[: facts.height_px, : facts.width_px], channel, facts.bits, self.path, index)
 
 
 def _opened(path: Path) -> tuple[Any, Any]:

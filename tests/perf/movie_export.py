@@ -4,6 +4,9 @@
 
 PyAV alone encodes the same images from memory, with the preset and quality of the format. Each is done in turn, because
 the load of a machine changes, and the medians are compared.
+
+On two cores that were shared with other work, 1001 images of 640 x 512: mp4 0.89 of PyAV alone (75 and 84 frames/s), by
+CPU time 0.87; mp4_plain 0.83 and 0.76.
 """
 
 from __future__ import annotations

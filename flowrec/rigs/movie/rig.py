@@ -98,6 +98,7 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
     MovieError : the movie or its log can not be used.
     """
     with MovieSource(config.movie, config.coils) as source:
+        config = _stated(config, source)
         _refuse_missing(config, source)
         facts, log, robot = source.facts, source.log, config.robot
         camera: dict[str, Any] = {"width_px": facts.width_px, "height_px": facts.height_px, "bits": facts.bits}
@@ -124,6 +125,21 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
             config, camera=replace(config.camera, **camera), robot=replace(robot, **known), mission=mission
         )
         return changed, source.provenance(), remarks
+
+
+def _stated(config: Config, source: MovieSource) -> Config:
+    """The configuration with what flowrec wrote into the movie of a session, where nothing else is given."""
+    notes = source.facts.notes
+    if notes is None:
+        return config
+    camera, robot, chip = config.camera, config.robot, config.chip
+    if camera.um_per_px is None:
+        camera = replace(camera, um_per_px=notes.um_per_px)
+    if robot.radius_um is None and notes.radius_um is not None:
+        robot = replace(robot, radius_um=notes.radius_um)
+    if not chip.path:
+        chip = replace(chip, path=str(source.path))
+    return replace(config, camera=camera, robot=robot, chip=chip)
 
 
 def _refuse_missing(config: Config, source: MovieSource) -> None:

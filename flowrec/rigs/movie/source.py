@@ -131,6 +131,10 @@ class MovieSource:
         }
         if facts.um_per_px is not None:
             stated["source_um_per_px"] = f"{facts.um_per_px:.6g}"
+        if facts.notes is not None:
+            stated["source_session"] = facts.notes.session
+            stated["source_session_key"] = facts.notes.session_key
+            stated["source_started"] = facts.notes.started
         if settings.channel is not None:
             stated["source_channel"] = settings.channel
         for key, file in (("times", settings.times), ("coil_log", settings.coils)):

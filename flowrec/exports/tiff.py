@@ -1,0 +1,93 @@
+"""The format tiff: the camera's images without loss as OME-TIFF, for Fiji, napari, QuPath and tifffile.
+
+DeltaT of each plane is its session stamp in s, AcquisitionDate the start of the run, PhysicalSizeX and Y the size of a
+pixel, SignificantBits the depth of the camera. A file that may become larger than 4 GB is a BigTIFF. Pages are
+compressed by Deflate with differences of neighbours, which every reader knows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import tifffile
+
+from flowrec.declarations import Image
+from flowrec.errors import MovieError, SessionError
+from flowrec.exports.camera_images import GreyScale, first_frame, image_stamps, notes_of, title_of, with_images
+from flowrec.movies.notes import MovieNotes, notes_in
+from flowrec.movies.ome import NAMESPACE, annotation_in
+from flowrec.session import Session
+from flowrec.units import seconds
+
+_BIG_BYTES = 3_900_000_000  # of pixels; a plain TIFF ends at 4 GiB, and headers and the text are in it, too
+_LEVEL = 3  # of Deflate
+
+
+class TiffExport:
+    """Implements flowrec.exports.formats.Exporter. Memory grows with the number of images by some 300 bytes each."""
+
+    suffixes = (".ome.tif", ".tif", ".tiff", ".btf")
+    folder = False
+    advice = "open it with Fiji (Bio-Formats), napari or tifffile:"
+
+    def is_export_of(self, path: Path, session: Session) -> bool:
+        try:
+            with tifffile.TiffFile(path) as file:
+                notes = notes_in(annotation_in(file.ome_metadata or ""), path)
+        except (tifffile.TiffFileError, OSError, MovieError, ValueError):
+            return False
+        return notes is not None and notes.session_key == session.key
+
+    def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
+        first = first_frame(session)
+        stamps = image_stamps(session)
+        height, width = first.image.shape
+        notes = notes_of(session, first, GreyScale(first.bits, 0, (1 << first.bits) - 1))
+        with tifffile.TiffWriter(part, bigtiff=first.image.nbytes * len(stamps) > _BIG_BYTES, ome=True) as file:
+            file.write(
+                self._images(session, stamps, progress),
+                shape=(len(stamps), height, width),
+                dtype=first.image.dtype,
+                photometric="minisblack",
+                compression="adobe_deflate",
+                compressionargs={"level": _LEVEL},
+                predictor=True,
+                rowsperstrip=height,
+                metadata=_metadata(session, notes, stamps),
+                resolution=(1e4 / notes.um_per_px, 1e4 / notes.um_per_px),
+                resolutionunit="CENTIMETER",
+                software=f"flowrec {session.provenance.get('flowrec', '')}".strip(),
+            )
+
+    def _images(self, session: Session, stamps: list[int], progress: Callable[[float], None]) -> Iterator[Image]:
+        """The images that the file was made for, one after another."""
+        number = 0
+        for _, frame in with_images(session):
+            if number == len(stamps) or frame.stamp_ns != stamps[number]:
+                break
+            progress(seconds(frame.stamp_ns - session.run.first_ns))
+            yield frame.image
+            number += 1
+        if number != len(stamps):
+            raise SessionError(
+                f"{session.path}: its index names {len(stamps)} images, {number} are there; flowrec check says more"
+            )
+
+
+def _metadata(session: Session, notes: MovieNotes, stamps: list[int]) -> dict[str, Any]:
+    """OME-XML as tifffile takes it."""
+    facts: dict[str, Any] = {
+        "axes": "TYX",
+        "Name": title_of(session),
+        "Description": f"flowrec session {notes.session_key}; DeltaT is the time on the session clock",
+        "SignificantBits": notes.bits,
+        "PhysicalSizeX": notes.um_per_px,
+        "PhysicalSizeXUnit": "µm",
+        "PhysicalSizeY": notes.um_per_px,
+        "PhysicalSizeYUnit": "µm",
+        "Plane": {"DeltaT": [seconds(stamp) for stamp in stamps], "DeltaTUnit": ["s"] * len(stamps)},
+        "CommentAnnotation": {"Namespace": NAMESPACE, "Value": notes.text()},
+    }
+    return facts | ({"AcquisitionDate": notes.started} if notes.started else {})
