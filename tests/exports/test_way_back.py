@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,8 @@ import tifffile
 import flowrec
 from flowrec.commands.align import aligned
 from flowrec.commands.import_movie import asked_import
-from flowrec.control import Coils
-from flowrec.control.coil_log import read_coil_log
 from flowrec.errors import MovieError
 from flowrec.movies import open_movie
-from flowrec.rig_settings import Columns
 from flowrec.rigs.movie.rig import fitted_to_movie
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
@@ -59,13 +55,6 @@ def test_an_import_need_not_be_told_scale_robot_chip_and_clock(kind, exported):
     assert (flowrec.chip.load_chip(config.chip).mask == session.chip.mask).all()
     assert facts["source_started"] == session.provenance["wall_time"]
     assert facts["source_session_key"] == session.key
-
-
-def test_the_table_of_the_coils_has_the_turns_of_every_frame(exported):
-    log = read_coil_log(exported["csv"] / "applied.csv", Columns(), Coils())
-    applied = list(flowrec.open(GOLDEN).messages("applied"))
-    for before, now in itertools.pairwise(applied):
-        assert log.turns(before.stamp_ns, now.stamp_ns) == pytest.approx(now.turns, abs=1e-9)
 
 
 def test_a_movie_with_drawings_is_refused_and_the_error_names_the_format_to_import(exported):
