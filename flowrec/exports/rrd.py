@@ -38,7 +38,6 @@ _FIGURES = (
     "navigation_s",
     "tracking_error_um",
     "contacts",
-    "observations",
     "frames_dropped",
 )
 

@@ -17,11 +17,11 @@ from flowrec.view.scene import Scene
 
 _SEVERAL_LINES = frozenset({e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
 _OVERLAYS = (e.OUTLINE, e.PATH, e.ROBOT)  # of each map, for orientation
-_ABOVE = 0.55  # height of camera and maps
+_ABOVE = 0.51  # height of camera and maps
 _SUMMARY = 0.31  # width of the text panel
 # Pixels of the area below, on a small screen: its height, the frame of the lanes and each of them.
-_BELOW_PX, _LANES_PX, _LANE_PX = 290.0, 58.0, 34.0
-_PANEL_PX = 320.0, 1280.0  # height of the camera's panel and width of a small screen
+_BELOW_PX, _LANES_PX, _LANE_PX = 315.0, 58.0, 34.0
+_PANEL_PX = 300.0, 1280.0  # height of the camera's panel and width of a small screen
 _FLAT = 1.6  # width over height of a chip that has its maps one above the other
 _LEGEND = 0.5  # of the time shown, kept free for a legend beside the curves
 Shown = rrb.View | rrb.Container
