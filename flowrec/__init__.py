@@ -56,7 +56,7 @@ _MODULES = {
     "open": "session",
     "record": "commands.record",
     "recover": "store.recovery",
-    "refine": "refine",  # a room that can be called, because Python gives its name to the room anyway
+    "refine": "refine",  # a callable package: the name of a package can not be that of a function beside it
     "replay": "commands.replay_api",
     "solve": "refine.user_flow",
     "report": "commands.report",

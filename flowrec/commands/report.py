@@ -26,7 +26,7 @@ from flowrec.topics import Tick
 if TYPE_CHECKING:
     from flowrec.reporting.history import Remark
     from flowrec.reporting.page import Page, ReplayPart, ReportFigure, Table
-    from flowrec.reporting.story import Story
+    from flowrec.reporting.report_data import ReportData
 
 HTML = (".html", ".htm")
 _PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
@@ -68,7 +68,7 @@ def report(
     _require_packages()
     from flowrec.reporting import style
     from flowrec.reporting.page import render
-    from flowrec.reporting.story import Story
+    from flowrec.reporting.report_data import ReportData
 
     session = Session.of(session)
     parts = [Session.of(each) for each in replays]
@@ -87,13 +87,13 @@ def report(
         done = stack.enter_context(progress(f"reading {path.name}", max(session.duration_s, 1e-3)))
         stack.enter_context(input_blamed(session, config, "reported on"))
         verdict = check(session)
-        story = Story.of(session, done)
+        data = ReportData.of(session, done)
         pairs = [ReplayFiles.of(session, each) for each in parts]
         with style.drawing():
-            kinds = _figures(story, verdict, pairs)
-            page = _page(story, verdict, pairs, kinds)
+            kinds = _figures(data, verdict, pairs)
+            page = _page(data, verdict, pairs, kinds)
             # Made before either is written: an error in one leaves neither.
-            files = dict(_files(kinds, story)) if folder is not None else {}
+            files = dict(_files(kinds, data)) if folder is not None else {}
         text = render(page)
     with ExitStack() as stack:  # what fails in one leaves neither
         stack.enter_context(output.new_file()).write_text(text, encoding="utf-8")
@@ -126,23 +126,23 @@ def _check_parents(session: Session, replays: Sequence[Session]) -> None:
             )
 
 
-def _figures(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles]) -> list[ReportFigure]:
+def _figures(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles]) -> list[ReportFigure]:
     from flowrec.reporting.curves import Span
     from flowrec.reporting.map_figure import ChangeFigure, MapFigure
     from flowrec.reporting.motion_figure import MotionFigure
     from flowrec.reporting.observer_figure import ObserverFigure
     from flowrec.reporting.path_figure import PathFigure
+    from flowrec.reporting.path_flow_figure import PathFlowFigure
     from flowrec.reporting.recording_figure import RecordingFigure
     from flowrec.reporting.timeline_figure import TimelineFigure
-    from flowrec.reporting.way_figure import WayFigure
 
-    first_s = story.history.first_s
+    first_s = data.history.first_s
     gaps = [Span("no image", first_s + gap.at_s, first_s + gap.at_s + gap.length_s) for gap in verdict.gaps]
     changes = [ChangeFigure(pair.recorded.field, pair.replayed.field, n) for n, pair in enumerate(pairs, 1)]
     return [
         PathFigure(),
         MapFigure(),
-        WayFigure(),
+        PathFlowFigure(),
         ObserverFigure(),
         MotionFigure(),
         TimelineFigure(gaps),
@@ -151,28 +151,28 @@ def _figures(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles]) -> li
     ]
 
 
-def _files(kinds: Sequence[ReportFigure], story: Story) -> Iterator[tuple[str, bytes]]:
+def _files(kinds: Sequence[ReportFigure], data: ReportData) -> Iterator[tuple[str, bytes]]:
     """Name and content of each figure's files."""
     from flowrec.reporting import style
 
     for kind in kinds:
-        if kind.why_not(story):
+        if kind.why_not(data):
             continue
         for width_mm in style.WIDTHS_MM:
-            figure = kind.draw(story, width_mm)
+            figure = kind.draw(data, width_mm)
             name = f"{kind.name}_{width_mm:.0f}mm"
             yield f"{name}.svg", style.as_svg(figure, kind.title, style.PAPER_DPI, text="none")
             yield f"{name}.pdf", style.as_pdf(figure, kind.title)
 
 
-def _page(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: Sequence[ReportFigure]) -> Page:
+def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: Sequence[ReportFigure]) -> Page:
+    from flowrec.reporting.explanations import GLOSSARY, sentence
     from flowrec.reporting.page import Folded, Page, Table, drawn
-    from flowrec.reporting.words import GLOSSARY, sentence
 
-    session = story.session
+    session = data.session
     facts = info(session)
     outcome = str(facts["outcome"])
-    done = {kind.name: drawn(kind, story) for kind in kinds}
+    done = {kind.name: drawn(kind, data) for kind in kinds}
     judgement, *_ = verdict.lines()
     provenance = session.provenance
     packages = [(key.removeprefix("package."), text) for key, text in provenance.items() if key.startswith("package.")]
@@ -184,12 +184,12 @@ def _page(story: Story, verdict: Verdict, pairs: Sequence[ReplayFiles], kinds: S
         note=_sentence(str(facts["note"] or "")),
         about=_about(facts, session),
         notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],
-        key_figures=_key_figures(story),
+        key_figures=_key_figures(data),
         figures=done,
-        refined=story.refined is not None,
-        refinement=story.refined.note.split("; ") if story.refined is not None and story.refined.note else [],
-        boundary=_boundary(story),
-        events=_events(story),
+        refined=data.refined is not None,
+        refinement=data.refined.note.split("; ") if data.refined is not None and data.refined.note else [],
+        boundary=_boundary(data),
+        events=_events(data),
         recording=Table("", [fact for fact in verdict.facts.items() if fact[0] not in ("written", "outcome")]),
         findings=[judgement, *(finding.text for finding in verdict.findings)],
         replays=[_replay_part(pair, done[f"replay_{number}"]) for number, pair in enumerate(pairs, 1)],
@@ -222,24 +222,24 @@ def _about(facts: dict[str, Any], session: Session) -> str:
     return ", ".join(parts)
 
 
-def _key_figures(story: Story) -> Table:
+def _key_figures(data: ReportData) -> Table:
+    from flowrec.reporting.explanations import MEANINGS
     from flowrec.reporting.page import Table
-    from flowrec.reporting.words import MEANINGS
 
-    session = story.session
+    session = data.session
     figures = {"duration_s": session.duration_s} | {
         key: value for key, value in session.outcome.items() if key not in _HIDDEN and value not in (None, "")
     }
-    for name, field in (("assumed", story.assumed), ("refined", story.refined)):
-        error = flow_error(story.scene.chip, field, story.truth)
+    for name, field in (("assumed", data.assumed), ("refined", data.refined)):
+        error = flow_error(data.scene.chip, field, data.truth)
         if error is not None:  # of a run that was cut off, its last tick instead of its figures
             figures.setdefault(f"{name}_flow_error", error)
     rows = [(name_of(key), _micro(shown(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
-    for name, field in (("assumed", story.assumed), ("refined", story.refined)):
+    for name, field in (("assumed", data.assumed), ("refined", data.refined)):
         if field is not None and field.error_share is not None:
             text = shown("_error", field.error_share)
             rows.append((f"{name} flow, stated error", text, f"what the {name} map expects its error to be"))
-    if story.truth is None:
+    if data.truth is None:
         rows.append(("error of the flow", "-", "not known: only a simulation knows the true flow"))
     return Table("In numbers", rows, ("", "", ""))
 
@@ -249,13 +249,13 @@ def _micro(text: str) -> str:
     return text.replace(" um", " µm")
 
 
-def _boundary(story: Story) -> Table | None:
+def _boundary(data: ReportData) -> Table | None:
     """Inflow and pressure at the openings of the chip, before and after."""
     from flowrec.reporting.page import Table
 
-    named = {"assumed": story.assumed, "refined": story.refined, "true": story.truth}
+    named = {"assumed": data.assumed, "refined": data.refined, "true": data.truth}
     fields = {name: field for name, field in named.items() if field is not None}
-    openings = story.scene.chip.openings
+    openings = data.scene.chip.openings
     if any(len(field.boundary_values) != len(openings) for field in fields.values()) or not fields:
         return None
     rows = []
@@ -268,11 +268,11 @@ def _boundary(story: Story) -> Table | None:
     return Table("At the openings of the chip", rows, ("", *fields))
 
 
-def _events(story: Story) -> list[Table]:
+def _events(data: ReportData) -> list[Table]:
     from flowrec.reporting.page import Table
     from flowrec.reporting.timeline_figure import numbered
 
-    history = story.history
+    history = data.history
     tables = []
     actions = [(number, f"{each.time_s:.2f} s", each.action, each.text) for number, each in numbered(history.remarks)]
     if actions:
@@ -307,8 +307,8 @@ def _provenance(facts: dict[str, Any], session: Session) -> list[tuple[str, str]
 
 
 def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
+    from flowrec.reporting.explanations import MEANINGS
     from flowrec.reporting.page import ReplayPart, Table
-    from flowrec.reporting.words import MEANINGS
 
     stated: Row = ("stated_flow_error", _stated(pair.recorded), _stated(pair.replayed))
     texts = [

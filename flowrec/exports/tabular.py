@@ -21,7 +21,7 @@ from flowrec.exports.datapackage import write_datapackage
 from flowrec.meanings import summary_of
 from flowrec.session import Session
 from flowrec.tables.arrow import schema_of
-from flowrec.tables.long import field_values, observed_flow
+from flowrec.tables.field_tables import field_values, observed_flow
 from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import seconds
 

@@ -8,7 +8,7 @@ local_viscosity, residuals, gauss_newton: a case without dimensions, its equatio
 network_inputs, network_fit, weights: what pi_unet, ni and unet share. pinn, collocation: the network of coordinates and
 its case. training: makes the shipped weights. torch is imported when a method that needs it runs.
 
-The room is also the function `flowrec.refine(chip, observations)` (user_flow.py): calling it refines measurements.
+The package is also the function `flowrec.refine(chip, observations)` (user_flow.py): calling it refines measurements.
 """
 
 import sys
@@ -25,7 +25,7 @@ from flowrec.refine.unet import Unet
 __all__ = ["REFINERS", "Assimilate", "Ni", "PiUnet", "Pinn", "Refiner", "Unet"]
 
 
-class _Room(ModuleType):
+class _CallablePackage(ModuleType):
     """A package that is a function, too: `flowrec.refine` is the name of both."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
@@ -34,4 +34,4 @@ class _Room(ModuleType):
         return refine(*args, **options)
 
 
-sys.modules[__name__].__class__ = _Room
+sys.modules[__name__].__class__ = _CallablePackage

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flowrec.messages import FlowField
 from flowrec.reporting import style
 from flowrec.reporting.path_figure import scale_bar
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.view.colours import Scale
 from flowrec.view.flow_values import change, scale_of, speed, uncertainty
 
@@ -68,13 +68,13 @@ class MapFigure:
     name = "maps"
     title = "Maps of the flow"
 
-    def why_not(self, story: Story) -> str:
-        if story.assumed is None and story.refined is None:
+    def why_not(self, data: ReportData) -> str:
+        if data.assumed is None and data.refined is None:
             return "the session holds no map of the flow"
         return ""
 
-    def caption(self, story: Story) -> str:
-        mask, refined, assumed = story.scene.chip.mask, story.refined, story.assumed
+    def caption(self, data: ReportData) -> str:
+        mask, refined, assumed = data.scene.chip.mask, data.refined, data.assumed
         parts = []
         if assumed is not None:
             parts.append(f"Assumed: computed from the chip and its stated inflow alone (method {assumed.method}).")
@@ -87,15 +87,15 @@ class MapFigure:
         best = refined if refined is not None else assumed
         assert best is not None
         parts.append(known_text(best, mask, "refined" if refined is not None else "assumed"))
-        if story.truth is not None:
+        if data.truth is not None:
             parts.append("True: the flow of the simulated world, which no stage of the run knew.")
         return " ".join(parts)
 
-    def alt(self, story: Story) -> str:
-        return f"Maps of the flow on the chip {story.scene.chip.name}: {', '.join(p.title for p in _panels(story))}."
+    def alt(self, data: ReportData) -> str:
+        return f"Maps of the flow on the chip {data.scene.chip.name}: {', '.join(p.title for p in _panels(data))}."
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
-        return draw_panels(_panels(story), story, width_mm)
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        return draw_panels(_panels(data), data, width_mm)
 
 
 class ChangeFigure:
@@ -108,7 +108,7 @@ class ChangeFigure:
         self._before, self._after = before, after
         self.name = f"replay_{number}"
 
-    def why_not(self, _story: Story) -> str:
+    def why_not(self, _story: ReportData) -> str:
         if self._before is None or self._after is None:
             return "one of the two holds no map of the flow"
         if self._before.same_as(self._after):
@@ -117,36 +117,36 @@ class ChangeFigure:
             return "the two maps have different sizes"
         return ""
 
-    def caption(self, story: Story) -> str:
+    def caption(self, data: ReportData) -> str:
         assert self._before is not None and self._after is not None
         return (
             f"Recorded: the best map of the session (method {self._before.method}). Replayed: that of the replay "
             f"(method {self._after.method}). Change: replayed minus recorded speed. "
-            + known_text(self._after, story.scene.chip.mask, "replayed")
+            + known_text(self._after, data.scene.chip.mask, "replayed")
         )
 
-    def alt(self, story: Story) -> str:
-        return f"Maps of the flow on the chip {story.scene.chip.name}: recorded, replayed, and their difference."
+    def alt(self, data: ReportData) -> str:
+        return f"Maps of the flow on the chip {data.scene.chip.name}: recorded, replayed, and their difference."
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
         assert self._before is not None and self._after is not None
-        mask = story.scene.chip.mask
+        mask = data.scene.chip.mask
         values = [speed(field, mask) for field in (self._before, self._after)]
         scale = Scale.up_to(float(np.nanmax(values)), "speed")
         panels = [Panel("recorded", values[0], scale), Panel("replayed", values[1], scale)]
         panels += [_change(self._after, self._before, mask), *_deviation(self._after, mask)]
-        return draw_panels(panels, story, width_mm)
+        return draw_panels(panels, data, width_mm)
 
 
-def _panels(story: Story) -> list[Panel]:
-    mask, scale = story.scene.chip.mask, story.speed_scale()
-    named = {"assumed": story.assumed, "refined": story.refined}
+def _panels(data: ReportData) -> list[Panel]:
+    mask, scale = data.scene.chip.mask, data.speed_scale()
+    named = {"assumed": data.assumed, "refined": data.refined}
     panels = [Panel(name, speed(field, mask), scale) for name, field in named.items() if field is not None]
-    if story.refined is not None and story.assumed is not None:
-        panels.append(_change(story.refined, story.assumed, mask))
-    best = story.refined if story.refined is not None else story.assumed
+    if data.refined is not None and data.assumed is not None:
+        panels.append(_change(data.refined, data.assumed, mask))
+    best = data.refined if data.refined is not None else data.assumed
     panels += _deviation(best, mask) if best is not None else []
-    return [*panels, Panel("true", speed(story.truth, mask), scale)] if story.truth is not None else panels
+    return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
 
 
 def _change(now: FlowField, was: FlowField, mask: NDArray[np.bool_]) -> Panel:
@@ -161,9 +161,9 @@ def _deviation(field: FlowField, mask: NDArray[np.bool_]) -> list[Panel]:
     return [Panel("deviation", values, scale_of(values, "uncertainty"), not_known(field, mask))]
 
 
-def draw_panels(panels: list[Panel], story: Story, width_mm: float) -> Figure:
+def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figure:
     """Maps side by side, each kind of value with its colour bar; several rows where they do not fit in one."""
-    mask, um_per_px = story.scene.chip.mask, story.scene.chip.um_per_px
+    mask, um_per_px = data.scene.chip.mask, data.scene.chip.um_per_px
     rows_px, columns_px = np.nonzero(mask)
     box = (
         slice(max(rows_px.min() - _MARGIN_PX, 0), rows_px.max() + _MARGIN_PX + 1),

@@ -8,7 +8,7 @@ import numpy as np
 
 from flowrec.reporting import style
 from flowrec.reporting.curves import Curve
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.reporting.time_axis import line, panels, shown_observations
 
 if TYPE_CHECKING:
@@ -24,37 +24,37 @@ class ObserverFigure:
     name = "observer"
     title = "Observer against map"
 
-    def why_not(self, story: Story) -> str:
-        if story.no_position or story.history.curve("flow_x_um_s"):
-            return story.no_position
+    def why_not(self, data: ReportData) -> str:
+        if data.no_position or data.history.curve("flow_x_um_s"):
+            return data.no_position
         return "the session holds no estimate of the flow at the robot"
 
-    def caption(self, story: Story) -> str:
+    def caption(self, data: ReportData) -> str:
         parts = [
             "Flow at the robot along the chip's x axis (right) and y axis (down). Observer: estimated from the robot's "
             "motion; the band is one standard deviation."
         ]
-        if story.history.curve("map_x_um_s"):
+        if data.history.curve("map_x_um_s"):
             parts.append("Map: the best flow map known at that time, at the same place; it jumps when a map is new.")
         else:
             parts.append("No map of the flow was known in this session.")
-        parts.append(shown_observations(story)[1])
-        if story.history.curve("nis"):
+        parts.append(shown_observations(data)[1])
+        if data.history.curve("nis"):
             parts.append(
                 "Below: consistency of the observer (normalised innovation squared, mean); 2 is expected, and much "
                 "more means that the robot moves in a way that the observer does not know."
             )
         return " ".join(parts)
 
-    def alt(self, story: Story) -> str:
+    def alt(self, data: ReportData) -> str:
         observed, on_map = (
-            np.hypot(*(story.history.curve(f"{name}_{axis}_um_s").mean for axis in "xy")) for name in ("flow", "map")
+            np.hypot(*(data.history.curve(f"{name}_{axis}_um_s").mean for axis in "xy")) for name in ("flow", "map")
         )
         text = f"Flow at the robot over time: observer up to {_largest(observed):.0f} µm/s"
         return text + (f", map up to {_largest(on_map):.0f} µm/s." if len(on_map) else "; no map.")
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
-        history, (observations, _) = story.history, shown_observations(story)
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        history, (observations, _) = data.history, shown_observations(data)
         nis = history.curve("nis")
         narrow = width_mm <= style.NARROW_MM
         figure, axes = panels(history, width_mm, [28.0, 28.0, 16.0] if nis else [28.0, 28.0])

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 from flowrec.errors import printable
 from flowrec.reporting import style
-from flowrec.reporting.story import Story
-from flowrec.reporting.words import LONGEST
+from flowrec.reporting.explanations import LONGEST
+from flowrec.reporting.report_data import ReportData
 from flowrec.version import __version__
 
 _TEMPLATE = "page.html"
@@ -29,16 +29,16 @@ class ReportFigure(Protocol):
     name: str
     title: str
 
-    def why_not(self, story: Story) -> str:
+    def why_not(self, data: ReportData) -> str:
         """Why it can not be drawn of this session, as words after a colon; '' if it can."""
 
-    def caption(self, story: Story) -> str:
+    def caption(self, data: ReportData) -> str:
         """What it shows, and what it can not show of this session."""
 
-    def alt(self, story: Story) -> str:
+    def alt(self, data: ReportData) -> str:
         """What it shows, for a reader who does not see it."""
 
-    def draw(self, story: Story, width_mm: float) -> Any:
+    def draw(self, data: ReportData, width_mm: float) -> Any:
         """A matplotlib figure of this width."""
 
 
@@ -109,17 +109,17 @@ class Page:
     glossary: Sequence[tuple[str, str]] = ()
 
 
-def drawn(figure: ReportFigure, story: Story) -> Drawn:
+def drawn(figure: ReportFigure, data: ReportData) -> Drawn:
     """Draw a figure for the page; call it within `style.drawing()`."""
-    why = figure.why_not(story)
+    why = figure.why_not(data)
     if why:
         return Drawn(figure.name, figure.title, why_not=why)
     narrow, wide = (
         "data:image/svg+xml;base64,"
-        + base64.b64encode(style.as_svg(figure.draw(story, width_mm), figure.title)).decode("ascii")
+        + base64.b64encode(style.as_svg(figure.draw(data, width_mm), figure.title)).decode("ascii")
         for width_mm in style.WIDTHS_MM
     )
-    return Drawn(figure.name, figure.title, figure.caption(story), figure.alt(story), narrow, wide)
+    return Drawn(figure.name, figure.title, figure.caption(data), figure.alt(data), narrow, wide)
 
 
 def plain(value: Any) -> Any:

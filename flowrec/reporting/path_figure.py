@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.reporting import style
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.view.flow_values import arrow_grid, flow_arrows, speed
 
 if TYPE_CHECKING:
@@ -35,49 +35,49 @@ class PathFigure:
     name = "path"
     title = "Path of the robot over the flow"
 
-    def why_not(self, story: Story) -> str:
-        return story.no_position
+    def why_not(self, data: ReportData) -> str:
+        return data.no_position
 
-    def caption(self, story: Story) -> str:
+    def caption(self, data: ReportData) -> str:
         parts = ["Line: the way of the robot (estimated position)."]
-        if story.route is not None:
+        if data.route is not None:
             parts.append("Dashes: the route that was planned last.")
-        field = story.history.last.field
+        field = data.history.last.field
         if field is not None:
-            kind = "refined" if story.refined is not None else "assumed"
+            kind = "refined" if data.refined is not None else "assumed"
             parts.append(f"Colours and arrows: speed and direction of the flow by the {kind} map.")
-        if story.picture is None:
+        if data.picture is None:
             parts.append("The session holds no camera image: the mask of the chip is shown, walls in grey.")
-        elif story.picture.images > 1:
+        elif data.picture.images > 1:
             parts.append(
-                f"Beneath: the camera's picture, median of {story.picture.images} images, in which what moves is not "
+                f"Beneath: the camera's picture, median of {data.picture.images} images, in which what moves is not "
                 "visible."
             )
         else:
             parts.append("Beneath: the one image of the camera that was found whole.")
         return " ".join(parts)
 
-    def alt(self, story: Story) -> str:
-        path = story.path_um
+    def alt(self, data: ReportData) -> str:
+        path = data.path_um
         length_mm = float(np.nansum(np.hypot(*np.diff(path, axis=0).T))) * style.MM_PER_UM
-        return f"Map of the chip {story.scene.chip.name} with the robot's path of {length_mm:.1f} mm."
+        return f"Map of the chip {data.scene.chip.name} with the robot's path of {length_mm:.1f} mm."
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
-        left, top, right, bottom = _bounds(story)
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        left, top, right, bottom = _bounds(data)
         aspect = (bottom - top) / (right - left)
-        picture_mm = width_mm - (_BAR_MM if story.history.last.field is not None else 2.0)
+        picture_mm = width_mm - (_BAR_MM if data.history.last.field is not None else 2.0)
         figure = style.new_figure(width_mm, min(picture_mm * aspect + _BELOW_MM, _TALLEST_MM))
         ax = figure.subplots()
         style.bare(ax)
-        _background(ax, story)
-        _flow(figure, ax, story)
-        _outline(ax, story)
+        _background(ax, data)
+        _flow(figure, ax, data)
+        _outline(ax, data)
         ax.set_xlim(left, right)
         ax.set_ylim(bottom, top)
         ax.set_aspect("equal")
         ax.autoscale(False)
-        _paths(ax, story)
-        scale_bar(ax, story.scene.length_px(1e3))
+        _paths(ax, data)
+        scale_bar(ax, data.scene.length_px(1e3))
         return figure
 
 
@@ -98,35 +98,35 @@ def scale_bar(ax: Axes, per_mm: float) -> None:
     ax.text(share + 0.01, 0.0, text, transform=below, va="center", ha="left")
 
 
-def _bounds(story: Story) -> tuple[float, float, float, float]:
+def _bounds(data: ReportData) -> tuple[float, float, float, float]:
     """Left, top, right, bottom of the fluid with a margin, within the chip, in the picture plane."""
-    chip = story.scene.chip
+    chip = data.scene.chip
     rows, columns = np.nonzero(chip.mask)
     corners = np.array([(x, y) for x in (columns.min(), columns.max()) for y in (rows.min(), rows.max())], np.float64)
-    places = story.scene.to_plane(corners * chip.um_per_px)
+    places = data.scene.to_plane(corners * chip.um_per_px)
     margin = _MARGIN * float(np.ptp(places[:, 0]))
-    chip_left, chip_top, chip_right, chip_bottom = story.scene.chip_bounds()
+    chip_left, chip_top, chip_right, chip_bottom = data.scene.chip_bounds()
     left, top = places.min(axis=0) - margin
     right, bottom = places.max(axis=0) + margin
     return max(left, chip_left), max(top, chip_top), min(right, chip_right), min(bottom, chip_bottom)
 
 
-def _background(ax: Axes, story: Story) -> None:
+def _background(ax: Axes, data: ReportData) -> None:
     """The camera's picture, else the mask: walls grey, fluid white."""
-    scene, picture = story.scene, story.picture
+    scene, picture = data.scene, data.picture
     if picture is not None:
         height, width = (size * picture.step for size in picture.image.shape)
         # Brightened: the path and the arrows are dark.
         ax.imshow(picture.image, cmap="gray", vmin=-90, vmax=255, extent=(0.0, width, height, 0.0), zorder=0)
     else:
-        _on_mask(ax, story, np.where(scene.chip.mask, 255.0, 200.0), cmap="gray", vmin=0, vmax=255, zorder=0)
+        _on_mask(ax, data, np.where(scene.chip.mask, 255.0, 200.0), cmap="gray", vmin=0, vmax=255, zorder=0)
 
 
-def _on_mask(ax: Axes, story: Story, values: NDArray[np.float64], **how: Any) -> AxesImage:
+def _on_mask(ax: Axes, data: ReportData, values: NDArray[np.float64], **how: Any) -> AxesImage:
     """Values (h, w) of the mask's pixels, where the camera sees them."""
     from matplotlib.transforms import Affine2D
 
-    placement = story.scene.mask_placement()
+    placement = data.scene.mask_placement()
     (a, b), (c, d) = placement.scale * placement.axes
     x, y = placement.offset
     height, width = values.shape
@@ -135,16 +135,16 @@ def _on_mask(ax: Axes, story: Story, values: NDArray[np.float64], **how: Any) ->
     return shown
 
 
-def _flow(figure: Figure, ax: Axes, story: Story) -> None:
+def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
     """The speed of the best map in colours, its direction as arrows."""
-    field, scene = story.history.last.field, story.scene
+    field, scene = data.history.last.field, data.scene
     if field is None:
         return
-    scale = story.speed_scale()
-    opacity = _OVER_PICTURE if story.picture is not None else 1.0
+    scale = data.speed_scale()
+    opacity = _OVER_PICTURE if data.picture is not None else 1.0
     values = speed(field, scene.chip.mask)
     how = {"cmap": style.SPEEDS, "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
-    speeds = _on_mask(ax, story, values, **how)
+    speeds = _on_mask(ax, data, values, **how)
     bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
     bar.set_label("speed of the flow (µm/s)")
     bar.outline.set_visible(False)
@@ -167,30 +167,30 @@ def _flow(figure: Figure, ax: Axes, story: Story) -> None:
         )
 
 
-def _outline(ax: Axes, story: Story) -> None:
+def _outline(ax: Axes, data: ReportData) -> None:
     """The walls of the mask."""
-    chip = story.scene.chip
+    chip = data.scene.chip
     contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     for contour in contours:
         around = np.concatenate([contour, contour[:1]])[:, 0] * chip.um_per_px
-        ax.plot(*story.scene.to_plane(around).T, color=style.QUIET, lw=0.5, zorder=2)
+        ax.plot(*data.scene.to_plane(around).T, color=style.QUIET, lw=0.5, zorder=2)
 
 
-def _paths(ax: Axes, story: Story) -> None:
+def _paths(ax: Axes, data: ReportData) -> None:
     """The route, the way of the robot, and where both begin and end."""
-    scene = story.scene
+    scene = data.scene
     white: dict[str, Any] = {"color": "white", "solid_capstyle": "round"}
-    if story.route is not None:
-        route = scene.to_plane(story.route.waypoints_um)
+    if data.route is not None:
+        route = scene.to_plane(data.route.waypoints_um)
         ax.plot(*route.T, lw=1.8, zorder=4, **white)
         ax.plot(*route.T, color=style.INK, lw=0.9, ls=(0, (4, 2)), zorder=5)
-    path = scene.to_plane(story.path_um)
+    path = scene.to_plane(data.path_um)
     ax.plot(*path.T, lw=2.4, zorder=6, **white)
     ax.plot(*path.T, color=style.VERMILLION, lw=1.3, zorder=7)
     _directions(ax, path)
     known = path[np.isfinite(path[:, 0])]
     radius_px = scene.length_px(scene.robot.radius_um)
-    goal = scene.to_plane(story.goal_um) if story.goal_um is not None else None
+    goal = scene.to_plane(data.goal_um) if data.goal_um is not None else None
     at_goal = goal is not None and float(np.hypot(*(known[-1] - goal))) < _SAME_PLACE * radius_px
     _place(ax, known[0], radius_px, "start", style.INK, below=goal is not None)
     if goal is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from flowrec.reporting import style
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.reporting.time_axis import line, panels
 
 if TYPE_CHECKING:
@@ -20,10 +20,10 @@ class RecordingFigure:
     name = "recording"
     title = "Losses and clocks"
 
-    def why_not(self, story: Story) -> str:
-        return "" if self._panels(story) else "the session holds neither the times of its ticks nor its clocks"
+    def why_not(self, data: ReportData) -> str:
+        return "" if self._panels(data) else "the session holds neither the times of its ticks nor its clocks"
 
-    def caption(self, story: Story) -> str:
+    def caption(self, data: ReportData) -> str:
         texts = {
             "tick_ms": "Time per tick: computing time of one image (logarithmic); dashed: the time between images.",
             "late_ms": "Delay of images: arrival at the computer after the moment that the fit of the camera's clock "
@@ -32,16 +32,16 @@ class RecordingFigure:
             "dropped": "Dropped images: images so far that reached the loop and were not written.",
             "queue_mb": "Queue: data that waits for the disk.",
         }
-        shown = [texts[name] for name in self._panels(story)]
+        shown = [texts[name] for name in self._panels(data)]
         absent = []
-        if not story.history.curve("late_ms"):
+        if not data.history.curve("late_ms"):
             absent.append("The session holds no clock of a camera.")
-        if not story.history.curve("lost"):
+        if not data.history.curve("lost"):
             absent.append("The camera did not count its images, or the session is not from a camera that does.")
         return " ".join([*shown, *absent])
 
-    def alt(self, story: Story) -> str:
-        largest = {name: story.history.curve(name).largest for name in self._panels(story)}
+    def alt(self, data: ReportData) -> str:
+        largest = {name: data.history.curve(name).largest for name in self._panels(data)}
         words = {
             "tick_ms": "time per tick up to {:.1f} ms",
             "late_ms": "mean delay of images up to {:.1f} ms",
@@ -51,8 +51,8 @@ class RecordingFigure:
         }
         return f"Curves over time: {', '.join(words[name].format(value) for name, value in largest.items())}."
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
-        history, names = story.history, self._panels(story)
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        history, names = data.history, self._panels(data)
         figure, axes = panels(history, width_mm, [_PANEL_MM] * len(names))
         labels = {
             "tick_ms": "time per\ntick (ms)",
@@ -61,7 +61,7 @@ class RecordingFigure:
             "dropped": "dropped\nimages",
             "queue_mb": "queue\n(MB)",
         }
-        rate_hz = story.session.config.camera.rate_hz
+        rate_hz = data.session.config.camera.rate_hz
         for ax, name in zip(axes, names, strict=True):
             line(ax, history.curve(name), style.BLUE, "mean")
             if name == "late_ms":
@@ -79,9 +79,9 @@ class RecordingFigure:
             ax.set_ylabel(labels[name])
         return figure
 
-    def _panels(self, story: Story) -> list[str]:
+    def _panels(self, data: ReportData) -> list[str]:
         """The curves to draw; of the queue and of dropped images only where there were any."""
-        history = story.history
+        history = data.history
         always = [name for name in ("tick_ms", "late_ms", "lost") if history.curve(name)]
         if not history.curve("tick_ms"):
             return always

@@ -11,7 +11,7 @@ from flowrec.messages import Observations
 from flowrec.reporting import style
 from flowrec.reporting.curves import Curve, Span
 from flowrec.reporting.history import History
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,12 +78,12 @@ def line(ax: Axes, curve: Curve, colour: str, label: str, **how: object) -> None
     ax.plot(curve.time_s, curve.mean, color=colour, label=label, **how)  # type: ignore[arg-type]
 
 
-def shown_observations(story: Story) -> tuple[Observations | None, str]:
+def shown_observations(data: ReportData) -> tuple[Observations | None, str]:
     """The observations that curves over time show, at most _MOST_POINTS of them, and what they are in words.
 
     None where there are none, or where they do not state their times.
     """
-    found = story.observations
+    found = data.observations
     if found is None:
         return None, "No observation of the flow was taken."
     count = len(found.position_um)

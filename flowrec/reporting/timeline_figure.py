@@ -10,7 +10,7 @@ from flowrec.enums import Action, Alarm, Level
 from flowrec.reporting import style
 from flowrec.reporting.curves import Span
 from flowrec.reporting.history import History, Remark
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.reporting.time_axis import panels, spans
 
 if TYPE_CHECKING:
@@ -45,14 +45,14 @@ class TimelineFigure:
     def __init__(self, gaps: Sequence[Span] = ()) -> None:
         self._gaps = gaps
 
-    def why_not(self, story: Story) -> str:
-        history = story.history
+    def why_not(self, data: ReportData) -> str:
+        history = data.history
         return "" if history.phases.spans or self._lanes(history) else "the session holds no phase, event or alarm"
 
-    def caption(self, story: Story) -> str:
-        drawn = {lane.name for lane in self._lanes(story.history)}
+    def caption(self, data: ReportData) -> str:
+        drawn = {lane.name for lane in self._lanes(data.history)}
         parts = []
-        if numbered(story.history.remarks):
+        if numbered(data.history.remarks):
             parts.append("Numbers: actions of the operator in the table below.")
         absent = [
             words
@@ -69,13 +69,13 @@ class TimelineFigure:
             parts.append(f"There was {', '.join(absent)}.")
         return " ".join(parts)
 
-    def alt(self, story: Story) -> str:
-        phases = ", ".join(span.name for span in story.history.phases.spans) or "none recorded"
-        lanes = ", ".join(lane.name for lane in self._lanes(story.history)) or "nothing else"
+    def alt(self, data: ReportData) -> str:
+        phases = ", ".join(span.name for span in data.history.phases.spans) or "none recorded"
+        lanes = ", ".join(lane.name for lane in self._lanes(data.history)) or "nothing else"
         return f"Time line. Phases: {phases}. Beside them: {lanes}."
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
-        history = story.history
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        history = data.history
         lanes = self._lanes(history)
         figure, (ax,) = panels(history, width_mm, [_LANE_MM * max(len(lanes), 1)])
         least_s = _LEAST_WIDTH * (history.last_s - history.first_s)

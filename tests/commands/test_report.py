@@ -26,10 +26,10 @@ from flowrec.messages import OperatorEvent
 from flowrec.reporting import page as pages
 from flowrec.reporting import style
 from flowrec.reporting.curves import BUCKETS, CurveBuilder
+from flowrec.reporting.explanations import MEANINGS, OUTCOMES
 from flowrec.reporting.recording_figure import RecordingFigure
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.reporting.timeline_figure import TimelineFigure
-from flowrec.reporting.words import MEANINGS, OUTCOMES
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.summary import Row
@@ -122,7 +122,7 @@ def test_the_page_states_outcome_numbers_with_units_refinement_and_provenance(ht
 
 
 def test_an_older_session_without_clocks_says_so_in_words() -> None:
-    caption = RecordingFigure().caption(Story.of(flowrec.open(GOLDEN)))
+    caption = RecordingFigure().caption(ReportData.of(flowrec.open(GOLDEN)))
     assert "Time per tick" in caption and "The session holds no clock of a camera." in caption
 
 
@@ -131,7 +131,7 @@ def test_the_same_session_gives_the_same_bytes_twice_and_outputs_are_not_replace
 ) -> None:
     session = part_of(MODERATE, tmp_path / "s.mcap", 30)
     monkeypatch.setattr(command, "_figures", lambda *_: [TimelineFigure()])
-    monkeypatch.setattr(command, "_page", lambda story, *_: pages.drawn(TimelineFigure(), story))
+    monkeypatch.setattr(command, "_page", lambda data, *_: pages.drawn(TimelineFigure(), data))
     monkeypatch.setattr(pages, "render", lambda drawn: drawn.wide)
     first = flowrec.report(session, figures=tmp_path / "figures")
     assert first == tmp_path / "s_report.html"

@@ -39,7 +39,7 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Story:
+class ReportData:
     """One session for its figures; `picture` is None where no image is in the file."""
 
     session: Session
@@ -48,7 +48,7 @@ class Story:
     picture: Picture | None
 
     @classmethod
-    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> Story:
+    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> ReportData:
         """Read a session; `progress` takes the session time in s since the first tick.
 
         Raises
@@ -58,16 +58,16 @@ class Story:
         config = session.config
         size_px = (config.camera.width_px, config.camera.height_px)
         scene = Scene(session.chip, session.calibration, config.robot, session.path.stem, image_px=size_px)
-        story = cls(session, scene, History.of(session, progress), picture_of(session))
+        data = cls(session, scene, History.of(session, progress), picture_of(session))
         shape = scene.chip.mask.shape
-        for name, field in (("assumed", story.assumed), ("refined", story.refined), ("true", story.truth)):
+        for name, field in (("assumed", data.assumed), ("refined", data.refined), ("true", data.truth)):
             if field is not None and field.velocity_um_s.shape[:2] != shape:
                 found, wanted = (" x ".join(map(str, size)) for size in (field.velocity_um_s.shape[:2], shape))
                 raise SessionError(
                     f"{session.path}: the {name} flow has {found} pixels, and the mask of the chip {wanted}; the file "
                     f"was edited or damaged, see flowrec check {session.path}"
                 )
-        return story
+        return data
 
     @property
     def assumed(self) -> FlowField | None:

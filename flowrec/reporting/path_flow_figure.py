@@ -11,7 +11,7 @@ from flowrec.flow import sample
 from flowrec.reporting import style
 from flowrec.reporting.history import std_at
 from flowrec.reporting.motion_figure import speed_of
-from flowrec.reporting.story import Story
+from flowrec.reporting.report_data import ReportData
 from flowrec.reporting.time_axis import line, panels, shown_observations
 
 if TYPE_CHECKING:
@@ -20,26 +20,26 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
-class WayFigure:
+class PathFlowFigure:
     """What both maps say of the places where the robot was, and what was observed there."""
 
     name = "before_after"
     title = "Flow at the places of the robot"
 
-    def why_not(self, story: Story) -> str:
-        if story.assumed is None and story.refined is None:
+    def why_not(self, data: ReportData) -> str:
+        if data.assumed is None and data.refined is None:
             return "the session holds no map of the flow"
-        return story.no_position
+        return data.no_position
 
-    def caption(self, story: Story) -> str:
+    def caption(self, data: ReportData) -> str:
         parts = ["Speed of the flow at the place where the robot was at each time, by the last map of each kind."]
-        if story.refined is None:
+        if data.refined is None:
             parts.append("The flow was not refined in this session.")
-        elif story.refined.std_um_s is None:
-            parts.append(f"The method {story.refined.method} states no standard deviation, so there is no band.")
+        elif data.refined.std_um_s is None:
+            parts.append(f"The method {data.refined.method} states no standard deviation, so there is no band.")
         else:
             parts.append("Band: one standard deviation that the refined map states for itself.")
-        shown, words = shown_observations(story)
+        shown, words = shown_observations(data)
         parts.append(words)
         if shown is not None:
             parts.append(
@@ -48,25 +48,25 @@ class WayFigure:
             )
         return " ".join(parts)
 
-    def alt(self, story: Story) -> str:
-        kinds = [name for name, field in (("assumed", story.assumed), ("refined", story.refined)) if field is not None]
+    def alt(self, data: ReportData) -> str:
+        kinds = [name for name, field in (("assumed", data.assumed), ("refined", data.refined)) if field is not None]
         return f"Curves over time: speed of the flow at the robot by the {' and the '.join(kinds)} map."
 
-    def draw(self, story: Story, width_mm: float) -> Figure:
-        history = story.history
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        history = data.history
         figure, (ax,) = panels(history, width_mm, [44.0])
-        path_um, time_s = story.path_um, history.curve("x_um").time_s
-        line(ax, speed_of(story, "true"), style.INK, "true (simulated)", lw=0.7)
-        if story.assumed is not None:
-            speed = _speed(sample(story.assumed, path_um), path_um)
+        path_um, time_s = data.path_um, history.curve("x_um").time_s
+        line(ax, speed_of(data, "true"), style.INK, "true (simulated)", lw=0.7)
+        if data.assumed is not None:
+            speed = _speed(sample(data.assumed, path_um), path_um)
             ax.plot(time_s, speed, color=style.QUIET, ls=(0, (4, 2)), label="assumed")
         top = 0.0
-        if story.refined is not None:
-            speed, std = _speed(sample(story.refined, path_um), path_um), std_at(story.refined, path_um)
+        if data.refined is not None:
+            speed, std = _speed(sample(data.refined, path_um), path_um), std_at(data.refined, path_um)
             ax.fill_between(time_s, np.maximum(speed - std, 0.0), speed + std, color=style.ORANGE, alpha=0.3, lw=0.0)
             ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
             top = float(np.nanmax(speed, initial=0.0))
-        observations, _ = shown_observations(story)
+        observations, _ = shown_observations(data)
         if observations is not None and observations.time_s is not None:
             observed = np.hypot(*observations.flow_um_s.T)
             ax.errorbar(
