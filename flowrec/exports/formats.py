@@ -32,6 +32,7 @@ EXPORTS = Methods(
         "OME-TIFF, the camera's images without loss, which flowrec import reads",
         extra="export",
     ),
+    Method("nwb", "flowrec.exports.nwb:NwbExport", "Neurodata Without Borders, the pose by ndx-pose", extra="export"),
     Method("zarr", "flowrec.exports.zarr:ZarrExport", "images and flow fields in chunks, for xarray", extra="export"),
 )
 
