@@ -3,8 +3,8 @@
 The reference time is the start of the run with its zone; timestamps are s on the session clock. Images are in the
 file, compressed, with the stamp of each. A session that states no start time is refused: NWB demands it.
 
-nwbinspector takes the images of a short session, which has fewer of them than they have pixels on a side, for turned. The
-subject is the robot; age and sex are demanded, and say in its description that they state nothing.
+nwbinspector takes the images of a short session, which has fewer of them than they have pixels on a side, for turned.
+The subject is the robot; age and sex are demanded, and its description says that they state nothing.
 """
 
 from __future__ import annotations
