@@ -4,7 +4,7 @@ The reference time is the start of the run with its zone; timestamps are s on th
 file, compressed, with the stamp of each. A session that states no start time is refused: NWB demands it.
 
 nwbinspector takes the images of a short session, which has fewer of them than they have pixels on a side, for turned.
-The subject is the robot; age and sex are demanded, and its description says that they state nothing.
+The subject is the sample; age and sex, which NWB's inspector demands, are stated as unknown.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ class NwbExport:
             source_script=f"flowrec {session.provenance.get('flowrec', '')}".strip(),
             source_script_file_name="flowrec export",
         )
-        radius_um = session.config.robot.radius_um
-        what = f"magnetic micro-robot with a radius of {radius_um:.6g} um; no organism: age and sex state nothing"
-        file.subject = Subject(subject_id=_text(recording.sample) or "robot", description=what, age="P0D", sex="U")
+        what = f"micro-robot with a radius of {session.config.robot.radius_um:.6g} um, no organism"
+        sample = _text(recording.sample) or "robot"
+        file.subject = Subject(subject_id=sample, description=what, age="P0D/", sex="U")  # any age; sex unknown
         if session.topics.get("/camera/frame", 0):
             _add_images(file, session, progress)
         _add_pose(file, session)
