@@ -19,7 +19,13 @@ from flowrec.system.stderr import Outlet
 _STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
 
 outlet = Outlet()
-console = Console(file=cast(TextIO, outlet), highlight=False, force_jupyter=False)
+# In a notebook lines are text, and nothing moves.
+console = Console(
+    file=cast(TextIO, outlet),
+    highlight=False,
+    force_jupyter=False,
+    force_terminal=False if "ipykernel" in sys.modules else None,
+)
 
 
 def say(text: str) -> None:
