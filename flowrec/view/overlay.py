@@ -1,6 +1,6 @@
-"""Robot, route and flow drawn over the camera's images by OpenCV, with a strip below them for clock, state and scale.
+"""Robot, route and flow drawn over the images by OpenCV, with a status bar below them for clock, state and scale.
 
-Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the strip.
+Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the bar.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from flowrec.topics import Tick
 from flowrec.units import NS_PER_S
 from flowrec.view import colours
 from flowrec.view.colours import round_below
+from flowrec.view.drawing import CIRCLE, Layer, Picture, Points, drawable, fixed, outlined, restore
 from flowrec.view.flow_values import arrow_grid, flow_arrows
-from flowrec.view.ink import CIRCLE, Layer, Picture, Points, drawable, fixed, restore, rimmed
 from flowrec.view.scene import Scene
-from flowrec.view.strip import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, Strip
+from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, StatusBar
 
 _LEAST_WIDTH_PX = 480  # smaller images are enlarged by a whole factor, so that words and lines are readable
 _NOMINAL_PX = 640.0  # width of the picture that the sizes below are meant for
@@ -60,7 +60,7 @@ class Overlay:
         self._grid = _sparser(*arrow_grid(scene))
         self._trail: deque[tuple[int, Points]] = deque()
         um_per_px = scene.calibration.um_per_px / self.zoom
-        self._strip = Strip((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
+        self._status_bar = StatusBar((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
         self._tick = Tick()
         self._layer = Layer((0, 0))
         self._redraw(self._tick)
@@ -81,7 +81,7 @@ class Overlay:
         canvas = self._canvas
         canvas[: self._height, : self._width] = picture
         canvas[: self._height, self._width :] = picture[:, -1:]
-        self._strip.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
+        self._status_bar.draw(canvas[self._height :], tick.stamp_ns, tick.mission, tick.estimate)
         return canvas
 
     def _to_px(self, points_um: Points) -> Points:
@@ -102,7 +102,7 @@ class Overlay:
             layer.lines([centre + reach * part for part in GOAL_SIGN], GOAL, _LINE_PX * self._unit)
         layer.finish()
         self._layer = layer
-        self._strip.set_legend(goal=goal is not None, route=has_route, flow=flow)
+        self._status_bar.set_legend(goal=goal is not None, route=has_route, flow=flow)
 
     def _draw_flow(self, layer: Layer, field: FlowField, *, refined: bool) -> tuple[str, float, float] | None:
         """Arrows as long as the flow is fast; returns what the legend says of them."""
@@ -128,10 +128,10 @@ class Overlay:
             trail.popleft()
         colour = ROBOT if estimate.seen else colours.PALE
         way = np.array([*(point for _, point in trail), centre])
-        rimmed(picture, [fixed(way)], colour, _LINE_PX * unit)
+        outlined(picture, [fixed(way)], colour, _LINE_PX * unit)
         ring = self._robot_px + _RING_PX * unit
         restore(picture, clean, centre, ring)
-        rimmed(picture, [fixed(centre + ring * CIRCLE)], colour, _LINE_PX * unit)
+        outlined(picture, [fixed(centre + ring * CIRCLE)], colour, _LINE_PX * unit)
 
 
 def _goal(mission: Mission | None) -> tuple[float, float] | None:

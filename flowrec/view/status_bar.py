@@ -1,4 +1,4 @@
-"""The strip below a picture: clock and state on the left; on the right a legend that ends with the scale bar."""
+"""The bar below a picture: clock and state on the left; on the right a legend that ends with the scale bar."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from flowrec.messages import Estimate, Mission
 from flowrec.units import seconds
 from flowrec.view import colours
 from flowrec.view.colours import round_below
-from flowrec.view.ink import CIRCLE, CROSS, Layer, Picture, bgr, stamp
-from flowrec.view.lettering import clock_mask, text_mask
+from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, bgr, draw_mask
+from flowrec.view.text_masks import clock_mask, text_mask
 
 ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.PALE
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
@@ -31,8 +31,8 @@ _PHASES: dict[str, str] = {
 _MOST_LETTERS = 40  # of words from a file
 
 
-class Strip:
-    """Draws the strip of one picture after another.
+class StatusBar:
+    """Draws the bar of one picture after another.
 
     Parameters
     ----------
@@ -76,19 +76,19 @@ class Strip:
             )
         self._parts.append(self._scale_bar())
 
-    def draw(self, strip: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
+    def draw(self, bar: Picture, stamp_ns: int, mission: Mission | None, estimate: Estimate | None) -> None:
         """Draw it into the lower part of a picture. What has no room on the right is left out, the robot first."""
-        strip[:] = bgr(_GROUND)
+        bar[:] = bgr(_GROUND)
         left = round(0.6 * self._letter)
-        left += stamp(strip, clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
+        left += draw_mask(bar, clock_mask(clock_text(seconds(stamp_ns)), self._letter), left, self._top, _TEXT)
         left += round(0.9 * self._letter)
-        left += stamp(strip, text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
-        right = strip.shape[1]
+        left += draw_mask(bar, text_mask(state_text(mission, estimate), self._letter), left, self._top, _TEXT)
+        right = bar.shape[1]
         for part in reversed(self._parts):
             begin = right - part.shape[1]
             if begin < left + self._letter:
                 return
-            strip[:, begin:right] = part
+            bar[:, begin:right] = part
             right = begin
 
     def _scale_bar(self) -> Picture:
@@ -104,7 +104,7 @@ class Strip:
         sign = math.ceil(sign_px)
         picture = np.empty((self._height, sign + gap + mask.shape[1] + round(1.2 * self._letter), 3), np.uint8)
         picture[:] = bgr(_GROUND)
-        stamp(picture, mask, sign + gap, self._top, _TEXT)
+        draw_mask(picture, mask, sign + gap, self._top, _TEXT)
         layer = Layer(picture.shape[:2])
         draw(layer)
         layer.finish()

@@ -38,15 +38,15 @@ class Layer:
 
     def lines(self, lines: Iterable[Points], colour: Rgb, width_px: float) -> None:
         """Polylines, each (n, 2) as x, y."""
-        strips = [fixed(each) for each in lines if drawable(each)]
-        for ink, width, opacity in ((SOLID, width_px + 2.0, _RIM), (colour, width_px, 1.0)):
+        polylines = [fixed(each) for each in lines if drawable(each)]
+        for shade, width, opacity in ((SOLID, width_px + 2.0, _RIM), (colour, width_px, 1.0)):
             mask = np.zeros(self._kept.shape, np.uint8)
-            cv2.polylines(mask, strips, False, 255, max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
-            self._mix(mask, ink, opacity)
+            cv2.polylines(mask, polylines, False, 255, max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+            self._mix(mask, shade, opacity)
 
     def arrows(self, begins: Points, ends: Points, colour: Rgb, width_px: float) -> None:
         """Arrows from `begins` to `ends`, both (n, 2)."""
-        strips, heads = [], []
+        polylines, heads = [], []
         for begin, end in zip(begins, ends, strict=True):
             length = float(np.hypot(*(end - begin)))
             if not drawable(np.array([begin, end])) or length <= 0.0:
@@ -55,16 +55,16 @@ class Layer:
             head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
             across = 0.45 * head * np.array([-along[1], along[0]])
             base = end - head * along
-            strips.append(fixed(np.array([begin, base])))
+            polylines.append(fixed(np.array([begin, base])))
             heads.append(fixed(np.array([end, base + across, base - across])))
-        for ink, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
+        for shade, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
             mask = np.zeros(self._kept.shape, np.uint8)
-            cv2.polylines(mask, strips, False, 255, max(round(width_px + rim), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+            cv2.polylines(mask, polylines, False, 255, max(round(width_px + rim), 1), cv2.LINE_AA, SUBPIXEL_BITS)
             for each in heads:
                 cv2.fillPoly(mask, [each], 255, cv2.LINE_AA, SUBPIXEL_BITS)
             if rim:
                 cv2.polylines(mask, heads, True, 255, round(rim), cv2.LINE_AA, SUBPIXEL_BITS)
-            self._mix(mask, ink, opacity)
+            self._mix(mask, shade, opacity)
 
     def finish(self) -> None:
         """End the drawing; only then the layer can be mixed with images."""
@@ -86,14 +86,14 @@ class Layer:
         added[inked] = added[inked] * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32)
 
 
-def rimmed(picture: Picture, strips: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
+def outlined(picture: Picture, polylines: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
     """Polylines, as `fixed` returns them, that are drawn for one image only."""
-    for ink, width in ((SOLID, width_px + 1.0), (colour, width_px)):
-        cv2.polylines(picture, strips, False, bgr(ink), max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
+    for shade, width in ((SOLID, width_px + 1.0), (colour, width_px)):
+        cv2.polylines(picture, polylines, False, bgr(shade), max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def stamp(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
-    """Put letters (see lettering.py) on a picture of one colour; returns their width in px."""
+def draw_mask(picture: Picture, mask: NDArray[np.uint8], left: int, top: int, colour: Rgb) -> int:
+    """Put letters (see text_masks.py) on a picture of one colour; returns their width in px."""
     rows, columns = max(picture.shape[0] - top, 0), max(picture.shape[1] - left, 0)
     mask = mask[:rows, :columns]
     part = picture[top : top + mask.shape[0], left : left + mask.shape[1]]
