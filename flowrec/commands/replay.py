@@ -43,6 +43,8 @@ from flowrec.units import seconds
 
 # Sections that a replay can not change.
 FIXED = ("chip", "camera", "rig", "simulated")
+# Settings that every changed replay sets by itself: no person has changed them.
+OF_EVERY_REPLAY = ("mission.replan_error_um",)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from flowrec.commands.check import check
 from flowrec.commands.info import facts_for_people, info
+from flowrec.commands.replay import OF_EVERY_REPLAY
 from flowrec.commands.replay_report import refinement_remarks
 from flowrec.commands.verdict import Verdict
 from flowrec.enums import Level, Outcome
@@ -339,7 +340,7 @@ def _changed_settings(pair: ReplayFiles) -> list[tuple[str, str, str]]:
         }
         sides.append(settings | code)
     was, now = sides
-    keys = [key for key in was | now if was.get(key) != now.get(key)]
+    keys = [key for key in was | now if key not in OF_EVERY_REPLAY and was.get(key) != now.get(key)]
     return [(key, was.get(key, "-")[:80], now.get(key, "-")[:80]) for key in keys[:_LINES]]
 
 

@@ -127,6 +127,11 @@ def test_files_and_folders_are_listed_together_chosen_by_their_facts_and_sorted(
         ("refined_flow_error <", "syntax error"),
         ("1) union select name from sqlite_master --", "syntax error"),
         ("load_extension('x')", "not authorized"),
+        ("exists(select * from pragma_database_list)", "not authorized|prohibited"),
+        (
+            "exists(with recursive n(x) as (select 1 union all select x + 1 from n limit 3) select x from n)",
+            "not authorized|prohibited",
+        ),
         ("1; drop table sessions", "syntax error"),
     ],
 )
