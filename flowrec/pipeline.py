@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flowrec.chip import clearance_um
 from flowrec.chip.chip import Chip
-from flowrec.chip.registration import Calibration
+from flowrec.chip.registration import Calibration, on_chip
 from flowrec.clocks import Fit
 from flowrec.config import ResolvedConfig, calibration_of
 from flowrec.control import Coils, Controller
@@ -131,9 +131,7 @@ def _placed(estimate: Estimate, refined: FlowField | None) -> Estimate:
     """The estimate with its position on the chip, by the registration that the refinement found."""
     if refined is None or refined.registration is None:
         return estimate
-    # Not a matrix product, whose last bits depend on the machine.
-    turned = (refined.registration[:, :2] * estimate.position_um).sum(axis=1)
-    return replace(estimate, position_um=turned + refined.registration[:, 2])
+    return replace(estimate, position_um=on_chip(refined.registration, estimate.position_um))
 
 
 def _strength(coils: Coils, last: Tick) -> float:

@@ -12,6 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 _EXACT = {0.0: (1.0, 0.0), 90.0: (0.0, 1.0), 180.0: (-1.0, 0.0), 270.0: (0.0, -1.0)}
 
 
+def on_chip(registration: NDArray[np.float64] | None, measured_um: ArrayLike) -> NDArray[np.float64]:
+    """Where measured places (..., 2) in um lie on the chip, by the registration of a FlowField; None: as measured."""
+    measured = np.asarray(measured_um, np.float64)
+    if registration is None:
+        return measured
+    # Not a matrix product, whose last bits depend on the machine.
+    x, y = measured[..., 0], measured[..., 1]
+    (xx, xy, x0), (yx, yy, y0) = registration
+    return np.stack((xx * x + xy * y + x0, yx * x + yy * y + y0), -1)
+
+
 @dataclass(frozen=True, slots=True)
 class Calibration:
     """Camera pixel p = (column, row), counted at pixel centres, lies at origin + um_per_px * A^T p in the chip frame.

@@ -7,9 +7,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 from flowrec.errors import UsageError
-from flowrec.exports.formats import EXPORTS, Exporter
+from flowrec.exports.formats import EXPORTS, Exporter, FileExporter
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
@@ -89,7 +90,7 @@ def _output(
     if exporter.folder:
         facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
         return OutputFolder(target, facts, exporter.suffixes, inputs, overwrite)
-    overwrite = overwrite or (not named and exporter.is_export_of(target, session))
+    overwrite = overwrite or (not named and cast(FileExporter, exporter).is_export_of(target, session))
     return Output(target, exporter.suffixes, inputs, overwrite)
 
 

@@ -43,9 +43,6 @@ class _Tables:
         """The columns that the format holds."""
         return table
 
-    def is_export_of(self, _path: Path, _session: Session) -> bool:
-        return False
-
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         topics = [topic.field for topic in TOPICS if session.topics.get(topic.path)]
         if not topics:

@@ -35,9 +35,6 @@ class ZarrExport:
     folder = True
     advice = "open it with xarray.open_zarr:"
 
-    def is_export_of(self, _path: Path, _session: Session) -> bool:
-        return False
-
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         fields, frames = session.fields, session.frames
         if not fields and not len(frames):

@@ -69,9 +69,7 @@ class MapFigure:
     title = "Maps of the flow"
 
     def why_not(self, data: ReportData) -> str:
-        if data.assumed is None and data.refined is None:
-            return "the session holds no map of the flow"
-        return ""
+        return data.no_map
 
     def caption(self, data: ReportData) -> str:
         mask, refined, assumed = data.scene.chip.mask, data.refined, data.assumed

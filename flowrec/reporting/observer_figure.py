@@ -9,7 +9,7 @@ import numpy as np
 from flowrec.reporting import style
 from flowrec.reporting.curves import Curve
 from flowrec.reporting.report_data import ReportData
-from flowrec.reporting.time_axis import line, panels, shown_observations
+from flowrec.reporting.time_axis import line, observation_points, panels, shown_observations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,18 +66,9 @@ class ObserverFigure:
             line(ax, history.curve(f"true_{axis}_um_s"), style.INK, "true (simulated)", lw=0.7)
             ax.plot(flow.time_s, flow.mean, color=style.BLUE, label="observer")
             line(ax, history.curve(f"map_{axis}_um_s"), style.ORANGE, "map", lw=1.3)
-            if observations is not None and observations.time_s is not None:
-                ax.errorbar(
-                    observations.time_s,
-                    observations.flow_um_s[:, column],
-                    observations.std_um_s,
-                    fmt="o",
-                    ms=1.8,
-                    lw=0.6,
-                    color=style.PURPLE,
-                    label="observations",
-                    zorder=1.5,  # behind the curves
-                )
+            if observations is not None:
+                # Behind the curves.
+                observation_points(ax, observations, observations.flow_um_s[:, column], 1.8, 1.5)
             _limit(ax, [flow, history.curve(f"map_{axis}_um_s"), history.curve(f"true_{axis}_um_s")])
             ax.axhline(0.0, color=style.FAINT, lw=0.6, zorder=0)
             ax.set_ylabel(f"flow along {axis} (µm/s)")

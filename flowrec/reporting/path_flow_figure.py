@@ -12,7 +12,7 @@ from flowrec.reporting import style
 from flowrec.reporting.history import std_at
 from flowrec.reporting.motion_figure import speed_of
 from flowrec.reporting.report_data import ReportData
-from flowrec.reporting.time_axis import line, panels, shown_observations
+from flowrec.reporting.time_axis import line, observation_points, panels, shown_observations
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,9 +27,7 @@ class PathFlowFigure:
     title = "Flow at the places of the robot"
 
     def why_not(self, data: ReportData) -> str:
-        if data.assumed is None and data.refined is None:
-            return "the session holds no map of the flow"
-        return data.no_position
+        return data.no_map or data.no_position
 
     def caption(self, data: ReportData) -> str:
         parts = ["Speed of the flow at the place where the robot was at each time, by the last map of each kind."]
@@ -67,18 +65,9 @@ class PathFlowFigure:
             ax.plot(time_s, speed, color=style.ORANGE, lw=1.3, label="refined")
             top = float(np.nanmax(speed, initial=0.0))
         observations, _ = shown_observations(data)
-        if observations is not None and observations.time_s is not None:
+        if observations is not None:
             observed = np.hypot(*observations.flow_um_s.T)
-            ax.errorbar(
-                observations.time_s,
-                observed,
-                observations.std_um_s,
-                fmt="o",
-                ms=2.0,
-                lw=0.6,
-                color=style.PURPLE,
-                label="observations",
-            )
+            observation_points(ax, observations, observed, 2.0)
             top = max(top, float(observed.max()))
         _, high = ax.get_ylim()
         ax.set_ylim(0.0, min(high, 1.6 * top) if top else high)

@@ -107,6 +107,11 @@ class ReportData:
         return mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
 
     @property
+    def no_map(self) -> str:
+        """Why there is no map of the flow; '' if there is."""
+        return "the session holds no map of the flow" if self.assumed is None and self.refined is None else ""
+
+    @property
     def no_position(self) -> str:
         """Why there is no position of the robot; '' if there is."""
         if self.history.curve("x_um"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.enums import Phase
 from flowrec.messages import Observations
@@ -94,6 +95,24 @@ def shown_observations(data: ReportData) -> tuple[Observations | None, str]:
     if step > 1:
         which = f"every {_ORDINALS.get(step, f'{step}th')} of {count} observations"
     return found.only(slice(None, None, step)), f"Points: {which}, with one standard deviation."
+
+
+def observation_points(
+    ax: Axes, observations: Observations, observed: NDArray[np.float64], ms: float, zorder: float | None = None
+) -> None:
+    """Observations of `shown_observations` as points with one standard deviation."""
+    assert observations.time_s is not None, "those without times are not shown"
+    ax.errorbar(
+        observations.time_s,
+        observed,
+        observations.std_um_s,
+        fmt="o",
+        ms=ms,
+        lw=0.6,
+        color=style.PURPLE,
+        label="observations",
+        zorder=zorder,
+    )
 
 
 def spans(ax: Axes, found: list[Span], y: float, height: float, colour: str, least_s: float) -> None:

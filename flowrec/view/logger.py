@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from flowrec.chip.registration import on_chip
 from flowrec.declarations import Matrix
 from flowrec.diagnostics import Timing
 from flowrec.enums import Level
@@ -269,7 +270,4 @@ class TickLogger:
     def _chip_um(self, measured_um: NDArray[np.float64]) -> NDArray[np.float64]:
         """The same of a point (2,) in um."""
         refined = self._tick.refined
-        if refined is None or refined.registration is None:
-            return measured_um
-        moved: NDArray[np.float64] = refined.registration[:, :2] @ measured_um + refined.registration[:, 2]
-        return moved
+        return on_chip(None if refined is None else refined.registration, measured_um)

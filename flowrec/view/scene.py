@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flowrec.chip.chip import Chip
-from flowrec.chip.registration import Calibration
+from flowrec.chip.registration import Calibration, on_chip
 from flowrec.declarations import Matrix
 from flowrec.robot import Robot
 
@@ -55,7 +55,7 @@ class Scene:
             return np.eye(2, 3)
         corners = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
         measured_um = self.calibration.to_um(corners - _HALF_PX)
-        moved = self.to_plane(measured_um @ registration[:, :2].T + registration[:, 2])
+        moved = self.to_plane(on_chip(registration, measured_um))
         return np.column_stack((moved[1] - moved[0], moved[2] - moved[0], moved[0]))
 
     def directions(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:

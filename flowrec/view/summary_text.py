@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
 import rerun as rr
 
+from flowrec.chip.registration import on_chip
 from flowrec.errors import printable
 from flowrec.messages import FlowField
 from flowrec.summary import Row, comparison_for_people
@@ -31,11 +33,12 @@ def registration_remark(refined: FlowField | None) -> str:
     """That the picture is moved, and by how much; '' without a registration."""
     if refined is None or refined.registration is None:
         return ""
-    matrix = refined.registration
-    x_um, y_um = matrix[:, 2].tolist()
+    height, width = refined.pressure_pa.shape
+    middle_um = 0.5 * refined.um_per_px * np.array([width - 1.0, height - 1.0])
+    x_um, y_um = (on_chip(refined.registration, middle_um) - middle_um).tolist()
     return (
-        f"The refinement found another registration: image and robot are drawn moved by ({x_um:.1f}, {y_um:.1f}) um "
-        "and turned as it states, so that they lie on the chip, route and map."
+        f"The refinement found another registration: image and robot are drawn moved by ({x_um:.1f}, {y_um:.1f}) um in "
+        "the middle of the chip, and turned as it states, so that they lie on the chip, route and map."
     )
 
 
