@@ -19,6 +19,7 @@ from flowrec.view.colours import Scale
 from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.logger import TickLogger
 from flowrec.view.scene import Scene
+from flowrec.view.summary_text import registration_remark
 from flowrec.view.window_images import WindowCompleter
 
 
@@ -228,3 +229,15 @@ def test_image_and_robot_lie_on_the_chip_once_the_refinement_found_the_registrat
     shift = np.array(moved.translation.as_arrow_array().to_pylist()[0])[:2]
     seen = turned.to_plane(tick.estimate.position_um)  # where the robot is in the image
     assert np.allclose(matrix @ seen + shift, turned.to_plane(on_chip), atol=1e-3)
+
+
+def test_the_summary_says_by_how_much_the_picture_is_moved_in_the_middle_of_the_chip(ticks: list[Tick]) -> None:
+    refined = ticks[-1].refined
+    assert refined is not None
+    assert registration_remark(replace(refined, registration=None)) == ""
+    height, width = refined.pressure_pa.shape
+    middle = 0.5 * refined.um_per_px * np.array([width - 1.0, height - 1.0])
+    # 3 % smaller about the middle, and 12.5 um to the right, 4 um up: at the origin it would be another shift.
+    grown = 0.97 * np.eye(2)
+    registration = np.column_stack((grown, middle + np.array([12.5, -4.0]) - grown @ middle))
+    assert "(12.5, -4.0) um in the middle" in registration_remark(replace(refined, registration=registration))
