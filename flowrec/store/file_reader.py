@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import heapq
 import itertools
-import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -279,14 +278,16 @@ def _detached(record: Record) -> Record:
 
 @contextlib.contextmanager
 def _threads() -> Iterator[Executor]:
-    """The threads that decompress; at the end the tasks that have not begun are cancelled."""
+    """The threads that decompress; where a reading is abandoned, the tasks that have not begun are cancelled."""
     executor = ThreadPoolExecutor(_THREADS, _THREAD_NAME)
     try:
         yield executor
-    finally:
-        # The garbage collector may end an abandoned reading in one of these threads, which can not wait for itself.
-        own = threading.current_thread().name.startswith(_THREAD_NAME)
-        executor.shutdown(wait=not own, cancel_futures=True)
+    except BaseException:
+        # The garbage collector may end an abandoned reading in any thread, in the middle of anything: in one of these
+        # threads, or while a thread starts and holds the lock without which no other one can be joined.
+        executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    executor.shutdown()
 
 
 def _merged(

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from dataclasses import replace
@@ -29,6 +30,7 @@ from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
+from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(30, shape=(8, 8)))
@@ -319,11 +321,16 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_named(tmp_path, session
             list(reader.ticks())
 
 
-def test_a_reading_that_is_abandoned_may_be_collected_in_one_of_its_own_threads():
+def test_a_reading_that_is_abandoned_waits_for_no_thread_whichever_it_is_collected_in():
     def reading():
         with file_reader._threads() as executor:
             yield executor
 
-    abandoned = reading()
-    executor = next(abandoned)
-    executor.submit(abandoned.close).result(timeout=10.0)
+    busy, abandoned = threading.Event(), reading()
+    task = next(abandoned).submit(busy.wait, HANG_S)
+    collector = threading.Thread(target=abandoned.close)
+    collector.start()
+    collector.join(HANG_S / 4)
+    hangs = collector.is_alive()
+    busy.set()
+    assert not hangs and task.result()
