@@ -63,11 +63,20 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
+def _timeout(seconds: float | None) -> None:
+    if seconds is not None:
+        os.environ["FLOWREC_TIMEOUT_S"] = str(seconds)  # processes that a verb starts take it over
+
+
 @app.callback()
 def root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
+    timeout: Annotated[
+        float | None,
+        typer.Option(metavar="S", callback=_timeout, help="Time limit of each request for a session at a URL; 30."),
+    ] = None,
 ) -> None:
     """Record, replay and view missions of magnetic micro-robots in flow."""
 

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from flowrec.errors import FlowrecError, SessionError, UsageError
+from flowrec.store.byte_source import open_bytes
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run, files_of, run_files
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.session_path import UrlPath, session_path
 from flowrec.summary import Figures, of_text, rows_for_people
 from flowrec.system.toml_file import parse_toml
 from flowrec.units import nanoseconds, seconds
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from flowrec.store.reader import SessionReader
     from flowrec.topics import Tick
 
+_HASHED_BYTES = 4 << 20
 _LARGEST_NUMBER = 1e15  # larger numbers are damage: it is a million kilometres in um
 
 
@@ -40,7 +43,7 @@ class Session:
 
     Parameters
     ----------
-    path : the session (.mcap).
+    path : the session (.mcap), or the URL of one: s3://, gs://, az://, http:// or https://.
 
     Attributes
     ----------
@@ -53,7 +56,7 @@ class Session:
     """
 
     def __init__(self, path: Path | str) -> None:
-        self.path = Path(path)
+        self.path = session_path(path)
         self.run = Run.at(self.path)
 
     @classmethod
@@ -293,7 +296,7 @@ def files_behind(path: Path) -> list[Path]:
     An output that is made from the session must not replace any of them.
     """
     files: list[Path] = []
-    while path not in files:
+    while path not in files and not isinstance(path, UrlPath):  # no output of this machine is at a URL
         files += [path, *run_files(path)]
         # Errors in a file are reported by the code that reads it.
         with contextlib.suppress(SessionError), SessionMetadata(files_of(path)[0]) as file:
@@ -349,6 +352,9 @@ def session_sha256(files: Sequence[Path]) -> str:
     """SHA-256 of a session, by which a replay names its parent: of its file, or of its parts in order."""
     digest = hashlib.sha256()
     for path in files:
-        with path.open("rb") as file:
-            hashlib.file_digest(file, lambda: digest)
+        source = open_bytes(path)
+        with contextlib.closing(source):
+            for offset in range(0, source.size, _HASHED_BYTES):
+                source.prefetch((at, _HASHED_BYTES) for at in range(offset, offset + 4 * _HASHED_BYTES, _HASHED_BYTES))
+                digest.update(source.read(offset, min(_HASHED_BYTES, source.size - offset)))
     return digest.hexdigest()

@@ -42,7 +42,7 @@ EXAMPLES = {
     "compare": ("flowrec compare a.mcap b.mcap",),
 }
 
-SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap).")]
+SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap), or its URL.")]
 RrdOut = Annotated[
     Path | None,
     typer.Option(

@@ -20,6 +20,7 @@ from flowrec.session import Session
 from flowrec.store.audit import audit
 from flowrec.store.channels import is_left_out
 from flowrec.store.run_files import continuity_fault, is_continued, part_number, part_path, run_files
+from flowrec.store.session_path import session_path
 from flowrec.summary import finite
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS
@@ -55,7 +56,7 @@ def check(session: Session | Path | str, progress: Callable[[int], None] | None 
     ------
     SessionError : it is no session that this flowrec can read; the text says what it is.
     """
-    path = session.path if isinstance(session, Session) else Path(session)
+    path = session.path if isinstance(session, Session) else session_path(session)
     files = files_to_check(path)
     if files == [path]:
         return _FileCheck(path, progress).verdict

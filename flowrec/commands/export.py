@@ -12,6 +12,7 @@ from typing import cast
 from flowrec.errors import UsageError
 from flowrec.exports.formats import EXPORTS, Exporter, FileExporter
 from flowrec.session import Session, files_behind, input_blamed
+from flowrec.store.session_path import named_beside
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
@@ -47,7 +48,7 @@ def export(
     if second is not None:
         exporter = _beside(file_format, session, second)
         if out is None:
-            out = session.path.with_name(f"{session.path.stem}_and_{second.path.stem}{exporter.suffixes[0]}")
+            out = named_beside(session.path, f"{session.path.stem}_and_{second.path.stem}{exporter.suffixes[0]}")
     target = _target(session, exporter, file_format, None if out is None else Path(out))
     output = _output(session, exporter, file_format, target, overwrite, named=named)
     if second is not None and isinstance(output, Output):
@@ -78,7 +79,7 @@ def _target(session: Session, exporter: Exporter, file_format: str, out: Path | 
     suffix = exporter.suffixes[0]
     name = session.path.stem + (suffix or f"_{file_format}")
     if out is None:
-        return session.path.with_name(name)
+        return named_beside(session.path, name)
     within = suffix and out.is_dir() and out.suffix not in exporter.suffixes
     return out / name if within else out
 

@@ -105,7 +105,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _size(run: Run) -> int:
-    return sum(file.path.stat().st_size for file in run.files)
+    return sum(file.size_bytes for file in run.files)
 
 
 def _piece(part: Part, path: Path) -> str:

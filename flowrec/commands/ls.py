@@ -18,6 +18,7 @@ from flowrec.commands.info import info
 from flowrec.errors import SessionError, UsageError, printable
 from flowrec.session import Session
 from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX, part_number, run_files, run_path
+from flowrec.store.session_path import UrlPath, session_path
 from flowrec.summary import shown
 from flowrec.system.locks import is_growing
 
@@ -112,6 +113,9 @@ def _width(name: str, column: Sequence[str]) -> int:
 
 
 def _files(place: Path) -> list[Path]:
+    place = session_path(place)
+    if isinstance(place, UrlPath) and place.suffix == SUFFIX:
+        return [place]
     if not place.is_dir():
         files = [place] if place.is_file() else run_files(place)
         if not files or not place.name.endswith(_NAMES):

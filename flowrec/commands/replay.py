@@ -34,6 +34,7 @@ from flowrec.run.workers import LockstepWorker, work
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
+from flowrec.store.session_path import session_path
 from flowrec.store.writer import SessionWriter
 from flowrec.summary import as_text
 from flowrec.system.outputs import MCAP, Output
@@ -151,7 +152,7 @@ def replay(
     SessionError : the session can not be read or replayed, or `out` not be written.
     """
     if out is not None:
-        source = session.path if isinstance(session, Session) else Path(session)
+        source = session.path if isinstance(session, Session) else session_path(session)
         output = Output(Path(out), MCAP, tuple(files_behind(source)), overwrite)
         output.check()
     session, change = Session.of(session), change or Change()

@@ -23,6 +23,7 @@ from flowrec.run.loop import RunReport, Sink, run
 from flowrec.run.workers import LockstepWorker, Preloaded
 from flowrec.session import files_behind
 from flowrec.session_writer import session_writer
+from flowrec.store.session_path import named_beside
 from flowrec.summary import Row
 from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.terminal import say
@@ -72,7 +73,7 @@ class Outputs:
         ------
         OutputError : one of them may not be written.
         """
-        numbered = (path.with_name(f"{path.stem}_replay_{number:03d}{MCAP[0]}") for number in range(1, 1000))
+        numbered = (named_beside(path, f"{path.stem}_replay_{number:03d}{MCAP[0]}") for number in range(1, 1000))
         out = out or next((name for name in numbered if not name.exists()), None)
         if out is None:
             raise SessionError(f"{path.parent}: 999 replays of {path.name} are here; name one with --out")

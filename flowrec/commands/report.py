@@ -18,6 +18,7 @@ from flowrec.enums import Level, Outcome
 from flowrec.errors import UsageError
 from flowrec.replay_figures import ReplayFiles, before_after, flow_error
 from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
+from flowrec.store.session_path import named_beside
 from flowrec.summary import Row, name_of, shown
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
@@ -75,7 +76,8 @@ def report(
     parts = [Session.of(each) for each in replays]
     path = session.path
     read = tuple(file for each in (session, *parts) for file in files_behind(each.path))
-    output = Output(Path(out) if out is not None else path.with_name(f"{path.stem}_report.html"), HTML, read, overwrite)
+    target = Path(out) if out is not None else named_beside(path, f"{path.stem}_report.html")
+    output = Output(target, HTML, read, overwrite)
     output.check()
     folder = None
     if figures is not None:

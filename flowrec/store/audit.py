@@ -84,7 +84,8 @@ class Audit:
         """The file as run_files.py compares it with others."""
         part = self.header.part if self.header is not None else None
         counts = {BY_FIELD[name].path: count for name, count in self.counts.items()}
-        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, self.flowrec_version)
+        version, size_bytes = self.flowrec_version, self.size_bytes
+        return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, version, size_bytes)
 
 
 def audit(

@@ -1,6 +1,6 @@
 """Sources of the bytes of a session. mcap_reader.py reads byte ranges from one of them.
 
-Another kind (an URL, an archive) is one class and one row of BYTE_SOURCES.
+Another kind (an archive) is one class and one row of BYTE_SOURCES.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ import os
 import sys
 import threading
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
 from flowrec.errors import SessionError
+from flowrec.store.session_path import UrlPath
 
 
 class ByteSource(Protocol):
@@ -35,6 +36,9 @@ class ByteSource(Protocol):
         ------
         SessionError : it can not be read, or has been closed.
         """
+
+    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Ranges (offset, length) that will be read soon, each once; a hint, which may do nothing."""
 
     def close(self) -> None:
         """Release it; garbage collection releases it, too."""
@@ -87,12 +91,21 @@ class LocalFile:
                 data = os.read(self._descriptor, length)
         return data
 
+    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        pass  # the operating system reads ahead
+
     def close(self) -> None:
         self._closer()
 
 
-# By the scheme of an URL.
-BYTE_SOURCES: Mapping[str, Callable[[Path], ByteSource]] = {"file": LocalFile}
+def _remote_file(path: Path) -> ByteSource:
+    from flowrec.store.remote_file import RemoteFile
+
+    return RemoteFile(path)
+
+
+# By the kind of path that session_path.py makes.
+BYTE_SOURCES: Mapping[type[Path], Callable[[Path], ByteSource]] = {UrlPath: _remote_file}
 
 
 def open_bytes(path: Path) -> ByteSource:
@@ -102,5 +115,4 @@ def open_bytes(path: Path) -> ByteSource:
     ------
     SessionError : they can not be opened.
     """
-    scheme = str(path).partition(":")[0]
-    return BYTE_SOURCES.get(scheme, LocalFile)(path)
+    return BYTE_SOURCES.get(type(path), LocalFile)(path)

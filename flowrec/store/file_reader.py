@@ -30,7 +30,8 @@ _CACHED_MESSAGES = 64  # of restored states
 _STATE_LIMIT_BYTES = 176 << 20  # three flow fields on the largest chip, a route to all of it and an image
 _LARGE_CHUNK_BYTES = 1 << 22
 _GROWTH = 2  # of an image that is decoded ahead; JPEG compresses more and is decoded when its turn comes
-_AHEAD_BYTES, _AHEAD_CHUNKS = 32 << 20, 16  # decompressed before they are asked for
+# Decompressed before they are asked for. The number grows as they are read: who reads little fetches little.
+_AHEAD_BYTES, _AHEAD_CHUNKS, _AHEAD_AT_FIRST = 32 << 20, 48, 4
 _THREADS = 2
 _THREAD_NAME = "session-reader"
 _FEW = 64  # messages of a chunk that may wait as objects
@@ -120,7 +121,9 @@ class FileReader:
         """The stamps of the ticks with a message of a topic, in order, from the index of the file where it has one."""
         found: list[int] = []
         for channel in self._channels_of({field}):
-            for chunk in self._chunks_with({channel}):
+            chunks = self._chunks_with({channel})
+            self._source.prefetch(chunks, indexes=True)
+            for chunk in chunks:
                 times = self._source.message_times(chunk, channel)
                 if times is None:
                     times = [record.log_ns for record in self._source.messages(chunk) if record.channel == channel]
@@ -231,9 +234,10 @@ class FileReader:
     def _latest(self, stamp_ns: int, channels: set[int]) -> dict[str, Record]:
         latest: dict[str, Record] = {}
         size = _StateSize(self.path)
-        for chunk in sorted(self._chunks_with(channels), key=lambda chunk: chunk.message_end_time, reverse=True):
-            if chunk.message_start_time > stamp_ns:
-                continue
+        chunks = [chunk for chunk in self._chunks_with(channels) if chunk.message_start_time <= stamp_ns]
+        chunks.sort(key=lambda chunk: chunk.message_end_time, reverse=True)
+        self._source.prefetch(_likely(chunks, channels, stamp_ns))
+        for chunk in chunks:
             end_ns = min(chunk.message_end_time, stamp_ns)
             found = channels & set(chunk.message_index_offsets) if chunk.message_index_offsets else channels
             fields = {self._fields[channel] for channel in found}
@@ -249,6 +253,21 @@ class FileReader:
             if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # it is not kept in memory for a few messages in it
                 latest = {field: _detached(record) for field, record in latest.items()}
         return latest
+
+
+def _likely(chunks: list[ChunkIndex], channels: set[int], stamp_ns: int) -> list[ChunkIndex]:
+    """Of chunks, the latest first, those that probably hold the latest message of each channel at a stamp."""
+    likely: list[ChunkIndex] = []
+    missing = set(channels)
+    for chunk in chunks:
+        found = missing & set(chunk.message_index_offsets)
+        if found:
+            likely.append(chunk)
+        if chunk.message_end_time <= stamp_ns:  # else its messages may all be later
+            missing -= found
+        if not missing:
+            break
+    return likely
 
 
 class _StateSize:
@@ -311,15 +330,18 @@ def _merged(
         _overlapping(source, sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset)))
     )
     running: deque[tuple[list[ChunkIndex], Future[list[_ChunkContent]]]] = deque()
-    ahead_bytes = 0
+    ahead_bytes, ahead = 0, _AHEAD_AT_FIRST
     while waiting or running:
-        while waiting and len(running) < _AHEAD_CHUNKS:
+        begun: list[list[ChunkIndex]] = []
+        while waiting and len(running) + len(begun) < ahead:
             nbytes = _size(waiting[0])
             if ahead_bytes and ahead_bytes + nbytes > _AHEAD_BYTES:
                 break  # a bundle that is larger than all that may be ahead comes alone
-            bundle = waiting.popleft()
-            running.append((bundle, executor.submit(_contents, source, bundle, decode)))
+            begun.append(waiting.popleft())
             ahead_bytes += nbytes
+        source.prefetch(chunk for bundle in begun for chunk in bundle)
+        running.extend((bundle, executor.submit(_contents, source, bundle, decode)) for bundle in begun)
+        ahead = min(ahead + 1, _AHEAD_CHUNKS)
         bundle, future = running.popleft()
         # A small message as an object takes more memory than as bytes: they are made for one bundle at a time.
         records = _sorted_messages(source, bundle, future.result())

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -120,6 +120,14 @@ class McapReader:
         if len(data) < length:
             raise self.damaged(offset, "the file has become shorter while it was read")
         return data
+
+    def prefetch(self, chunks: Iterable[ChunkIndex], *, indexes: bool = False) -> None:
+        """Announce that these chunks, or the indexes after them, will be read soon: one round trip for a URL."""
+        ends = ((chunk, chunk.chunk_start_offset + chunk.chunk_length) for chunk in chunks)
+        if indexes:
+            self._bytes.prefetch([(end, chunk.message_index_length) for chunk, end in ends])
+        else:
+            self._bytes.prefetch([(chunk.chunk_start_offset, chunk.chunk_length) for chunk, _ in ends])
 
     def damaged(self, offset: int, why: object) -> DamageError:
         """The error for bytes that can not be parsed."""

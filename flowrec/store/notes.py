@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flowrec.errors import SessionError, UsageError
+from flowrec.store.session_path import on_this_machine
 
 SUFFIX = ".notes.jsonl"
 TEXT_LIMIT = 10_000  # characters of a note
@@ -74,7 +75,7 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
         raise UsageError(f"a note has at most {TEXT_LIMIT} characters, a tag 1 to {_TAG_LIMIT}")
     note = Note(datetime.now(UTC).isoformat(timespec="seconds"), author, text.strip(), tags)
     line = json.dumps({"session": key, **asdict(note)}).encode()
-    path = notes_file(session)
+    path = on_this_machine(notes_file(session), "no note is added to")
     try:
         with path.open("ab+", buffering=0) as file:
             if file.seek(0, os.SEEK_END):

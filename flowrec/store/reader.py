@@ -17,6 +17,7 @@ from flowrec.store.roi import Region
 from flowrec.store.rows import Row
 from flowrec.store.run_files import Run, RunFile
 from flowrec.store.session_metadata import SessionHeader
+from flowrec.store.session_path import session_path
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS, Tick
 from flowrec.units import seconds
 
@@ -54,7 +55,7 @@ class SessionReader:
     def __init__(
         self, path: Path | str, contents: SessionContents | None = None, skip: Callable[[str], None] | None = None
     ) -> None:
-        self.path = Path(path)
+        self.path = session_path(path)
         self._cache: Cache = {}
         self._closed = False
         self._open: dict[int, FileReader] = {}  # the one that was used longest ago first

@@ -34,6 +34,7 @@ from flowrec.store.session_metadata import (
     SESSION,
     Part,
 )
+from flowrec.store.session_path import on_this_machine
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import held
 from flowrec.system.outputs import MCAP, Output, OutputError, put_in_place
@@ -125,7 +126,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
     ------
     SessionError : as `recover`; `out` where there are several files; parts that are no run.
     """
-    left = unfinished_of(path)
+    left = unfinished_of(on_this_machine(path, "nothing is recovered from"))
     if path.exists() or not (left or parts(path)):
         return [recover(path, out)]
     if out is not None and len(left) != 1:

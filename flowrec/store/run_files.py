@@ -99,13 +99,15 @@ class RunFile:
     counts: Mapping[str, int]
     outcome: Mapping[str, str]
     flowrec_version: str
+    size_bytes: int
 
     @classmethod
     def of(cls, file: SessionMetadata) -> Self:
         """Of an open file."""
         statistics = file.statistics
         first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
-        return cls(file.source.path, file.part, first_ns, last_ns, file.counts, file.outcome, file.flowrec_version)
+        source, version = file.source, file.flowrec_version
+        return cls(source.path, file.part, first_ns, last_ns, file.counts, file.outcome, version, source.size)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,244 @@
+"""Range requests for an object at a URL: obstore for buckets, urllib3 for http and https.
+
+Both have one verb, `get`, and raise one of three errors: of the object, of a passing state of the network or server, or
+because ranges are not served. Retries are the caller's (remote_file.py), so that they can be counted.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import re
+import socket
+import time
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any, Protocol
+from urllib.parse import urljoin, urlsplit
+
+from flowrec.errors import SessionError, UsageError
+
+CONNECTIONS = 32  # requests at a time
+_REDIRECTS = 3
+_PIECE_BYTES = 1 << 16
+_ENDPOINTS = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AZURE_STORAGE_ENDPOINT", "GOOGLE_BASE_URL")
+_CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
+_OK, _PARTIAL, _NO_RANGE, _TOO_MANY = 200, 206, 416, 429
+_REFUSED = "refuses access ({}); check the credentials in the environment"
+_MISSING = "is not there (404); check the name"
+
+
+class TransientError(Exception):
+    """A failure that may not come again: no connection, a time limit, a server in trouble, a body that was cut."""
+
+
+class RefusedError(Exception):
+    """A failure that the same request will meet again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The bytes of a range, and of which object.
+
+    Attributes
+    ----------
+    first : offset of the first byte.
+    size : of the whole object in bytes.
+    version : the server's word for this content, its ETag or the time of its last change; '' where it has none.
+    """
+
+    data: bytes
+    first: int
+    size: int
+    version: str
+
+
+class ObjectRequests(Protocol):
+    """Requests for one object, from several threads at a time."""
+
+    def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
+        """The bytes from `first` on, or the last ones where it is None; fewer where the object has no more.
+
+        Raises
+        ------
+        TransientError, RefusedError : it failed, in a few words.
+        """
+
+
+def requests_for(url: str, timeout_s: float) -> ObjectRequests:
+    """The requests for the object at a URL.
+
+    Raises
+    ------
+    UsageError : the packages of the extra `remote` are not installed.
+    SessionError : the URL can not name an object.
+    """
+    try:
+        return _Http(url) if url.startswith("http") else _Bucket(url, timeout_s)
+    except ImportError as error:
+        raise UsageError(f"{url}: reading from a URL needs a package; pip install 'flowrec[remote]'") from error
+
+
+class _Bucket:
+    """An object of s3, gs or az; credentials and endpoint come from the environment."""
+
+    def __init__(self, url: str, timeout_s: float) -> None:
+        from obstore.exceptions import BaseError
+        from obstore.store import from_url
+
+        scheme, _, rest = url.partition("://")
+        bucket, _, self._key = rest.partition("/")
+        limit = timedelta(seconds=timeout_s)
+        self._without_suffix = scheme == "az"
+        try:
+            self._store = from_url(
+                f"{scheme}://{bucket}",
+                client_options={
+                    "timeout": limit,
+                    "connect_timeout": min(limit, timedelta(seconds=5)),
+                    # Plain http is for an endpoint that somebody has named so.
+                    "allow_http": any(os.environ.get(key, "").startswith("http:") for key in _ENDPOINTS),
+                },
+                retry_config={"max_retries": 0, "retry_timeout": limit},
+            )
+        except (BaseError, ValueError) as error:
+            if "account must be specified" in str(error).lower():
+                raise SessionError(
+                    f"{url}: the environment names no account; set AZURE_STORAGE_ACCOUNT_NAME"
+                ) from error
+            raise SessionError(f"{url}: is no URL of a bucket ({_in_a_line(error)})") from error
+
+    def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
+        import obstore
+        from obstore import exceptions as faults
+
+        try:
+            if first is None and self._without_suffix:
+                first = max(0, obstore.head(self._store, self._key)["size"] - length)
+            wanted: Any = {"suffix": length} if first is None else (first, first + length)
+            found = obstore.get(self._store, self._key, options={"range": wanted})
+            meta, (begin, end) = found.meta, found.range
+            data = bytes(found.bytes())
+        except (faults.NotFoundError, FileNotFoundError) as error:
+            raise RefusedError(_MISSING) from error
+        except (faults.PermissionDeniedError, faults.UnauthenticatedError, PermissionError) as error:
+            raise RefusedError(_REFUSED.format("403")) from error
+        except (faults.BaseError, OSError, ValueError) as error:
+            text = _in_a_line(error)
+            if "416" in text and "ange" in text:
+                return Answer(b"", 0, 0, "")
+            if "169.254.169.254" in text or "redential" in text:
+                raise RefusedError("can not be asked for: there are no credentials in the environment") from error
+            status = re.search(r"\b(?:status|Status|code)\D{0,20}([45]\d\d)\b", text)
+            raise TransientError(f"the server answers {status[1]}" if status else _reason(text)) from error
+        if len(data) != end - begin:
+            raise TransientError(f"the server sent {len(data)} of {end - begin} bytes")
+        return Answer(data, begin, meta["size"], meta.get("e_tag") or str(meta.get("last_modified") or ""))
+
+
+class _Http:
+    """An object of an http server. Redirects are followed, but never from a public host to a private one."""
+
+    def __init__(self, url: str) -> None:
+        import urllib3
+
+        self._url = url
+        self._pool = urllib3.PoolManager(maxsize=CONNECTIONS, retries=False)
+
+    def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
+        import urllib3
+
+        wanted = f"bytes=-{length}" if first is None else f"bytes={first}-{first + length - 1}"
+        headers = {"Range": wanted, "Accept-Encoding": "identity"}
+        end_s = time.monotonic() + timeout_s
+        limits = urllib3.Timeout(connect=min(5.0, timeout_s), read=timeout_s)
+        url = self._url
+        try:
+            for _ in range(_REDIRECTS + 1):
+                response = self._pool.request(
+                    "GET", url, headers=headers, redirect=False, timeout=limits, preload_content=False
+                )
+                try:
+                    target = response.get_redirect_location()
+                    if not target:
+                        return _answer(response, first, length, end_s)
+                    url = _redirected(url, urljoin(url, target))
+                finally:
+                    response.close()  # gives a connection back that was read to its end, and cuts any other
+        except urllib3.exceptions.HTTPError as error:
+            raise TransientError(_reason(_in_a_line(error))) from error
+        raise RefusedError(f"is redirected more than {_REDIRECTS} times")
+
+
+def _answer(response: Any, first: int | None, length: int, end_s: float) -> Answer:
+    """The answer in an http response.
+
+    Raises
+    ------
+    TransientError, RefusedError : it is not what was asked for.
+    """
+    status = response.status
+    if status == _NO_RANGE:
+        return Answer(b"", 0, 0, "")
+    if status in (401, 403):
+        raise RefusedError(_REFUSED.format(status))
+    if status in (404, 410):
+        raise RefusedError(_MISSING)
+    if status >= 500 or status == _TOO_MANY:
+        raise TransientError(f"the server answers {status}")
+    if status == _OK:
+        raise RefusedError("can not be read in ranges, the server sends whole files only; copy it to this machine")
+    found = _CONTENT_RANGE.fullmatch(response.headers.get("Content-Range", ""))
+    if status != _PARTIAL or found is None:
+        raise RefusedError(f"can not be read: the server answers {status} without a range")
+    begin, last, size = map(int, found.groups())
+    expected = last - begin + 1
+    asked = max(0, size - length) if first is None else first
+    if begin != asked or expected != min(length, size - asked):
+        raise TransientError(f"the server sent the bytes {begin} to {last} where {length} from {asked} were asked for")
+    data = bytearray()
+    while piece := response.read1(_PIECE_BYTES):
+        data += piece
+        if time.monotonic() > end_s:
+            raise TransientError("the server is too slow")
+        if len(data) > expected:
+            break
+    if len(data) != expected:
+        raise TransientError(f"the server sent {len(data)} of {expected} bytes")
+    version = response.headers.get("ETag") or response.headers.get("Last-Modified") or ""
+    return Answer(bytes(data), begin, size, version)
+
+
+def _redirected(url: str, target: str) -> str:
+    """The target of a redirect; RefusedError where it leads from a public host to a private one, or to no http."""
+    before, after = urlsplit(url), urlsplit(target)
+    if after.scheme not in ("http", "https") or (before.scheme == "https" and after.scheme == "http"):
+        raise RefusedError(f"is redirected from {before.scheme} to {after.scheme or 'nothing'}, which is not followed")
+    if after.hostname != before.hostname and _is_private(after.hostname) and not _is_private(before.hostname):
+        raise RefusedError("is redirected to a private address, which is not followed; name that URL itself")
+    return target
+
+
+def _is_private(host: str | None) -> bool:
+    """Whether any address of a host is not of the public network."""
+    try:
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+    except OSError:
+        return False  # the request says so
+    return any(not ipaddress.ip_address(str(address[4][0]).partition("%")[0]).is_global for address in found)
+
+
+def _in_a_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def _reason(text: str) -> str:
+    """What a library says about a failed connection, in a few words that can not hold a credential."""
+    lower = text.lower()
+    if "timed out" in lower or "kind: timeout" in lower:
+        return "the server does not answer in time"
+    if "incompleteread" in lower or "body" in lower or "broken" in lower:
+        return "the connection was cut"
+    if "resolve" in lower or "dns" in lower:
+        return "the host is not known"
+    return "no connection"

@@ -1,0 +1,239 @@
+"""A session at a URL as a source of bytes: few requests, many at a time, and one version of the object.
+
+Opening asks for the first and the last 256 KiB together: they hold head, index and outcome of most sessions. Both are
+remembered for a while, because a session is opened several times in a row. What `prefetch` announces is fetched at
+once, a bounded number of bytes ahead. Each answer must be of the object that was opened.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flowrec.errors import SessionError, UsageError
+from flowrec.store.object_requests import (
+    CONNECTIONS,
+    Answer,
+    ObjectRequests,
+    RefusedError,
+    TransientError,
+    requests_for,
+)
+
+TIMEOUT_KEY = "FLOWREC_TIMEOUT_S"  # environment variable; the option --timeout sets it
+_TIMEOUT_S = 30.0
+_END_BYTES = 256 << 10
+_TRIES, _PAUSE_S = 4, 0.2
+_AHEAD_BYTES = 48 << 20
+_GAP_BYTES, _JOINED_BYTES = 64 << 10, 8 << 20
+_REMEMBERED, _REMEMBERED_S = 16, 60.0
+
+
+@dataclass(slots=True)
+class Traffic:
+    """What was asked of servers by this process.
+
+    Attributes
+    ----------
+    requests, repeated : number of requests, and how many of them repeated a failed one.
+    nbytes : bytes of content received.
+    """
+
+    requests: int = 0
+    repeated: int = 0
+    nbytes: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, requests: int = 0, repeated: int = 0, nbytes: int = 0) -> None:
+        """Count; from any thread."""
+        with self._lock:
+            self.requests += requests
+            self.repeated += repeated
+            self.nbytes += nbytes
+
+
+TRAFFIC = Traffic()
+
+
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """An object as it was when it was opened."""
+
+    requests: ObjectRequests
+    size: int
+    version: str
+    ends: tuple[Answer, ...]
+    until_s: float
+
+
+@dataclass(slots=True)
+class _Ahead:
+    """A range that was asked for ahead; `waits` announced ranges of it have not been read."""
+
+    first: int
+    end: int
+    waits: int
+    answer: Future[Answer]
+
+
+_remembered: OrderedDict[str, _Opened] = OrderedDict()
+_remembering = threading.Lock()
+
+
+class RemoteFile:
+    """An object at a URL (ByteSource).
+
+    Raises
+    ------
+    SessionError : it is not there, access is refused, or the server does not answer, in one line.
+    UsageError : the extra `remote` is not installed, or the time limit is no number.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._url = str(path)
+        self._timeout_s = _timeout_s()
+        self._threads = ThreadPoolExecutor(CONNECTIONS, "remote-file")
+        self._closer = weakref.finalize(self, self._threads.shutdown, wait=False, cancel_futures=True)
+        self._ahead: list[_Ahead] = []
+        self._block: Answer | None = None  # of a reader that goes through the file
+        self._last_end = 0
+        self._lock = threading.Lock()
+        self._object = self._opened()
+        self.size = self._object.size
+
+    def read(self, offset: int, length: int) -> bytes:
+        if not self._closer.alive:
+            raise SessionError(f"{self.path}: has been closed; open the session again")
+        end = min(offset + length, self.size)
+        if end <= offset:
+            return b""
+        for known in self._object.ends:
+            if known.first <= offset and end <= known.first + len(known.data):
+                return known.data[offset - known.first : end - known.first]
+        ahead = self._taken(offset, end)
+        answer = ahead.result() if ahead is not None else self._unannounced(offset, end)
+        return answer.data[offset - answer.first : end - answer.first]
+
+    def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
+        """Ask for ranges (offset, length) that will be read soon; those near each other are one request."""
+        known = [(each.first, each.first + len(each.data)) for each in self._object.ends]
+        with self._lock:
+            known += [(each.first, each.end) for each in self._ahead]
+            room = _AHEAD_BYTES - sum(each.end - each.first for each in self._ahead)
+            joined: list[list[int]] = []
+            for offset, length in sorted(ranges):
+                end = min(offset + length, self.size)
+                if length > _JOINED_BYTES or any(first <= offset and end <= last for first, last in known):
+                    continue
+                last_one = joined[-1] if joined else None
+                if last_one and offset - last_one[1] <= _GAP_BYTES and end - last_one[0] <= _JOINED_BYTES:
+                    last_one[1], last_one[2] = max(last_one[1], end), last_one[2] + 1
+                else:
+                    joined.append([offset, end, 1])
+            for first, end, waits in joined:
+                room -= end - first
+                while room < 0 and self._ahead and self._ahead[0].answer.done():  # abandoned by who announced it
+                    oldest = self._ahead.pop(0)
+                    room += oldest.end - oldest.first
+                if room < 0 or not self._closer.alive:
+                    break  # it is read when its turn comes
+                self._ahead.append(_Ahead(first, end, waits, self._threads.submit(self._range, first, end - first)))
+
+    def close(self) -> None:
+        self._closer()
+
+    def _taken(self, offset: int, end: int) -> Future[Answer] | None:
+        """The range ahead that has these bytes; it is forgotten with the last one that was announced."""
+        with self._lock:
+            for each in self._ahead:
+                if each.first <= offset and end <= each.end:
+                    each.waits -= 1
+                    if not each.waits:
+                        self._ahead.remove(each)
+                    return each.answer
+        return None
+
+    def _unannounced(self, offset: int, end: int) -> Answer:
+        """A range that holds these bytes; who reads on from where the last one ended gets more at a time."""
+        with self._lock:
+            block, last_end = self._block, self._last_end
+            self._last_end = end
+        if block is not None and block.first <= offset and end <= block.first + len(block.data):
+            return block
+        if not 0 <= offset - last_end <= _GAP_BYTES:
+            return self._range(offset, end - offset)
+        block = self._range(offset, min(max(end - offset, _JOINED_BYTES // 2), self.size - offset))
+        with self._lock:
+            self._block = block
+        return block
+
+    def _opened(self) -> _Opened:
+        with _remembering:
+            known = _remembered.get(self._url)
+        if known is not None and time.monotonic() < known.until_s:
+            return known
+        asked = requests_for(self._url, self._timeout_s)
+        head = self._threads.submit(self._answer, asked, 0, _END_BYTES)
+        tail = self._answer(asked, None, _END_BYTES)
+        ends = (head.result(), tail)
+        if (ends[0].version, ends[0].size) != (tail.version, tail.size):
+            raise self._changed()
+        opened = _Opened(asked, tail.size, tail.version, ends, time.monotonic() + _REMEMBERED_S)
+        with _remembering:
+            _remembered[self._url] = opened
+            _remembered.move_to_end(self._url)
+            while len(_remembered) > _REMEMBERED:
+                _remembered.popitem(last=False)
+        return opened
+
+    def _range(self, first: int, length: int) -> Answer:
+        answer = self._answer(self._object.requests, first, length)
+        if (answer.version, answer.size) != (self._object.version, self._object.size):
+            raise self._changed()
+        if (answer.first, len(answer.data)) != (first, length):
+            raise SessionError(f"{self.path}: the server sent other bytes than those that were asked for")
+        return answer
+
+    def _changed(self) -> SessionError:
+        with _remembering:
+            _remembered.pop(self._url, None)
+        return SessionError(f"{self.path}: was replaced while it was read; open it again")
+
+    def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
+        """An answer, after several tries and within the time limit."""
+        end_s = time.monotonic() + self._timeout_s
+        for number in range(_TRIES):
+            TRAFFIC.add(requests=1, repeated=int(number > 0))
+            try:
+                answer = asked.get(first, length, max(0.1, end_s - time.monotonic()))
+            except RefusedError as error:
+                raise SessionError(f"{self.path}: {error}") from error
+            except TransientError as error:
+                pause_s = _PAUSE_S * 2.0**number
+                if number == _TRIES - 1 or time.monotonic() + pause_s > end_s:
+                    tries = f"{number + 1} tries" if number else "one try"
+                    raise SessionError(f"{self.path}: can not be read ({error}, {tries})") from error
+                time.sleep(pause_s)
+            else:
+                TRAFFIC.add(nbytes=len(answer.data))
+                return answer
+        raise AssertionError("the last try raises or returns")
+
+
+def _timeout_s() -> float:
+    text = os.environ.get(TIMEOUT_KEY, "")
+    try:
+        timeout_s = float(text) if text else _TIMEOUT_S
+    except ValueError:
+        timeout_s = 0.0
+    if not 0.0 < timeout_s <= 3600.0:
+        raise UsageError(f"{TIMEOUT_KEY}={text}: the time limit of a request is a number of seconds up to 3600")
+    return timeout_s

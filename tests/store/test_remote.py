@@ -1,0 +1,209 @@
+"""Sessions at a URL: the same as the file, in few requests, and one line for whatever a server does."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import flowrec
+from flowrec.errors import FlowrecError, SessionError, UsageError
+from flowrec.session import session_sha256
+from flowrec.store import remote_file
+from flowrec.store.object_requests import RefusedError, _redirected
+from flowrec.store.remote_file import TIMEOUT_KEY, TRAFFIC
+from flowrec.store.session_path import UrlPath, session_path
+from tests.conftest import HANG_S
+from tests.store.range_server import RangeServer, answer, served, some, status
+
+SESSION = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
+
+
+@pytest.fixture
+def session() -> Path:
+    return SESSION
+
+
+@pytest.fixture
+def server(session: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RangeServer]:
+    monkeypatch.setenv(TIMEOUT_KEY, "1")
+    monkeypatch.setattr(remote_file, "_PAUSE_S", 0.01)
+    remote_file._remembered.clear()
+    with served(session) as found:
+        yield found
+
+
+def test_a_session_at_a_url_is_the_file(server: RangeServer, session: Path) -> None:
+    far, near = flowrec.open(server.url), flowrec.open(session)
+    assert flowrec.compare(near, far).identical
+    assert flowrec.check(far.path).findings == flowrec.check(session).findings
+    assert (far.header, far.outcome, far.key) == (near.header, near.outcome, near.key)
+    assert session_sha256([far.path]) == session_sha256([session])
+
+
+def test_a_session_is_opened_in_two_requests(server: RangeServer) -> None:
+    opened = flowrec.open(server.url)
+    assert opened.outcome and opened.header.provenance and opened.duration_s > 0.0
+    assert len(server.requests) == 2
+
+
+def test_a_second_of_ticks_is_fetched_alone(server: RangeServer, session: Path) -> None:
+    far = flowrec.open(server.url)
+    near = [tick.stamp_ns for tick in flowrec.open(session).ticks(2.0, with_frames=False) if tick.stamp_ns < 3e9]
+    found = []
+    for tick in far.ticks(2.0, with_frames=False):
+        if tick.stamp_ns >= 3_000_000_000:
+            break
+        found.append(tick.stamp_ns)
+    assert found == near
+    fetched = sum(nbytes for _, nbytes in server.requests)
+    assert fetched < session.stat().st_size / 2
+    assert len(server.requests) == len(set(server.requests))  # nothing is asked for twice
+
+
+FAULTS = {
+    "refused": (status(403), r"refuses access \(403\); check the credentials in the environment"),
+    "missing": (status(404), r"is not there \(404\)"),
+    "broken": (status(500), r"the server answers 500, \d tries"),
+    "cut": (lambda to, a, b, size: answer(to, a, b, size, b"x" * ((b - a) // 2)) is None, "was cut, \\d tries"),
+    "silent": (lambda *_: time.sleep(1.2) is None, "does not answer in time"),
+    "shorter": (lambda to, a, b, size: answer(to, a, b - 1, size, b"x" * (b - a)) is None, "were asked for"),
+    "other": (lambda to, a, b, size: answer(to, 7, 7 + b - a, size, b"x" * (b - a + 1)) is None, "were asked for"),
+    "whole": (status(200), "can not be read in ranges"),
+    "circle": (status(302, "/again"), "redirected more than 3 times"),
+    "file": (status(302, "file:///etc/passwd"), "redirected from http to file"),
+}
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_fault_of_a_server_is_one_line_within_the_time_limit(server: RangeServer, kind: str) -> None:
+    server.fault, expected = FAULTS[kind]
+    began_s = time.monotonic()
+    with pytest.raises(SessionError, match=expected) as caught:
+        flowrec.open(server.url)
+    assert str(caught.value).startswith(server.url) and "\n" not in str(caught.value)
+    assert time.monotonic() - began_s < HANG_S
+
+
+@pytest.mark.parametrize("kind", ["broken", "cut", "shorter"])
+def test_a_fault_that_passes_is_counted_and_does_no_harm(server: RangeServer, session: Path, kind: str) -> None:
+    server.fault = some(FAULTS[kind][0], after=3, count=2)
+    before = TRAFFIC.repeated
+    assert flowrec.compare(flowrec.open(session), flowrec.open(server.url)).identical
+    assert TRAFFIC.repeated - before == 2
+
+
+def test_a_session_that_is_replaced_while_it_is_read_is_not_mixed_with_the_new_one(
+    server: RangeServer, session: Path
+) -> None:
+    opened = flowrec.open(server.url)
+    content = session.read_bytes()
+    server.fault = lambda to, a, b, size: answer(to, a, b, size, content[a : b + 1], etag="2") is None
+    with pytest.raises(SessionError, match="was replaced while it was read"):
+        list(opened.ticks())
+    assert flowrec.open(server.url).outcome == opened.outcome  # opened anew it is the new one
+
+
+def test_the_limits_on_hostile_files_hold_at_a_url(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(TIMEOUT_KEY, "2")
+    data = bytearray(session.read_bytes())
+    data[-37 + 9 : -37 + 17] = (1 << 40).to_bytes(8, "little")  # the footer's offset of the index
+    (bad := tmp_path / "bad.mcap").write_bytes(data)
+    with served(bad) as server:
+        for place in (bad, server.url):
+            with pytest.raises(SessionError, match=r"announced, the file ends at|bytes, more than|damaged"):
+                flowrec.open(place)
+        assert sum(nbytes for _, nbytes in server.requests) <= 1 << 20
+    with served(tmp_path / "empty.mcap") as server:
+        (tmp_path / "empty.mcap").touch()
+        server.fault = status(416)
+        with pytest.raises(SessionError, match="is empty"):
+            flowrec.open(server.url)
+
+
+def test_outputs_of_a_session_at_a_url_are_made_in_this_folder(
+    server: RangeServer, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert flowrec.export(server.url, file_format="csv") == Path(f"{session.stem}_csv")
+    with pytest.raises(UsageError, match="no note is added to a session at a URL"):
+        flowrec.open(server.url).add_note("seen")
+
+
+@pytest.mark.parametrize("url", ["https://host/a.mcap?sig=KEY", "https://KEY@host/a.mcap", "http://me:KEY@host/a.mcap"])
+def test_a_url_with_a_credential_is_refused_and_not_repeated(url: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        flowrec.open(url)
+    assert "KEY" not in str(caught.value)
+
+
+def test_a_url_stays_one_as_a_path() -> None:
+    path = session_path("s3://bucket/runs/a.mcap")
+    assert isinstance(path, UrlPath)
+    assert str(path.with_name("b.mcap")) == "s3://bucket/runs/b.mcap"
+    assert session_path(Path("s3://bucket/runs/a.mcap")) == path
+    assert not isinstance(session_path("runs/a.mcap"), UrlPath)
+
+
+@pytest.mark.parametrize(
+    ("url", "target"),
+    [
+        ("https://93.184.216.34/a", "http://93.184.216.34/a"),
+        ("http://93.184.216.34/a", "http://127.0.0.1/a"),
+        ("http://93.184.216.34/a", "http://169.254.169.254/latest/meta-data"),
+        ("http://93.184.216.34/a", "http://[::1]/a"),
+    ],
+)
+def test_a_redirect_to_a_private_or_a_less_safe_place_is_not_followed(url: str, target: str) -> None:
+    with pytest.raises(RefusedError, match="not followed"):
+        _redirected(url, target)
+
+
+def test_a_session_in_a_bucket_is_the_file_and_credentials_are_never_printed(
+    session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With moto's S3 server, and boto3 for the upload."""
+    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[s3]' flask flask-cors")
+    import boto3
+
+    with socket.create_server(("127.0.0.1", 0)) as found:
+        port = found.getsockname()[1]
+    endpoint = f"http://127.0.0.1:{port}"
+    process = subprocess.Popen(
+        [sys.executable, "-c", f"from moto.server import main; main(['-p', '{port}'])"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        end_s = time.monotonic() + HANG_S
+        while time.monotonic() < end_s:
+            try:
+                socket.create_connection(("127.0.0.1", port), 0.2).close()
+                break
+            except OSError:
+                time.sleep(0.05)
+        keys = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "SECRET", "AWS_REGION": "us-east-1"}
+        for name, value in {**keys, "AWS_ENDPOINT_URL": endpoint}.items():
+            monkeypatch.setenv(name, value)
+        client = boto3.client("s3", endpoint_url=endpoint, region_name="us-east-1")
+        client.create_bucket(Bucket="lab")
+        client.upload_file(str(session), "lab", "runs/a.mcap")
+        assert flowrec.compare(flowrec.open(session), flowrec.open("s3://lab/runs/a.mcap")).identical
+        for missing in ("s3://lab/none.mcap", "s3://other/a.mcap"):
+            with pytest.raises(FlowrecError, match=r"is not there \(404\)") as caught:
+                flowrec.open(missing)
+            assert not re.search("SECRET|key", str(caught.value))
+    finally:
+        process.terminate()
+        process.wait(HANG_S)
+    with pytest.raises(FlowrecError, match="no connection") as caught:
+        flowrec.open("s3://lab/runs/b.mcap")
+    assert "SECRET" not in str(caught.value)
