@@ -106,7 +106,11 @@ class RemoteFile:
         self._block: Answer | None = None  # of a reader that goes through the file
         self._last_end = 0
         self._lock = threading.Lock()
-        self._object = self._opened()
+        try:
+            self._object = self._opened()
+        except BaseException:
+            self.close()
+            raise
         self.size = self._object.size
 
     def read(self, offset: int, length: int) -> bytes:
@@ -218,7 +222,7 @@ class RemoteFile:
                 raise SessionError(f"{self.path}: {error}") from error
             except TransientError as error:
                 pause_s = _PAUSE_S * 2.0**number
-                if number == _TRIES - 1 or time.monotonic() + pause_s > end_s:
+                if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not self._closer.alive:
                     tries = f"{number + 1} tries" if number else "one try"
                     raise SessionError(f"{self.path}: can not be read ({error}, {tries})") from error
                 time.sleep(pause_s)

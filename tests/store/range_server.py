@@ -54,10 +54,19 @@ class RangeServer:
         self.url = f"http://127.0.0.1:{self.server.server_port}/runs/{path.name}"
 
 
-def answer(handler: BaseHTTPRequestHandler, first: int, last: int, size: int, body: bytes, etag: str = "1") -> None:
-    """A partial content; a body that is too short is followed by the end of the connection."""
+def answer(
+    handler: BaseHTTPRequestHandler,
+    first: int,
+    last: int,
+    size: int,
+    body: bytes,
+    etag: str = "1",
+    *,
+    announced: bool = True,
+) -> None:
+    """A partial content; a body that is too short is followed by the end of the connection, if it was `announced`."""
     handler.send_response(206)
-    handler.send_header("Content-Length", str(last - first + 1))
+    handler.send_header("Content-Length", str(last - first + 1 if announced else len(body)))
     handler.send_header("Content-Range", f"bytes {first}-{last}/{size}")
     handler.send_header("ETag", f'"{etag}"')
     handler.end_headers()
