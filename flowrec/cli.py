@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 import flowrec
-from flowrec.bench.verbs import AsJson, Overwrite, Sets, bench
+from flowrec.bench.verbs import HELP_WIDTH, AsJson, Overwrite, Sets, bench
 from flowrec.calibrate_verbs import calibrate
 from flowrec.doctor_verb import doctor, look_at_lab
 from flowrec.errors import FlowrecError, printable
@@ -46,9 +46,9 @@ app = typer.Typer(
     name="flowrec",
     help="Record, replay and view missions of magnetic micro-robots in flow.",
     no_args_is_help=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode=None,  # frames around the help would take as long to draw as all the rest
 )
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(bench, name="bench")

@@ -239,12 +239,13 @@ class SlowStage:
 
     Attributes
     ----------
-    orders : the work orders (`Mission.wanted`) that it answers.
+    orders : the work orders (`Mission.wanted`) that it answers, each with the settings that its computation reads
+        itself: sections of the configuration, or one setting of a section as `section.name`.
     reads : fields of the ordering tick that are needed, besides its stamp and the mission.
     settings : sections of the configuration on which it depends, besides those on which what it reads depends.
     """
 
-    orders: tuple[WorkOrder, ...]
+    orders: Mapping[WorkOrder, tuple[str, ...]]
     reads: tuple[str, ...]
     settings: tuple[str, ...]
 

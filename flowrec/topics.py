@@ -35,14 +35,18 @@ from flowrec.messages import (
 _ASSUMED = {"velocity_um_s": 1e-4, "std_um_s": 1e-4, "pressure_pa": 1e-7}
 _REFINED = {"velocity_um_s": 1e-3, "std_um_s": 1e-3, "pressure_pa": 1e-6}
 _ROUTE = {"waypoints_um": 1e-4, "arrival_s": 1e-6, "time_to_go_s": 1e-6}
-_SOLVE = SlowStage((WorkOrder.SOLVE,), reads=(), settings=("flow",))
+_UNCERTAINTY = ("sampler", "flow", "refine.assimilate")  # that of the flow after the observations so far
+_SOLVE = SlowStage({WorkOrder.SOLVE: ("flow", "refine.assimilate")}, reads=(), settings=("flow",))
 _REFINE = SlowStage(
-    (WorkOrder.REFINE,),
+    {WorkOrder.REFINE: ("sampler", "flow", "refine")},
     reads=("assumed", "refined", "observations"),
     settings=("tracker", "observer", "sampler", "refine", "mission"),
 )
 _PLAN = SlowStage(
-    (WorkOrder.SURVEY_ROUTE, WorkOrder.ROUTE),
+    {
+        WorkOrder.SURVEY_ROUTE: ("robot", "survey", "mission.survey_limit_s", "mission.lead_s", *_UNCERTAINTY),
+        WorkOrder.ROUTE: ("robot", "plan", "mission.lead_s", *_UNCERTAINTY),
+    },
     reads=("assumed", "refined", "health", "route", "estimate", "observations", "demand"),
     settings=("robot", "survey", "plan"),
 )

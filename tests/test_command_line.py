@@ -51,7 +51,7 @@ def test_help_is_asked_for_in_short(words: list[str]) -> None:
 
 def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> None:
     helps = [CliRunner().invoke(app, [verb, "--help"], env={"COLUMNS": "200"}).output for verb in ("replay", "export")]
-    shown = "".join(helps)
+    shown = " ".join("".join(helps).split())
     for target in METHODS.values():
         module, _, table = target.partition(":")
         for name in getattr(importlib.import_module(module), table):

@@ -28,7 +28,7 @@ def tick_with(**changed: Any) -> type:
     return make_dataclass("Changed", hints.items())
 
 
-ORDERS = (WorkOrder.SOLVE,)
+ORDERS = {WorkOrder.SOLVE: ()}
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ ORDERS = (WorkOrder.SOLVE,)
             "each work order needs one field",
         ),
         (
-            {"extra": Annotated[Track | None, Topic("/extra", Source.WORKER, made_by=SlowStage((), ("gone",), ()))]},
+            {"extra": Annotated[Track | None, Topic("/extra", Source.WORKER, made_by=SlowStage({}, ("gone",), ()))]},
             r"fields that do not exist: \['gone'\]",
         ),
         ({"extra": Annotated[Track | None, Topic("/extra", Source.STAGE, 1e-6, {"gone": 1.0})]}, "do not exist"),
@@ -88,4 +88,6 @@ def test_a_changed_section_makes_stale_what_depends_on_it_and_all_that_is_made_f
 
 def test_the_settings_of_slow_stages_are_sections_of_the_configuration() -> None:
     sections = {each.name for each in fields(Config)}
-    assert {name for made_by in WORKER_FIELDS.values() for name in made_by.settings} <= sections
+    for made_by in WORKER_FIELDS.values():
+        read = {setting.partition(".")[0] for settings in made_by.orders.values() for setting in settings}
+        assert {*made_by.settings, *read} <= sections

@@ -43,6 +43,7 @@ Names = Annotated[str | None, typer.Option(metavar="A,B", help="Only these metho
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Smaller cases only.")]
 
+HELP_WIDTH = 110  # characters, on a terminal as wide as that
 _Z = 1.959963984540054  # of a two-sided interval of 95 %
 _BOOTSTRAP_DRAWS = 10_000
 
@@ -61,7 +62,8 @@ def run(
     app = typer.Typer(
         add_completion=False,
         pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
+        rich_markup_mode=None,
     )
     app.command(help=summary or inspect.getdoc(sys.modules[measure.__module__]))(_command(measure, show))
     try:

@@ -6,10 +6,10 @@ import importlib
 
 import typer
 
-from flowrec.bench.harness import AsJson, Overwrite, Sets, run
+from flowrec.bench.harness import HELP_WIDTH, AsJson, Overwrite, Sets, run
 from flowrec.errors import UsageError
 
-__all__ = ["AsJson", "Overwrite", "Sets", "bench"]
+__all__ = ["HELP_WIDTH", "AsJson", "Overwrite", "Sets", "bench"]
 
 BENCHES = {
     "flow": "Refinement: error of the flow before and after each method (Table I and Fig. 4 of the paper).",

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from flowrec.planning.planner import PLANNERS
 from flowrec.replay_figures import CommandDifference
 from flowrec.rigs.recorded import RecordedRig
 from flowrec.run.loop import Sink, run
-from flowrec.run.workers import LockstepWorker, work
+from flowrec.run.workers import ReplayWorker, work
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
@@ -41,6 +42,7 @@ from flowrec.system.outputs import MCAP, Output
 from flowrec.terminal import Progress, warn
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from flowrec.units import seconds
+from flowrec.version import NUMERICS_VERSION
 
 # Sections that a replay can not change.
 FIXED = ("chip", "camera", "rig", "simulated")
@@ -112,6 +114,16 @@ class Change:
                 )
         return topics.stale_results([*sections, *(["refine"] if self.refine is not None else [])])
 
+    def same_orders(self, recorded: ResolvedConfig, changed: ResolvedConfig) -> frozenset[WorkOrder]:
+        """Work orders whose computation reads no setting that has changed; a refinement asked for is not one."""
+        orders = {order: settings for made_by in WORKER_FIELDS.values() for order, settings in made_by.orders.items()}
+        same = {
+            order
+            for order, settings in orders.items()
+            if all(attrgetter(setting)(recorded) == attrgetter(setting)(changed) for setting in settings)
+        }
+        return frozenset(same - ({WorkOrder.REFINE} if self.refine is not None else set()))
+
 
 def _provides(planner: str, needs: tuple[str, ...]) -> bool:
     return set(needs) <= set(PLANNERS[planner].provides)
@@ -173,8 +185,16 @@ def replay(
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
     rig = RecordedRig(reader, start_ns, stale)
     progress = Progress()  # until the bar is shown
-    worker = LockstepWorker(
-        pipeline, config.worker.adopt_after_s, adoption_stamps(reader), stale, lambda what: progress.stage(what)
+    # Recorded results stand where today's code computes the same of the same. Hindsight is no message of a tick.
+    stands = session.numerics == str(NUMERICS_VERSION) and pipeline.hindsight is None
+    worker = ReplayWorker(
+        pipeline,
+        config.worker.adopt_after_s,
+        adoption_stamps(reader),
+        stale,
+        lambda what: progress.stage(what),
+        lambda: rig.recorded,
+        change.same_orders(session.config, config) if stands else (),
     )
     order = _order_under_way(reader, start)
     if order is not None:

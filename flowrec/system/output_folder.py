@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import secrets
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -73,7 +72,7 @@ class OutputFolder:
         """
         self.check()
         path = self.path.absolute()
-        name = f".flowrec-{secrets.token_hex(6)}"
+        name = f".flowrec-{os.urandom(6).hex()}"
         part, old = path.with_name(name), path.with_name(name + "-old")
         try:
             part.mkdir()

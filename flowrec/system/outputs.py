@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import secrets
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -101,7 +100,7 @@ class Output:
         """
         self.check()
         path = self.path
-        part = path.with_name(f".flowrec-{secrets.token_hex(6)}{path.suffix}")
+        part = path.with_name(f".flowrec-{os.urandom(6).hex()}{path.suffix}")
         try:
             part.touch(exist_ok=False)  # fails before any work is done if the folder can not be written to
             yield part

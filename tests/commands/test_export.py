@@ -44,7 +44,7 @@ def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_f
 
 def test_the_help_of_export_lists_every_format_with_its_summary(any_export: str) -> None:
     shown = CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "200"}).stdout
-    words = " ".join(shown.replace("│", " ").split())
+    words = " ".join(shown.split())
     assert f"{any_export}: {EXPORTS[any_export].summary}" in words
 
 

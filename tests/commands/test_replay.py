@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +15,30 @@ from flowrec.commands.record import record
 from flowrec.commands.replay import Change
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import load_config
+from flowrec.enums import WorkOrder
 from flowrec.errors import SessionError, UsageError
 from flowrec.estimation import Observer
 from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Estimate
+from flowrec.pipeline import Pipeline
+from flowrec.refine import Refiner
+from flowrec.run.workers import work
 from flowrec.store.reader import SessionReader
+from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from tests.short_missions import SMALL
+
+
+@pytest.fixture
+def computed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The orders whose results a replay computes."""
+    orders: list[str] = []
+
+    def counted(pipeline, order):  # type: ignore[no-untyped-def]
+        orders.append(order.mission.wanted)
+        return work(pipeline, order)
+
+    monkeypatch.setattr("flowrec.run.workers.work", counted)
+    return orders
 
 
 def test_the_mission_reaches_its_goal_without_touching_a_wall(mission: Recorded) -> None:
@@ -52,8 +71,35 @@ def test_a_replay_from_any_time_is_identical(session: Path, share: float) -> Non
     assert done.comparison.identical, str(done.comparison.first)
 
 
+STAGE_OF = {"flow": "solver", "refine": "refiner", "plan": "planner"}  # where it is not named as its section
+
+
+def with_declared_settings(pipeline: Pipeline, order: Tick) -> object:
+    """The result of an order by stages that have nothing but the settings which topics.py says that it reads."""
+    assert order.mission is not None
+    wanted = WorkOrder(order.mission.wanted)
+    made_by = WORKER_FIELDS[ANSWERED_BY[wanted]]
+    stages = {each.name: SimpleNamespace() for each in fields(Pipeline)}
+    stages |= {"chip": pipeline.chip, "hindsight": None}  # type: ignore[dict-item]
+    for setting in made_by.orders[wanted]:
+        section, _, name = setting.partition(".")
+        stage = STAGE_OF.get(section, section)
+        value = getattr(pipeline, stage)
+        if setting == "refine.assimilate":
+            stages[stage] = Refiner("fvm", place_robot=False, assimilate=value.assimilate)  # type: ignore[assignment]
+        elif name:
+            setattr(stages[stage], name, getattr(value, name))
+        else:
+            stages[stage] = value
+    known = {name: getattr(order, name) for name in ("mission", *made_by.reads)}
+    return work(SimpleNamespace(**stages), Tick(order.stamp_ns, **known))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("where", ["the start", "an order under way", "the survey", "the end"])
-def test_a_recording_in_real_time_verifies_from_any_time(realtime_session: Path, where: str) -> None:
+def test_a_recording_in_real_time_verifies_from_any_time_by_the_declared_settings_alone(
+    realtime_session: Path, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flowrec.commands.replay_result.work", with_declared_settings)
     reader = SessionReader(realtime_session)
     adopted = sorted(verb.adoption_stamps(reader).values())
     start_ns = {
@@ -72,14 +118,27 @@ def test_a_recording_in_real_time_verifies_from_any_time(realtime_session: Path,
 
 
 def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
-    realtime_session: Path, tmp_path: Path
+    realtime_session: Path, tmp_path: Path, computed: list[str]
 ) -> None:
     recorded = verb.adoption_stamps(SessionReader(realtime_session))
-    assert len(recorded) > 4  # solved, surveyed in several stretches, refined, planned
     out = tmp_path / "again.mcap"
-    done = verb.replay(realtime_session, Change(refine="assimilate"), out=out)
+    done = verb.replay(realtime_session, Change(refine="assimilate", sets=("survey.worth=0.0301",)), out=out)
     assert verb.adoption_stamps(SessionReader(out)) == recorded
     assert done.comparison.same
+    assert computed == [*["survey_route"] * (len(recorded) - 3), "refine"]  # solved before, planned as was recorded
+    assert len(computed) > 2
+
+
+def test_a_replay_computes_nothing_whose_settings_and_inputs_are_those_of_the_recording(
+    realtime_session: Path, session: Path, computed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = verb.replay(realtime_session, Change(refine="assimilate"))
+    assert done.comparison.same
+    assert computed == ["refine"]  # which was asked for
+    computed.clear()
+    monkeypatch.setattr(verb, "NUMERICS_VERSION", -1)  # other numerics would give something else
+    verb.replay(session, Change(controller="ff_fb"))
+    assert computed == ["survey_route", "refine", "route"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +217,9 @@ def test_another_controller_changes_the_commands_and_nothing_before_them(session
     assert done.commands.changed > 0
 
 
-def test_another_observer_changes_estimates_and_leaves_tracks(session: Path) -> None:
+def test_another_observer_changes_estimates_and_leaves_tracks(session: Path, computed: list[str]) -> None:
     done = verb.replay(session, Change(observer="luenberger"))
+    assert computed == ["survey_route", "refine", "route"]  # all of which read something else now
     assert done.comparison.topics["/robot/track"].different == 0
     assert done.comparison.topics["/robot/estimate"].different > 0
 
