@@ -305,14 +305,14 @@ def files_behind(path: Path) -> list[Path]:
 
 
 @contextlib.contextmanager
-def input_blamed(session: Session, config: ResolvedConfig, done: str) -> Iterator[None]:
+def input_blamed(session: Session, config: ResolvedConfig | None, done: str) -> Iterator[None]:
     """Turn an exception that absurd numbers or settings in a session cause into a SessionError.
 
     A replay does not check the recorded settings. Any other exception is raised unchanged.
 
     Parameters
     ----------
-    config : the settings in use.
+    config : the settings in use; None: those of the session, which are only read to explain an exception.
     done : the participle for the error, such as "replayed".
     """
     try:
@@ -322,7 +322,8 @@ def input_blamed(session: Session, config: ResolvedConfig, done: str) -> Iterato
     except Exception as error:
         from flowrec.ranges import faults
 
-        number, fault = next(_absurd_numbers(session), None), next(faults(config), None)
+        used = session.config if config is None else config
+        number, fault = next(_absurd_numbers(session), None), next(faults(used), None)
         if number is not None:
             reason, advice = number, f"`flowrec check {session.path}` says more"
         elif fault is not None:

@@ -54,11 +54,10 @@ def export(
     if second is not None and isinstance(output, Output):
         output = replace(output, inputs=(*output.inputs, *files_behind(second.path)))
     output.check()
-    config = session.config
     began_s = time.perf_counter()
     with (
         progress(f"writing {target.name}", max(session.duration_s, 1e-3)) as done,
-        input_blamed(session, config, "exported"),
+        input_blamed(session, None, "exported"),
         _opened(output) as part,
     ):
         exporter.write(session, part, done)

@@ -1,6 +1,6 @@
 """Rows of messages -> Arrow record batches: typed columns whose metadata state unit and meaning.
 
-The rows come from `SessionReader.rows`. A batch has at most some thousand rows and some tens of MB, so a session of
+The rows come from `SessionReader.rows`. A batch has at most some thousand rows and some 8 MB, so a session of
 any length is streamed. https://arrow.apache.org/docs/python/data.html#record-batches
 """
 
@@ -25,7 +25,7 @@ except ModuleNotFoundError as error:
     raise UsageError("tables need pyarrow, which is not installed: pip install 'flowrec[export]'") from error
 
 _ROWS = 4096
-_BATCH_BYTES = 32 << 20
+_BATCH_BYTES = 8 << 20  # an export holds some five times as much: columns, copies, and the pages of its writer
 
 
 def schema_of(topic: str) -> pa.Schema:
