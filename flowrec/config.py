@@ -171,6 +171,14 @@ def load_config(path: Path | None = None, sets: Iterable[str] = (), flags: Mappi
     return config
 
 
+def config_from_tree(tree: dict[str, Any], where: str) -> Config:
+    """The configuration of nested tables; UsageError, which begins with `where`, for a setting that is wrong."""
+    origin = Origin(where)
+    config = _config_from(Config, tree, origin)
+    check_config(config, origin)
+    return config
+
+
 def config_from_toml(text: str, where: str) -> ResolvedConfig:
     """The configuration of a session, as `to_toml` wrote it; `where` names its origin in errors.
 

@@ -35,6 +35,7 @@ from flowrec.control.field_log import FieldLog
 from flowrec.errors import UsageError
 from flowrec.estimation.motion_fit import MotionFit
 from flowrec.messages import Appearance, FlowField, Track
+from flowrec.rigs.movie.exported import session_of_log
 from flowrec.rigs.movie.source import MovieSource
 from flowrec.terminal import say, table, warn
 from flowrec.units import seconds
@@ -97,8 +98,8 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     """
     if not asked.movie.coils:
         return asked, {}
-    if _on_one_clock(asked):  # what the coils did to the robot, without any latency: that of the rig is taken off
-        return replace(asked, movie=replace(asked.movie, clock_offset_s=asked.robot.delay_s or 0.0)), {}
+    if _on_one_clock(asked):
+        return asked, {}
     rough = _overlapping(asked)
     tracks = tracks_of(rough)
     assert tracks.log is not None, "there is a log"
@@ -110,8 +111,9 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     if fit.refusal:
         raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {fit.refusal}; or {_WITHOUT}")
     movie = rough.movie
-    # The rig applies the log robot.delay_s late; the offset that is found has that latency in it.
-    offset_s = movie.clock_offset_s + fit.offset_s + (asked.robot.delay_s or 0.0)
+    # The rig applies a log of commands robot.delay_s late; the offset that is found has that latency in it.
+    latency_s = 0.0 if is_of_session(Path(movie.coils)) else asked.robot.delay_s or 0.0
+    offset_s = movie.clock_offset_s + fit.offset_s + latency_s
     heading = heading_settings(fit, movie.heading_offset_deg, movie.heading_mirrored)
     changed = replace(
         movie,
@@ -127,11 +129,13 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
 
 
 def _on_one_clock(asked: Config) -> bool:
-    """Whether movie and log are exports of a session, whose clock both have."""
-    if not is_of_session(Path(asked.movie.coils)):
+    """Whether movie and log are exports of one session, whose clock both have."""
+    log = Path(asked.movie.coils)
+    if not is_of_session(log):
         return False
     with MovieSource(replace(asked.movie, coils=""), asked.coils) as source:
-        return source.facts.notes is not None
+        notes = source.facts.notes
+    return notes is not None and session_of_log(log) in ("", notes.session_key)
 
 
 def _refuted(um_per_rev: float, fit: MotionFit) -> bool:

@@ -12,6 +12,8 @@ from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import Config
 from flowrec.rig_settings import MOVIE
+from flowrec.rigs.movie.exported import with_exported
+from flowrec.terminal import say
 
 
 def asked_import(
@@ -23,7 +25,10 @@ def asked_import(
     fps: float | None = None,
     partial: bool = False,
 ) -> Config:
-    """The configuration of an import: what is given here goes before section [movie] of `config`."""
+    """The configuration of an import: what is given here goes before section [movie] of `config`.
+
+    What flowrec wrote into the movie, or beside the log, of a session goes before default values; it is printed.
+    """
     config = config if config is not None else Config()
     given: dict[str, object] = {"path": str(movie)}
     given |= {"coils": str(coils)} if coils is not None else {}
@@ -31,7 +36,10 @@ def asked_import(
     given |= {"rate_hz": fps} if fps is not None else {}
     given |= {"times": ""} if fps is not None and times is None else {}
     given |= {"partial": True} if partial else {}
-    return replace(config, rig=MOVIE, movie=replace(config.movie, **given))  # type: ignore[arg-type]
+    asked, taken = with_exported(replace(config, rig=MOVIE, movie=replace(config.movie, **given)))  # type: ignore[arg-type]
+    if taken:
+        say(f"taken from the export of the session: {', '.join(taken)}")
+    return asked
 
 
 def import_movie(
@@ -54,7 +62,9 @@ def import_movie(
     ----------
     movie : a file, or a folder of images.
     out : the session (.mcap); None: named by date and sample.
-    config : settings; it must give camera.um_per_px, robot.radius_um and chip.path, which no file tells.
+    config : settings; it must give camera.um_per_px, robot.radius_um and chip.path, which no file tells but one that
+        flowrec exported: such a movie, or else the folder of tables around `coils`, gives these and what else is known
+        of robot, camera and coils. It is used where a setting has its default value.
     coils : log of the coils (CSV or Excel), see control/coil_log.py. Without one the motion of the robot is its flow.
     times : CSV with the time of each image in time_s, on the clock of the log.
     fps : images per second, instead.

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +14,11 @@ import tifffile
 import flowrec
 from flowrec.commands.align import aligned
 from flowrec.commands.import_movie import asked_import
+from flowrec.commands.record import prepare
+from flowrec.config import Config, to_toml
 from flowrec.errors import MovieError
 from flowrec.movies import open_movie
-from flowrec.rigs.movie.rig import fitted_to_movie
+from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -60,3 +65,56 @@ def test_an_import_need_not_be_told_scale_robot_chip_and_clock(kind, exported):
 def test_a_movie_with_drawings_is_refused_and_the_error_names_the_format_to_import(exported):
     with pytest.raises(MovieError, match=r"drawn over its images; import what flowrec export .*mp4_plain"):
         open_movie(exported["mp4"])
+
+
+@pytest.fixture(scope="module")
+def slow_robot(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Exports of the golden session as if robot, camera and latency were not the usual ones."""
+    session, folder = flowrec.open(GOLDEN), tmp_path_factory.mktemp("slow_robot")
+    config = session.config
+    config = replace(
+        config,
+        robot=replace(config.robot, um_per_rev=30.0, delay_s=0.08),
+        camera=replace(config.camera, angle_deg=12.0),
+    )
+    vars(session).update(config=config, header=replace(session.header, config_toml=to_toml(config)))
+    plain = folder / "plain.tif"
+    tifffile.imwrite(plain, np.array([frame.image for frame in session.frames]), metadata={"axes": "TYX"})
+    names = {"tiff": "a.ome.tif", "csv": "tables"}
+    made = {kind: flowrec.export(session, folder / name, file_format=kind) for kind, name in names.items()}
+    return made | {"plain": plain, "log": made["csv"] / "applied.csv"}
+
+
+@pytest.mark.parametrize("movie", ["tiff", "plain"])
+def test_robot_and_pose_of_the_camera_come_from_the_movie_or_from_the_tables_and_what_is_given_stays(movie, slow_robot):
+    rate = {} if movie == "tiff" else {"fps": 15.0}
+    asked = asked_import(slow_robot[movie], coils=slow_robot["log"], **rate)
+    assert (asked.robot.um_per_rev, asked.robot.delay_s, asked.camera.angle_deg) == (30.0, 0.08, 12.0)
+    assert (flowrec.chip.load_chip(asked.chip).mask == flowrec.open(GOLDEN).chip.mask).all()
+    usual = Config()
+    given = replace(usual, robot=replace(usual.robot, um_per_rev=28.0), camera=replace(usual.camera, angle_deg=10.0))
+    asked = asked_import(slow_robot[movie], given, coils=slow_robot["log"], **rate)
+    assert (asked.robot.um_per_rev, asked.robot.delay_s, asked.camera.angle_deg) == (28.0, 0.08, 10.0)
+    measured = replace(usual, camera=replace(usual.camera, registration="measured.toml"))
+    assert asked_import(slow_robot[movie], measured, coils=slow_robot["log"], **rate).camera.angle_deg == 0.0
+
+
+def test_what_the_robot_rolled_between_two_images_is_what_the_session_holds_whatever_the_latency(slow_robot):
+    asked, _ = aligned(asked_import(slow_robot["tiff"], coils=slow_robot["log"]))
+    config, _, pipeline, *_ = prepare(asked, aloud=False)
+    assert config.robot.delay_s == 0.08
+    with MovieRig.of(pipeline, config) as rig:
+        inputs = list(rig.inputs())
+    session = flowrec.open(GOLDEN)
+    assert [each.stamp_ns for each in inputs] == session.reader.frame_stamps
+    turns = [each.turns for each in session.messages("applied")]
+    np.testing.assert_allclose([each.applied.turns for each in inputs], turns, atol=1e-9)
+
+
+def test_the_log_of_another_session_is_not_taken_to_have_the_clock_of_the_movie(exported, tmp_path):
+    other = Path(shutil.copytree(exported["csv"], tmp_path / "tables"))
+    marker = other / "flowrec_export.json"
+    marker.write_text(json.dumps(json.loads(marker.read_text()) | {"session_key": "another"}))
+    assert aligned(asked_import(exported["tiff"], coils=exported["csv"] / "applied.csv"))[1] == {}
+    _, facts = aligned(asked_import(exported["tiff"], coils=other / "applied.csv"))
+    assert abs(json.loads(facts["alignment"])["offset_s"]) < 0.01

@@ -1,6 +1,7 @@
 """The rig of a movie: its images, and of a log what the coils did. Nothing is sent.
 
-`Applied` at an image holds what acts on the robot: what the log says of the time robot.delay_s before it.
+`Applied` at an image holds what acts on the robot: what the log says of the time robot.delay_s before it, or, of the
+tables of a session, of that time.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ class MovieRig:
     ) -> MovieRig:
         """The rig of a resolved configuration."""
         source = MovieSource(config.movie, config.coils)
-        return cls(source, config.robot.delay_s, duration_s, realtime)
+        delay_s = 0.0 if source.log_delayed else config.robot.delay_s
+        return cls(source, delay_s, duration_s, realtime)
 
     def __init__(
         self, source: MovieSource, delay_s: float, duration_s: float | None = None, realtime: bool = False

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.control import Coils
-from flowrec.control.coil_log import read_coil_log
+from flowrec.control.coil_log import is_of_session, read_coil_log
 from flowrec.control.field_log import FieldLog
 from flowrec.errors import MovieError, UsageError
 from flowrec.messages import Frame
@@ -48,7 +48,8 @@ class MovieSource:
     times_text : where the times come from.
     first_ns : time of the first image on the movie's clock.
     stamps_ns : (n,) expected stamps of the images; of a few movies the images themselves tell better.
-    log : what the coils did, without any delay; None: there is no log.
+    log : what the coils did; None: there is no log.
+    log_delayed : the log tells what reached the robot, as the tables of a session do: the latency is in it already.
     remarks : what was assumed, and what is unusual.
 
     Raises
@@ -74,6 +75,7 @@ class MovieSource:
             self.first_ns = first_ns
             self.stamps_ns = self._expected()
             self._log_remarks: list[str] = []
+            self.log_delayed = bool(settings.coils) and is_of_session(Path(settings.coils))
             self.log = self._read_log(coils)
         except BaseException:
             self._movie.close()

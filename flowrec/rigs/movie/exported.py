@@ -1,0 +1,117 @@
+"""What an export of a session tells of the run, so that `flowrec import` need not be given it.
+
+It is in what flowrec writes into a movie (movies/notes.py), and in config.toml and chip.png of a folder of tables.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from flowrec.config import Config, config_from_tree
+from flowrec.control.coil_log import is_of_session
+from flowrec.errors import MovieError
+from flowrec.movies import MovieFacts
+from flowrec.rigs.movie.source import opened
+from flowrec.system.output_folder import marker_of
+from flowrec.system.toml_file import parse_toml, read_toml
+
+# Settings that state facts about the run. What analyses it, such as the observer, is left to the import.
+_OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")
+_SECTIONS = ("robot", "camera", "coils")
+_SETTINGS, _CHIP = "config.toml", "chip.png"  # in a folder of tables
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """A session as its exports state it.
+
+    Attributes
+    ----------
+    key : `Session.key`; "" if it is not stated.
+    settings : of the sections robot, camera and coils.
+    chip : path of the chip, as in chip.path.
+    """
+
+    key: str
+    settings: dict[str, dict[str, Any]]
+    chip: str
+
+
+def session_of_log(log: Path) -> str:
+    """`Session.key` of the session of whose tables a log is one; "" for any other log, and for one that was moved."""
+    marker = marker_of(log.parent)
+    return str(marker.get("session_key", "")) if marker is not None and is_of_session(log) else ""
+
+
+def with_exported(asked: Config) -> tuple[Config, list[str]]:
+    """The configuration with what the movie or its log tell of the session that they were exported from.
+
+    Settings that are given stay: those that differ from their defaults, of the camera also those of a registration.
+
+    Returns
+    -------
+    The configuration, and the settings that were taken, such as "robot.um_per_rev = 30".
+
+    Raises
+    ------
+    MovieError : the movie can not be read, or what flowrec wrote is damaged.
+    """
+    with opened(asked.movie) as movie:
+        facts = movie.facts
+    found = _of_movie(facts, asked.movie.path) or _of_folder(Path(asked.movie.coils), facts)
+    if found is None:
+        return asked, []
+    told = config_from_tree(found.settings, f"{asked.movie.path}: the settings that flowrec wrote")
+    default, changed, taken = Config(), asked, list[str]()
+    for section in _SECTIONS:
+        given, stated, usual = (getattr(config, section) for config in (asked, told, default))
+        if section == "camera" and asked.camera.registration:
+            continue
+        new = {
+            each.name: value
+            for each in fields(given)
+            if getattr(given, each.name) == getattr(usual, each.name)
+            and (value := getattr(stated, each.name)) != getattr(usual, each.name)
+        }
+        changed = replace(changed, **{section: replace(given, **new)})
+        taken += [f"{section}.{name} = {value}" for name, value in new.items()]
+    if not asked.chip.path:
+        changed = replace(changed, chip=replace(asked.chip, path=found.chip))
+        taken.append("the chip")
+    return changed, taken
+
+
+def _of_movie(facts: MovieFacts, path: str) -> Exported | None:
+    notes = facts.notes
+    if notes is None:
+        return None
+    try:
+        settings = _chosen(parse_toml(notes.settings))
+    except (ValueError, RecursionError) as error:
+        raise MovieError(f"{path}: the settings in it are damaged ({error}); export the session again") from error
+    settings["camera"] = {**settings.get("camera", {}), "um_per_px": notes.um_per_px}
+    return Exported(notes.session_key, settings, path)
+
+
+def _of_folder(log: Path, facts: MovieFacts) -> Exported | None:
+    """What the folder of tables states in which a log is."""
+    key = session_of_log(log) if log.name else ""
+    settings, chip = log.with_name(_SETTINGS), log.with_name(_CHIP)
+    if not key or not settings.is_file() or not chip.is_file():
+        return None
+    tree = read_toml(settings)
+    found = _chosen(tree)
+    camera = tree.get("camera", {})
+    if (camera.get("width_px"), camera.get("height_px")) != (facts.width_px, facts.height_px):
+        found.pop("camera", None)  # the movie was cut or scaled
+    return Exported(key, found, str(chip))
+
+
+def _chosen(tree: dict[str, Any]) -> dict[str, Any]:
+    """The settings of a run that state facts about it."""
+    found = {section: tree[section] for section in _SECTIONS if section in tree}
+    if isinstance(found.get("camera"), dict):
+        found["camera"] = {key: value for key, value in found["camera"].items() if key in _OF_CAMERA}
+    return found
