@@ -3,7 +3,8 @@
 The reference time is the start of the run with its zone; timestamps are s on the session clock. Images are in the
 file, compressed, with the stamp of each. A session that states no start time is refused: NWB demands it.
 
-nwbinspector takes the images of a short session, which has fewer of them than they have pixels on a side, for turned.
+The images are an ImageSeries. Of a short session, with fewer images than they have pixels on a side, nwbinspector takes
+that for a series that is turned, which no archive accepts; they are Images then, with the times in an IndexSeries.
 The subject is the sample; age and sex, which NWB's inspector demands, are stated as unknown.
 """
 
@@ -17,16 +18,19 @@ from typing import Any
 import numpy as np
 from hdmf.backends.hdf5.h5_utils import H5DataIO
 from hdmf.common import DynamicTable, VectorData
-from hdmf.data_utils import DataChunkIterator
+from hdmf.data_utils import DataChunkIterator, GenericDataChunkIterator
 from ndx_pose import PoseEstimation, PoseEstimationSeries, Skeleton, Skeletons
 from numpy.typing import NDArray
 from pynwb import NWBHDF5IO, NWBFile, TimeSeries
+from pynwb.base import ImageReferences, Images
 from pynwb.file import Subject
-from pynwb.image import ImageSeries
+from pynwb.image import GrayscaleImage, ImageSeries, IndexSeries
 
 from flowrec.errors import SessionError, printable
-from flowrec.exports.camera_images import image_stamps, started, with_images
-from flowrec.messages import FlowField
+from flowrec.exports.camera_images import first_frame, image_stamps, started, with_images
+from flowrec.exports.hdf5_file import NewHdf5, new_hdf5
+from flowrec.declarations import Image
+from flowrec.messages import FlowField, Frame, pixel_type
 from flowrec.session import Session
 from flowrec.units import NS_PER_S, seconds
 
@@ -67,39 +71,90 @@ class NwbExport:
         what = f"micro-robot with a radius of {session.config.robot.radius_um:.6g} um, no organism"
         sample = _text(recording.sample) or "robot"
         file.subject = Subject(subject_id=sample, description=what, age="P0D/", sex="U")  # any age; sex unknown
-        if session.topics.get("/camera/frame", 0):
-            _add_images(file, session, progress)
-        _add_pose(file, session)
-        _add_coils(file, session)
-        for name, field in session.fields.items():
-            file.add_analysis(_flow_table(name, field, session.chip.mask))
-        with NWBHDF5IO(str(part), "w") as output:
-            output.write(file)
+        with new_hdf5(part) as made:
+
+            def done(frame: Frame) -> None:
+                made.check()
+                progress(seconds(frame.stamp_ns - session.run.first_ns))
+
+            if session.topics.get("/camera/frame", 0):
+                _add_images(file, session, done)
+            _add_pose(file, session)
+            _add_coils(file, session)
+            for name, field in session.fields.items():
+                file.add_analysis(_flow_table(name, field, session.chip.mask))
+            with NWBHDF5IO(file=made.file, mode="w") as output:
+                output.write(file)
 
 
-def _add_images(file: NWBFile, session: Session, progress: Callable[[float], None]) -> None:
+def _add_images(file: NWBFile, session: Session, done: Callable[[Frame], None]) -> None:
     stamps = image_stamps(session)
     bits = session.config.camera.bits
+    file.create_device(name="camera", description="camera of the microscope")
+    what = f"of {bits} bit; {session.config.camera.um_per_px:.6g} um per pixel"
+    if len(stamps) < max(first_frame(session).image.shape):
+        images = [
+            GrayscaleImage(
+                name=f"image_{number:05d}",
+                data=_compressed(_OneImage(session, stamp, done), bits),
+                resolution=1e4 / session.config.camera.um_per_px,  # pixels per cm
+                description=f"taken at {seconds(stamp):.9f} s",
+            )
+            for number, stamp in enumerate(stamps)
+        ]
+        order = ImageReferences(name="order_of_images", data=images)
+        shown = Images(name="camera_images", images=images, description=f"images {what}", order_of_images=order)
+        file.add_acquisition(shown)
+        times = IndexSeries(
+            name="camera_image_times",
+            description="number of each image in camera_images, at the time when it was taken",
+            data=np.arange(len(stamps), dtype=np.uint32),
+            unit="N/A",
+            indexed_images=shown,
+            timestamps=_seconds(stamps),
+        )
+        file.add_acquisition(times)
+        return
 
-    def images() -> Iterator[Any]:
+    def each() -> Iterator[Any]:
         for _, frame in with_images(session):
-            progress(seconds(frame.stamp_ns - session.run.first_ns))
+            done(frame)
             yield frame.image
 
-    file.create_device(name="camera", description="camera of the microscope")
-    data = H5DataIO(
-        DataChunkIterator(data=images(), buffer_size=1), compression="gzip", compression_opts=_LEVEL, shuffle=bits > 8
-    )
     file.add_acquisition(
         ImageSeries(
             name="camera_images",
-            description=f"images (time, row, column) of {bits} bit; {session.config.camera.um_per_px:.6g} um per pixel",
-            data=data,
+            description=f"images (time, row, column) {what}",
+            data=_compressed(DataChunkIterator(data=each(), buffer_size=1), bits),
             unit="grey level",
             timestamps=_seconds(stamps),
             device=file.devices["camera"],
         )
     )
+
+
+class _OneImage(GenericDataChunkIterator):  # type: ignore[misc]  # hdmf has no types
+    """An image that is read when it is written."""
+
+    def __init__(self, session: Session, stamp_ns: int, done: Callable[[Frame], None]) -> None:
+        self._session, self._stamp_ns, self._done = session, stamp_ns, done
+        shape = session.config.camera.height_px, session.config.camera.width_px
+        super().__init__(buffer_shape=shape, chunk_shape=shape)
+
+    def _get_data(self, selection: tuple[slice, ...]) -> Image:
+        frame = self._session.reader.frame_at(self._stamp_ns)
+        self._done(frame)
+        return frame.image[selection]
+
+    def _get_maxshape(self) -> tuple[int, int]:
+        return self._session.config.camera.height_px, self._session.config.camera.width_px
+
+    def _get_dtype(self) -> np.dtype[Any]:
+        return np.dtype(pixel_type(self._session.config.camera.bits))
+
+
+def _compressed(data: Any, bits: int) -> H5DataIO:
+    return H5DataIO(data, compression="gzip", compression_opts=_LEVEL, shuffle=bits > 8)
 
 
 def _add_pose(file: NWBFile, session: Session) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
+import os
 import secrets
 from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Set as AbstractSet
@@ -22,6 +24,7 @@ from flowrec.view.scene import Scene
 APPLICATION = "flowrec"
 _PROGRESS_EVERY = 20  # ticks
 _MAGIC = b"RRF"
+_END, _END_BYTES = b"RRF2FOOT", 12  # a number follows
 _HEAD_BYTES = 1024  # contains the names of application and recording as plain text
 
 
@@ -55,9 +58,19 @@ def write_rrd(
                 stream.log(SUMMARY, summary, static=True)
             shown = frozenset({SUMMARY} if summary is not None else ())
             _log_all(stream, scene, ticks, second_ticks, progress, prefixes, shown)
-            stream.flush()
+            with contextlib.suppress(RuntimeError):  # where its thread could not write; the end is missing then
+                stream.flush()
         finally:
             stream.disconnect()
+        if not _is_whole(part):  # Rerun writes in a thread, whose errors it only prints
+            raise OSError("Rerun could not write all of it; is the disk full?")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a file has the end that Rerun writes last."""
+    with path.open("rb") as file:
+        file.seek(-min(_END_BYTES, path.stat().st_size), os.SEEK_END)
+        return _END in file.read()
 
 
 def is_made_from(path: Path, key: str) -> bool:

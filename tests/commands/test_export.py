@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import resource
 import shutil
 from pathlib import Path
 
@@ -112,18 +113,21 @@ def test_the_data_package_names_every_file_and_column_with_unit_and_meaning(tabl
     assert table[["u_um_s", "v_um_s"]].to_numpy()[100].tolist() == field.velocity_um_s[row, column].tolist()
 
 
-def test_a_disk_that_is_full_halfway_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import errno
-
-    import pyarrow.parquet
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(pyarrow.parquet.ParquetWriter, "write_batch", full)
-    with pytest.raises(SessionError, match=r"a: can not be written \(No space left on device\); choose another place"):
-        flowrec.export(GOLDEN, tmp_path / "a", file_format="parquet")
+def test_a_disk_that_is_full_halfway_leaves_nothing_and_is_an_error_of_one_line(
+    any_export: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    suffix = EXPORTS[any_export].load().suffixes[0]
+    _, most = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, most))
+    try:
+        with pytest.raises(SessionError, match=r"can not be written \(.*\); choose another place$") as failed:
+            flowrec.export(GOLDEN, tmp_path / f"a{suffix}", file_format=any_export)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(failed.value)
     assert not list(tmp_path.iterdir())
+    said = capfd.readouterr().err
+    assert "Traceback" not in said and "HDF5" not in said
 
 
 def test_a_format_with_a_suffix_is_written_into_an_existing_folder(tmp_path: Path) -> None:

@@ -152,13 +152,3 @@ def test_a_session_without_images_or_with_regions_only_is_refused_in_one_line(se
     monkeypatch.setitem(vars(session), "config", config)
     with pytest.raises(SessionError, match=r"only the region around the robot .* use --format mp4"):
         written(mp4.PlainMp4Export(), session, tmp_path / "x.mp4")
-
-
-def test_a_full_disk_is_one_line_and_leaves_no_file(session, tmp_path, monkeypatch):
-    def full(self, packets):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(mp4.Mp4Writer, "_mux", full)
-    with pytest.raises(SessionError, match=r"x.mp4: can not be written \(No space left on device\)"):
-        flowrec.export(GOLDEN, tmp_path / "x.mp4", file_format="mp4")
-    assert not list(tmp_path.iterdir())

@@ -16,9 +16,9 @@ def test_images_pose_coils_and_flow_are_those_of_the_session_with_units(tmp_path
     with pynwb.NWBHDF5IO(str(path), "r") as io:
         file = io.read()
         assert file.session_start_time.isoformat() == session.provenance["wall_time"]
-        images = file.acquisition["camera_images"]
-        assert (np.rint(1e9 * images.timestamps[:]) == session.reader.frame_stamps).all()
-        assert (images.data[40] == list(session.frames)[40].image).all()
+        times = file.acquisition["camera_image_times"]
+        assert (np.rint(1e9 * times.timestamps[:]) == session.reader.frame_stamps).all()
+        assert (times.indexed_images.order_of_images[40].data[:] == session.frames[40].image).all()
         pose = file.processing["behavior"]["PoseEstimation"]["centre"]
         expected = [each.position_um for each in session.messages("estimate")]
         np.testing.assert_allclose(1e6 * pose.data[:], expected)

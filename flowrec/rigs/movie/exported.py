@@ -60,7 +60,7 @@ def with_exported(asked: Config) -> tuple[Config, list[str]]:
     """
     with opened(asked.movie) as movie:
         facts = movie.facts
-    found = _of_movie(facts, asked.movie.path) or _of_folder(Path(asked.movie.coils), facts)
+    found = _of_movie(facts, asked.movie.path) or _of_folder(asked.movie.coils, facts)
     if found is None:
         return asked, []
     told = config_from_tree(found.settings, f"{asked.movie.path}: the settings that flowrec wrote")
@@ -95,10 +95,10 @@ def _of_movie(facts: MovieFacts, path: str) -> Exported | None:
     return Exported(notes.session_key, settings, path)
 
 
-def _of_folder(log: Path, facts: MovieFacts) -> Exported | None:
+def _of_folder(log: str, facts: MovieFacts) -> Exported | None:
     """What the folder of tables states in which a log is."""
-    key = session_of_log(log) if log.name else ""
-    settings, chip = log.with_name(_SETTINGS), log.with_name(_CHIP)
+    folder, key = Path(log).parent, session_of_log(Path(log)) if log else ""
+    settings, chip = folder / _SETTINGS, folder / _CHIP
     if not key or not settings.is_file() or not chip.is_file():
         return None
     tree = read_toml(settings)
