@@ -70,7 +70,7 @@ class NewHdf5:
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[NewHdf5]:
-    """An HDF5 file in place of an empty file. OSError at the end, or at a `check`, if not all of it could be written."""
+    """An HDF5 file in place of an empty file; OSError at a `check`, or at the end, if not all could be written."""
     disk = _Disk(path)
     try:
         with h5py.File(disk, "w") as file:

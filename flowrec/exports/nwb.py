@@ -26,10 +26,10 @@ from pynwb.base import ImageReferences, Images
 from pynwb.file import Subject
 from pynwb.image import GrayscaleImage, ImageSeries, IndexSeries
 
+from flowrec.declarations import Image
 from flowrec.errors import SessionError, printable
 from flowrec.exports.camera_images import first_frame, image_stamps, started, with_images
-from flowrec.exports.hdf5_file import NewHdf5, new_hdf5
-from flowrec.declarations import Image
+from flowrec.exports.hdf5_file import new_hdf5
 from flowrec.messages import FlowField, Frame, pixel_type
 from flowrec.session import Session
 from flowrec.units import NS_PER_S, seconds

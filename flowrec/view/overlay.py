@@ -1,6 +1,8 @@
 """Robot, route and flow drawn over the images by OpenCV, with a status bar below them for clock, state and scale.
 
-Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the bar.
+Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the bar. The image
+stays as the camera took it: where a refinement found another registration, what lies on the chip is drawn where the
+image shows it.
 """
 
 from __future__ import annotations
@@ -58,6 +60,7 @@ class Overlay:
         self._canvas = np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
         self._robot_px = self.zoom * scene.length_px(scene.robot.radius_um)
         self._grid = _sparser(*arrow_grid(scene))
+        self._to_image: NDArray[np.float64] = np.eye(2, 3)  # by the refined registration
         self._trail: deque[tuple[int, Points]] = deque()
         um_per_px = scene.calibration.um_per_px / self.zoom
         self._status_bar = StatusBar((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
@@ -85,20 +88,31 @@ class Overlay:
         return canvas
 
     def _to_px(self, points_um: Points) -> Points:
-        """Chip coordinates (..., 2) to pixels of the picture, counted at their centres."""
+        """Measured places (..., 2) in um to pixels of the picture, counted at their centres."""
         return self.zoom * self._scene.to_plane(points_um) - 0.5
+
+    def _chip_to_px(self, points_um: Points) -> Points:
+        """The same of places on the chip."""
+        return self.zoom * self._shown(self._scene.to_plane(points_um)) - 0.5
+
+    def _shown(self, plane: Points) -> Points:
+        """Where the image shows points (..., 2) of the picture plane."""
+        return plane @ self._to_image[:, :2].T + self._to_image[:, 2]
 
     def _redraw(self, tick: Tick) -> None:
         """Draw what does not move: flow, route, goal, and the legend."""
         layer, field, route = Layer((self._height, self._width)), tick.field, tick.route
+        registration = None if tick.refined is None else tick.refined.registration
+        inverse = cv2.invertAffineTransform(self._scene.measured_to_plane(registration))
+        self._to_image = np.asarray(inverse, np.float64)
         flow = None if field is None else self._draw_flow(layer, field, refined=tick.refined is not None)
-        path = self._to_px(route.waypoints_um) if route is not None and route.reachable else np.zeros((0, 2))
+        path = self._chip_to_px(route.waypoints_um) if route is not None and route.reachable else np.zeros((0, 2))
         has_route = len(path) > 1 and drawable(path)
         if has_route:
             layer.lines([path], ROUTE, _LINE_PX * self._unit)
         goal = _goal(tick.mission)
         if goal is not None:
-            centre, reach = self._to_px(np.array(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
+            centre, reach = self._chip_to_px(np.array(goal)), max(1.5 * self._robot_px, 8.0 * self._unit)
             layer.lines([centre + reach * part for part in GOAL_SIGN], GOAL, _LINE_PX * self._unit)
         layer.finish()
         self._layer = layer
@@ -112,8 +126,9 @@ class Overlay:
             return None
         fastest = float(np.quantile(speed[known], _FASTEST))
         px_per_speed = _LONGEST * self.zoom * self._scene.length_px(self._grid[1]) / fastest
-        middle = self.zoom * (origins + 0.5 * vectors)[known] - 0.5
-        along = vectors[known] / np.linalg.norm(vectors[known], axis=1, keepdims=True)
+        middle = self.zoom * self._shown((origins + 0.5 * vectors)[known]) - 0.5
+        along = vectors[known] @ self._to_image[:, :2].T
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
         half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along
         layer.arrows(middle - half, middle + half, FLOW, 0.8 * _LINE_PX * self._unit)
         return "refined flow" if refined else "assumed flow", round_below(fastest), px_per_speed

@@ -100,11 +100,11 @@ def test_the_data_package_names_every_file_and_column_with_unit_and_meaning(tabl
         files = {each["path"]: each for each in package["resources"]}
         assert set(files) | {"datapackage.json", "flowrec_export.json"} == {path.name for path in folder.iterdir()}
         read = pandas.read_parquet if name == "parquet" else pandas.read_csv
-        for path, resource in files.items():
-            if "schema" in resource:
-                columns = [each["name"] for each in resource["schema"]["fields"]]
+        for path, described in files.items():
+            if "schema" in described:
+                columns = [each["name"] for each in described["schema"]["fields"]]
                 assert columns == list(read(folder / path).columns)
-                assert all(each["description"] for each in resource["schema"]["fields"])
+                assert all(each["description"] for each in described["schema"]["fields"])
     units = {each["name"]: each.get("unit") for each in files["track.csv"]["schema"]["fields"]}
     assert units["position_x_um"] == "um" and units["seen"] is None
     field = flowrec.open(GOLDEN).fields["refined"]

@@ -118,6 +118,30 @@ def test_the_robot_is_in_its_ring_and_nothing_is_drawn_over_it(session, tmp_path
         assert np.abs(red_over_blue[distance < radius - 3.0]).mean() < 15, "the camera's grey within it"
 
 
+def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_that_was_found(session):
+    from dataclasses import replace
+
+    from flowrec.view.overlay import Overlay
+    from flowrec.view.scene import Scene
+
+    tick = replace(session.at(5.0), estimate=None)
+    grey = np.full(tick.frame.image.shape, 100, np.uint8)
+    moved_px = np.array([4.0, -2.0])  # of the camera: the chip lies that far from where the image shows it
+    moved_um = session.config.camera.um_per_px * moved_px
+    found = replace(tick.refined, registration=np.column_stack((np.eye(2), moved_um)))
+    pictures = []
+    for refined in (replace(tick.refined, registration=None), found):
+        scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=grey.shape[::-1])
+        overlay = Overlay(scene, grey.shape[::-1])
+        pictures.append(overlay.draw(grey, replace(tick, refined=refined))[: 3 * grey.shape[0]].astype(int))
+    left, down = (3 * moved_px).astype(int)
+    stated, shown = pictures
+    expected = np.roll(stated, (-down, -left), (0, 1))
+    inside = np.s_[20:-20, 20:-20]
+    assert np.abs(shown - stated)[inside].max() > 50
+    assert np.abs(shown - expected)[inside].max() <= 8
+
+
 def test_odd_sizes_are_made_even_and_deep_images_keep_the_scale_of_their_levels(session, tmp_path):
     ticks = made(shape=(61, 83), bits=12)
     frames, metadata, _ = read(written(mp4.PlainMp4Export(), OfTicks(session, ticks), tmp_path / "x.mp4"))
