@@ -9,13 +9,12 @@ from typing import Protocol
 
 import numpy as np
 
-from flowrec.chip.chip import Chip
 from flowrec.config import ResolvedConfig
 from flowrec.flow import sample
-from flowrec.flow.sampling import relative_rmse
 from flowrec.messages import Demand, FlowField, Observations, Route
 from flowrec.planning import travel_time
 from flowrec.run.route_orders import no_observations
+from flowrec.run_figures import flow_error, length_um
 from flowrec.session import Session
 from flowrec.summary import Row, Value, finite
 from flowrec.topics import Tick
@@ -153,18 +152,6 @@ def before_after(done: ReplayPair) -> list[Row]:
         rows.append(("commands_difference_rms_um_s", None, commands.rms_um_s))
         rows.append(("first_changed_command_s", None, seconds(commands.first_ns)))
     return rows
-
-
-def length_um(route: Route) -> float:
-    """Length of a route in um."""
-    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
-
-
-def flow_error(chip: Chip, flow: FlowField | None, true_field: FlowField | None) -> float | None:
-    """Relative RMSE of a flow over the fluid pixels; None where one is not known, or not comparable."""
-    if flow is None or true_field is None or (flow.wall_px is None) != (true_field.wall_px is None):
-        return None  # means over pixels, of numerics 1, are not compared with values at their centres
-    return finite(float(relative_rmse(flow, true_field, chip.mask).v))
 
 
 def _residual_um_s(flow: FlowField | None, observations: Observations) -> float | None:

@@ -18,7 +18,7 @@ from flowrec.chip.chip import Chip
 from flowrec.clocks import ClockMonitor
 from flowrec.commands.auto_recovery import recover_leftovers
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.run_summary import GOOD_ENDS, Recorded, RunStatistics, figures_of, files_text
+from flowrec.commands.run_summary import GOOD_ENDS, Recorded, figures_of, files_text
 from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.enums import Outcome, Phase
 from flowrec.errors import MovieError, SessionError, UnreachableError, UsageError
@@ -36,11 +36,12 @@ from flowrec.run.loop import Sink, run
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import LockstepWorker, Preloaded, Worker
+from flowrec.run_figures import RunStatistics
 from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
 from flowrec.store.run_files import run_files, run_path, runs_in
 from flowrec.store.writer import SessionWriter
-from flowrec.summary import as_text, finite
+from flowrec.summary import as_text
 from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.system.processes import realtime_priority
 from flowrec.terminal import say, warn
@@ -281,7 +282,9 @@ def record(
             from flowrec.exports.rrd import scene_of
             from flowrec.view.live import LiveView
 
-            live = stack.enter_context(LiveView(scene_of(resolved, chip, pipeline, path), view))
+            live = LiveView(scene_of(resolved, chip, pipeline, path), view)
+            stack.callback(_say_what_stays, live)  # after it is closed
+            stack.enter_context(live)
             say(live.message)
             sinks.append(live)
         worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, resolved.worker.adopt_after_s)
@@ -312,7 +315,7 @@ def record(
         facts = figures_of(chip, report, statistics.true_field)
         # Without navigation, and for a control law that descends the time to go, there is no reference.
         if not (resolved.mission.observes or resolved.control.needs):
-            facts["tracking_error_um"] = finite(statistics.tracking_error_um)
+            facts["tracking_error_um"] = statistics.tracking_error_um
         if control.note:
             facts["note_not_finished"] = control.note
         if isinstance(rig, MovieRig) and rig.noticed:
@@ -382,6 +385,11 @@ def _files_of(config: Config) -> list[Path]:
         files += files_behind(Path(config.start.field))
     movie = config.movie
     return [*files, *(Path(name) for name in (movie.path, movie.times, movie.coils) if name)]
+
+
+def _say_what_stays(live: LiveView) -> None:
+    if live.afterwards:
+        say(live.afterwards)
 
 
 def _report_remarks(writer: SessionWriter) -> None:

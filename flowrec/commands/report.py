@@ -16,7 +16,8 @@ from flowrec.commands.replay_report import refinement_remarks
 from flowrec.commands.verdict import Verdict
 from flowrec.enums import Level, Outcome
 from flowrec.errors import UsageError
-from flowrec.replay_figures import ReplayFiles, before_after, flow_error
+from flowrec.replay_figures import ReplayFiles, before_after
+from flowrec.run_figures import flow_error
 from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
 from flowrec.store.session_path import named_beside
 from flowrec.summary import Row, name_of, shown

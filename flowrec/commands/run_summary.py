@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from flowrec import run_figures
 from flowrec.chip.chip import Chip
-from flowrec.enums import Outcome, Phase
-from flowrec.messages import Demand, FlowField
-from flowrec.replay_figures import flow_error, length_um
+from flowrec.enums import Outcome
+from flowrec.messages import FlowField
 from flowrec.run.loop import RunReport
 from flowrec.store.run_files import is_snapshot
 from flowrec.summary import Figures, rows_for_people
 from flowrec.terminal import say, table
-from flowrec.topics import FLOW_FIELDS, Tick
-from flowrec.units import seconds
 
 # The mission was completed, or was ended on purpose.
 GOOD_ENDS = frozenset(
@@ -62,58 +59,16 @@ class Recorded:
         return 0 if self.report.outcome in GOOD_ENDS else 1
 
 
-class RunStatistics:
-    """A sink that collects the true flow and the distance to the reference during navigation, for the figures."""
-
-    def __init__(self) -> None:
-        self.true_field: FlowField | None = None
-        self._square_um2 = 0.0
-        self._count = 0
-        self._last: Demand | None = None
-
-    def write(self, tick: Tick) -> None:
-        self.true_field = tick.true_field or self.true_field
-        demand = tick.demand
-        if demand is None or demand is self._last or tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
-            return
-        self._last = demand
-        if math.isfinite(demand.error_um):
-            self._square_um2 += demand.error_um**2
-            self._count += 1
-
-    @property
-    def tracking_error_um(self) -> float:
-        """Root mean square distance to the reference, NaN if nothing was navigated."""
-        return math.sqrt(self._square_um2 / self._count) if self._count else math.nan
-
-
 def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
     """The figures of a run in the order of the table; flow errors are relative to the true flow."""
-    figures: Figures = {
+    ran: Figures = {
         "outcome": report.outcome,
         "note": report.note,
         "duration_s": report.duration_s,
         "wall_s": report.wall_s,
         "ticks": report.ticks,
     }
-    last = report.last
-    mission, route = last.mission, last.route
-    if mission is not None and route is not None and route.reachable and mission.phase == Phase.DONE:
-        figures["planner"] = route.method
-        figures["route_length_um"] = length_um(route)
-        figures["planned_s"] = float(route.arrival_s[-1])
-        if mission.outcome == Outcome.REACHED and report.navigating_ns is not None:
-            figures["navigation_s"] = seconds(mission.since_ns - report.navigating_ns)
-    if true_field is not None:
-        figures["contacts"] = report.contacts
-        for name in FLOW_FIELDS:
-            flow: FlowField | None = getattr(last, name)
-            if flow is not None:
-                figures[f"{name}_method"] = flow.method
-                figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)
-    if last.observations is not None:
-        figures["observations"] = len(last.observations.position_um)
-    return figures
+    return ran | run_figures.figures_of(chip, report.last, true_field, report.contacts, report.navigating_ns)
 
 
 def files_text(path: Path, files: tuple[Path, ...]) -> str:

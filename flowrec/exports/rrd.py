@@ -16,30 +16,14 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.replay_figures import ReplayFiles, before_after
 from flowrec.session import Session
 from flowrec.store.run_files import files_of
-from flowrec.summary import Row
 from flowrec.system.outputs import RRD, Output
-from flowrec.topics import Tick
 from flowrec.view.entities import PAIR, REPLAY
 from flowrec.view.rrd_file import is_made_from, write_rrd
 from flowrec.view.scene import Scene
-from flowrec.view.summary_text import registration_remark, summary_document
+from flowrec.view.summary_text import FIGURES, document_of_run, registration_remark, rows_of_run, summary_document
 
 if TYPE_CHECKING:
     import rerun as rr
-
-# Figures of the end of a run in the text panel, in this order.
-_FIGURES = (
-    "outcome",
-    "note",
-    "duration_s",
-    "assumed_flow_error",
-    "refined_flow_error",
-    "planned_s",
-    "navigation_s",
-    "tracking_error_um",
-    "contacts",
-    "frames_dropped",
-)
 
 
 class RrdExport:
@@ -83,40 +67,20 @@ class RrdExport:
             ticks, replayed = recorded.ticks(), session.ticks(with_frames=False)
             summary = _comparison(ReplayFiles.of(recorded, session))
         else:
-            ticks, replayed, summary = session.ticks(), None, _summary(session)
+            ticks, replayed = session.ticks(), None
+            summary = document_of_run(path.stem, session.last, session.outcome)
         write_rrd(Output(part, RRD, overwrite=True), scene, ticks, replayed, progress, prefixes, summary)
 
 
-def _summary(session: Session) -> rr.TextDocument:
-    return summary_document([session.path.stem], _rows(session), _remarks(session.last))
-
-
-def _rows(session: Session) -> list[Row]:
-    figures = session.outcome
-    start_goal: list[Row] = [("goal", _place(session.last), None)]
-    return start_goal + [(key, figures[key], None) for key in _FIGURES if figures.get(key) not in (None, "")]
-
-
 def _comparison(pair: ReplayFiles) -> rr.TextDocument:
-    return summary_document(["recorded", "replayed"], before_after(pair), _remarks(pair.replayed))
+    remark = registration_remark(pair.replayed.refined)
+    return summary_document(["recorded", "replayed"], before_after(pair), [remark] if remark else [])
 
 
 def _pair(first: Session, second: Session) -> rr.TextDocument:
-    was, now = ({key: value for key, value, _ in _rows(each)} for each in (first, second))
-    rows = [(key, was.get(key), now.get(key)) for key in ("goal", *_FIGURES) if key in was or key in now]
+    was, now = ({key: value for key, value, _ in rows_of_run(each.last, each.outcome)} for each in (first, second))
+    rows = [(key, was.get(key), now.get(key)) for key in ("goal", *FIGURES) if key in was or key in now]
     return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, [])
-
-
-def _place(last: Tick) -> str:
-    goal = last.mission.goal_um if last.mission is not None else None
-    if goal is None or not np.isfinite(goal).all():
-        return "none"
-    return f"({goal[0]:.0f}, {goal[1]:.0f}) um"
-
-
-def _remarks(last: Tick) -> list[str]:
-    remark = registration_remark(last.refined)
-    return [remark] if remark else []
 
 
 def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:

@@ -1,26 +1,20 @@
-"""Live view of a run that never makes the run wait, and the process that serves it.
+"""Live view of a run that never makes the run wait.
 
 `write` appends a tick to a bounded queue and returns. A thread sends what has accumulated, some times per second,
-through a pipe to a process that owns Rerun (`python -m flowrec.view.live`). Only that thread can block, on a viewer
-that is stopped or slow; then the queue drops its oldest ticks. The latest state is not lost with them, because each
-tick is sent as the difference from the last one that was sent.
-
-The process hosts a server on the loopback interface to which any number of viewers connect, so a viewer that was closed
-can be opened again. It ends with the pipe, or with the window that it has opened.
+through a pipe to a process that owns Rerun (live_server.py). Only that thread can block, on a viewer that is stopped or
+slow; then the queue drops its oldest ticks. The latest state is not lost with them, because each tick is sent as the
+difference from the last one that was sent.
 """
 
 from __future__ import annotations
 
 import contextlib
 import pickle
-import socket
 import subprocess
-import sys
 import tempfile
 import threading
 import time
 from collections import deque
-from collections.abc import Set as AbstractSet
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -30,22 +24,18 @@ import numpy as np
 from flowrec.messages import Frame
 from flowrec.system.processes import child_command, child_environment
 from flowrec.topics import Tick
-from flowrec.view import viewer
+from flowrec.view import live_server, viewer
 from flowrec.view.scene import Scene
 
 Mode = Literal["spawn", "serve"]
-Batch = tuple[int, list[dict[str, Any]]]  # step of the preview image, and the changes of each tick
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
-_START_S = 10.0  # for the server to accept viewers: importing Rerun takes a second
-_CLOSE_S = 2.5  # for the last ticks to be shown
+_START_S = 30.0  # for the server to accept viewers: importing Rerun takes a second, on a busy machine more
+_CLOSE_S = 10.0  # for the last ticks to be shown; then the process hangs
 _POLL_S = 0.02
-_ALL_SHOWN = "all is shown"
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
 _FIELDS = tuple(field.name for field in fields(Tick))
-_SERVER_MEMORY = "256MB"  # kept for viewers that connect later
-_FLUSH_S = 0.5  # for the last ticks to reach the viewers
 _WITHOUT = "the run goes on without"
 
 
@@ -64,14 +54,14 @@ class LiveView:
         self._ended = False
         self._closing = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
-        self._port = viewer.free_port() if port is None else port
+        self.port = viewer.free_port() if port is None else port
         with tempfile.NamedTemporaryFile(prefix="flowrec-view-", suffix=".log", delete=False) as log:
             self._log = Path(log.name)
+        self.afterwards = ""  # one line for the operator about a server that stays after `close`; '' if it does not
         self._message = self._start(mode)
         self._thread = threading.Thread(target=self._send_all, name="live view", daemon=True)
         self._thread.start()
-        if not self._ended:
-            viewer.wait_for_server(self._port, _START_S, lambda: self._ended)
+        self._wait_until_it_accepts()
 
     def _start(self, mode: Mode) -> str:
         """Start the process; the message for the operator."""
@@ -79,7 +69,7 @@ class LiveView:
             self._ended = True
             return f"no live view: Rerun's viewer is not installed (pip install rerun-sdk); {_WITHOUT}"
         window = mode == "spawn" and viewer.has_display()
-        command = child_command(__name__, str(self._port), "window" if window else "serve")
+        command = child_command(live_server.__name__, str(self.port), "window" if window else "serve")
         try:
             with self._log.open("wb") as log:
                 self._process = subprocess.Popen(  # noqa: S603 - our own module
@@ -111,7 +101,7 @@ class LiveView:
     @property
     def url(self) -> str:
         """What a viewer on this machine connects to."""
-        return viewer.url(self._port)
+        return viewer.url(self.port)
 
     @property
     def pid(self) -> int | None:
@@ -131,7 +121,7 @@ class LiveView:
         self._queue.append(tick)
 
     def close(self, timeout_s: float = _CLOSE_S) -> None:
-        """Show the last ticks within a time limit, then end the process. A window stays open."""
+        """Show the last ticks within a time limit, then end the process. It stays for viewers that are connected."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -139,10 +129,14 @@ class LiveView:
         self._thread.join(timeout_s)
         process = self._process
         if process is not None:
-            while process.poll() is None and not self._shows_all() and time.monotonic() < end:
+            while process.poll() is None and not self._said(live_server.STAYS) and time.monotonic() < end:
                 time.sleep(_POLL_S)
-            if process.poll() is None and self._shows_all():
-                process.returncode = 0  # it serves its window on: not waited for, and no leak
+            if process.poll() is None and self._said(live_server.STAYS):
+                self.afterwards = (
+                    f"live view: its server (process {process.pid}) stays for the viewers that are connected, and ends "
+                    f"{live_server.ABSENT_S:g} s after the last of them"
+                )
+                viewer.leave(process)
             else:
                 process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
                 process.wait()
@@ -150,10 +144,21 @@ class LiveView:
         with contextlib.suppress(OSError):  # Windows, while the process has it open
             self._log.unlink(missing_ok=True)
 
-    def _shows_all(self) -> bool:
-        """Whether the process has shown everything and only waits for its window to be closed."""
+    def _wait_until_it_accepts(self) -> None:
+        """Wait for the server, so that its address is said when viewers can connect; end it if it takes too long."""
+        end = time.monotonic() + _START_S
+        while not self._ended and not self._said(live_server.ACCEPTS):
+            if time.monotonic() > end:
+                assert self._process is not None
+                self._process.kill()
+                self._message = f"no live view: its server did not start within {_START_S:g} s; {_WITHOUT}"
+                return
+            time.sleep(_POLL_S)
+
+    def _said(self, word: str) -> bool:
+        """Whether the process has written a word."""
         try:
-            return _ALL_SHOWN in self._log.read_text(errors="replace")
+            return word in self._log.read_text(errors="replace")
         except OSError:
             return False
 
@@ -189,7 +194,7 @@ class LiveView:
             with contextlib.suppress(OSError):
                 pipe.close()
 
-    def _batch(self, sent: Tick) -> tuple[Batch, Tick]:
+    def _batch(self, sent: Tick) -> tuple[live_server.Batch, Tick]:
         """All ticks in the queue, each as its changes, the last with its image; and the last tick itself."""
         changes: list[dict[str, Any]] = []
         step = 1
@@ -209,59 +214,3 @@ class LiveView:
 def _send(pipe: Any, what: object) -> None:
     pickle.dump(what, pipe, pickle.HIGHEST_PROTOCOL)
     pipe.flush()
-
-
-def serve() -> None:
-    """Show what arrives at stdin, first the scene, then batches: the process."""
-    import rerun as rr  # here, so that a run does not import it
-
-    from flowrec.view.blueprint import blueprint
-    from flowrec.view.logger import TickLogger
-    from flowrec.view.rrd_file import describe, open_stream
-
-    port, window = int(sys.argv[1]), sys.argv[2] == "window"
-    source = sys.stdin.buffer
-    scene: Scene = pickle.load(source)  # noqa: S301 - from our own parent
-    stream = open_stream(scene)
-    present: AbstractSet[str] = frozenset()
-    with socket.socket() as trial:  # Rerun reports a taken port only in its log
-        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            trial.bind((viewer.LOOPBACK, port))
-        except OSError:
-            sys.exit(f"port {port} is taken by another program")
-    stream.set_sinks(
-        rr.GrpcServerSink(bind_ip=viewer.LOOPBACK, port=port, server_memory_limit=_SERVER_MEMORY),
-        default_blueprint=blueprint(scene, ("",), present),
-    )
-    describe(stream, scene)
-    viewer_process = None
-    if window:
-        viewer.wait_for_server(port, _START_S)
-        viewer_process = viewer.open_window("--connect", viewer.url(port))
-    logger = TickLogger(stream, scene)
-    tick = Tick()
-    while True:
-        try:
-            step, changes_of_ticks = pickle.load(source)  # noqa: S301
-        except (EOFError, pickle.UnpicklingError):  # the run ended, or was killed while it wrote
-            break
-        logger.image_step = step
-        for changes in changes_of_ticks:
-            tick = replace(tick, **changes)
-            logger.log(tick)
-        if logger.present != present:
-            # Something is shown for the first time: its view is added to the layout.
-            present = frozenset(logger.present)
-            stream.send_blueprint(blueprint(scene, ("",), present))
-    stream.flush(timeout_sec=1.0)
-    time.sleep(_FLUSH_S)
-    if viewer_process is not None:
-        # A viewer calls it an error when its server ends, so the server stays as long as its own window.
-        print(_ALL_SHOWN, flush=True)
-        viewer_process.wait()
-    stream.disconnect()
-
-
-if __name__ == "__main__":
-    serve()

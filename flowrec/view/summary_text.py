@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -10,10 +10,28 @@ import rerun as rr
 from flowrec.chip.registration import on_chip
 from flowrec.errors import printable
 from flowrec.messages import FlowField
-from flowrec.summary import Row, comparison_for_people
+from flowrec.run_figures import RunStatistics, figures_of
+from flowrec.summary import Row, Value, comparison_for_people
+from flowrec.topics import FLOW_FIELDS, Tick
+from flowrec.units import seconds
+from flowrec.view.scene import Scene
 
 _MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\`*_{}[]()<>#+!|~"})
 _LETTERS = 200  # of one cell: names and notes come from the file
+# Figures of the end of a run in the text panel, in this order.
+FIGURES = (
+    "outcome",
+    "note",
+    "duration_s",
+    "assumed_flow_error",
+    "refined_flow_error",
+    "planned_s",
+    "navigation_s",
+    "tracking_error_um",
+    "contacts",
+    "frames_dropped",
+)
+_NEWS = ("mission", "route", "drops", "true_field", *FLOW_FIELDS)  # messages that bring another fact
 
 
 def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Iterable[str]) -> rr.TextDocument:
@@ -29,6 +47,51 @@ def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Itera
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
+def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
+    """Goal and figures of one run; those that are not known are left out."""
+    goal: list[Row] = [("goal", _place(last), None)]
+    return goal + [(key, figures[key], None) for key in FIGURES if figures.get(key) not in (None, "")]
+
+
+def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.TextDocument:
+    """The panel of one run, finished or not."""
+    remark = registration_remark(last.refined)
+    return summary_document([title], rows_of_run(last, figures), [remark] if remark else [])
+
+
+class LiveSummary:
+    """The same panel of a run that is under way; at its end it states what the panel of its session states."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._statistics = RunStatistics()
+        self._last = Tick()
+        self._first_ns: int | None = None
+
+    def add(self, tick: Tick) -> bool:
+        """Take the next tick; whether the panel changes with it."""
+        news = any(getattr(tick, name) is not getattr(self._last, name) for name in _NEWS)
+        self._statistics.write(tick)
+        self._last = tick
+        self._first_ns = tick.stamp_ns if self._first_ns is None else self._first_ns
+        return news
+
+    def document(self) -> rr.TextDocument:
+        """The panel at the last tick."""
+        last, seen = self._last, self._statistics
+        figures = figures_of(self._scene.chip, last, seen.true_field, seen.contacts, seen.navigating_ns)
+        mission, timing = last.mission, last.timing
+        if mission is not None and mission.finished:
+            figures |= {"outcome": mission.outcome, "note": mission.note}
+            figures["duration_s"] = seconds(last.stamp_ns - (self._first_ns or 0))
+            figures["tracking_error_um"] = seen.tracking_error_um or None  # a policy has no reference
+        elif mission is not None:
+            figures["outcome"] = f"under way: {mission.phase}"
+        if timing is not None:
+            figures["frames_dropped"] = timing.dropped_frames
+        return document_of_run(self._scene.title, last, figures)
+
+
 def registration_remark(refined: FlowField | None) -> str:
     """That the picture is moved, and by how much; '' without a registration."""
     if refined is None or refined.registration is None:
@@ -40,6 +103,13 @@ def registration_remark(refined: FlowField | None) -> str:
         f"The refinement found another registration: image and robot are drawn moved by ({x_um:.1f}, {y_um:.1f}) um in "
         "the middle of the chip, and turned as it states, so that they lie on the chip, route and map."
     )
+
+
+def _place(last: Tick) -> str:
+    goal = last.mission.goal_um if last.mission is not None else None
+    if goal is None or not np.isfinite(goal).all():
+        return "none"
+    return f"({goal[0]:.0f}, {goal[1]:.0f}) um"
 
 
 def _cell(text: str) -> str:

@@ -8,6 +8,7 @@ import platform
 import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -105,6 +106,11 @@ def open_window(*arguments: str) -> subprocess.Popen[bytes]:
     return start(["--port", "auto", "--hide-welcome-screen", *arguments])
 
 
+def leave(process: subprocess.Popen[bytes]) -> None:
+    """Let a process outlive this one; if it ends before, it leaves no entry in the table of processes."""
+    threading.Thread(target=process.wait, name="outlives", daemon=True).start()
+
+
 def open_viewer(path: Path | str) -> str:
     """Open a file in the viewer's window; '' on success, else one line that says how to see it."""
     path = Path(path)
@@ -116,5 +122,5 @@ def open_viewer(path: Path | str) -> str:
         process = open_window(str(path.resolve()))
     except OSError as error:
         return f"{path}: Rerun's viewer does not start ({error.strerror or error}); try `rerun {path}`"
-    process.returncode = 0  # so that a process that is not waited for is not reported as a leak
+    leave(process)
     return ""

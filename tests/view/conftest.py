@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 
 from flowrec import messages as m
@@ -57,6 +58,19 @@ def field(share: float, method: str, std: bool = False) -> m.FlowField:
 def mask() -> np.ndarray:
     """(H, W) fluid."""
     return _channel(MIDDLE, 22, 1)[1] | _channel(UPPER, 15, 1)[1] | _channel(LOWER, 15, 1)[1]
+
+
+@pytest.fixture(autouse=True)
+def no_process_stays() -> Iterator[None]:
+    """End what a test has started and not ended, such as a viewer where it failed: it would stay for ever."""
+    before = set(psutil.Process().children(recursive=True))
+    yield
+    left = set(psutil.Process().children(recursive=True)) - before
+    _, alive = psutil.wait_procs(left, 5.0)
+    for process in alive:
+        process.kill()
+    psutil.wait_procs(alive)
+    assert not alive
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +15,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
+from flowrec.exports.rrd import scene_of
 from flowrec.messages import Frame
+from flowrec.pipeline import assemble
+from flowrec.session import Session
 from flowrec.topics import Tick
-from flowrec.view import viewer
+from flowrec.view import live_server, viewer
 from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene
+from flowrec.view.summary_text import LiveSummary, document_of_run
 from tests.conftest import HANG_S, until
 
 LISTENING, CONNECTED = "0A", "01"
@@ -67,7 +73,6 @@ def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
 ) -> None:
     live = LiveView(scene, "serve", max_hz=50)
     assert live.pid is not None
-    until(lambda: sockets(live.pid or 0))
     live.write(ticks[0])
     os.kill(live.pid, blow)
     # More than the queue and the pipe hold.
@@ -75,34 +80,34 @@ def test_a_viewer_that_is_stopped_or_killed_does_not_slow_the_run(
     assert live.dropped > 1000
     if blow == signal.SIGKILL:
         until(lambda: "the run goes on without" in live.message)  # the thread that sends finds it out
-    assert returns(live.close)
+    assert returns(lambda: live.close(0.5))
 
 
 def test_a_live_view_listens_on_this_machine_only_and_ends_with_the_run(scene: Scene, ticks: list[Tick]) -> None:
     with LiveView(scene, "spawn") as live:
         pid = live.pid
         assert pid is not None
-        until(lambda: sockets(pid))
         for tick in ticks[:30]:
             live.write(tick)
-        assert {address for address, _ in sockets(pid)} == {LOOPBACK}
+        assert {address for address, _ in sockets(pid)} == {LOOPBACK}  # it accepts when its address is said
         assert live.url in live.message
         assert "no screen" in live.message
         live.close(HANG_S)
     assert live.dropped == 0
+    assert live.afterwards == ""
     assert not Path(f"/proc/{pid}").exists()
     live.write(ticks[0])  # late, and no error
     live.close()
 
 
-def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the listener is interrupted
+def test_a_viewer_receives_every_tick_and_a_smaller_image_and_its_server_stays_until_it_has_left(
     tmp_path: Path, scene: Scene, ticks: list[Tick]
 ) -> None:
     image = cv2.resize(ticks[0].frame.image, (1600, 1280))  # type: ignore[union-attr]
     program = viewer.executable()
     assert program is not None
     with LiveView(scene, "serve", max_hz=20) as live:
-        until(lambda: sockets(live.pid or 0))
         received = tmp_path / "received.rrd"
         listener = subprocess.Popen(
             [program, live.url, "--save", received], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
@@ -111,7 +116,13 @@ def test_what_a_viewer_receives_is_every_tick_and_a_smaller_image(
         for i, tick in enumerate(ticks[:60]):
             live.write(replace(tick, frame=Frame(tick.stamp_ns, i, image)))
         live.close(HANG_S)
+    # A viewer calls the end of its server an error: the server stays until the last one has left.
+    assert f"its server (process {live.pid}) stays" in live.afterwards
+    time.sleep(1.5 * live_server.ABSENT_S)
+    assert listener.poll() is None
+    listener.send_signal(signal.SIGINT)
     until(lambda: listener.poll() is not None)
+    until(lambda: not Path(f"/proc/{live.pid}").exists())
     robot, images, scale = [], [], []
     for chunk in RrdReader(received).stream():
         batch = chunk.to_record_batch()
@@ -150,7 +161,7 @@ def test_a_port_that_is_taken_is_said(scene: Scene, ticks: list[Tick]) -> None:
             live.write(ticks[0])
 
 
-def test_a_window_keeps_its_server_after_the_run_because_a_viewer_calls_its_end_an_error(
+def test_a_window_keeps_its_server_after_the_run(
     scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     program, closed = tmp_path / "rerun", tmp_path / "closed"
@@ -161,10 +172,29 @@ def test_a_window_keeps_its_server_after_the_run_because_a_viewer_calls_its_end_
     with LiveView(scene, "spawn") as live:
         pid = live.pid
         assert pid is not None
-        assert {address for address, _ in sockets(pid)} == {LOOPBACK}  # it accepts when its address is said
         live.write(ticks[0])
         live.close(HANG_S)
     assert sockets(pid)
     closed.touch()
-    until(lambda: "State:\tZ" in Path(f"/proc/{pid}/status").read_text())
-    os.waitpid(pid, 0)
+    until(lambda: not Path(f"/proc/{pid}").exists())
+
+
+def test_the_summary_tells_what_is_known_and_ends_as_that_of_the_session(session: Path) -> None:
+    stored = Session(session)
+    live = LiveSummary(scene_of(stored.config, stored.chip, assemble(stored.config, stored.chip), session))
+    texts = []
+    for tick in stored.ticks(with_frames=False):
+        if live.add(tick):
+            texts.append(text_of(live.document()))
+    assert len(set(texts)) >= 5
+    assert "under way: start" in texts[0]
+    assert "refined flow error" not in texts[0]
+    surveyed = next(text for text in texts if "refined flow error" in text)
+    assert "under way: refine" in surveyed or "under way: plan" in surveyed
+    assert text_of(live.document()) == text_of(document_of_run(session.stem, stored.last, stored.outcome))
+
+
+def text_of(document: rr.TextDocument) -> str:
+    assert document.text is not None
+    (text,) = document.text.as_arrow_array().to_pylist()
+    return str(text)

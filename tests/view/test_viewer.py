@@ -31,10 +31,11 @@ def test_the_window_is_bound_to_this_machine(monkeypatch: pytest.MonkeyPatch, tm
     started: list[list[str]] = []
 
     class Started:
-        returncode: int | None = None
-
         def __init__(self, command: list[str], **_: object) -> None:
             started.append(command)
+
+        def wait(self) -> None:
+            """It ends at once."""
 
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(subprocess, "Popen", Started)
