@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class Phase(StrEnum):
-    """What the mission does."""
+    """What the mission does. Configuration, terminal, reports, movies and the viewer all show these words."""
 
     START = "start"
     SURVEY = "survey"

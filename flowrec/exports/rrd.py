@@ -20,10 +20,21 @@ from flowrec.system.outputs import RRD, Output
 from flowrec.view.entities import PAIR, REPLAY
 from flowrec.view.rrd_file import is_made_from, write_rrd
 from flowrec.view.scene import Scene
-from flowrec.view.summary_text import FIGURES, document_of_run, registration_remark, rows_of_run, summary_document
+from flowrec.view.summary_text import (
+    FIGURES,
+    document_of_run,
+    note_of,
+    registration_remark,
+    rows_of_run,
+    summary_document,
+)
 
 if TYPE_CHECKING:
     import rerun as rr
+
+
+# What the table of a replay tells of its commands and the panel leaves out: it has room for eleven rows.
+_OF_COMMANDS = ("commands_compared", "commands_difference_rms_um_s")
 
 
 class RrdExport:
@@ -73,14 +84,18 @@ class RrdExport:
 
 
 def _comparison(pair: ReplayFiles) -> rr.TextDocument:
-    remark = registration_remark(pair.replayed.refined)
-    return summary_document(["recorded", "replayed"], before_after(pair), [remark] if remark else [])
+    rows = before_after(pair)
+    planners = next((values for key, *values in rows if key == "planner"), [None, None])
+    hidden = {*_OF_COMMANDS, *(("planner",) if planners[0] == planners[1] else ())}
+    shown = [row for row in rows if row[0] not in hidden]
+    return summary_document(["recorded", "replayed"], shown, [registration_remark(pair.replayed.refined)])
 
 
 def _pair(first: Session, second: Session) -> rr.TextDocument:
     was, now = ({key: value for key, value, _ in rows_of_run(each.last, each.outcome)} for each in (first, second))
+    notes = [note_of(each.outcome, f"{name}: ") for name, each in zip(PAIR, (first, second), strict=True)]
     rows = [(key, was.get(key), now.get(key)) for key in ("goal", *FIGURES) if key in was or key in now]
-    return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, [])
+    return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, notes)
 
 
 def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path) -> Scene:

@@ -50,13 +50,14 @@ NIS = "robot/observer NIS"
 NIS_MEAN = "robot/observer NIS, mean"
 PULSATION = "robot/pulsation"
 TIMING = "run/timing"
-# Lanes of the timeline of states, which shows these names.
+# Lanes of the timeline of states, which shows these names in the order of the alphabet.
 PHASE = "Mission"
+ALARM = "Observer"
+MARKS = "Operator"
+LOSSES = "Recording"
 SIGHT = "Robot"
-ALARM = "Alarm"
-MARKS = "Marks"
-LOSSES = "Losses"
-LANES = (PHASE, SIGHT, ALARM, MARKS, LOSSES)
+LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
+LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"

@@ -14,7 +14,7 @@ from flowrec.view.scene import Scene
 Floats = NDArray[np.float64]
 # Lengths in arrow spacings, unless stated otherwise.
 _ARROWS_ACROSS_IMAGE = (28.0, 45.0)  # along its width: for wide channels, and for narrow ones
-ARROWS_ACROSS_VIEW = (16.0, 26.0)  # the same in a view with other panels beside it
+ARROWS_ACROSS_VIEW = (16.0, 21.0)  # the same in a view with other panels beside it
 _ARROWS_ACROSS_CHANNEL = 2.5  # in a typical channel, within these limits
 _LONGEST = 0.9  # the fastest arrow: a row of longer ones would look like one line
 _FROM_WALL = 0.3  # least distance of an arrow from a wall, except in the middle of a narrow channel

@@ -17,6 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 from flowrec.topics import Tick
+from flowrec.units import seconds
 from flowrec.view import viewer
 from flowrec.view.scene import Scene
 
@@ -53,7 +54,7 @@ def serve() -> None:
             sys.exit(f"port {port} is taken by another program")
     stream.set_sinks(
         rr.GrpcServerSink(bind_ip=viewer.LOOPBACK, port=port, server_memory_limit=_SERVER_MEMORY),
-        default_blueprint=blueprint(scene, ("",), present),
+        default_blueprint=blueprint(scene, ("",), present, 0.0, [{}], live=True),
     )
     if not viewer.wait_for_server(port, _START_S):
         sys.exit(f"the server does not accept viewers at port {port}")
@@ -61,7 +62,7 @@ def serve() -> None:
     describe(stream, scene)
     opened = viewer.open_window("--connect", viewer.url(port)) if window else None
     logger, summary = TickLogger(stream, scene), LiveSummary(scene)
-    tick = Tick()
+    tick, phases = Tick(), 0
     while True:
         try:
             step, changes_of_ticks = pickle.load(source)  # noqa: S301
@@ -75,10 +76,12 @@ def serve() -> None:
             news |= summary.add(tick)
         if news:
             stream.log(SUMMARY, summary.document(), static=True)
-        if not logger.present <= present:
-            # Something is shown for the first time: its view is added to the layout.
-            present |= logger.present
-            stream.send_blueprint(blueprint(scene, ("",), present))
+        begun = len(logger.phases)
+        ended = tick.mission is not None and tick.mission.finished
+        if not logger.present <= present or (begun > phases and not ended):
+            # What is shown for the first time is added to the layout. At the end it stays as a person has arranged it.
+            present, phases = present | logger.present, begun
+            stream.send_blueprint(blueprint(scene, ("",), present, seconds(tick.stamp_ns), [logger.phases], live=True))
     stream.log(SUMMARY, summary.document(), static=True)
     _stay(port, opened)
     stream.disconnect()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import cv2
@@ -34,6 +34,7 @@ _TRAIL_S = 4.0
 _TRAIL_STEP_PX = 1.0
 _COMMAND_PX = 60.0  # length of the arrow of the fastest command
 _LEVELS: dict[str, str] = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
+_WORD_SHARE = 0.16, 0.12  # of the view: half the width, and the height, of the longest word about the robot
 _CROSS = np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
@@ -96,6 +97,11 @@ class TickLogger:
             "drops": self._states.log_drops,
             "losses": self._states.log_losses,
         }
+
+    @property
+    def phases(self) -> Mapping[str, int]:
+        """See StateLogger."""
+        return self._states.phases
 
     def log(self, tick: Tick, frame_index: int | None = None) -> None:
         """Log what is new since the previous tick; `frame_index` is for a tick without its frame."""
@@ -181,8 +187,8 @@ class TickLogger:
         # A word only where something is wrong: the title of the view states the colours, and words hide each other.
         last = self._last.estimate
         if not estimate.seen:
-            position = [centre + np.array([0.0, self._robot_px + 2.0 * self._unit_px])]
-            word = f"{self._style.word}robot not seen"
+            position = [self._place_of_word(centre)]
+            word = f"{self._style.word}not seen" if self._prefix else "robot not seen"
             self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=position, labels=[word], colors=colour))
         elif last is not None and not last.seen:
             self._log(e.ROBOT_LABEL, rr.Points2D.from_fields(positions=[], labels=[]))
@@ -200,6 +206,18 @@ class TickLogger:
         if math.isfinite(estimate.nis):
             self._log(e.NIS, rr.Scalars(estimate.nis))
 
+    def _place_of_word(self, centre: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where a word about the robot is not cut by the border of the view, nor by that of a second session's robot.
+
+        Rerun centres it below the place.
+        """
+        left, top, right, bottom = self._scene.shown_bounds()
+        aside, high = _WORD_SHARE[0] * (right - left), _WORD_SHARE[1] * (bottom - top)
+        y = centre[1] + self._robot_px + 2.0 * self._unit_px
+        if y > bottom - high or (self._prefix and not self._style.second):
+            y = centre[1] - self._robot_px - high
+        return np.array([np.clip(centre[0], left + aside, right - aside), np.clip(y, top, bottom - high)])
+
     def _log_trail(self, stamp_ns: int, centre: NDArray[np.float64]) -> None:
         trail = self._trail
         if not trail or math.dist(trail[-1][1], centre) >= _TRAIL_STEP_PX * self._unit_px:
@@ -216,6 +234,7 @@ class TickLogger:
         if math.isfinite(demand.error_um):
             if demand.error_um > 0.0:  # a policy has no reference
                 self._log(e.TRACKING_ERROR, rr.Scalars(demand.error_um))
+                self.present.add("tracking")
             reference = self._scene.to_plane(demand.reference_um)
             self._log(e.REFERENCE, rr.Points2D.from_fields(positions=[reference]))
         if self._tick.estimate is not None:

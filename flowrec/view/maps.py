@@ -82,7 +82,7 @@ class ColourBar:
         left, _, _, _ = scene.fluid_bounds()
         size = self.height / _BAR_SHARE
         top = self.top - 0.16 * size
-        return left - 0.03 * size, top - 0.02 * size, self.left + self.width + 0.3 * size, top + 1.02 * size
+        return left - 0.03 * size, top - 0.02 * size, self.left + self.width + 0.34 * size, top + 1.02 * size
 
     def strip(self, scale: Scale) -> tuple[rr.Image, rr.Transform3D]:
         """The colours, the highest value on top."""
@@ -103,7 +103,7 @@ class ColourBar:
         labels = [f"{value:{sign}g}" if abs(value) > 1e-9 * scale.high else "0" for value in scale.ticks]
         labels.append(scale.unit)
         # Rerun centres a label below its point: a little up and half a label to the right puts it beside its tick.
-        positions = [(right + 2.0 * self.width, row - 0.045 * self.height) for row in y]
-        positions.append((self.left + 0.5 * self.width, self.top - 0.14 * self.height))
+        positions = [(right + 3.2 * self.width, row - 0.045 * self.height) for row in y]
+        positions.append((self.left + 0.5 * self.width, self.top - 0.2 * self.height))
         numbers = rr.Points2D(positions, labels=labels, show_labels=True, colors=colours.WHITE, radii=points(0))
         return marks, numbers

@@ -130,8 +130,9 @@ def _log_all(
     present = first.present | shown
     if second is not None:
         present |= {f"{prefixes[1]} {what}" for what in second.present}
+    phases = [first.phases] if second is None else [first.phases, second.phases]
     # Last, when it is known which views are not empty. Rerun accepts it anywhere in the file.
-    stream.send_blueprint(blueprint(scene, prefixes if both else ("",), present, seconds(stamp_ns)))
+    stream.send_blueprint(blueprint(scene, prefixes if both else ("",), present, seconds(stamp_ns), phases))
 
 
 def _merged(ticks: Iterable[Tick], second: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:

@@ -15,21 +15,18 @@ from flowrec.view.entities import EntityLogger
 
 _MARK_NS = NS_PER_S // 2  # a mark is drawn this long: it has no duration
 _STATES = 200  # of a lane that have a colour of their own: a session of hours may have many marks
+_PHASES = 9  # that have a name in `StateLogger.phases`
 _LETTERS = 40  # of a mark's text
-_PHASES: dict[str, tuple[str, Rgb]] = {
-    Phase.START.value: ("Start", colours.GREY),
-    Phase.SURVEY.value: ("Survey the flow", colours.PURPLE),
-    Phase.REFINE.value: ("Refine the map", colours.BLUE),
-    Phase.PLAN.value: ("Plan the route", colours.YELLOW),
-    Phase.NAVIGATE.value: ("Navigate to the goal", colours.ORANGE),
-    Phase.OBSERVE.value: ("Observe", colours.PURPLE),
-    Phase.DONE.value: ("Done", colours.GREEN),
+_PHASE_COLOURS: dict[str, Rgb] = {
+    Phase.SURVEY: colours.PURPLE,
+    Phase.REFINE: colours.BLUE,
+    Phase.PLAN: colours.YELLOW,
+    Phase.NAVIGATE: colours.ORANGE,
+    Phase.OBSERVE: colours.PURPLE,
+    Phase.DONE: colours.GREEN,
 }
-_ALARMS = {
-    Alarm.NIS.value: "observer inconsistent (NIS)",
-    Alarm.PULSATION.value: "flow pulsates",
-    Alarm.TRACKING.value: "robot not seen",
-}
+# That the robot is not seen has a lane of its own.
+_ALARMS = {Alarm.NIS.value: "inconsistent (NIS)", Alarm.PULSATION.value: "flow pulsates", Alarm.TRACKING.value: ""}
 _NONE = ""  # a state that is not drawn
 
 
@@ -39,6 +36,7 @@ class StateLogger:
     def __init__(self, entities: EntityLogger, present: set[str]) -> None:
         self._log = entities.log
         self._present = present
+        self.phases: dict[str, int] = {}  # stamp at which each phase, and the outcome, first began
         self._now: dict[str, str] = {}
         self._colours: dict[str, dict[str, Rgb]] = {}  # of the states of each lane so far
         self._mark_ends_ns: int | None = None
@@ -47,9 +45,14 @@ class StateLogger:
         """The phase, and at the end the outcome."""
         if mission.finished and mission.outcome:
             done = mission.outcome in set(Outcome) and Outcome(mission.outcome).completes_mission
-            self._log_state(e.PHASE, mission.outcome.capitalize(), colours.GREEN if done else colours.RED)
+            self._log_phase(mission, mission.outcome, colours.GREEN if done else colours.RED)
         else:
-            self._log_state(e.PHASE, *_PHASES.get(mission.phase, (mission.phase, colours.GREY)))
+            self._log_phase(mission, mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY))
+
+    def _log_phase(self, mission: Mission, name: str, colour: Rgb) -> None:
+        if len(self.phases) < _PHASES:
+            self.phases.setdefault(name, mission.since_ns)
+        self._log_state(e.PHASE, name.capitalize(), colour)
 
     def log_sight(self, seen: bool) -> None:
         """The robot is not seen: nothing is drawn while it is."""
@@ -58,7 +61,7 @@ class StateLogger:
     def log_alarm(self, alarm: str) -> None:
         """Alarms of the observer: words of enums.Alarm, separated by "; "."""
         words = [_ALARMS.get(word, word) for word in alarm.split("; ") if word]
-        self._log_state(e.ALARM, ", ".join(words), colours.RED)
+        self._log_state(e.ALARM, ", ".join(word for word in words if word), colours.RED)
 
     def log_mark(self, event: OperatorEvent) -> None:
         """A mark or another action of the operator."""

@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flowrec.enums import Phase
 from flowrec.errors import printable
 from flowrec.messages import Estimate, Mission
 from flowrec.units import seconds
@@ -20,14 +19,6 @@ ROBOT, ROUTE, GOAL, FLOW = colours.ORANGE, colours.CYAN, colours.GREEN, colours.
 _TEXT, _GROUND = colours.WHITE, (24, 24, 28)
 GOAL_SIGN = (*(np.array([0.5 * arm, arm]) for line in CROSS for arm in line), 0.75 * CIRCLE)  # a crosshair, open inside
 _LONGEST_BAR = 0.16  # of the width of the picture
-_PHASES: dict[str, str] = {
-    Phase.START: "starting",
-    Phase.SURVEY: "surveying the flow",
-    Phase.REFINE: "refining the flow",
-    Phase.PLAN: "planning the route",
-    Phase.NAVIGATE: "going to the goal",
-    Phase.OBSERVE: "observing",
-}
 _MOST_LETTERS = 40  # of words from a file
 
 
@@ -137,7 +128,7 @@ def state_text(mission: Mission | None, estimate: Estimate | None) -> str:
         elif mission.held_since_ns is not None:
             words = "held by the operator"
         else:
-            words = _PHASES.get(mission.phase, mission.phase)
+            words = mission.phase
     if estimate is not None and not estimate.seen:
         words += ", robot not seen" if words else "robot not seen"
     words = printable(words)

@@ -18,10 +18,9 @@ from flowrec.view.scene import Scene
 
 _MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\`*_{}[]()<>#+!|~"})
 _LETTERS = 200  # of one cell: names and notes come from the file
-# Figures of the end of a run in the text panel, in this order.
+# Figures of a run in the text panel, in this order. The panel has room for eleven rows.
 FIGURES = (
     "outcome",
-    "note",
     "duration_s",
     "assumed_flow_error",
     "refined_flow_error",
@@ -31,11 +30,12 @@ FIGURES = (
     "contacts",
     "frames_dropped",
 )
+_AT_ZERO = ("contacts",)  # counts that are shown also where they are 0
 _NEWS = ("mission", "route", "drops", "true_field", *FLOW_FIELDS)  # messages that bring another fact
 
 
 def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Iterable[str]) -> rr.TextDocument:
-    """A table with one or two columns of values, then the remarks as paragraphs.
+    """A table with one or two columns of values, then the remarks as paragraphs; '' is none.
 
     Rows are key and values, as flowrec.summary reads them; of one column the second value is not shown.
     """
@@ -43,20 +43,26 @@ def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Itera
     lines = [[_cell(each) for each in row] for row in (["", *columns], *cells)]
     lines.insert(1, ["---"] + ["---:"] * len(columns))
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    text = "\n\n".join([table, *map(_cell, remarks)])
+    text = "\n\n".join([table, *(_cell(remark) for remark in remarks if remark)])
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
 def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
     """Goal and figures of one run; those that are not known are left out."""
     goal: list[Row] = [("goal", _place(last), None)]
-    return goal + [(key, figures[key], None) for key in FIGURES if figures.get(key) not in (None, "")]
+    known = [key for key in FIGURES if figures.get(key) not in (None, "")]
+    return goal + [(key, figures[key], None) for key in known if figures[key] != 0 or key in _AT_ZERO]
 
 
 def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.TextDocument:
     """The panel of one run, finished or not."""
-    remark = registration_remark(last.refined)
-    return summary_document([title], rows_of_run(last, figures), [remark] if remark else [])
+    return summary_document([title], rows_of_run(last, figures), [note_of(figures), registration_remark(last.refined)])
+
+
+def note_of(figures: Mapping[str, Value], whose: str = "") -> str:
+    """The note on how a run ended, as a remark: in a row of the table it would be cut; '' if there is none."""
+    note = figures.get("note")
+    return f"{whose}{note}" if note else ""
 
 
 class LiveSummary:
@@ -93,16 +99,13 @@ class LiveSummary:
 
 
 def registration_remark(refined: FlowField | None) -> str:
-    """That the picture is moved, and by how much; '' without a registration."""
+    """By how much the picture is moved in the middle of the chip; '' without a registration. Fits in one line."""
     if refined is None or refined.registration is None:
         return ""
     height, width = refined.pressure_pa.shape
     middle_um = 0.5 * refined.um_per_px * np.array([width - 1.0, height - 1.0])
     x_um, y_um = (on_chip(refined.registration, middle_um) - middle_um).tolist()
-    return (
-        f"The refinement found another registration: image and robot are drawn moved by ({x_um:.1f}, {y_um:.1f}) um in "
-        "the middle of the chip, and turned as it states, so that they lie on the chip, route and map."
-    )
+    return f"Found registration: picture moved by ({x_um:.1f}, {y_um:.1f}) um"
 
 
 def _place(last: Tick) -> str:
