@@ -189,6 +189,7 @@ def replay(
     refly: Annotated[
         bool, typer.Option("--refly", help="Fly both plans in a simulator with the refined flow.")
     ] = False,
+    jobs: Annotated[int, typer.Option(metavar="N", help="Processes of --verify; 0: one a core.")] = 1,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Session file of the replay.")] = None,
     frames: Annotated[bool, typer.Option("--frames", help="Copy the camera images into the replay's file.")] = False,
     view: Annotated[Literal["rrd", "none"], typer.Option(help="Write an .rrd of both, side by side.")] = "none",
@@ -199,12 +200,21 @@ def replay(
     from flowrec.commands.interactive import AtTerminal
 
     change = flowrec.Change(refine, plan, observer, controller, tuple(sets or ()))
+    if jobs != 1 and not verify:
+        raise typer.BadParameter("--jobs goes with --verify: in a changed replay each tick depends on those before")
     if verify:
         if refly:
             raise typer.BadParameter("--verify only compares; it goes without --refly")
-        from flowrec.commands.replay import replay as replay_verb
+        if jobs == 1:
+            from flowrec.commands.replay import replay as replay_verb
 
-        done = replay_verb(session, change, from_s, True, out, overwrite, frames, AtTerminal())
+            done = replay_verb(session, change, from_s, True, out, overwrite, frames, AtTerminal())
+        else:
+            from flowrec.commands.replay_segments import verify as verify_in_segments
+
+            if change != flowrec.Change() or out is not None:
+                raise typer.BadParameter("--verify --jobs only compares: it goes without --refine, --set, --out ...")
+            done = verify_in_segments(session, jobs, from_s, AtTerminal())
         if as_json:
             typer.echo(json.dumps({"session": str(session), **done.as_json()}))
         else:

@@ -117,6 +117,19 @@ class TopicCount:
     different: int = 0
     first: Difference | None = None
 
+    def see(self, difference: Difference) -> None:
+        """Keep a difference if it is the first, or the first beyond the tolerance."""
+        if self.first is None or (difference.beyond and not self.first.beyond):
+            self.first = difference
+
+    def followed_by(self, later: TopicCount) -> None:
+        """Add the counts of later messages."""
+        self.identical += later.identical
+        self.within_tolerance += later.within_tolerance
+        self.different += later.different
+        if later.first is not None:
+            self.see(later.first)
+
     def as_json(self) -> dict[str, Any]:
         """The result for JSON."""
         return {
@@ -177,6 +190,18 @@ class Comparison:
         """The words for the values of the two sides."""
         return self.sides[0].word, self.sides[1].word
 
+    def begin_after(self, tick: Tick) -> None:
+        """Take a tick that both sides have in common: its messages are compared elsewhere."""
+        self._before = (tick, tick)
+
+    def followed_by(self, later: Comparison) -> None:
+        """Add what was compared in the ticks that follow."""
+        self.ticks += later.ticks
+        self.different_ticks += later.different_ticks
+        self.first = self.first or later.first
+        for path, count in later.topics.items():
+            self.topics.setdefault(path, TopicCount()).followed_by(count)
+
     def add(self, recorded: Tick, replayed: Tick) -> None:
         """Compare all topics of the chosen roles in one tick."""
         self.ticks += 1
@@ -214,8 +239,7 @@ class Comparison:
             self.first = self.first or difference
         else:
             count.within_tolerance += 1
-        if count.first is None or (difference.beyond and not count.first.beyond):
-            count.first = difference
+        count.see(difference)
         return difference
 
     @property

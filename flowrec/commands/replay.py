@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flowrec import topics
 from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.replay_result import Replayed, WorkerCheck, digest_lines
+from flowrec.commands.replay_result import Replayed, WorkerCheck, WorkerResults, digest_lines
 from flowrec.commands.run_summary import figures_of
 from flowrec.config import ResolvedConfig, with_sets
 from flowrec.control.controller import CONTROLLERS
@@ -145,6 +145,8 @@ def replay(
     overwrite: bool = False,
     frames: bool = False,
     control: Unattended | None = None,
+    *,
+    segment_ns: tuple[int | None, int] | None = None,
 ) -> Replayed:
     """Replay a session, in any thread; write the result to a new session if `out` is given.
 
@@ -157,6 +159,8 @@ def replay(
     overwrite : `out` may replace an existing file.
     frames : copy the camera's images to `out`.
     control : who attends the replay; None: nobody, it takes no signals and shows no progress.
+    segment_ns : replay a segment of a verification: stamps of its first and its last tick, None for the beginning. Its
+        start is compared in the segment before, and digests are not.
 
     Raises
     ------
@@ -179,11 +183,14 @@ def replay(
         pipeline = replace(pipeline, hindsight=hindsight(session, pipeline))
     path, reader = session.path, session.reader
     start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
+    end_ns = reader.last_ns
+    if segment_ns is not None:
+        start_ns, end_ns = segment_ns
     if reader.keyframe_ns is not None:
         # A part of a run begins with a keyframe, whose inputs the part before holds.
         start_ns = max(start_ns or 0, reader.keyframe_ns + 1)
     start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
-    rig = RecordedRig(reader, start_ns, stale)
+    rig = RecordedRig(reader, start_ns, stale, end_ns)
     progress = Progress()  # until the bar is shown
     # Recorded results stand where today's code computes the same of the same. Hindsight is no message of a tick.
     stands = session.numerics == str(NUMERICS_VERSION) and pipeline.hindsight is None
@@ -200,8 +207,10 @@ def replay(
     if order is not None:
         worker.submit(order)
     sides = Side.of("recorded", session), Side("replayed", "the replay")
-    check = WorkerCheck(pipeline, start, order, Comparison(sides=sides)) if verify else None
+    results = WorkerResults(Comparison(sides=sides))
+    check = WorkerCheck(pipeline, start, order, results) if verify else None
     comparison, commands = Comparison(sides=sides), CommandDifference()
+    comparison.begin_after(start)
     first_ns = start_ns if start_ns is not None else reader.first_ns
 
     def on_tick(tick: Tick) -> None:
@@ -218,7 +227,7 @@ def replay(
         if out is not None:
             writer = stack.enter_context(session_writer(output, config, session.chip, parent=path))
             sinks.append(writer if frames else WithoutFrames(writer))
-        length_s = max(seconds(reader.last_ns - first_ns), 1e-3)
+        length_s = max(seconds(end_ns - first_ns), 1e-3)
         progress = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
         with control.armed():
             report = run(
@@ -239,7 +248,9 @@ def replay(
             writer.close(as_text(figures | {"outcome": ended, "note": note}))
     result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing)
     if verify:
-        result.worker_check, result.digest = check, digest_lines(path)
+        result.worker = results
+        if segment_ns is None:
+            result.digest = digest_lines(path)
     return result
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from flowrec.commands.compare import Comparison
 from flowrec.config import ResolvedConfig
 from flowrec.enums import WorkOrder
 from flowrec.errors import printable
-from flowrec.messages import FlowField, Mission, Route
+from flowrec.messages import Mission
 from flowrec.pipeline import Pipeline
 from flowrec.replay_figures import CommandDifference
 from flowrec.run.loop import RunReport
@@ -19,6 +19,25 @@ from flowrec.run.workers import work
 from flowrec.session import Session
 from flowrec.store.audit import digest_faults
 from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS, Tick
+
+
+@dataclass(slots=True)
+class WorkerResults:
+    """How the recorded results of the worker compare with those that were computed again.
+
+    Attributes
+    ----------
+    comparison : of the messages.
+    lines : a line of text for each result.
+    """
+
+    comparison: Comparison
+    lines: list[str] = field(default_factory=list)
+
+    def followed_by(self, later: WorkerResults) -> None:
+        """Add what was compared in the ticks that follow."""
+        self.comparison.followed_by(later.comparison)
+        self.lines += later.lines
 
 
 class WorkerCheck:
@@ -29,21 +48,16 @@ class WorkerCheck:
     pipeline : the stages as recorded.
     start : the tick before the first one of the replay.
     order : the tick of an order whose result is not yet adopted at `start`; None without one.
-    comparison : takes the results.
-
-    Attributes
-    ----------
-    results : a line of text for each result.
+    results : receives what is found.
     """
 
-    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None, comparison: Comparison) -> None:
+    def __init__(self, pipeline: Pipeline, start: Tick, order: Tick | None, results: WorkerResults) -> None:
         self._pipeline = pipeline
-        self._computed: dict[int, FlowField | Route] = {}  # by number of the order
+        self._orders: dict[int, Tick] = {}  # by number; computed when the result was adopted, if it ever was
         self._ordered = start.mission.request if start.mission is not None else 0
         self._last = start
         self._unknown = {0}  # orders that can not be computed again; 0: fields of an earlier session
-        self.comparison = comparison
-        self.results: list[str] = []
+        self.results = results
         if order is None or order.mission is None:
             return
         mission = order.mission
@@ -51,28 +65,29 @@ class WorkerCheck:
         if _knows_more(order, mission, WORKER_FIELDS[answer].reads):
             self._unknown.add(mission.request)
             path = BY_FIELD[answer].path
-            self.results.append(f"{path}: ordered in the part before, taken as recorded")
+            self.results.lines.append(f"{path}: ordered in the part before, taken as recorded")
         else:
-            self._computed[mission.request] = work(pipeline, order)
+            self._orders[mission.request] = order
 
     def add(self, tick: Tick) -> None:
-        """Take the next tick: compute a new order, compare newly adopted results."""
+        """Take the next tick: note a new order, compute and compare newly adopted results."""
         for name in WORKER_FIELDS:
             adopted = getattr(tick, name)
             if adopted is None or adopted is getattr(self._last, name) or adopted.request in self._unknown:
                 continue
-            computed = self._computed.pop(adopted.request, None)
-            computed = replace(computed, stamp_ns=tick.stamp_ns) if computed is not None else None
+            order = self._orders.pop(adopted.request, None)
+            computed = replace(work(self._pipeline, order), stamp_ns=tick.stamp_ns) if order is not None else None
             topic = BY_FIELD[name]
-            found = self.comparison.add_pair(topic, adopted, computed, tick.stamp_ns)
+            comparison = self.results.comparison
+            found = comparison.add_pair(topic, adopted, computed, tick.stamp_ns)
             how = "identical"
             if found is not None:
-                how = f"{self.comparison.different_word if found.beyond else 'within tolerance'}: {found}"
-            self.results.append(printable(f"{topic.path} {adopted.method}: {how}"))
+                how = f"{comparison.different_word if found.beyond else 'within tolerance'}: {found}"
+            self.results.lines.append(printable(f"{topic.path} {adopted.method}: {how}"))
         mission = tick.mission
         if mission is not None and mission.wanted and mission.request > self._ordered:
             self._ordered = mission.request
-            self._computed[mission.request] = work(self._pipeline, tick)
+            self._orders[mission.request] = tick
         self._last = tick
 
 
@@ -108,7 +123,7 @@ class Replayed:
     comparison : of the outputs of both, tick by tick.
     commands : of the demands of both.
     frames_missing : images that are not in the file.
-    worker_check : of --verify: the results of the worker.
+    worker : of --verify: the results of the worker.
     digest : of --verify: whether the files match their digests, and lines of text about it.
     """
 
@@ -120,7 +135,7 @@ class Replayed:
     comparison: Comparison
     commands: CommandDifference
     frames_missing: int
-    worker_check: WorkerCheck | None = None
+    worker: WorkerResults | None = None
     digest: tuple[bool, list[str]] = (True, [])
 
     @property
@@ -135,13 +150,13 @@ class Replayed:
 
     @property
     def _comparisons(self) -> list[Comparison]:
-        return [self.comparison, *([self.worker_check.comparison] if self.worker_check is not None else [])]
+        return [self.comparison, *([self.worker.comparison] if self.worker is not None else [])]
 
     def lines(self) -> list[str]:
         """How the replay compares with the recording, the conclusion last."""
         lines = self.comparison.lines()
-        if self.worker_check is not None:
-            lines += self.worker_check.results
+        if self.worker is not None:
+            lines += self.worker.lines
         lines += self.digest[1]
         if self.frames_missing:
             lines.append(f"{self.frames_missing} frames are not in the file; the recorded tracks were used instead")

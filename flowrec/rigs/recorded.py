@@ -18,11 +18,16 @@ class RecordedRig:
     """
 
     def __init__(
-        self, reader: SessionReader, start_ns: int | None = None, recompute: frozenset[str] = frozenset()
+        self,
+        reader: SessionReader,
+        start_ns: int | None = None,
+        recompute: frozenset[str] = frozenset(),
+        end_ns: int | None = None,
     ) -> None:
         self._reader = reader
         self._start_ns = start_ns
         self._recompute = recompute
+        self._end_ns = reader.last_ns if end_ns is None else end_ns
         self.recorded = Tick()
         self.frames_missing = 0
 
@@ -33,9 +38,11 @@ class RecordedRig:
         """Nothing to switch off."""
 
     def inputs(self) -> Iterator[Inputs]:
-        """One Inputs per recorded tick, from the start on."""
+        """One Inputs per recorded tick, from the start to the end, both included."""
         before = self._reader.tick_before(self._start_ns - 1) if self._start_ns is not None else Tick()
         for tick in self._reader.ticks(self._start_ns):
+            if tick.stamp_ns > self._end_ns:
+                return
             if tick.applied is None or tick.applied is before.applied:
                 # An incomplete tick: the last one before a crash, or an operator event, which the next tick takes.
                 before = replace(before, frame=tick.frame)

@@ -176,10 +176,14 @@ class SessionReader:
     @functools.cached_property
     def frame_stamps(self) -> list[int]:
         """The stamps of the recorded images, in order; no image is read for them."""
+        return self.stamps("frame")
+
+    def stamps(self, field: str) -> list[int]:
+        """The stamps of the ticks with a new message of a topic, in order; from the index, no message is read."""
         found: list[int] = []
         for number, file in enumerate(self._run.files):
-            if "frame" in self._fields[number]:
-                stamps = self._file(number).stamps("frame")
+            if field in self._fields[number]:
+                stamps = self._file(number).stamps(field)
                 found += [stamp_ns for stamp_ns in stamps if not number or stamp_ns > file.first_ns]
         return found
 

@@ -42,10 +42,22 @@ def pool(processes: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
 
 
+def end_pool(executor: ProcessPoolExecutor) -> None:
+    """End the processes of a pool at once, also in the middle of their work, and wait until they have ended."""
+    processes = list((getattr(executor, "_processes", None) or {}).values())
+    executor.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.join()
+
+
 def _end_with_parent() -> None:
     """By itself the pool's process waits for work for ever, because its siblings keep its pipe open."""
     import multiprocessing
+    import signal
 
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of a terminal's processes; the parent decides
     parent = multiprocessing.parent_process()
     assert parent is not None
 

@@ -38,10 +38,10 @@ def test_the_golden_session_replays_the_same_but_for_the_meaning_of_its_fields(f
     done = verb.replay(GOLDEN, Change(), from_s=from_s, verify=True)
     lines = done.lines()
     assert done.comparison.same and done.digest[0], lines
-    assert done.worker_check is not None
-    different = {path for path, count in done.worker_check.comparison.topics.items() if count.different}
+    assert done.worker is not None
+    different = {path for path, count in done.worker.comparison.topics.items() if count.different}
     assert different == (BY_OTHER_NUMERICS if from_s is None else set()), lines
-    routes = done.worker_check.comparison.topics["/plan/route"]
+    routes = done.worker.comparison.topics["/plan/route"]
     assert routes.identical + routes.within_tolerance == (2 if from_s is None else 1)
     if different:
         assert not done.same
@@ -54,9 +54,9 @@ def test_the_golden_session_of_the_moderate_world_replays_the_same() -> None:
     done = verb.replay(MODERATE, Change(), verify=True)
     lines = done.lines()
     assert done.comparison.same and done.digest[0], lines
-    assert done.worker_check is not None
+    assert done.worker is not None
     assert done.same, lines  # on other processors within tolerance
-    routes = done.worker_check.comparison.topics["/plan/route"]
+    routes = done.worker.comparison.topics["/plan/route"]
     assert routes.identical + routes.within_tolerance > 3
     assert done.recorded.mission is not None
     assert done.recorded.mission.outcome == "reached"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flowrec.commands import replay as verb
+from flowrec.commands import replay_segments
 from flowrec.commands.compare import compare
 from flowrec.commands.record import record
 from flowrec.commands.replay import Change
@@ -23,6 +24,7 @@ from flowrec.messages import Estimate
 from flowrec.pipeline import Pipeline
 from flowrec.refine import Refiner
 from flowrec.run.workers import work
+from flowrec.session import Session
 from flowrec.store.reader import SessionReader
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from tests.short_missions import SMALL
@@ -59,8 +61,8 @@ def test_a_replay_is_identical_tick_by_tick_and_its_worker_results_can_be_made_a
     same, lines = done.same, done.lines()
     assert same, lines
     assert done.comparison.identical, str(done.comparison.first)
-    assert done.worker_check is not None
-    assert len(done.worker_check.results) >= 4  # solved, surveyed, refined, planned
+    assert done.worker is not None
+    assert len(done.worker.lines) >= 4  # solved, surveyed, refined, planned
 
 
 @pytest.mark.parametrize("share", [0.01, 0.23, 0.5, 0.77, 0.95])
@@ -112,9 +114,9 @@ def test_a_recording_in_real_time_verifies_from_any_time_by_the_declared_setting
     done = verb.replay(realtime_session, Change(), from_s=from_s, verify=True)
     same, lines = done.same, done.lines()
     assert same and done.comparison.identical, lines
-    assert done.worker_check is not None
+    assert done.worker is not None
     made = sum(stamp_ns >= (start_ns or 0) for stamp_ns in adopted)
-    assert len(done.worker_check.results) == made >= 1, lines
+    assert len(done.worker.lines) == made >= 1, lines
 
 
 def test_a_replay_adopts_what_it_computes_anew_on_the_ticks_of_the_recording(
@@ -257,3 +259,13 @@ def test_a_time_outside_the_session_is_refused(session: Path) -> None:
 def test_an_existing_output_is_not_overwritten(session: Path) -> None:
     with pytest.raises(SessionError, match="is read by this command"):
         verb.replay(session, Change(), out=session)
+
+
+def test_a_verification_in_segments_finds_what_one_pass_finds(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_segments, "_TICKS", 40)
+    alone = replay_segments.verify(session)
+    beside = replay_segments.verify(session, jobs=2)
+    assert len(replay_segments._segments(Session(session), 2, None)) > 2
+    assert beside.identical
+    assert beside.lines() == alone.lines()
+    assert beside.as_json() == alone.as_json()

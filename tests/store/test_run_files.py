@@ -290,7 +290,7 @@ def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut
         done = verb.replay(file, Change(), verify=True)
         same_again, lines = done.same, done.lines()
         assert same_again and done.comparison.identical, lines
-        assert (done.worker_check is not None and done.worker_check.results) or file == files[0]
+        assert (done.worker is not None and done.worker.lines) or file == files[0]
     # What is planned or refined anew from a part alone goes out from what the part knows.
     done = verb.replay(files[-1], Change(refine="assimilate"), out=tmp_path / "again.mcap")
     assert done.replayed.refined is not None

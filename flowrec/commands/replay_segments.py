@@ -1,0 +1,125 @@
+"""A verification in segments side by side: any tick is a restart point of a replay.
+
+Each segment starts from the recorded state at the last tick of the one before and is compared tick by tick, its last
+tick included. So the state with which a segment ends is the state with which the next one begins, or it is a
+difference. The verdict and the first difference are those of one pass; after it the counts of differences are not,
+because the next segment starts from the recording again.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from flowrec.commands.compare import Comparison
+from flowrec.commands.interactive import Unattended
+from flowrec.commands.replay import replay
+from flowrec.commands.replay_result import Replayed, WorkerResults, digest_lines
+from flowrec.errors import SessionError, UsageError
+from flowrec.replay_figures import CommandDifference
+from flowrec.run.loop import RunReport
+from flowrec.session import Session
+from flowrec.system.processes import end_pool, pool
+from flowrec.topics import Tick
+from flowrec.version import NUMERICS_VERSION
+
+_TICKS = 300  # of a segment at least: restoring its start takes as long as a few of them
+_PER_JOB = 4  # segments, because those with work orders take longer
+_JOBS_LIMIT = 256
+
+Segment = tuple[int | None, int]  # stamps of the first and the last tick; None: the beginning of the session
+
+
+@dataclass(frozen=True, slots=True)
+class _Verified:
+    """A segment's result, without the session, which the caller has."""
+
+    report: RunReport
+    recorded: Tick
+    comparison: Comparison
+    worker: WorkerResults
+    frames_missing: int
+
+
+def verify(
+    session: Session | Path | str, jobs: int = 1, from_s: float | None = None, control: Unattended | None = None
+) -> Replayed:
+    """Replay a session as it was recorded, in `jobs` processes, and compare every message.
+
+    Parameters
+    ----------
+    jobs : processes at a time; 1: one pass in this process, as for a session of other numerics; 0: one for each core.
+    from_s : session time in s to start at.
+    control : as of `replay`.
+
+    Raises
+    ------
+    UsageError : a number of jobs that is not possible, or a time outside of the session.
+    SessionError : the session can not be read or replayed, or a process was killed.
+    """
+    if not 0 <= jobs <= _JOBS_LIMIT:
+        raise UsageError(f"--jobs {jobs}: the number of processes is 1 to {_JOBS_LIMIT}, or 0 for one a core")
+    jobs = jobs or os.cpu_count() or 1
+    session, control = Session.of(session), control or Unattended()
+    segments = _segments(session, jobs, from_s) if jobs > 1 else []
+    if len(segments) < 2:
+        return replay(session, from_s=from_s, verify=True, control=control)
+    executor = pool(min(jobs, len(segments)))
+    try:
+        with control.progress(f"replaying {session.path.name}", float(len(segments))) as progress:
+            tasks = [executor.submit(_verified, session.path, segment) for segment in segments]
+            digest: Future[tuple[bool, list[str]]] = executor.submit(digest_lines, session.path)
+            for count, task in enumerate(as_completed(tasks), 1):
+                task.result()  # a failure ends the others
+                progress(float(count))
+            found = [task.result() for task in tasks]
+            return _joined(session, found, digest.result())
+    except BrokenProcessPool as error:
+        raise SessionError(f"{session.path}: a process of the replay was killed; try fewer --jobs") from error
+    finally:
+        end_pool(executor)
+
+
+def _segments(session: Session, jobs: int, from_s: float | None) -> list[Segment]:
+    """Segments of about equal numbers of ticks, a few for each job."""
+    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
+    if session.numerics != str(NUMERICS_VERSION):
+        return []  # today's stages compute from more than an older file states, so it can not be entered anywhere
+    stamps = [stamp_ns for stamp_ns in session.reader.stamps("applied") if stamp_ns >= (start_ns or 0)]
+    count = min(_PER_JOB * jobs, len(stamps) // _TICKS)
+    if count < 2:
+        return []
+    starts = [stamps[len(stamps) * number // count] for number in range(1, count)]
+    ends = [stamp_ns - 1 for stamp_ns in starts] + [session.reader.last_ns]
+    return list(zip([start_ns, *starts], ends, strict=True))
+
+
+def _verified(path: Path, segment: Segment) -> _Verified:
+    """The replay of a segment, in a process of the pool."""
+    done = replay(path, verify=True, segment_ns=segment)
+    assert done.worker is not None
+    return _Verified(done.report, done.recorded, done.comparison, done.worker, done.frames_missing)
+
+
+def _joined(session: Session, found: list[_Verified], digest: tuple[bool, list[str]]) -> Replayed:
+    """The segments, in order, as one replay."""
+    first, *others = found
+    for each in others:
+        first.comparison.followed_by(each.comparison)
+        first.worker.followed_by(each.worker)
+    last = found[-1]
+    return Replayed(
+        session,
+        session.config,
+        replace(last.report, ticks=first.comparison.ticks, duration_s=session.duration_s),
+        last.recorded,
+        last.report.last,
+        first.comparison,
+        CommandDifference(),
+        sum(each.frames_missing for each in found),
+        first.worker,
+        digest,
+    )
