@@ -31,7 +31,11 @@ EXAMPLES = {
     "replay": ("flowrec replay a.mcap --refine", "flowrec replay a.mcap --plan astar_time --refly -o b.mcap"),
     "import": ("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap",),
     "doctor": ("flowrec doctor lab.toml",),
-    "view": ("flowrec view a.mcap", "flowrec view a.mcap --screenshot a.png --time 12"),
+    "view": (
+        "flowrec view a.mcap",
+        "flowrec view a.mcap --screenshot a.png --time 12",
+        "flowrec view a.mcap --layout .",
+    ),
     "export": ("flowrec export a.mcap", "flowrec export a.mcap tables --format parquet"),
     "report": ("flowrec report a.mcap", "flowrec report a.mcap a_replay_001.mcap -o report.html --figures figures"),
     "info": ("flowrec info a.mcap --json",),
@@ -92,6 +96,13 @@ def view(
         Path | None, typer.Option(metavar="PNG", help="Save a picture of the viewer instead of opening it.")
     ] = None,
     time: Annotated[float | None, typer.Option(metavar="S", help="Session time of the screenshot.")] = None,
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Write layouts into this folder by which Foxglove (.json) and Rerun (.rbl) show the .mcap itself.",
+        ),
+    ] = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Only write the .rrd.")] = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -107,6 +118,11 @@ def view(
         raise FlowrecError(f"{session}: no such file; flowrec export makes one of a session")
     if beside is not None and ".rrd" in (session.suffix, beside.suffix):
         raise UsageError(f"{session} and {beside}: two sessions (.mcap) are shown in one view, not .rrd files")
+    if layout is not None:
+        if session.suffix == ".rrd" or any(value is not None for value in (beside, out, screenshot, time)):
+            raise UsageError(f"--layout {layout}: is for one session (.mcap) and goes with no other output")
+        _write_layouts(session, layout, overwrite, as_json)
+        return
     if screenshot is not None:
         Output(screenshot, PICTURE, tuple(files_behind(session)), overwrite).check()
     rrd = session if session.suffix == ".rrd" else flowrec.export(session, out, overwrite, beside=beside)
@@ -303,6 +319,18 @@ def compare(
             conclusion = comparison.other_numerics or f"{comparison.different_ticks} of them differ"
         typer.echo(f"{comparison.ticks} ticks: {conclusion}")
     raise typer.Exit(0 if comparison.same else 3)
+
+
+def _write_layouts(session: Path, folder: Path, overwrite: bool, as_json: bool) -> None:
+    from flowrec.commands.layout import write_layouts
+    from flowrec.terminal import say
+
+    made = write_layouts(session, folder, overwrite)
+    if as_json:
+        found = {"session": session, "foxglove": made.foxglove, "rerun": made.rerun}
+        typer.echo(json.dumps({key: str(path) for key, path in found.items()}))
+    for line in made.advice:
+        say(line)
 
 
 def _export_json(session: Path, made: Path, file_format: str = "rrd") -> str:

@@ -24,7 +24,7 @@ from flowrec.store.codec import Codec, codec_of, decode
 from flowrec.store.frame_encodings import FrameEncoding, frame_codec
 from flowrec.store.mcap_format import Record, Summary
 from flowrec.store.roi import Region, region_from
-from flowrec.store.schema import Schema, foxglove_schema
+from flowrec.store.schema import Schema
 from flowrec.store.session_metadata import SessionMetadata
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
@@ -66,10 +66,11 @@ def _slots() -> Iterator[tuple[str, Slot]]:
         yield topic.path, Slot(number, group, message_codec(topic.type).schema, {"role": topic.role.value})
     for number, view in enumerate(VIEWER_TOPICS, len(TOPICS) + 1):
         metadata = {"role": "view", "made_from": view.source}
-        yield view.path, Slot(number, VIEW, foxglove_schema(view.schema), metadata)
+        yield view.path, Slot(number, VIEW, view.schema, metadata)
 
 
 SLOTS: dict[str, Slot] = dict(_slots())
+VIEWED = frozenset(view.path for view in VIEWER_TOPICS)
 
 
 def declarations(frames: FrameEncoding, region: Region | None = None) -> Iterator[SchemaRecord | Channel]:
@@ -94,7 +95,7 @@ def is_left_out(path: str, patterns: Iterable[str]) -> bool:
 
 
 def left_out(patterns: Iterable[str]) -> frozenset[str]:
-    """The topics, viewer topics included, that match names or patterns such as `/view/*`.
+    """The topics that match names or patterns; `/view/*` matches all viewer topics, also those under the images' topic.
 
     Raises
     ------
@@ -103,12 +104,13 @@ def left_out(patterns: Iterable[str]) -> frozenset[str]:
     chosen: set[str] = set()
     for pattern in patterns:
         found = {path for path in SLOTS if is_left_out(path, [pattern])}
+        found |= {path for path in VIEWED if is_left_out(f"/view{path}", [pattern])}
         if not found:
             raise UsageError(
                 f"recording.leave_out: no topic is called {pattern!r}; flowrec info lists those of a session"
             )
         if needed := sorted(found & _NEEDED):
-            free = ", ".join(path for path in SLOTS if path not in _NEEDED and not path.startswith("/view/"))
+            free = ", ".join(path for path in SLOTS if path not in _NEEDED | VIEWED)
             raise UsageError(
                 f"recording.leave_out: a replay needs {needed[0]}; what can be left out is {free} and /view/*"
             )

@@ -39,6 +39,7 @@ _UP = 2  # PNG's filter that stores each row as its difference from the one abov
 _JPEG_QUALITY = 90
 # Deflate compresses no more than 1032 pixels into one byte, baseline JPEG fewer.
 _PIXELS_PER_BYTE = 1100
+CAMERA_FRAME = "camera"  # coordinate frame of the images, for viewers; see viewer_scene.py
 PIXELS_LIMIT = 32 << 20  # an image is in memory twice while it is decoded
 # Filter and strategy by which cv2's PNG is three times quicker than by default and smaller, on camera noise.
 _PNG_OPTIONS = (
@@ -244,7 +245,12 @@ def _raw_image(bits: int) -> Codec:
     def encode(frame: Frame) -> Payload:
         height, width = _shape(frame, bits)
         head = schema.wire(
-            timestamp=timestamp(frame.stamp_ns), width=width, height=height, encoding=name, step=nbytes * width
+            timestamp=timestamp(frame.stamp_ns),
+            frame_id=CAMERA_FRAME,
+            width=width,
+            height=height,
+            encoding=name,
+            step=nbytes * width,
         )
         prefix = head.SerializeToString() + byte_field_head(_RAW_IMAGE_DATA, frame.image.nbytes)
         return (prefix, frame.image.astype(stored, copy=False).reshape(-1).view(np.uint8).data)
@@ -271,7 +277,8 @@ def _compressed_image(file_format: str, file_of: Callable[[Image], Payload], bit
     def encode(frame: Frame) -> Payload:
         _shape(frame, bits)
         parts = file_of(frame.image)
-        head = schema.wire(timestamp=timestamp(frame.stamp_ns), format=file_format).SerializeToString()
+        stamp = timestamp(frame.stamp_ns)
+        head = schema.wire(timestamp=stamp, frame_id=CAMERA_FRAME, format=file_format).SerializeToString()
         return (head + byte_field_head(_COMPRESSED_IMAGE_DATA, sum(map(len, parts))), *parts)
 
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:

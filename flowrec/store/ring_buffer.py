@@ -138,7 +138,7 @@ class RingBuffer:
         self._segment_ns = min(nanoseconds(_SEGMENT_S), self._before_ns // _SEGMENTS)
         self._limit_bytes = int(1e6 * self._settings.megabytes)
         self._number = 0
-        self._views = ViewerTopics(options.left_out_topics, header.start_unix_ns)
+        self._views = ViewerTopics.of_session(header, options.left_out_topics)
         self._sequences: Counter[str] = Counter()
         self._free: list[ChunkEncoder] = []
         self._ring: deque[tuple[_RingSegment, Counters]] = deque()  # without those that still wait for images

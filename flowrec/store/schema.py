@@ -9,6 +9,7 @@ This file defines the wire layout. Fields are numbered in the order of the datac
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +26,7 @@ _SCALARS: dict[Any, Any] = {
     str: _Field.TYPE_STRING,
 }
 _ARRAY_FILE = "flowrec/Array.proto"
+_TIMESTAMP_FILE = "google/protobuf/timestamp.proto"
 
 ARRAY_DATA = 3  # number of the field of flowrec.Array that holds the bytes
 
@@ -90,6 +92,20 @@ def foxglove_schema(name: str) -> Schema:
             _files[file.name] = file
             _pool.Add(file)
     return _schema(declared.name, declared.data)
+
+
+def plot_schema(name: str, numbers: Iterable[str], lists: Iterable[str] = ()) -> Schema:
+    """`flowrec.NAME`: `timestamp` as in foxglove's schemas, then floats, and lists of floats."""
+    foxglove_schema("Log")  # brings Timestamp
+    file = descriptor_pb2.FileDescriptorProto(name=f"flowrec/{name}.proto", package="flowrec", syntax="proto3")
+    file.dependency.append(_TIMESTAMP_FILE)
+    message = file.message_type.add(name=name)
+    stamp = message.field.add(name="timestamp", number=1, type=_Field.TYPE_MESSAGE, label=_Field.LABEL_OPTIONAL)
+    stamp.type_name = ".google.protobuf.Timestamp"
+    labels = [(each, _Field.LABEL_OPTIONAL) for each in numbers] + [(each, _Field.LABEL_REPEATED) for each in lists]
+    for number, (each, label) in enumerate(labels, 2):
+        message.field.add(name=each, number=number, type=_Field.TYPE_FLOAT, label=label)
+    return _add(file, f"flowrec.{name}")
 
 
 def _add(file: descriptor_pb2.FileDescriptorProto, name: str) -> Schema:

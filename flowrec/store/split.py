@@ -228,7 +228,7 @@ class Parts:
     def __init__(self, path: Path, header: SessionHeader, options: WriterOptions, split: Split, run: str) -> None:
         self.files: list[Path] = []
         self.options = options
-        self.views = ViewerTopics(options.left_out_topics, header.start_unix_ns)
+        self.views = ViewerTopics.of_session(header, options.left_out_topics)
         self._path, self._header, self._split, self._run = path, header, split, run
         self._until_ns: int | None = None
         self._finished_bytes = 0

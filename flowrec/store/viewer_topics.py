@@ -1,34 +1,30 @@
 """The table of viewer topics: derived messages that Rerun and Foxglove show of a session file. The reader ignores them.
 
-Positions are in um, one unit of the 3D view = 1 um, in the chip's frame (origin at pixel (0, 0), x right, y down),
-so that pose, path and grid lie over each other; the frame_id is empty because a named one needs a transform tree.
-Both flow previews use one colour scale, viridis from 0 to the highest speed of the first field; solid is black.
+Frames, units and cameras are those of viewer_scene.py. What Rerun is to draw on the camera's image is below that
+image's topic, because Rerun's own layout of a file shows an image with all that is below it.
 """
 
 from __future__ import annotations
 
 import copy
-import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
-from foxglove import messages as fg
-from numpy.typing import NDArray
 
 from flowrec.declarations import Message
-from flowrec.messages import Estimate, FlowField, Route, Track
-from flowrec.store.codec import Payload, byte_field_head, timestamp
-from flowrec.store.schema import foxglove_schema
+from flowrec.messages import Estimate, FlowField, Observations, Track
+from flowrec.store import viewer_drawings as drawings
+from flowrec.store import viewer_numbers as numbers
+from flowrec.store.codec import Payload
+from flowrec.store.schema import Schema, foxglove_schema
+from flowrec.store.session_metadata import SessionHeader
+from flowrec.store.viewer_scene import ChipCamera, ViewerScene, drawable
 from flowrec.units import NS_PER_S
 
-_GRID_DATA = 9  # number of the field that holds the values
-# The robot is drawn as a ring: a single point of Rerun's default size is hidden by the path.
-_RING_POINTS, _RING_UM = 24, 60.0
-_RING_RGBA = (255, 64, 32, 255)
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
+_NEVER = -(1 << 62)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,157 +33,123 @@ class ViewerTopic:
 
     Attributes
     ----------
-    path, schema : of the topic; the schema is one of foxglove's.
-    input : what it is derived from: robot, route, assumed or refined.
+    path, schema : of the topic.
+    input : what it is derived from, a name of ViewerTopics._inputs.
     source : the same, in words, for the channel's metadata.
-    make : message, highest speed of the colour scale in um/s -> payload without its timestamp.
+    make : input, scene -> payload, without its timestamp.
+    has_timestamp : whether the message has one, in field 1; its parts may have timestamps of their own.
     """
 
     path: str
-    schema: str
+    schema: Schema
     input: str
     source: str
-    make: Callable[[Any, float], Payload]
+    make: Callable[[Any, ViewerScene], Payload]
+    has_timestamp: bool = True
 
 
 class ViewerTopics:
-    """Makes the viewer topics of one session but for `left_out`; remembers the colour scale. For use by one thread.
+    """Makes the viewer topics of one session but for `left_out`, and remembers what they depend on. For one thread."""
 
-    `start_unix_ns` of the session is added to the timestamps in the messages.
+    def __init__(self, scene: ViewerScene | None = None, left_out: frozenset[str] = frozenset()) -> None:
+        self._views: dict[str, list[ViewerTopic]] = {}
+        for view in VIEWER_TOPICS:
+            if view.path not in left_out:
+                self._views.setdefault(view.input, []).append(view)
+        self._left_out = left_out
+        self._scene = ViewerScene() if scene is None else scene
+        self._placed: tuple[object, object] = (None, None)  # picture and map whose cameras were described last
+        self._goal: object = None
+        self._marked: tuple[object, ...] = (None, None, None)  # route, goal and picture that were drawn last
+        self._robot_ns = _NEVER
 
-    Attributes
-    ----------
-    top_um_s : speed at the bright end of the colour scale; None before the first flow field.
-    """
+    @classmethod
+    def of_session(cls, header: SessionHeader, left_out: frozenset[str]) -> ViewerTopics:
+        """Those of a session with this header."""
+        return cls(ViewerScene(ChipCamera.of(header), header.start_unix_ns), left_out)
 
-    def __init__(self, left_out: frozenset[str] = frozenset(), start_unix_ns: int = 0) -> None:
-        self.top_um_s: float | None = None
-        self._start_unix_ns = start_unix_ns
-        self._views = [view for view in VIEWER_TOPICS if view.path not in left_out]
-        self._robot_ns = -_ROBOT_EVERY_NS
+    @property
+    def top_um_s(self) -> float | None:
+        """Speed at the bright end of the colour scale; None before the first flow field."""
+        return self._scene.top_um_s
 
     def copy(self) -> ViewerTopics:
-        """One for another thread that continues from here, with the present colour scale."""
-        return copy.copy(self)
+        """One for the keyframe of another file, which describes the cameras anew; with the present colour scale."""
+        return ViewerTopics(copy.copy(self._scene), self._left_out)
 
     def of(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, int, Payload]]:
         """Topic, stamp in ns and payload of all that follows from the new messages of one tick, by field of Tick."""
-        for source, message in self._inputs(messages):
-            for view in self._views:
-                if view.input == source:
-                    # Numbers that can not be drawn are no error here.
-                    with np.errstate(all="ignore"):
-                        payload = view.make(message, self.top_um_s or 1.0)
-                    stamp_ns = message.stamp_ns
-                    yield view.path, stamp_ns, (_timestamp(stamp_ns + self._start_unix_ns), *payload)
+        # Numbers that can not be drawn are no error here.
+        with np.errstate(all="ignore"):
+            self._scene.update(messages)
+            for source, stamp_ns, made_of in list(self._inputs(messages)):
+                for view in self._views.get(source, ()):
+                    payload = view.make(made_of, self._scene)
+                    if view.has_timestamp:
+                        payload = (self._scene.stamp(stamp_ns), *payload)
+                    yield view.path, stamp_ns, payload
 
-    def _inputs(self, messages: Mapping[str, Message]) -> Iterator[tuple[str, Estimate | Track | Route | FlowField]]:
+    def _inputs(self, messages: Mapping[str, Any]) -> Iterator[tuple[str, int, Any]]:
+        """Name, stamp in ns and message of what viewer topics are made of; a stamp alone where the scene says all."""
+        scene, last_ns = self._scene, max((message.stamp_ns for message in messages.values()), default=0)
+        if scene.picture is not self._placed[0] or scene.map is not self._placed[1]:
+            yield "frames", last_ns, last_ns
+            if scene.picture is not None and scene.picture is not self._placed[0]:
+                yield "picture", last_ns, scene.picture
+            if scene.map is not None and scene.map is not self._placed[1]:
+                yield "map", last_ns, scene.map
+            self._placed = scene.picture, scene.map
         robot = messages.get("estimate") or messages.get("track")
         if isinstance(robot, (Estimate, Track)) and abs(robot.stamp_ns - self._robot_ns) >= _ROBOT_EVERY_NS:
             self._robot_ns = robot.stamp_ns
-            yield "robot", robot
-        route = messages.get("route")
-        if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
-            yield "route", route
+            yield "robot", robot.stamp_ns, robot
+            if scene.picture is not None and drawings.is_finite(robot.position_um):
+                yield "robot on picture", robot.stamp_ns, robot
+        if messages.get("route") is scene.route and scene.route is not None:
+            yield "route", scene.route.stamp_ns, scene.route
+        goal = None if scene.goal_um is None else tuple(scene.goal_um.tolist())
+        if goal != self._goal:
+            self._goal = goal
+            yield "goal", last_ns, last_ns
+        marked = (scene.route, goal, scene.picture)
+        if scene.picture is not None and marked != self._marked and (scene.route, goal) != (None, None):
+            self._marked = marked
+            yield "marks", last_ns, last_ns
+        if scene.route is not None and ("route" in messages or scene.field in messages.values()):
+            yield "route on map", last_ns, scene.route
+        observations = messages.get("observations")
+        if isinstance(observations, Observations) and observations.position_um.shape[1:] == (2,):
+            yield "observations", observations.stamp_ns, observations
         for name in ("assumed", "refined"):
             field = messages.get(name)
-            if isinstance(field, FlowField) and field.velocity_um_s.shape[2:] == (2,) and field.velocity_um_s.size:
-                if self.top_um_s is None:
-                    self.top_um_s = float(_speed_um_s(field).max()) or 1.0
-                yield name, field
+            if isinstance(field, FlowField) and drawable(field):
+                yield name, field.stamp_ns, field
 
 
-@functools.lru_cache(maxsize=4)  # several views are of the same moment
-def _timestamp(unix_ns: int) -> bytes:
-    """The field `timestamp`, which has the same number in all schemas; foxglove's class refuses times out of range."""
-    data: bytes = foxglove_schema("PoseInFrame").wire(timestamp=timestamp(unix_ns)).SerializeToString()
-    return data
-
-
-def _pose(x_um: float, y_um: float) -> fg.Pose:
-    return fg.Pose(position=fg.Vector3(x=x_um, y=y_um, z=0.0), orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
-
-
-def _robot_pose(robot: Estimate | Track, _top_um_s: float) -> Payload:
-    return (fg.PoseInFrame(pose=_pose(float(robot.position_um[0]), float(robot.position_um[1]))).encode(),)
-
-
-def _robot_ring(robot: Estimate | Track, top_um_s: float) -> Payload:
-    # `pose` has the same number in both schemas, and protobuf merges messages that follow each other.
-    return (*_robot_pose(robot, top_um_s), _ring())
-
-
-@functools.cache
-def _ring() -> bytes:
-    """The points about the robot; the first one is the robot itself."""
-    angle = np.arange(_RING_POINTS) * (2.0 * np.pi / _RING_POINTS)
-    points = np.zeros(1 + _RING_POINTS, [("at", "<f4", 3), ("colour", "u1", 4)])
-    points["at"][1:, 0], points["at"][1:, 1] = _RING_UM * np.cos(angle), _RING_UM * np.sin(angle)
-    points["colour"] = _RING_RGBA
-    colours = [
-        fg.PackedElementField(name=name, offset=12 + place, type=fg.PackedElementFieldNumericType.Uint8)
-        for place, name in enumerate(("red", "green", "blue", "alpha"))
-    ]
-    fields = _float_fields("x", "y", "z") + colours
-    return fg.PointCloud(point_stride=points.itemsize, fields=fields, data=points.tobytes()).encode()
-
-
-def _path(route: Route, _top_um_s: float) -> Payload:
-    return (fg.PosesInFrame(poses=[_pose(x, y) for x, y in route.waypoints_um.tolist()]).encode(),)
-
-
-def _path_points(route: Route, _top_um_s: float) -> Payload:
-    points = np.zeros((len(route.waypoints_um), 3), "<f4")
-    points[:, :2] = route.waypoints_um
-    fields, data = _float_fields("x", "y", "z"), points.tobytes()
-    return (fg.PointCloud(pose=_pose(0.0, 0.0), point_stride=12, fields=fields, data=data).encode(),)
-
-
-def _preview(field: FlowField, top_um_s: float) -> Payload:
-    speed = _speed_um_s(field)
-    solid = speed == 0.0
-    speed *= 255.0 / top_um_s
-    grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
-    colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
-    colours[solid] = 0
-    return (fg.CompressedImage(data=cv2.imencode(".png", colours)[1].tobytes(), format="png").encode(),)
-
-
-def _speed_um_s(field: FlowField) -> NDArray[np.float32]:
-    """(h, w) speed; 0 where it is not finite."""
-    with np.errstate(over="ignore"):
-        speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
-    np.nan_to_num(speed, copy=False, posinf=0.0)
-    return speed
-
-
-def _grid(field: FlowField, _top_um_s: float) -> Payload:
-    width, size_um = field.velocity_um_s.shape[1], field.um_per_px
-    grid = fg.Grid(
-        pose=_pose(-0.5 * size_um, -0.5 * size_um),  # the corner of pixel (0, 0), whose centre is the origin
-        column_count=width,
-        cell_size=fg.Vector2(x=size_um, y=size_um),
-        row_stride=8 * width,
-        cell_stride=8,
-        fields=_float_fields("vx", "vy"),
-    )
-    # Fields are large: the values follow uncopied.
-    data = field.velocity_um_s.astype("<f4", copy=False).reshape(-1).view(np.uint8).data
-    return (grid.encode() + byte_field_head(_GRID_DATA, len(data)), data)
-
-
-def _float_fields(*names: str) -> list[fg.PackedElementField]:
-    float32 = fg.PackedElementFieldNumericType.Float32
-    return [fg.PackedElementField(name=name, offset=4 * place, type=float32) for place, name in enumerate(names)]
-
-
+_FRAMES, _CAMERA, _POSE, _POSES, _POINTS, _MARKS, _IMAGE, _GRID = map(
+    foxglove_schema,
+    (
+        *("FrameTransforms", "CameraCalibration", "PoseInFrame", "PosesInFrame"),
+        *("PointCloud", "ImageAnnotations", "CompressedImage", "Grid"),
+    ),
+)
+_ROBOT = "estimate, else track"
 VIEWER_TOPICS = (
-    ViewerTopic("/view/robot_pose", "PoseInFrame", "robot", "estimate, else track", _robot_pose),
+    ViewerTopic("/view/frames", _FRAMES, "frames", "config, assumed, refined", drawings.transforms, False),
+    ViewerTopic("/view/camera", _CAMERA, "picture", "config, refined", drawings.camera),
+    ViewerTopic("/view/map", _CAMERA, "map", "assumed, refined", drawings.camera),
+    ViewerTopic("/view/robot_pose", _POSE, "robot", _ROBOT, drawings.robot_pose),
     # The same as points, because Rerun draws no pose.
-    ViewerTopic("/view/robot_point", "PointCloud", "robot", "estimate, else track", _robot_ring),
-    ViewerTopic("/view/path", "PosesInFrame", "route", "route", _path),
-    ViewerTopic("/view/path_points", "PointCloud", "route", "route", _path_points),
-    ViewerTopic("/view/flow_assumed", "CompressedImage", "assumed", "assumed", _preview),
-    ViewerTopic("/view/flow_refined", "CompressedImage", "refined", "refined", _preview),
-    ViewerTopic("/view/flow_refined_grid", "Grid", "refined", "refined", _grid),
+    ViewerTopic("/camera/frame/robot", _POINTS, "robot", _ROBOT, drawings.robot_points),
+    ViewerTopic("/view/path", _POSES, "route", "route", drawings.path),
+    ViewerTopic("/camera/frame/path", _POINTS, "route", "route", drawings.path_points),
+    ViewerTopic("/camera/frame/goal", _POINTS, "goal", "mission", drawings.goal_points),
+    ViewerTopic("/view/robot_mark", _MARKS, "robot on picture", _ROBOT, drawings.robot_mark, False),
+    ViewerTopic("/view/route_mark", _MARKS, "marks", "route, mission, refined", drawings.route_mark, False),
+    ViewerTopic("/view/flow_assumed", _IMAGE, "assumed", "assumed", drawings.preview),
+    ViewerTopic("/view/flow_refined", _IMAGE, "refined", "refined", drawings.preview),
+    ViewerTopic("/view/flow_refined_grid", _GRID, "refined", "refined", drawings.grid),
+    ViewerTopic("/view/robot_flow", numbers.ROBOT_FLOW, "robot", f"{_ROBOT}; assumed, refined", numbers.robot_flow),
+    ViewerTopic("/view/observation", numbers.OBSERVATION, "observations", "observations", numbers.observation),
+    ViewerTopic("/view/route_flow", numbers.ROUTE_FLOW, "route on map", "route, assumed, refined", numbers.route_flow),
 )

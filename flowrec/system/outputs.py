@@ -18,6 +18,7 @@ from flowrec.system.locks import is_growing
 
 MCAP = (".mcap",)
 RRD = (".rrd",)
+RBL = (".rbl",)
 PICTURE = (".png",)
 FIGURE = (".png", ".pdf", ".svg")
 JSON = (".json",)

@@ -20,6 +20,7 @@ from flowrec.config import load_config
 from flowrec.declarations import Role
 from flowrec.diagnostics import CameraLosses, Clocks, Drops
 from flowrec.messages import Appearance, Health
+from flowrec.resolve import resolve
 from flowrec.session_writer import session_header
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
@@ -58,7 +59,9 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file of a few kilobytes with a message of each topic; the stages have nothing to do with it."""
     path = tmp_path_factory.mktemp("small") / "small.mcap"
     config = load_config(None, SMALL)
-    with SessionWriter(path, session_header(config, load_chip(config.chip)), WriterOptions(block=True)) as writer:
+    chip = load_chip(config.chip)
+    header = session_header(resolve(config, chip), chip)
+    with SessionWriter(path, header, WriterOptions(block=True)) as writer:
         for tick in every_topic():
             writer.write(tick)
     return path

@@ -23,6 +23,7 @@ from flowrec.messages import Frame
 from flowrec.store.reader import SessionReader
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import WriterOptions
+from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
 from flowrec.topics import Tick
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
@@ -170,7 +171,7 @@ def seen_by_others(path):
         found, summary = {}, reader.get_summary()
         for schema, channel, message in reader.iter_messages():
             payload_ns = None
-            if schema.name.startswith("foxglove."):
+            if schema.name.startswith("foxglove.") and schema.name != "foxglove.FrameTransforms":
                 parsed = foxglove_schema(schema.name.removeprefix("foxglove.")).wire.FromString(message.data)
                 payload_ns = parsed.timestamp.ToNanoseconds()
             found.setdefault(channel.topic, []).append((message.log_time, message.publish_time, payload_ns))
@@ -233,19 +234,20 @@ def test_a_session_that_does_not_say_when_it_started_has_stamps_for_times(tmp_pa
 
 
 def test_other_viewers_get_pose_path_and_previews_on_one_scale(path):
+    schemas = {view.path: view.schema for view in VIEWER_TOPICS}
     with path.open("rb") as stream:
-        found = {}
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.topic.startswith("/view/"):
-                found[channel.topic] = foxglove_schema(schema.name.removeprefix("foxglove.")).wire.FromString(
-                    message.data
-                )
-    assert found["/view/robot_pose"].pose.position.x == TICKS[-1].estimate.position_um[0]
+        messages = make_reader(stream).iter_messages(topics=list(schemas))
+        found = {
+            channel.topic: schemas[channel.topic].wire.FromString(message.data) for _, channel, message in messages
+        }
+    assert found["/view/robot_pose"].pose.position.x == 1e-6 * TICKS[-1].estimate.position_um[0]
     assert len(found["/view/path"].poses) == 20
-    points = np.frombuffer(found["/view/path_points"].data, "<f4").reshape(-1, 3)
-    assert np.array_equal(points[:, :2], TICKS[-1].route.waypoints_um.astype("<f4"))
-    grid = np.frombuffer(found["/view/flow_refined_grid"].data, "<f4").reshape(24, 32, 2)
-    assert np.array_equal(grid, TICKS[-1].refined.velocity_um_s)
+    points = np.frombuffer(found["/camera/frame/path"].data, "<f4").reshape(-1, 4)
+    assert np.array_equal(points[:, :2], (1e-6 * TICKS[-1].route.waypoints_um).astype("<f4"))
+    grid = np.frombuffer(found["/view/flow_refined_grid"].data, "<f4").reshape(24, 32, 3)
+    assert np.allclose(grid[..., :2], TICKS[-1].refined.velocity_um_s, rtol=2**-12)
+    assert np.allclose(grid[..., 2], np.hypot(*np.moveaxis(TICKS[-1].refined.velocity_um_s, 2, 0)), rtol=2**-12)
+    assert found["/view/flow_refined_grid"].cell_size.x == 1e-6 * TICKS[-1].refined.um_per_px
     colours = cv2.imdecode(np.frombuffer(found["/view/flow_refined"].data, np.uint8), cv2.IMREAD_COLOR)
     assert colours.shape == (24, 32, 3) and not colours[:3].any() and colours[3:].any()
 
@@ -261,7 +263,9 @@ def test_rerun_accepts_the_bare_file(path, tmp_path):
     assert checked.returncode == 0, checked.stdout + checked.stderr
     done = run([rerun, "mcap", "convert", path, "-o", tmp_path / "s.rrd"])
     assert done.returncode == 0 and "ERROR" not in done.stderr, done.stderr
-    assert all(topic in done.stderr for topic in ("/camera/frame", "/robot/estimate", "/view/robot_pose", "/view/path"))
+    assert all(
+        topic in done.stderr for topic in ("/camera/frame", "/robot/estimate", "/camera/frame/robot", "/view/path")
+    )
 
 
 def test_a_full_queue_of_a_live_run_drops_images_only(tmp_path):

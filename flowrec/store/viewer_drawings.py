@@ -1,0 +1,240 @@
+"""Robot, route, goal and maps as messages of foxglove's schemas: as points in m on the chip, and on the camera's image.
+
+Rerun draws points and images, Foxglove draws all of it. Both flow previews use one colour scale, viridis from 0 to the
+highest speed of the first field; solid is black.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import cv2
+import numpy as np
+from foxglove import messages as fg
+from numpy.typing import NDArray
+
+from flowrec.messages import Estimate, FlowField, Route, Track
+from flowrec.store.codec import Payload, byte_field_head
+from flowrec.store.schema import foxglove_schema
+from flowrec.store.viewer_scene import CHIP, MAP, Picture, ViewerScene, speed_um_s
+from flowrec.units import M_PER_UM
+
+_GRID_DATA, _CIRCLES, _POINTS, _TRANSFORMS = 9, 1, 2, 1  # numbers of fields
+# The robot and the goal are drawn as rings: a single point of Rerun's default size is hidden by the path.
+_RING_POINTS, _RING_RADII = 32, 1.5  # radii of the robot
+_RADII_OF_GOAL = 2.5
+_LINE_PX = 1.5  # of the image, at most; thinner on a small one
+_LINE_SHARE = 1.0 / 200.0  # of the image's width
+_ROUNDING = np.uint32(1 << 11)  # half of the last bit kept of a float's 23; the rest are 0 and compress
+Rgba = tuple[int, int, int, int]
+_ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 216, 255, 255), (64, 255, 96, 255)
+
+
+def transforms(stamp_ns: int, scene: ViewerScene) -> Payload:
+    """Where chip and cameras are."""
+    stamp, parts = scene.stamp(stamp_ns), [transform.encode() for transform in scene.transforms()]
+    return tuple(byte_field_head(_TRANSFORMS, len(stamp) + len(part)) + stamp + part for part in parts)
+
+
+def camera(picture: Picture, _scene: ViewerScene) -> Payload:
+    """How a camera maps the chip to its image."""
+    return (picture.calibration().encode(),)
+
+
+def robot_pose(robot: Estimate | Track, scene: ViewerScene) -> Payload:
+    """Where the robot is on the chip, in m."""
+    return _pose_field(*scene.place_um(robot.position_um)), _IN_CHIP
+
+
+def robot_points(robot: Estimate | Track, scene: ViewerScene) -> Payload:
+    """A ring around it."""
+    # `pose` has the same number in both schemas, and protobuf merges messages that follow each other.
+    return _pose_field(*scene.place_um(robot.position_um)), _ring(scene.robot_um, _ROBOT if robot.seen else _UNSEEN)
+
+
+def robot_mark(robot: Estimate | Track, scene: ViewerScene) -> Payload:
+    """The same on the camera's image, in px."""
+    assert scene.picture is not None
+    place = scene.picture.pixel(*scene.place_um(robot.position_um))
+    ring_px = _RING_RADII * scene.robot_um / scene.picture.um_per_px
+    colour = _ROBOT if robot.seen else _UNSEEN
+    return _circle(scene.stamp(robot.stamp_ns), place, ring_px, scene.picture.width_px, colour)
+
+
+def path(route: Route, _scene: ViewerScene) -> Payload:
+    """The route as poses on the chip, in m."""
+    return (fg.PosesInFrame(frame_id=CHIP, poses=[_pose(x, y) for x, y in route.waypoints_um.tolist()]).encode(),)
+
+
+def path_points(route: Route, _scene: ViewerScene) -> Payload:
+    """The same as points."""
+    return (_cloud(route.waypoints_um, _PATH, _pose(0.0, 0.0)).encode(),)
+
+
+def goal_points(_stamp_ns: int, scene: ViewerScene) -> Payload:
+    """A ring with a cross around the goal; nothing without one."""
+    if scene.goal_um is None:
+        return (_cloud(np.zeros((0, 2)), _GOAL, _pose(0.0, 0.0)).encode(),)
+    ring_um = _RADII_OF_GOAL * scene.robot_um
+    across = np.linspace(-1.0, 1.0, _RING_POINTS // 2)
+    cross = np.concatenate((np.outer(across, (1.0, 0.0)), np.outer(across, (0.0, 1.0))))
+    return (
+        _cloud(scene.goal_um + ring_um * np.concatenate((_circle_points(), cross)), _GOAL, _pose(0.0, 0.0)).encode(),
+    )
+
+
+def route_mark(stamp_ns: int, scene: ViewerScene) -> Payload:
+    """Route and goal on the camera's image, in px."""
+    assert scene.picture is not None
+    stamp, width_px = scene.stamp(stamp_ns), scene.picture.width_px
+    parts: Payload = ()
+    if scene.route is not None:
+        way_px = scene.picture.to_px(thinned(scene.route.waypoints_um, scene.picture.um_per_px))
+        parts += _line(stamp, way_px, "LINE_STRIP", width_px, _PATH)
+    if scene.goal_um is not None:
+        place, ring_px = scene.picture.to_px(scene.goal_um), _RADII_OF_GOAL * scene.robot_um / scene.picture.um_per_px
+        x_px, y_px = place.tolist()
+        ends = np.array([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
+        parts += _circle(stamp, (x_px, y_px), ring_px, width_px, _GOAL)
+        parts += _line(stamp, place + ring_px * ends, "LINE_LIST", width_px, _GOAL)
+    return parts
+
+
+def thinned(points_um: NDArray[np.float64], step_um: float) -> NDArray[np.float64]:
+    """Points (n, 2) of a line: the first of each step along it, and its last one."""
+    if len(points_um) < 2:
+        return points_um
+    keep = np.diff(np.floor(distance_um(points_um) / step_um), prepend=-1.0) != 0.0
+    keep[-1] = True
+    kept: NDArray[np.float64] = points_um[keep]
+    return kept
+
+
+def distance_um(points_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) distance from the first of the points (n, 2), along them."""
+    steps = np.hypot(*np.diff(points_um, axis=0).T)
+    return np.concatenate((np.zeros(min(len(points_um), 1)), np.cumsum(steps)))
+
+
+def preview(field: FlowField, scene: ViewerScene) -> Payload:
+    """The speed of a flow as an image."""
+    speed = speed_um_s(field)
+    solid = speed == 0.0
+    speed *= 255.0 / (scene.top_um_s or 1.0)
+    grey = np.clip(speed, 0.0, 255.0, out=speed).astype(np.uint8)
+    colours = cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS)
+    colours[solid] = 0
+    data = cv2.imencode(".png", colours)[1].tobytes()
+    return (fg.CompressedImage(frame_id=MAP, data=data, format="png").encode(),)
+
+
+def grid(field: FlowField, _scene: ViewerScene) -> Payload:
+    """A flow in um/s on cells in m, with a relative precision of 2^-12: the topic of the field has all digits."""
+    (height, width), size_m = field.velocity_um_s.shape[:2], M_PER_UM * field.um_per_px
+    values = np.empty((height, width, 3), "<f4")
+    values[..., :2], values[..., 2] = field.velocity_um_s, speed_um_s(field)
+    bits = values.view("<u4")
+    bits += _ROUNDING
+    bits &= ~(2 * _ROUNDING - 1)
+    head = fg.Grid(
+        frame_id=CHIP,
+        pose=_pose(-0.5 * field.um_per_px, -0.5 * field.um_per_px),  # the corner of pixel (0, 0)
+        column_count=width,
+        cell_size=fg.Vector2(x=size_m, y=size_m),
+        row_stride=values.strides[0],
+        cell_stride=values.strides[1],
+        fields=_float_fields("vx_um_s", "vy_um_s", "speed_um_s"),
+    )
+    # Fields are large: the values follow uncopied.
+    return (head.encode() + byte_field_head(_GRID_DATA, values.nbytes), values.reshape(-1).view(np.uint8).data)
+
+
+def _pose(x_um: float, y_um: float) -> fg.Pose:
+    place = fg.Vector3(x=M_PER_UM * x_um, y=M_PER_UM * y_um, z=0.0)
+    return fg.Pose(position=place, orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0))
+
+
+@functools.lru_cache(maxsize=2)  # asked for twice
+def _pose_field(x_um: float, y_um: float) -> bytes:
+    """A message with a pose alone."""
+    data: bytes = fg.PoseInFrame(pose=_pose(x_um, y_um)).encode()
+    return data
+
+
+@functools.lru_cache(maxsize=8)
+def _ring(radius_um: float, rgba: Rgba) -> bytes:
+    """The points about the robot, without their pose."""
+    data: bytes = _cloud(_RING_RADII * radius_um * _circle_points(), rgba, None).encode()
+    return data
+
+
+def _circle_points() -> NDArray[np.float64]:
+    angle = np.arange(_RING_POINTS) * (2.0 * np.pi / _RING_POINTS)
+    return np.stack((np.cos(angle), np.sin(angle)), 1)
+
+
+def _cloud(points_um: NDArray[np.float64], rgba: Rgba, pose: fg.Pose | None) -> fg.PointCloud:
+    points = np.zeros(len(points_um), [("at", "<f4", 3), ("colour", "u1", 4)])
+    points["at"][:, :2], points["colour"] = M_PER_UM * points_um, rgba
+    colours = [
+        fg.PackedElementField(name=name, offset=12 + place, type=fg.PackedElementFieldNumericType.Uint8)
+        for place, name in enumerate(("red", "green", "blue", "alpha"))
+    ]
+    return fg.PointCloud(
+        frame_id=CHIP,
+        pose=pose,
+        point_stride=points.itemsize,
+        fields=_float_fields("x", "y", "z") + colours,
+        data=points.tobytes(),
+    )
+
+
+def _float_fields(*names: str) -> list[fg.PackedElementField]:
+    float32 = fg.PackedElementFieldNumericType.Float32
+    return [fg.PackedElementField(name=name, offset=4 * place, type=float32) for place, name in enumerate(names)]
+
+
+def _circle(stamp: bytes, place_px: tuple[float, float], radius_px: float, width_px: int, rgba: Rgba) -> Payload:
+    """A circle as a part of ImageAnnotations."""
+    x, y = place_px
+    place = foxglove_schema("CircleAnnotation").wire(position={"x": x, "y": y}).SerializeToString()
+    look = _circle_look(radius_px, width_px, rgba)
+    return byte_field_head(_CIRCLES, len(stamp) + len(place) + len(look)), stamp, place, look
+
+
+@functools.lru_cache(maxsize=8)
+def _circle_look(radius_px: float, width_px: int, rgba: Rgba) -> bytes:
+    wire = foxglove_schema("CircleAnnotation").wire
+    look = wire(diameter=2.0 * radius_px, thickness=_thickness(width_px), fill_color={}, outline_color=_colour(rgba))
+    data: bytes = look.SerializeToString()
+    return data
+
+
+def _line(stamp: bytes, points_px: NDArray[np.float64], kind: str, width_px: int, rgba: Rgba) -> Payload:
+    """A line as a part of ImageAnnotations."""
+    line = foxglove_schema("PointsAnnotation").wire(
+        type=kind,
+        points=[{"x": x, "y": y} for x, y in points_px.tolist()],
+        outline_color=_colour(rgba),
+        fill_color={},
+        thickness=_thickness(width_px),
+    )
+    data = line.SerializeToString()
+    return byte_field_head(_POINTS, len(stamp) + len(data)), stamp, data
+
+
+def _thickness(width_px: int) -> float:
+    return max(_LINE_PX, _LINE_SHARE * width_px)
+
+
+def _colour(rgba: Rgba) -> dict[str, float]:
+    return {name: value / 255.0 for name, value in zip("rgba", rgba, strict=True)}
+
+
+_IN_CHIP = fg.PoseInFrame(frame_id=CHIP).encode()
+
+
+def is_finite(place: NDArray[np.float64]) -> bool:
+    """Whether a place (2,) can be drawn on an image."""
+    return all(map(math.isfinite, place.tolist()))

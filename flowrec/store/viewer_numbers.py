@@ -1,0 +1,129 @@
+"""Numbers that viewers plot and that the recorded messages hold as arrays or not at all: the flow where the robot is,
+the newest observation, and the flow along the route, each beside what the map says there.
+
+All are derived for viewers; evaluations use the recorded messages, which have all digits.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flowrec.flow import sample
+from flowrec.messages import Estimate, Observations, Route, Track
+from flowrec.store.codec import Payload
+from flowrec.store.schema import plot_schema
+from flowrec.store.viewer_drawings import distance_um, thinned
+from flowrec.store.viewer_scene import ViewerScene
+
+_ROUTE_POINTS = 200  # along a route, at most; more are not visible
+
+# Places are on the chip; the map is the refined flow, before there is one the assumed one. NaN: not known.
+ROBOT_FLOW = plot_schema(
+    "RobotFlow",
+    (
+        "x_um",
+        "y_um",
+        "flow_um_s",  # speed of the flow by the observer
+        "map_um_s",  # by the map
+        "difference_um_s",  # length of the difference of the two velocities
+        "map_error_share",  # relative error that the map states of itself
+    ),
+)
+OBSERVATION = plot_schema(
+    "Observation",
+    (
+        "x_um",
+        "y_um",
+        "flow_x_um_s",
+        "flow_y_um_s",
+        "flow_um_s",
+        "std_um_s",  # of a component
+        "map_x_um_s",
+        "map_y_um_s",
+        "map_um_s",
+        "difference_um_s",
+        "count",  # observations so far
+    ),
+)
+ROUTE_FLOW = plot_schema(
+    "RouteFlow",
+    (),
+    (
+        "distance_um",  # from the start of the route, along it
+        "map_um_s",
+        "along_um_s",  # component along the route, positive where the flow helps
+        "std_um_s",  # one standard deviation of a component, root mean square of the two
+    ),
+)
+
+
+def robot_flow(robot: Estimate | Track, scene: ViewerScene) -> Payload:
+    """The flow where the robot is."""
+    x_um, y_um = scene.place_um(robot.position_um)
+    u, v = robot.flow_um_s.tolist() if isinstance(robot, Estimate) else (math.nan, math.nan)
+    map_u, map_v = _map_at(scene, x_um, y_um)
+    data: bytes = ROBOT_FLOW.wire(
+        x_um=x_um,
+        y_um=y_um,
+        flow_um_s=math.hypot(u, v),
+        map_um_s=math.hypot(map_u, map_v),
+        difference_um_s=math.hypot(u - map_u, v - map_v),
+        map_error_share=scene.map_error_share,
+    ).SerializeToString()
+    return (data,)
+
+
+def observation(observations: Observations, scene: ViewerScene) -> Payload:
+    """The newest observation; only their number where there is none."""
+    count = len(observations.position_um)
+    if not count:
+        return (OBSERVATION.wire(count=0).SerializeToString(),)
+    (x_um, y_um), (u, v) = scene.place_um(observations.position_um[-1]), observations.flow_um_s[-1].tolist()
+    map_u, map_v = _map_at(scene, x_um, y_um)
+    data: bytes = OBSERVATION.wire(
+        x_um=x_um,
+        y_um=y_um,
+        flow_x_um_s=u,
+        flow_y_um_s=v,
+        flow_um_s=math.hypot(u, v),
+        std_um_s=observations.std_um_s[-1],
+        map_x_um_s=map_u,
+        map_y_um_s=map_v,
+        map_um_s=math.hypot(map_u, map_v),
+        difference_um_s=math.hypot(u - map_u, v - map_v),
+        count=count,
+    ).SerializeToString()
+    return (data,)
+
+
+def route_flow(route: Route, scene: ViewerScene) -> Payload:
+    """The flow along the route."""
+    way_um = route.waypoints_um
+    if len(way_um) > _ROUTE_POINTS:
+        way_um = thinned(way_um, distance_um(way_um)[-1] / (_ROUTE_POINTS - 1) or 1.0)
+    along = np.gradient(way_um, axis=0) if len(way_um) > 1 else np.zeros_like(way_um)
+    along /= np.maximum(np.hypot(*along.T), 1e-12)[:, None]
+    flow, std = np.full(way_um.shape, math.nan), np.full(way_um.shape, math.nan)
+    if scene.field is not None:
+        flow = sample(scene.field, way_um)
+        if scene.field.std_um_s is not None:
+            height, width = scene.field.std_um_s.shape[:2]
+            columns, rows = np.nan_to_num(np.rint(way_um / scene.field.um_per_px)).astype(np.int64).T
+            std = scene.field.std_um_s[rows.clip(0, height - 1), columns.clip(0, width - 1)].astype(np.float64)
+    data: bytes = ROUTE_FLOW.wire(
+        distance_um=distance_um(way_um).tolist(),
+        map_um_s=np.hypot(*flow.T).tolist(),
+        along_um_s=(flow * along).sum(axis=1).tolist(),
+        std_um_s=np.sqrt((std**2).mean(axis=1)).tolist(),
+    ).SerializeToString()
+    return (data,)
+
+
+def _map_at(scene: ViewerScene, x_um: float, y_um: float) -> tuple[float, float]:
+    """The map's flow at a place on the chip; NaN without a map."""
+    if scene.field is None or not (math.isfinite(x_um) and math.isfinite(y_um)):
+        return math.nan, math.nan
+    u, v = sample(scene.field, (x_um, y_um)).tolist()
+    return u, v

@@ -1,0 +1,266 @@
+"""What viewers must know to draw a session: coordinate frames, cameras, and the map, route and goal of the moment.
+
+Frames, in m: `chip` has its origin at the centre of the mask's pixel (0, 0), x right, y down, z away from who looks at
+the mask; all that is drawn lies in its plane z = 0. `camera` and `map` are pinhole cameras (x right, y down, z ahead)
+that look straight at that plane and show on it the camera's image and the pixels of the mask; what lies in one plane
+has no perspective, so the height is of no importance. The camera of a mirrored image looks from the other side. The
+root of the tree is `tf#/`, which Rerun gives to all that has no frame.
+
+Pixels are counted from the corner of the first one, as foxglove's schemas and both viewers count them; flowrec counts
+from its centre. https://docs.foxglove.dev/docs/sdk/schemas/camera-calibration
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from foxglove import messages as fg
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.chip.registration import Calibration, on_chip
+from flowrec.declarations import Matrix, Message
+from flowrec.errors import FlowrecError
+from flowrec.messages import FlowField, Mission, Route
+from flowrec.store.codec import timestamp
+from flowrec.store.frame_encodings import CAMERA_FRAME
+from flowrec.store.schema import foxglove_schema
+from flowrec.store.session_metadata import SessionHeader
+from flowrec.units import M_PER_UM
+
+ROOT, CHIP, MAP = "tf#/", "chip", "map"
+# Of the cameras over the chip. Rerun clips what is nearer than 0.1 m; Foxglove's depth buffer resolves 2 um there.
+HEIGHT_M = 0.2
+_HALF_PX = 0.5
+_RADIUS_UM = 60.0  # of a robot whose size is not known
+_Number = TypeVar("_Number", float, NDArray[np.float64])
+_STILL = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Pixels on the chip: pixel (column, row) has its centre at `matrix` (2, 3) (column, row, 1) in um.
+
+    The left two columns of the matrix are a similarity, with or without mirror.
+    """
+
+    frame: str
+    width_px: int
+    height_px: int
+    matrix: Matrix
+
+    @functools.cached_property
+    def um_per_px(self) -> float:
+        """Size of a pixel on the chip."""
+        return math.sqrt(abs(self._determinant))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the chip is seen as in a mirror."""
+        return self._determinant < 0.0
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length of the pinhole camera."""
+        return HEIGHT_M / (self.um_per_px * M_PER_UM)
+
+    @property
+    def angle_rad(self) -> float:
+        """Direction of the rows of pixels on the chip, from its x to its y axis."""
+        return math.atan2(self.matrix[1, 0], self.matrix[0, 0])
+
+    @property
+    def _determinant(self) -> float:
+        (a, b, _), (c, d, _) = self.matrix.tolist()
+        return float(a * d - b * c)
+
+    @functools.cached_property
+    def _inverse(self) -> list[list[float]]:
+        """(2, 3): pixel, from the corner of the first, of chip coordinates (x, y, 1) in um."""
+        back = np.linalg.inv(self.matrix[:, :2])
+        found: list[list[float]] = np.column_stack((back, _HALF_PX - back @ self.matrix[:, 2])).tolist()
+        return found
+
+    def to_px(self, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Chip points (n, 2) in um as pixels (n, 2), counted from the corner of the first."""
+        x, y = self.pixel(points_um[..., 0], points_um[..., 1])
+        return np.stack((x, y), -1)
+
+    def pixel(self, x_um: _Number, y_um: _Number) -> tuple[_Number, _Number]:
+        """The same of one point, or of arrays of coordinates."""
+        (xx, xy, x0), (yx, yy, y0) = self._inverse
+        return xx * x_um + xy * y_um + x0, yx * x_um + yy * y_um + y0
+
+    def calibration(self) -> fg.CameraCalibration:
+        """The pinhole camera; its principal point is the middle of the image."""
+        f, cx, cy = self.focal_px, 0.5 * self.width_px, 0.5 * self.height_px
+        return fg.CameraCalibration(
+            frame_id=self.frame,
+            width=self.width_px,
+            height=self.height_px,
+            K=[f, 0.0, cx, 0.0, f, cy, 0.0, 0.0, 1.0],
+            R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            P=[f, 0.0, cx, 0.0, 0.0, f, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        )
+
+    def transform(self) -> fg.FrameTransform:
+        """Where the pinhole camera is: over the middle of the image, or behind it if that is mirrored."""
+        middle = np.array([0.5 * self.width_px - _HALF_PX, 0.5 * self.height_px - _HALF_PX, 1.0])
+        x, y = (M_PER_UM * (self.matrix @ middle)).tolist()
+        sin, cos = math.sin(0.5 * self.angle_rad), math.cos(0.5 * self.angle_rad)
+        # A turn about z; of a mirrored picture half a turn about x before it.
+        turn = {"x": cos, "y": sin, "z": 0.0, "w": 0.0} if self.mirrored else {"x": 0.0, "y": 0.0, "z": sin, "w": cos}
+        height = HEIGHT_M if self.mirrored else -HEIGHT_M
+        return fg.FrameTransform(
+            parent_frame_id=CHIP,
+            child_frame_id=self.frame,
+            translation=fg.Vector3(x=x, y=y, z=height),
+            rotation=fg.Quaternion(**turn),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChipCamera:
+    """The camera as the settings state it, its image's (width, height), and the radius of the robot in it."""
+
+    calibration: Calibration
+    size_px: tuple[int, int]
+    robot_um: float
+
+    @classmethod
+    def of(cls, header: SessionHeader) -> ChipCamera | None:
+        """The camera of a session; None where its settings or its chip can not be read, as in a damaged file."""
+        # Loaded late: listing sessions needs no settings.
+        from flowrec.chip import chip_from_files
+        from flowrec.config import calibration_of, config_from_toml
+
+        try:
+            config = config_from_toml(header.config_toml, "config.toml")
+            calibration = calibration_of(config, chip_from_files(header.chip_png, header.chip_toml))
+        except FlowrecError:
+            return None
+        return cls(calibration, (config.camera.width_px, config.camera.height_px), config.robot.radius_um)
+
+    def picture(self, registration: Matrix | None) -> Picture:
+        """The camera's image on the chip, by the registration that a refinement found."""
+        if registration is not None and not _is_similarity(registration):
+            registration = None
+        corners = on_chip(registration, self.calibration.to_um([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
+        matrix = np.column_stack((corners[1] - corners[0], corners[2] - corners[0], corners[0]))
+        return Picture(CAMERA_FRAME, *self.size_px, matrix)
+
+
+def _is_similarity(registration: Matrix) -> bool:
+    """Whether a registration (2, 3) turns, shifts and scales only; one of a damaged file may do anything."""
+    if registration.shape != (2, 3) or not np.isfinite(registration).all():
+        return False
+    (a, b, _), (c, d, _) = registration.tolist()
+    return bool(a * d - b * c > 0.0 and math.isclose(a, d, abs_tol=1e-6) and math.isclose(b, -c, abs_tol=1e-6))
+
+
+class ViewerScene:
+    """What is known so far of camera, flow and route.
+
+    Attributes
+    ----------
+    camera : of the session; None if its settings are not known.
+    start_unix_ns : Unix time of stamp 0.
+    top_um_s : speed at the bright end of the colour scale; None before the first flow field.
+    field : the best flow known: refined where there is one, else assumed.
+    route, goal_um : the latest; None without one.
+    picture, map : the camera's image and the pixels of the flow on the chip; None where they are not known.
+    """
+
+    def __init__(self, camera: ChipCamera | None = None, start_unix_ns: int = 0) -> None:
+        self.camera = camera
+        self.start_unix_ns = start_unix_ns
+        self.top_um_s: float | None = None
+        self.field: FlowField | None = None
+        self.route: Route | None = None
+        self.goal_um: NDArray[np.float64] | None = None
+        self.picture = camera.picture(None) if camera is not None else None
+        self.map: Picture | None = None
+        self._refined: FlowField | None = None
+
+    @property
+    def robot_um(self) -> float:
+        """Radius of the robot."""
+        return self.camera.robot_um if self.camera is not None else _RADIUS_UM
+
+    @property
+    def map_error_share(self) -> float:
+        """The error that the map states of itself; NaN where it states none."""
+        share = self.field.error_share if self.field is not None else None
+        return math.nan if share is None else share
+
+    def on_chip(self, measured_um: ArrayLike) -> NDArray[np.float64]:
+        """Where measured places (..., 2) in um lie on the chip."""
+        return on_chip(self._refined.registration if self._refined is not None else None, measured_um)
+
+    def place_um(self, measured_um: NDArray[np.float64]) -> tuple[float, float]:
+        """The same of one place (2,), quicker."""
+        x, y = measured_um.tolist()
+        if self._refined is None or self._refined.registration is None:
+            return x, y
+        (xx, xy, x0), (yx, yy, y0) = self._refined.registration.tolist()
+        return xx * x + xy * y + x0, yx * x + yy * y + y0
+
+    def update(self, messages: Mapping[str, Message]) -> None:
+        """Take over the new messages of one tick, by field of Tick."""
+        for name in ("assumed", "refined"):
+            field = messages.get(name)
+            if isinstance(field, FlowField) and drawable(field):
+                if self.top_um_s is None:
+                    self.top_um_s = float(speed_um_s(field).max()) or 1.0
+                if name == "refined":
+                    self._refined = field
+                    self.picture = self.camera.picture(field.registration) if self.camera is not None else None
+                if name == "refined" or self._refined is None:
+                    self.field = field
+                self.map = _map(field) or self.map
+        route, mission = messages.get("route"), messages.get("mission")
+        if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
+            self.route = route
+        if isinstance(mission, Mission):
+            self.goal_um = mission.goal_um if np.isfinite(mission.goal_um).all() else None
+
+    def transforms(self) -> list[fg.FrameTransform]:
+        """The tree of the frames that are known."""
+        chip = fg.FrameTransform(parent_frame_id=ROOT, child_frame_id=CHIP, translation=fg.Vector3(), rotation=_STILL)
+        return [chip, *(picture.transform() for picture in (self.picture, self.map) if picture is not None)]
+
+    def stamp(self, stamp_ns: int) -> bytes:
+        """The field `timestamp`, which has the number 1 in nearly all schemas."""
+        return _stamp(stamp_ns + self.start_unix_ns)
+
+
+@functools.lru_cache(maxsize=4)  # several views are of the same moment
+def _stamp(unix_ns: int) -> bytes:
+    # Not by foxglove's class, which refuses times out of range.
+    data: bytes = foxglove_schema("PoseInFrame").wire(timestamp=timestamp(unix_ns)).SerializeToString()
+    return data
+
+
+def _map(field: FlowField) -> Picture | None:
+    size_um = field.um_per_px
+    if not (math.isfinite(size_um) and size_um > 0.0):
+        return None
+    height, width = field.velocity_um_s.shape[:2]
+    return Picture(MAP, width, height, np.array([[size_um, 0.0, 0.0], [0.0, size_um, 0.0]]))
+
+
+def drawable(field: FlowField) -> bool:
+    """Whether a field has velocities on pixels."""
+    return field.velocity_um_s.shape[2:] == (2,) and field.velocity_um_s.size > 0
+
+
+def speed_um_s(field: FlowField) -> NDArray[np.float32]:
+    """(h, w) speed; 0 where it is not finite."""
+    with np.errstate(over="ignore"):
+        speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
+    np.nan_to_num(speed, copy=False, posinf=0.0)
+    return speed

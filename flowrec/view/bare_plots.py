@@ -1,0 +1,52 @@
+"""The plots that Rerun and Foxglove show of a session file itself: fields of messages, by topic."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """One plot over time.
+
+    Attributes
+    ----------
+    title : with the unit.
+    topic, lines : of the messages, and the names of the lines by the field that each shows.
+    points : single points, not lines.
+    """
+
+    title: str
+    topic: str
+    lines: dict[str, str]
+    points: bool = False
+
+
+_FLOW = {"flow_um_s": "measured", "map_um_s": "map", "difference_um_s": "difference"}
+# Plots of one group are behind each other.
+PLOTS: dict[str, tuple[Plot, ...]] = {
+    "flow": (
+        Plot("Flow at the robot (µm/s)", "/view/robot_flow", _FLOW),
+        Plot("Observations (µm/s)", "/view/observation", _FLOW, points=True),
+    ),
+    "error": (
+        Plot("Tracking error (µm)", "/control/demand", {"error_um": "tracking error"}),
+        Plot("Relative error that the map states", "/view/robot_flow", {"map_error_share": "of the map"}),
+    ),
+    "coils": (
+        Plot("Field (Hz)", "/coils/command", {"frequency_hz": "frequency"}),
+        Plot("Heading (rad)", "/coils/command", {"heading_rad": "heading"}),
+        Plot("Field (mT)", "/coils/command", {"amplitude_mt": "amplitude"}),
+    ),
+}
+# Along the latest route: the first field is that of the x axis.
+ROUTE = Plot(
+    "Flow along the route (µm/s over µm)",
+    "/view/route_flow",
+    {"distance_um": "", "map_um_s": "speed", "along_um_s": "along the route", "std_um_s": "1 σ"},
+)
+STATES = {"/run/mission": ("phase", "mission"), "/run/health": ("alarm", "alarm")}  # field and name by topic
+IMAGE = "/camera/frame"
+MAPS = {"/view/flow_assumed": "Assumed flow", "/view/flow_refined": "Refined flow"}
+ON_IMAGE = ("/camera/frame/path", "/camera/frame/goal", "/camera/frame/robot")  # points on the chip
+EVENTS = ("/run/events", "/operator/events")

@@ -1,0 +1,141 @@
+"""A layout for Foxglove and Lichtblick: camera with overlays, maps, plots, phases and log of a session file.
+
+Both import it with Layouts > Import from file. Topics that a file does not have leave their panels empty.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from flowrec.store.viewer_scene import HEIGHT_M
+from flowrec.view.bare_plots import EVENTS, IMAGE, ON_IMAGE, PLOTS, ROUTE, STATES, Plot
+
+_COLOURS = ("#4e98e2", "#f5774d", "#f7df71")
+_MAP = "/view/flow_refined"
+
+Panel = dict[str, Any]
+
+
+def foxglove_layout(centre_m: tuple[float, float], size_m: float) -> dict[str, Any]:
+    """The layout as JSON data, for a chip with this centre and longer side."""
+    panels: dict[str, Panel] = {
+        "Image!camera": _image("Camera", IMAGE, "/view/camera"),
+        "Image!map": _image("Refined flow", _MAP, "/view/map"),
+        "3D!chip": _chip(centre_m, size_m),
+        "Plot!route": _along_route(),
+        "StateTransitions!states": _states(),
+        "RosOut!log": {"searchTerms": [], "minLogLevel": 1, "topicToRender": EVENTS[0]},
+        "Tab!maps": _tab({"Refined flow": "Image!map", "Chip (m)": "3D!chip"}),
+    }
+    for name, group in PLOTS.items():
+        found = {f"Plot!{name}{number}": plot for number, plot in enumerate(group)}
+        panels |= {panel: _plot(plot) for panel, plot in found.items()}
+        tabs = {plot.title: panel for panel, plot in found.items()}
+        panels[f"Tab!{name}"] = _tab(tabs | ({"Route": "Plot!route"} if name == "flow" else {}))
+    states = _split("column", "StateTransitions!states", "RosOut!log", 40)
+    below = _split("row", states, _split("row", "Tab!flow", _split("row", "Tab!error", "Tab!coils", 50), 36), 28)
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _split("column", _split("row", "Image!camera", "Tab!maps", 58), below, 60),
+    }
+
+
+def _image(title: str, topic: str, calibration: str) -> Panel:
+    """An image; what is drawn over that of the camera is in its pixels, over a map projected from the chip."""
+    in_pixels = topic == IMAGE
+    return {
+        "foxglovePanelTitle": title,
+        "imageMode": {
+            "imageTopic": topic,
+            "calibrationTopic": calibration,
+            "annotations": {name: {"visible": in_pixels} for name in ("/view/route_mark", "/view/robot_mark")},
+            "synchronize": False,
+        },
+        "topics": {name: {"visible": not in_pixels, "pointSize": 3} for name in ON_IMAGE},
+        "followTf": "chip",
+    }
+
+
+def _chip(centre_m: tuple[float, float], size_m: float) -> Panel:
+    """Flow, route and robot on the chip, seen from where the camera is: x to the right, y down."""
+    grid = {"visible": True, "colorMode": "colormap", "colorMap": "turbo", "colorField": "speed_um_s"}
+    return {
+        "foxglovePanelTitle": "Chip (m)",
+        "cameraState": {
+            # Only a camera with perspective can look along z.
+            "perspective": True,
+            "distance": 1.4 * size_m,
+            "phi": 180,
+            "thetaOffset": 0,
+            "target": [0, 0, 0],
+            "targetOffset": [*centre_m, 0],
+            "targetOrientation": [0, 0, 0, 1],
+            "fovy": 45,
+            "near": 0.0001,
+            "far": 10,
+        },
+        "followMode": "follow-none",
+        "followTf": "chip",
+        "scene": {"transforms": {"showLabel": False, "axisScale": 0.0, "lineWidth": 0.0}},
+        "topics": {
+            **{name: {"visible": True, "pointSize": 4} for name in ON_IMAGE},
+            "/view/flow_refined_grid": grid,
+            IMAGE: {"visible": False, "cameraInfoTopic": "/view/camera", "distance": HEIGHT_M},
+        },
+        "layers": {},
+    }
+
+
+def _plot(plot: Plot) -> Panel:
+    paths = [
+        {
+            "value": f"{plot.topic}.{field}",
+            "label": label,
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+            "color": colour,
+            "showLine": not plot.points,
+            "lineSize": 2.5 if plot.points else 1.5,
+        }
+        for (field, label), colour in zip(plot.lines.items(), _COLOURS, strict=False)
+    ]
+    return {
+        "foxglovePanelTitle": plot.title,
+        "paths": paths,
+        "xAxisVal": "timestamp",
+        "showXAxisLabels": True,
+        "showYAxisLabels": True,
+        "showLegend": len(paths) > 1,
+        "legendDisplay": "floating",
+        "showPlotValuesInLegend": False,
+        "isSynced": True,
+        "sidebarDimension": 240,
+    }
+
+
+def _along_route() -> Panel:
+    """Numbers along the route over the distance along it."""
+    (distance, _), *lines = ROUTE.lines.items()
+    panel = _plot(Plot(ROUTE.title, ROUTE.topic, {f"{field}[:]": label for field, label in lines}))
+    axis = {"value": f"{ROUTE.topic}.{distance}[:]", "enabled": True}
+    return panel | {"xAxisVal": "currentCustom", "xAxisPath": axis, "isSynced": False}
+
+
+def _states() -> Panel:
+    paths = [
+        {"value": f"{topic}.{field}", "label": label, "enabled": True, "timestampMethod": "receiveTime"}
+        for topic, (field, label) in STATES.items()
+    ]
+    return {"paths": paths, "isSynced": True}
+
+
+def _tab(panels: dict[str, str]) -> Panel:
+    tabs = [{"title": title, "layout": panel} for title, panel in panels.items()]
+    return {"activeTabIdx": 0, "tabs": tabs}
+
+
+def _split(direction: str, first: Any, second: Any, percentage: float) -> dict[str, Any]:
+    return {"direction": direction, "first": first, "second": second, "splitPercentage": percentage}
