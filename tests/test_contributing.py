@@ -43,6 +43,7 @@ for sys.argv in json.loads(sys.argv[1]):
 """
 
 
+@pytest.mark.usefixtures("mission")  # has compiled most kernels, which the processes below would compile again
 def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     for folder in (PACKAGE, ROOT / "sessions"):

@@ -128,11 +128,11 @@ def _show(ax: Axes, image: NDArray[np.floating], mask: NDArray[np.bool_], colour
 
 
 def _arrows(ax: Axes, velocity: NDArray[np.floating], places: NDArray[np.intp], top: float) -> None:
-    """Arrows at places (n, 2) of row and column where the flow is not slow; an arrow at speed `top` fills a block."""
+    """Arrows at places (n, 2), row and column, where the flow is not slow; one of speed `top`, mm/s, fills a block."""
     rows, columns = places[_length(velocity[places[:, 0], places[:, 1]]) > SHORTEST * top].T
     shape: dict[str, Any] = {"width": 0.009, "headwidth": 3.6, "headlength": 4.0, "headaxislength": 3.6, "pivot": "mid"}
     scale: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": top / BLOCK_PX}
-    ax.quiver(columns, rows, *velocity[rows, columns].T, color="white", **scale, **shape)
+    ax.quiver(columns, rows, *(MM_PER_UM * velocity[rows, columns]).T, color="white", **scale, **shape)
 
 
 def _arrow_places(mask: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from flowrec.bench import flow
+from flowrec.bench import figure_flow, flow
 from flowrec.bench.figure_flow import Picture, draw, median_case
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import need_matplotlib
@@ -98,6 +98,14 @@ def test_the_case_of_the_figure_is_that_of_median_error_before_refinement():
     rows += [row(name, "ni", 1.0 - error) for name, error in errors.items()]
     assert median_case(rows) == "c"
     assert median_case([made for made in rows if made["method"] == "ni"]) == "a"
+
+
+def test_an_arrow_of_the_top_speed_is_as_long_as_a_block():
+    ax = figure_flow.new_figure(2.0, 2.0).subplots()
+    velocity_um_s = np.broadcast_to([2400.0, 3200.0], (40, 40, 2))
+    figure_flow._arrows(ax, velocity_um_s, np.array([[20, 20]]), top=4.0)
+    (arrows,) = ax.collections
+    assert np.hypot(arrows.U, arrows.V) / arrows.scale == pytest.approx(figure_flow.BLOCK_PX)
 
 
 def test_a_figure_is_drawn_even_where_a_method_is_far_off_or_perfect(tmp_path):
