@@ -25,6 +25,10 @@ _TYPES = (
     (pa.types.is_timestamp, "datetime"),
     (pa.types.is_string, "string"),
 )
+_MARKED = (
+    " A text that begins with = + - @, a tab, a return or an apostrophe has one more apostrophe before it, so that no "
+    "spreadsheet runs it."
+)
 _MEDIA_TYPES = {".parquet": "application/vnd.apache.parquet", ".csv": "text/csv"}
 
 
@@ -52,7 +56,8 @@ def write_datapackage(folder: Path, session: Session, tables: Mapping[str, tuple
         "description": (
             "Chip frame: origin at the centre of the mask's pixel (0, 0), x right, y down. stamp_ns and time_s are "
             "times on the session clock."
-        ),
+        )
+        + (_MARKED if any(name.endswith(".csv") for name in tables) else ""),
         "sources": [{"title": session.path.name, "path": session.path.name}],
         "provenance": dict(session.provenance),
         "outcome": dict(session.outcome),

@@ -92,6 +92,23 @@ def test_other_programs_read_the_tables_with_stamps_to_the_nanosecond(tables: di
     assert json.loads(read[0]["roi_px"]) == track[0].roi_px.tolist()
 
 
+def test_no_text_of_a_csv_is_a_formula_and_each_can_be_had_back_exactly(tmp_path: Path) -> None:
+    import pyarrow
+
+    from flowrec.exports.tabular import CsvExport
+
+    texts = ["=1+1", "+1", "-1", "@SUM(1)", "\t=1", "\r=1", "'", "'=1", "\uff1d1", "plain = 1", '"=1"', "", None]
+    batch = pyarrow.record_batch({"text": pyarrow.array(texts, pyarrow.string()), "number": [-1.5] * len(texts)})
+    exporter = CsvExport()
+    with exporter.opened(tmp_path / "a.csv", exporter.kept(batch.schema)) as writer:
+        writer.write(exporter.kept(batch))
+    with (tmp_path / "a.csv").open(newline="", encoding="utf-8") as lines:
+        rows = list(csv.DictReader(lines))
+    assert [row["text"].removeprefix("'") for row in rows] == [text or "" for text in texts]
+    assert not any(row["text"].startswith(("=", "+", "-", "@", "\t", "\r", "\uff1d")) for row in rows)
+    assert {row["number"] for row in rows} == {"-1.5"}
+
+
 def test_the_data_package_names_every_file_and_column_with_unit_and_meaning(tables: dict[str, Path]) -> None:
     import pandas
 
