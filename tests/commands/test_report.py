@@ -98,12 +98,14 @@ def test_the_page_needs_neither_network_nor_script_and_every_picture_says_what_i
     assert all(value is not None and value.startswith("data:") for value in references)
     assert "@import" not in html and "url(" not in html
     images = page.all("img")
-    assert len(images) == 7
+    assert [image["class"] for image in images] == ["wide", "narrow"] * 7  # narrow on a telephone, never on paper
+    assert html.index(".narrow { display: none; }") < html.index("@media screen and (max-width: 600px)")
     assert all(len(image["alt"] or "") > 20 for image in images)
     assert len(html) < 5_000_000
     for image in images:
         svg = ElementTree.fromstring(base64.b64decode((image["src"] or "").partition(",")[2]))
-        assert float(svg.attrib["width"].removesuffix("pt")) * 25.4 / 72.0 == pytest.approx(180.0, abs=0.01)
+        width_mm = {"wide": 180.0, "narrow": 88.0}[image["class"] or ""]
+        assert float(svg.attrib["width"].removesuffix("pt")) * 25.4 / 72.0 == pytest.approx(width_mm, abs=0.01)
         assert svg.attrib["role"] == "img" and svg[0].tag.endswith("title") and svg[0].text
 
 
