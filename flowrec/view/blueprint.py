@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TimelineColumn
 
 from flowrec.units import seconds
 from flowrec.view import colours
@@ -20,7 +21,7 @@ _SEVERAL_LINES = frozenset({e.FLOW_SPEED, e.FLOW_COMPONENTS, e.TIMING})
 _OVERLAYS = (e.OUTLINE, e.PATH, e.ROBOT)  # of each map, for orientation
 _SUMMARY = 0.31  # width of the text panel
 # Pixels on a small screen: its width, the height of all, that of text and plots below, the frame of the lanes and each.
-_WIDTH_PX, _ALL_PX, _BELOW_PX, _LANES_PX, _LANE_PX = 1280.0, 653.0, 333.0, 60.0, 40.0
+_WIDTH_PX, _ALL_PX, _BELOW_PX, _LANES_PX, _LANE_PX = 1280.0, 653.0, 345.0, 60.0, 40.0
 _FEW_LANES, _MOST_LANES = 2, 5  # more than few make the area below higher; more than most are scrolled
 _TITLE_PX = 28.0
 _LEGEND_LIVE_S = 6.0  # least time kept free for a legend in a view that follows the run
@@ -178,7 +179,11 @@ class _Views:
             name="Events",
             origin="/",
             contents=[f"+ {path}" for path in paths],
-            columns=rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"]),
+            columns=rrb.TextLogColumns(
+                # Hidden by name: an empty list would show the timeline of the view.
+                timeline_columns=[TimelineColumn(each, visible=False) for each in (e.SESSION_TIME, e.FRAME)],
+                text_log_columns=["Body"],
+            ),
         )
         summary = rrb.TextDocumentView(name="Summary", origin=entity_path("", e.SUMMARY)) if self._summary else None
         return _tabs(summary, events)
@@ -263,11 +268,11 @@ def _plots(v: _Views) -> tuple[Part, ...]:
         ),
         _row(
             "Observer",
-            v.plot("Components (µm/s)", e.FLOW_COMPONENTS) if single else None,
             v.plot("Estimate error (µm)", e.ESTIMATE_ERROR, needs="true robot"),
             v.plot("Observer NIS", *nis),
             v.plot("Pulsation (%)", e.PULSATION, needs="health"),
         ),
+        _row("Components", v.plot("Flow at the robot by components (µm/s)", e.FLOW_COMPONENTS) if single else None),
         _row(
             "Coils",
             None if single else frequency,

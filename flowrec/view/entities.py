@@ -146,7 +146,7 @@ class EntityLogger:
             TRACKING_ERROR: {"tracking error (µm)": own},
             ESTIMATE_ERROR: {"estimate error (µm)": own},
             NIS: {"NIS": own},
-            NIS_MEAN: {"mean NIS (2: all noise is stated right)": colours.WHITE},
+            NIS_MEAN: {"mean (2 is right)": colours.WHITE},
             PULSATION: {"pulsation (% of the flow)": own},
             FLOW_SPEED: {"observer": self.style.path, "map": pale} | truth,
             FLOW_COMPONENTS: {
