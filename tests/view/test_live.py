@@ -119,6 +119,7 @@ def test_a_viewer_receives_every_tick_and_a_smaller_image_and_its_server_stays_u
     # A viewer calls the end of its server an error: the server stays until the last one has left.
     assert f"its server (process {live.pid}) stays" in live.afterwards
     time.sleep(1.5 * live_server.ABSENT_S)
+    assert sockets(live.pid or 0)  # it accepts viewers still
     assert listener.poll() is None
     listener.send_signal(signal.SIGINT)
     until(lambda: listener.poll() is not None)
