@@ -1,7 +1,7 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in import_verb.py, doctor_verb.py, session_verbs.py and calibrate_verbs.py. Each function parses,
-calls and prints, with late imports.
+The other verbs are in import_verb.py, doctor_verb.py, sweep_verb.py, session_verbs.py and calibrate_verbs.py. Each
+function parses, calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
@@ -40,6 +40,7 @@ from flowrec.session_verbs import (
     report,
     view,
 )
+from flowrec.sweep_verb import sweep
 from flowrec.units import amounts
 
 app = typer.Typer(
@@ -241,6 +242,7 @@ def replay(
 
 
 app.command("import", epilog=examples("import"))(import_movie)
+app.command("sweep", epilog=examples("sweep"))(sweep)
 for _verb in (doctor, view, export, report, info, list_directory, note, check, recover, compare):
     _name = "ls" if _verb is list_directory else _verb.__name__
     app.command(_name, cls=HelpWithMethods, epilog=examples(_name))(_verb)

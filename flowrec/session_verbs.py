@@ -29,6 +29,10 @@ METHODS = {
 EXAMPLES = {
     "record": ("flowrec record --goal 5200,1400", "flowrec record lab.toml -o run.mcap --split 2GB,10min"),
     "replay": ("flowrec replay a.mcap --refine", "flowrec replay a.mcap --plan astar_time --refly -o b.mcap"),
+    "sweep": (
+        "flowrec sweep 'runs/*.mcap' --grid refine=fvm,assimilate --grid observer=kalman,kalman_map -o sweep.parquet",
+        "flowrec sweep runs --grid plan=astar_time,time_field --refly -o plans.parquet --scheduler tcp://10.0.0.1:8786",
+    ),
     "import": ("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap",),
     "doctor": ("flowrec doctor lab.toml",),
     "view": (
@@ -37,7 +41,11 @@ EXAMPLES = {
         "flowrec view a.mcap --layout .",
     ),
     "export": ("flowrec export a.mcap", "flowrec export a.mcap tables --format parquet"),
-    "report": ("flowrec report a.mcap", "flowrec report a.mcap a_replay_001.mcap -o report.html --figures figures"),
+    "report": (
+        "flowrec report a.mcap",
+        "flowrec report a.mcap a_replay_001.mcap -o report.html --figures figures",
+        "flowrec report sweep.parquet -o sweep.html",
+    ),
     "info": ("flowrec info a.mcap --json",),
     "ls": ("flowrec ls runs", 'flowrec ls runs/*.mcap --where "refined_flow_error < 0.05" --sort -duration_s'),
     "note": ('flowrec note a.mcap "bubble at the outlet" --tag bubble', "flowrec note a.mcap"),
@@ -182,8 +190,18 @@ def report(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write one page (HTML) about a session, to read, print or send: outcome, path, flow before and after, losses."""
-    page = flowrec.report(session, replays or (), out, figures, overwrite)
+    """Write one page (HTML) about a session, to read, print or send: outcome, path, flow before and after, losses.
+
+    Of a table of flowrec sweep (.parquet): the ranking of its settings.
+    """
+    if session.suffix == ".parquet":
+        if replays or figures is not None:
+            raise UsageError(f"{session}: the page of a sweep goes without replays and --figures")
+        from flowrec.sweeping.sweep_report import report_sweep
+
+        page = report_sweep(session, out, overwrite)
+    else:
+        page = flowrec.report(session, replays or (), out, figures, overwrite)
     if as_json:
         found = {"session": str(session), "html": str(page), "bytes": page.stat().st_size}
         typer.echo(json.dumps(found | ({"figures": str(figures)} if figures is not None else {})))

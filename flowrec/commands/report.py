@@ -68,7 +68,7 @@ def report(
     UsageError : a package of the extra `report` is not installed, or a replay is not one of this session.
     SessionError : a session can not be read, or an output not be written; OutputError if it may not be.
     """
-    _require_packages()
+    require_packages()
     from flowrec.reporting import style
     from flowrec.reporting.page import render
     from flowrec.reporting.report_data import ReportData
@@ -111,7 +111,8 @@ def report(
     return output.path
 
 
-def _require_packages() -> None:
+def require_packages() -> None:
+    """Raise UsageError where a package of the extra `report` is not installed."""
     for module, package in _PACKAGES.items():
         if importlib.util.find_spec(module) is None:
             raise UsageError(f"a report needs {package}, which is not installed: pip install 'flowrec[report]'")

@@ -14,7 +14,7 @@ from flowrec.reporting.explanations import LONGEST
 from flowrec.reporting.report_data import ReportData
 from flowrec.version import __version__
 
-_TEMPLATE = "page.html"
+_TEMPLATES = {"Page": "page.html", "SweepPage": "sweep.html"}  # by the class of the page
 
 
 class ReportFigure(Protocol):
@@ -109,17 +109,32 @@ class Page:
     glossary: Sequence[tuple[str, str]] = ()
 
 
+@dataclass(slots=True)
+class SweepPage:
+    """Content of the page about a sweep, in the order of reading; the texts are not trusted."""
+
+    name: str
+    outcome: str
+    good: bool
+    note: str
+    about: str
+    figure: Drawn
+    ranking: Table
+    tables: Sequence[Table] = ()
+
+
 def drawn(figure: ReportFigure, data: ReportData) -> Drawn:
     """Draw a figure for the page; call it within `style.drawing()`."""
     why = figure.why_not(data)
     if why:
         return Drawn(figure.name, figure.title, why_not=why)
-    narrow, wide = (
-        "data:image/svg+xml;base64,"
-        + base64.b64encode(style.as_svg(figure.draw(data, width_mm), figure.title)).decode("ascii")
-        for width_mm in style.WIDTHS_MM
-    )
+    narrow, wide = (as_uri(style.as_svg(figure.draw(data, width_mm), figure.title)) for width_mm in style.WIDTHS_MM)
     return Drawn(figure.name, figure.title, figure.caption(data), figure.alt(data), narrow, wide)
+
+
+def as_uri(svg: bytes) -> str:
+    """An image that is part of the page."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
 
 
 def plain(value: Any) -> Any:
@@ -133,7 +148,7 @@ def plain(value: Any) -> Any:
     return printable(value)
 
 
-def render(page: Page) -> str:
+def render(page: Page | SweepPage) -> str:
     """The page as HTML."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
@@ -148,4 +163,4 @@ def render(page: Page) -> str:
     )
     environment.globals["uri"] = Markup  # of images that were made here
     environment.globals["flowrec_version"] = __version__
-    return environment.get_template(_TEMPLATE).render(page=page)
+    return environment.get_template(_TEMPLATES[type(page).__name__]).render(page=page)

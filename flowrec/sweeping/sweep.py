@@ -1,0 +1,153 @@
+"""`flowrec sweep`: replay many sessions with many settings on the workers of Dask, and rank the settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flowrec.session import Session
+from flowrec.sweeping.cluster import rows_of, workers_of
+from flowrec.sweeping.ranking import Ranking
+from flowrec.sweeping.results import COLUMNS, Results, read_rows
+from flowrec.sweeping.tasks import Sessions, Settings, Task, change_of, combinations, session_files
+from flowrec.terminal import progress, say
+
+_NAMED = 5  # files and failed tasks that are named one by one
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """The result of a sweep.
+
+    Attributes
+    ----------
+    path : the Parquet file.
+    tasks, computed : all of this call, and those that were not done before.
+    sessions, unreadable : that were swept; files that are no whole sessions.
+    rows : of all tasks of this call that are done.
+    ranking : of the settings.
+    """
+
+    path: Path
+    tasks: int
+    computed: int
+    sessions: int
+    unreadable: int
+    rows: list[dict[str, Any]]
+    ranking: Ranking
+
+    @property
+    def failed(self) -> list[dict[str, Any]]:
+        """Rows with an error."""
+        return [row for row in self.rows if row.get("error")]
+
+    @property
+    def exit_status(self) -> int:
+        """0 all done, 3 a task has failed or a file is no whole session."""
+        return 3 if self.failed or self.unreadable else 0
+
+    def lines(self) -> list[str]:
+        """What was done and what has failed, as text."""
+        failed = self.failed
+        passed = f", {self.tasks - self.computed} were done before" if self.computed < self.tasks else ""
+        lines = [f"{self.computed} replays done{passed} -> {self.path}"]
+        for row in failed[:_NAMED]:
+            settings = ", ".join(f"{key}={value}" for key, value in row["settings"].items())
+            lines.append(f"failed: {row['session']} with {settings}: {row['error']}")
+        if failed:
+            more = f"{len(failed) - _NAMED} more have failed; " if len(failed) > _NAMED else ""
+            lines.append(f"{more}--retry does what has failed again")
+        return lines
+
+    def as_json(self) -> dict[str, Any]:
+        """The result in numbers; the rows are in the file."""
+        failed = [{name: row[name] for name in ("session", "settings", "error")} for row in self.failed]
+        counts = {"sessions": self.sessions, "unreadable": self.unreadable}
+        counts |= {"tasks": self.tasks, "computed": self.computed, "passed_over": self.tasks - self.computed}
+        return {"out": str(self.path), **counts, "failed": failed, "ranking": self.ranking.as_json()}
+
+
+def sweep(
+    places: Sequence[str],
+    grid: Sequence[str],
+    out: Path,
+    sets: Sequence[str] = (),
+    *,
+    refly: bool = False,
+    by: str | None = None,
+    retry: bool = False,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    timeout_s: float | None = None,
+    memory_bytes: int | None = None,
+) -> Swept:
+    """Replay sessions with every combination of settings, each once, and write one row a replay.
+
+    Parameters
+    ----------
+    places : files, folders and patterns such as `runs/*.mcap`.
+    grid : texts `key=value,value`: methods (refine, plan, observer, controller) and settings.
+    out : the Parquet file; one of an earlier sweep of these sessions is continued.
+    sets : texts `key=value` that hold for all replays.
+    refly : fly the recorded and the replayed plan, too, as `flowrec replay --refly`.
+    by : the figure by which settings are ranked; None: the first of RANKED_BY.
+    retry : do tasks again that have failed.
+    scheduler, workers : of Dask; see `workers_of`.
+    timeout_s, memory_bytes : limits of a task.
+
+    Raises
+    ------
+    UsageError : no session, a setting that is unknown or fixed by the recording.
+    OutputError : `out` may not be written.
+    FlowrecError : the scheduler does not answer, or has ended.
+    """
+    chosen = combinations(grid, sets, tuple(COLUMNS))
+    files = session_files(places)
+    with progress("reading heads and indexes", len(files)) as done:
+        sessions = Sessions.of(files, done)
+    _check_settings(next(iter(sessions.by_content.values())), chosen)
+    _tell(sessions.left_out)
+    tasks = {
+        task.key: task
+        for content, path in sessions.by_content.items()
+        for settings in chosen
+        for task in [Task(str(path), content, settings, refly, False, timeout_s, memory_bytes)]
+    }
+    computed = 0
+    with Results.opened(out, files, sessions.by_content) as results:
+        failed = results.failed
+        waiting = [task for key, task in tasks.items() if key not in failed or (retry and failed[key])]
+        if waiting:
+            say(f"{len(waiting)} replays to do, {len(tasks) - len(waiting)} are done")
+            with workers_of(scheduler, workers) as client, progress("sweeping", len(waiting)) as done:
+                for row in rows_of(client, _judged_once(waiting, results.judged), local=scheduler is None):
+                    results.put(row)
+                    computed += 1
+                    done(computed)
+    rows = [row for row in read_rows(out) if row["key"] in tasks]
+    return Swept(out, len(tasks), computed, len(sessions.by_content), sessions.unreadable, rows, Ranking.of(rows, by))
+
+
+def _check_settings(path: Path, chosen: Sequence[Settings]) -> None:
+    """Refuse settings that no replay takes, before the first one; UsageError."""
+    config = Session(path).config
+    for settings in chosen:
+        change = change_of(settings)
+        change.stale_results(config, change.apply(config))
+
+
+def _judged_once(tasks: Sequence[Task], judged: set[str]) -> Iterator[Task]:
+    """The tasks, of which the first of each session checks it where its verdict is not known."""
+    known = set(judged)
+    for task in tasks:
+        yield replace(task, judge=task.content not in known)
+        known.add(task.content)
+
+
+def _tell(lines: Sequence[str]) -> None:
+    for line in lines[:_NAMED]:
+        say(line)
+    if len(lines) > _NAMED:
+        say(f"and {len(lines) - _NAMED} files more")
