@@ -7,7 +7,9 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbclient import NotebookClient
 from typer.testing import CliRunner
 
 import flowrec
@@ -15,6 +17,7 @@ from flowrec.cli import app
 from flowrec.commands.replay_api import BeforeAfter
 from flowrec.errors import UsageError
 from flowrec.topics import TOPICS
+from tests.conftest import HANG_S
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 CHANGE = {"plan.speed_share": 0.7}
@@ -34,7 +37,7 @@ def payloads(path: Path) -> dict[str, list[tuple[int, bytes]]]:
     return found
 
 
-def test_replays_in_threads_make_the_bytes_that_the_verb_makes(tmp_path: Path) -> None:
+def test_replays_in_threads_and_in_a_notebook_make_the_bytes_that_the_verb_makes(tmp_path: Path) -> None:
     by_verb = tmp_path / "verb.mcap"
     words = ["replay", str(GOLDEN), "--plan", "astar_length", "--out", str(by_verb), "--json"]
     done = CliRunner().invoke(app, words)
@@ -43,15 +46,20 @@ def test_replays_in_threads_make_the_bytes_that_the_verb_makes(tmp_path: Path) -
         running = [
             threads.submit(flowrec.replay, GOLDEN, plan="astar_length", out=tmp_path / f"{n}.mcap") for n in range(2)
         ]
+        notebook = nbformat.v4.new_notebook()
+        code = f"import flowrec\nflowrec.replay({str(GOLDEN)!r}, plan='astar_length', out='2.mcap').before_after"
+        notebook.cells.append(nbformat.v4.new_code_cell(code))
+        NotebookClient(notebook, timeout=HANG_S, resources={"metadata": {"path": str(tmp_path)}}).execute()
         replays = [each.result() for each in running]
+    made = [each.result.path for each in replays] + [tmp_path / "2.mcap"]
     expected = payloads(by_verb)
     assert len(expected["/robot/estimate"]) == 107 and "/plan/route" in expected
     stamped = {"/run/events", "/operator/events"}  # hold the time of day, which is that of the replay
-    for replay in replays:
-        found = payloads(replay.result.path)
+    for path in made:
+        found = payloads(path)
         assert found.keys() == expected.keys()
         assert [topic for topic in found if topic not in stamped and found[topic] != expected[topic]] == []
-        assert replay.result.events == [] or len(replay.result.events) == len(flowrec.open(by_verb).events)
+        assert len(flowrec.open(path).events) == len(flowrec.open(by_verb).events)
     rows = json.loads(done.stdout)["rows"]
     assert [list(row.values()) for row in rows] == json.loads(
         json.dumps([list(row) for row in replays[0].before_after])
