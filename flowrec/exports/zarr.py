@@ -9,6 +9,7 @@ metadata; format 3 specifies neither yet. https://zarr-specs.readthedocs.io/en/l
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -78,16 +79,19 @@ def _write_frames(root: zarr.Group, session: Session, progress: Callable[[float]
         {_DIMENSIONS: ["time", "y_px", "x_px"], "description": "grey levels", "bits": session.reader.frame_bits}
     )
     block = np.empty((per_chunk, *first.shape), first.dtype)
-    for number, frame in enumerate(frames):
-        if frame.image.shape != first.shape:
-            raise SessionError(
-                f"{session.path}: frame {frame.index} has the shape {frame.image.shape}, not {first.shape}"
-            )
-        numbers[number], place = frame.index, number % per_chunk
-        block[place] = frame.image
-        if place == per_chunk - 1 or number == len(frames) - 1:
-            array[number - place : number + 1] = block[: place + 1]
-            progress(seconds(frame.stamp_ns - session.run.first_ns))
+    # zarr writes in threads of its own, which an interruption does not end: this one is left when they have.
+    with ThreadPoolExecutor(1) as writing:
+        for number, frame in enumerate(frames):
+            if frame.image.shape != first.shape:
+                raise SessionError(
+                    f"{session.path}: frame {frame.index} has the shape {frame.image.shape}, not {first.shape}"
+                )
+            numbers[number], place = frame.index, number % per_chunk
+            block[place] = frame.image
+            if place == per_chunk - 1 or number == len(frames) - 1:
+                chunk = slice(number - place, number + 1)
+                writing.submit(array.__setitem__, chunk, block[: place + 1]).result()
+                progress(seconds(frame.stamp_ns - session.run.first_ns))
     coordinates["frame_index"] = numbers, {"description": "of the camera; a gap is images that it did not deliver"}
     for name, (values, attributes) in coordinates.items():
         made = root.create_array(name, shape=values.shape, dtype=values.dtype, fill_value=None)
