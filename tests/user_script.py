@@ -1,4 +1,4 @@
-"""What a user writes: mypy --strict checks it against the installed package, and the names are real (test_door.py)."""
+"""What a user writes: .ci/run checks it with mypy --strict against the installed package; it is never run."""
 
 from pathlib import Path
 
