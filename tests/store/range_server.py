@@ -44,7 +44,9 @@ class RangeServer:
                 with lock:
                     outer.requests.append((first, last - first + 1))
                 if outer.fault is None or not outer.fault(self, first, last, size):
-                    answer(self, first, last, size, outer.path.read_bytes()[first : last + 1])
+                    with outer.path.open("rb") as file:
+                        file.seek(first)
+                        answer(self, first, last, size, file.read(last - first + 1))
 
         class Server(ThreadingHTTPServer):
             request_queue_size = 64
