@@ -296,6 +296,7 @@ def files_behind(path: Path) -> list[Path]:
     An output that is made from the session must not replace any of them.
     """
     files: list[Path] = []
+    path = session_path(path)
     while path not in files and not isinstance(path, UrlPath):  # no output of this machine is at a URL
         files += [path, *run_files(path)]
         # Errors in a file are reported by the code that reads it.

@@ -61,7 +61,7 @@ def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: 
     rerun.check()
     (width_m, height_m), px_m = (M_PER_UM * um for um in session.chip.size_um), M_PER_UM * session.chip.um_per_px
     layout = foxglove_layout((0.5 * (width_m - px_m), 0.5 * (height_m - px_m)), max(width_m, height_m))
-    with SessionMetadata(files[0]) as head:
+    with SessionMetadata(session.run.files[0].path) as head:
         counts, began_ns = head.statistics.channel_message_counts, head.source.start_unix_ns
         present = {head.channels[number].topic for number, count in counts.items() if count}
     blueprint = bare_blueprint(present, began_ns + session.run.first_ns, began_ns + session.run.last_ns)

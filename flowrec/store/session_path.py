@@ -60,4 +60,4 @@ def on_this_machine(named: Path, what: str) -> Path:
 
 def named_beside(session: Path, name: str) -> Path:
     """The path of an output that is named after a session: beside it, or in this folder if the session is at a URL."""
-    return Path(name) if isinstance(session, UrlPath) else session.with_name(name)
+    return Path(name) if isinstance(session_path(session), UrlPath) else session.with_name(name)

@@ -11,8 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import flowrec
+from flowrec.cli import app
+from flowrec.commands.layout import write_layouts
 from flowrec.errors import FlowrecError, SessionError, UsageError
 from flowrec.session import session_sha256
 from flowrec.store import remote_file
@@ -138,6 +141,9 @@ def test_outputs_of_a_session_at_a_url_are_made_in_this_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert flowrec.export(server.url, file_format="csv") == Path(f"{session.stem}_csv")
+    done = CliRunner().invoke(app, ["replay", server.url, "--set", "plan.speed_share=0.7"])  # a Path of the URL
+    assert done.exit_code == 0, done.output
+    assert flowrec.open(f"{session.stem}_replay_001.mcap").header.parent["file"] == session.name
     with pytest.raises(UsageError, match="no note is added to a session at a URL"):
         flowrec.open(server.url).add_note("seen")
 
@@ -211,3 +217,8 @@ def test_a_session_in_a_bucket_is_the_file_and_credentials_are_never_printed(
     with pytest.raises(FlowrecError, match="no connection") as caught:
         flowrec.open("s3://lab/runs/b.mcap")
     assert "SECRET" not in str(caught.value)
+
+
+def test_layouts_of_a_session_at_a_url_are_written_here(server: RangeServer, tmp_path: Path) -> None:
+    made = write_layouts(server.url, tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted([made.foxglove, made.rerun])
