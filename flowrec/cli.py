@@ -66,7 +66,9 @@ def _version(asked: bool) -> None:
 
 def _timeout(seconds: float | None) -> None:
     if seconds is not None:
-        os.environ["FLOWREC_TIMEOUT_S"] = str(seconds)  # processes that a verb starts take it over
+        from flowrec.store.remote_file import TIMEOUT_KEY
+
+        os.environ[TIMEOUT_KEY] = str(seconds)  # processes that a verb starts take it over
 
 
 @app.callback()

@@ -22,7 +22,7 @@ from flowrec.errors import SessionError, UsageError
 from flowrec.replay_figures import CommandDifference
 from flowrec.run.loop import RunReport
 from flowrec.session import Session
-from flowrec.system.processes import end_pool, pool
+from flowrec.system.processes import pool
 from flowrec.topics import Tick
 from flowrec.version import NUMERICS_VERSION
 
@@ -67,9 +67,11 @@ def verify(
     segments = _segments(session, jobs, from_s) if jobs > 1 else []
     if len(segments) < 2:
         return replay(session, from_s=from_s, verify=True, control=control)
-    executor = pool(min(jobs, len(segments)))
     try:
-        with control.progress(f"replaying {session.path.name}", float(len(segments))) as progress:
+        with (
+            pool(min(jobs, len(segments))) as executor,
+            control.progress(f"replaying {session.path.name}", float(len(segments))) as progress,
+        ):
             tasks = [executor.submit(_verified, session.path, segment) for segment in segments]
             digest: Future[tuple[bool, list[str]]] = executor.submit(digest_lines, session.path)
             for count, task in enumerate(as_completed(tasks), 1):
@@ -79,8 +81,6 @@ def verify(
             return _joined(session, found, digest.result())
     except BrokenProcessPool as error:
         raise SessionError(f"{session.path}: a process of the replay was killed; try fewer --jobs") from error
-    finally:
-        end_pool(executor)
 
 
 def _segments(session: Session, jobs: int, from_s: float | None) -> list[Segment]:

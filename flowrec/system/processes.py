@@ -34,22 +34,28 @@ def child_environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(kept if home in kept else [home, *kept])}
 
 
-def pool(processes: int) -> ProcessPoolExecutor:
-    """New processes for work that a bench shares out. They end with this process, also where that one is killed."""
+@contextmanager
+def pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """New processes for work that is shared out.
+
+    They end with the block: after their work, or at once, where an exception such as Ctrl-C leaves it. They end with
+    this process, too, also where it is killed.
+    """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
 
-    return ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
-
-
-def end_pool(executor: ProcessPoolExecutor) -> None:
-    """End the processes of a pool at once, also in the middle of their work, and wait until they have ended."""
-    processes = list((getattr(executor, "_processes", None) or {}).values())
-    executor.shutdown(wait=False, cancel_futures=True)
-    for process in processes:
-        process.terminate()
-    for process in processes:
-        process.join()
+    executor = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), _end_with_parent)
+    try:
+        yield executor
+    except BaseException:
+        running = list((getattr(executor, "_processes", None) or {}).values())
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in running:
+            process.terminate()
+        for process in running:
+            process.join()
+        raise
+    executor.shutdown()
 
 
 def _end_with_parent() -> None:

@@ -32,8 +32,8 @@ def lives(pid: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGTERM])
-def test_the_processes_of_a_bench_end_with_the_one_that_is_killed(blow, tmp_path):
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_the_processes_of_a_bench_end_with_the_one_that_is_killed_or_interrupted(blow, tmp_path):
     with subprocess.Popen([sys.executable, "-c", SHARED_OUT, tmp_path]) as bench:
         try:
             until(lambda: len(list(tmp_path.iterdir())) == 2)
