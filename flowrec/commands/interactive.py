@@ -91,7 +91,8 @@ class AtTerminal(Unattended):
         with ExitStack() as stack:
             help_text = ""
             if sys.platform != "win32":
-                from flowrec.run.keyboard import HELP, keyboard_of
+                from flowrec.run.keyboard import keyboard_of
+                from flowrec.run.operator_commands import HELP
 
                 terminal = stack.enter_context(keyboard_of(self.run_control))
                 if terminal is not None:

@@ -9,6 +9,7 @@ holds no lock.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -52,6 +53,7 @@ class RunControl:
         self._clock = clock
         self._since_s = 0.0
         self._waiting: deque[tuple[str, str]] = deque()
+        self._marks = itertools.count(1)
         self._zero_sent = self._at_work = self._looping = False
 
     # ---- for those who control the run, from any thread
@@ -59,6 +61,10 @@ class RunControl:
     def request(self, action: Action, text: str = "") -> None:
         """Ask for an event in the record."""
         self._waiting.append((action, text))
+
+    def mark(self) -> None:
+        """Ask for the next numbered mark; keys and console share the numbers."""
+        self.request(Action.MARK, str(next(self._marks)))
 
     def toggle_hold(self) -> None:
         """Hold the robot, or let it go on if it is held."""

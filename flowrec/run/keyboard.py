@@ -1,8 +1,7 @@
 """Keys during a run. They are read from the terminal, so they need no display server and work over SSH.
 
-q stops, m marks, n opens a note, space holds the robot or lets it go on, e ends an observation, ! switches the field
-off at once. Only a terminal is read, and only in the foreground: piped input belongs to the program that started the
-run.
+What each key does is in operator_commands.py. Only a terminal is read, and only in the foreground: piped input belongs
+to the program that started the run.
 """
 
 from __future__ import annotations
@@ -21,14 +20,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from flowrec.enums import Action
 from flowrec.run.control import RunControl
+from flowrec.run.operator_commands import BY_KEY, COMMANDS, LONGEST_NOTE
 
 assert sys.platform != "win32"  # there is no termios
 
-HELP = "keys: q stop   m mark   n note   space hold, go on   e end observing   ! zero field at once"
 _POLL_S = 0.25
-_LONGEST_NOTE = 500
 _SEQUENCE = re.compile("\x1b(\\[[0-?]*[ -/]*[@-~]|O.)")  # arrows and function keys, which are ignored
 _ESCAPE, _ENTER, _RUBOUT, _KILL_LINE = "\x1b", ("\r", "\n"), ("\x7f", "\x08"), "\x15"
 
@@ -44,7 +41,6 @@ class Keyboard:
     def __init__(self, control: RunControl) -> None:
         self.note: str | None = None
         self._control = control
-        self._marks = 0
 
     def take(self, typed: str) -> None:
         """Handle the characters of one read."""
@@ -55,32 +51,25 @@ class Keyboard:
                 self._edit_note(self.note, character)
 
     def _command(self, character: str) -> None:
-        if character == "q":
-            self._control.stop("stopped by the operator (q)")
-        elif character == "e":
-            self._control.request(Action.END, "ended by the operator (e)")
-        elif character == "!":
-            self._control.stop("operator: zero field (!)", zero=True)
-        elif character == " ":
-            self._control.toggle_hold()
-        elif character == "m":
-            self._marks += 1
-            self._control.request(Action.MARK, str(self._marks))
-        elif character == "n":
+        command = BY_KEY.get(character)
+        if command is None:
+            return
+        if command.name == "note":
             self.note = ""
+        else:
+            command.give(self._control, "", character)
 
     def _edit_note(self, note: str, character: str) -> None:
         if character in _ENTER:
             self.note = None
-            if note.strip():
-                self._control.request(Action.NOTE, note.strip())
+            COMMANDS["note"].give(self._control, note, "n")
         elif character == _ESCAPE:
             self.note = None
         elif character in _RUBOUT:
             self.note = note[:-1]
         elif character == _KILL_LINE:
             self.note = ""
-        elif character.isprintable() and len(note) < _LONGEST_NOTE:
+        elif character.isprintable() and len(note) < LONGEST_NOTE:
             self.note = note + character
 
 

@@ -14,14 +14,13 @@ import sys
 import time
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
-from typing import Any
 
 from flowrec.topics import Tick
 from flowrec.units import seconds
 from flowrec.view import viewer
+from flowrec.view.feed import Batch
 from flowrec.view.scene import Scene
 
-Batch = tuple[int, list[dict[str, Any]]]  # step of the preview image, and the changes of each tick
 ACCEPTS = "flowrec: accepts viewers"  # what the process says to the run
 STAYS = "flowrec: stays for its viewers"
 ABSENT_S = 2.0  # without a viewer, after which the process ends
@@ -46,6 +45,7 @@ def serve() -> None:
     scene: Scene = pickle.load(source)  # noqa: S301 - from our own parent
     stream = open_stream(scene)
     present: AbstractSet[str] = frozenset({SUMMARY})
+    batch: Batch
     with socket.socket() as trial:  # Rerun reports a taken port only in its log
         trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -65,12 +65,12 @@ def serve() -> None:
     tick, phases = Tick(), 0
     while True:
         try:
-            step, changes_of_ticks = pickle.load(source)  # noqa: S301
+            batch = pickle.load(source)  # noqa: S301
         except (EOFError, pickle.UnpicklingError):  # the run ended, or was killed while it wrote
             break
-        logger.image_step = step
+        logger.image_step = batch.step
         news = False
-        for changes in changes_of_ticks:
+        for changes in batch.changes:
             tick = replace(tick, **changes)
             logger.log(tick)
             news |= summary.add(tick)

@@ -1,0 +1,71 @@
+"""What an operator can ask of a run: one table for the keys of the terminal and the buttons of the console."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from flowrec.enums import Action
+from flowrec.run.control import RunControl
+
+LONGEST_NOTE = 500  # characters
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorCommand:
+    """A command without numbers.
+
+    Attributes
+    ----------
+    name : a word that identifies it.
+    key : of the terminal and of the console's page.
+    words : what the key does, in the terminal's line of keys and on the console's button.
+    meaning : what it does to the robot and the run.
+    give : takes the control, a text (only a note has one) and how the command was given: a key, or `console`.
+    """
+
+    name: str
+    key: str
+    words: str
+    meaning: str
+    give: Callable[[RunControl, str, str], None]
+
+
+def _stop(control: RunControl, _text: str, by: str) -> None:
+    control.stop(f"stopped by the operator ({by})")
+
+
+def _mark(control: RunControl, _text: str, _by: str) -> None:
+    control.mark()
+
+
+def _note(control: RunControl, text: str, _by: str) -> None:
+    if text.strip():
+        control.request(Action.NOTE, text.strip()[:LONGEST_NOTE])
+
+
+def _hold(control: RunControl, _text: str, _by: str) -> None:
+    control.toggle_hold()
+
+
+def _end(control: RunControl, _text: str, by: str) -> None:
+    control.request(Action.END, f"ended by the operator ({by})")
+
+
+def _zero(control: RunControl, _text: str, by: str) -> None:
+    control.stop(f"operator: zero field ({by})", zero=True)
+
+
+COMMANDS = {
+    row.name: row
+    for row in (
+        OperatorCommand("stop", "q", "stop", "The field ramps down, then the run ends.", _stop),
+        OperatorCommand("mark", "m", "mark", "A numbered mark at this moment of the recording.", _mark),
+        OperatorCommand("note", "n", "note", "A text at this moment of the recording.", _note),
+        OperatorCommand("hold", " ", "hold, go on", "The robot is held in its place, or goes on.", _hold),
+        OperatorCommand("end", "e", "end observing", "The observation ends; its refinement begins.", _end),
+        OperatorCommand("zero", "!", "zero field at once", "The field is off on the next tick; the run ends.", _zero),
+    )
+}
+BY_KEY = {row.key: row for row in COMMANDS.values()}
+HELP = "keys: " + "   ".join(f"{'space' if row.key == ' ' else row.key} {row.words}" for row in COMMANDS.values())

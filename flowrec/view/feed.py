@@ -1,0 +1,201 @@
+"""Ticks on their way to a process that shows them. The run never waits for it.
+
+`write` appends a tick to a bounded queue and returns. A thread sends what has accumulated, some times per second,
+through a pipe. Only that thread can block, on a process that is stopped or slow; then the queue drops its oldest ticks.
+The latest state is not lost with them, because each tick is sent as the difference from the last one that was sent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flowrec.messages import Frame
+from flowrec.system.processes import child_command, child_environment
+from flowrec.topics import Tick
+
+_QUEUE_TICKS = 600  # without images: small
+_PREVIEW_PX = 720  # longer side of the images that are shown
+_POLL_S = 0.02
+_NO_IMAGE = np.zeros((0, 0), np.uint8)
+_FIELDS = tuple(field.name for field in fields(Tick))
+
+
+class Batch(NamedTuple):
+    """What has happened since the last batch.
+
+    Attributes
+    ----------
+    step : of the last tick's image only each `step`-th row and column is sent; the other ticks have no image.
+    changes : the fields of each tick that differ from the tick before.
+    remarks : what the run tells besides its ticks.
+    """
+
+    step: int
+    changes: list[dict[str, Any]]
+    remarks: dict[str, Any]
+
+
+class Feed:
+    """A process that reads pickled objects from its stdin: first `first`, then batches.
+
+    Parameters
+    ----------
+    command : module of flowrec, and its words.
+    max_hz : of the batches.
+    shown : the fields of a tick that are sent.
+    remarks : asked for each batch, by the thread.
+    answers : whether the process writes to a pipe, `process.stdout`; otherwise all its output goes to its log.
+
+    Raises
+    ------
+    OSError : the process does not start.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        first: object,
+        max_hz: float,
+        shown: Sequence[str] = _FIELDS,
+        remarks: Callable[[], dict[str, Any]] = dict,
+        *,
+        answers: bool = False,
+    ) -> None:
+        self._first, self._shown, self._remarks = first, shown, remarks
+        self._last: object = None
+        self._period_s = 1.0 / max_hz
+        self._queue: deque[Tick] = deque(maxlen=_QUEUE_TICKS)
+        self._frame: Frame | None = None  # the latest, with its image
+        self.dropped = 0  # ticks that were not shown, because the process could not keep up or has ended
+        self.ended = False
+        self._closing = threading.Event()
+        with tempfile.NamedTemporaryFile(prefix="flowrec-view-", suffix=".log", delete=False) as log:
+            self._log = Path(log.name)
+            try:
+                self.process = subprocess.Popen(  # noqa: S603 - our own module
+                    child_command(*command),
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE if answers else log,
+                    stderr=log,
+                    start_new_session=True,  # Ctrl-C ends the run, and then the run ends this
+                    env=child_environment(),
+                )
+            except OSError:
+                self._log.unlink()
+                raise
+        self._thread = threading.Thread(target=self._send_all, name=command[0], daemon=True)
+        self._thread.start()
+
+    def write(self, tick: Tick) -> None:
+        """Take one tick; a few microseconds."""
+        if self.ended:
+            self.dropped += 1
+            return
+        if tick.frame is not None:
+            self._frame = tick.frame  # before the queue: the thread looks for the image of the tick that it takes last
+            tick = replace(tick, frame=Frame(tick.frame.stamp_ns, tick.frame.index, _NO_IMAGE))
+        if len(self._queue) == _QUEUE_TICKS:
+            self.dropped += 1
+        self._queue.append(tick)
+
+    @property
+    def closing(self) -> bool:
+        """Whether `close` was called."""
+        return self._closing.is_set()
+
+    @property
+    def last_words(self) -> str:
+        """The last line that the process has written to its log."""
+        lines = [line for line in self._text().splitlines() if line.strip()]
+        return lines[-1] if lines else "it was killed"
+
+    def said(self, words: str) -> bool:
+        """Whether the process has written these words to its log."""
+        return words in self._text()
+
+    def close(self, timeout_s: float, stays: str = "", last: object = None) -> bool:
+        """Send the last ticks and `last` within a time limit, then end the process; whether it stays instead.
+
+        Parameters
+        ----------
+        stays : words by which the process says that it will end by itself.
+        """
+        self._last = last
+        self._closing.set()
+        end = time.monotonic() + timeout_s
+        self._thread.join(timeout_s)
+        while self.process.poll() is None and not (stays and self.said(stays)) and time.monotonic() < end:
+            time.sleep(_POLL_S)
+        staying = self.process.poll() is None and bool(stays) and self.said(stays)
+        if not staying:
+            self.process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
+            self.process.wait()
+        self._thread.join(1.0)
+        with contextlib.suppress(OSError):  # Windows, while the process has it open
+            self._log.unlink(missing_ok=True)
+        return staying
+
+    def _text(self) -> str:
+        try:
+            return self._log.read_text(errors="replace")
+        except OSError:
+            return ""
+
+    def _send_all(self) -> None:
+        """Send until the feed is closed or its process ends: the thread."""
+        pipe = self.process.stdin
+        assert pipe is not None
+        sent = Tick()
+        try:
+            _send(pipe, self._first)
+            while not self.ended:
+                closing = self._closing.wait(self._period_s)
+                if closing or self._queue:
+                    batch, sent = self._batch(sent)
+                    _send(pipe, batch)
+                elif self.process.poll() is not None:
+                    break
+                if closing:
+                    if self._last is not None:
+                        _send(pipe, self._last)
+                    break
+        except OSError:  # the process has ended
+            pass
+        finally:
+            self.ended = True
+            self.dropped += len(self._queue)
+            self._queue.clear()
+            with contextlib.suppress(OSError):
+                pipe.close()
+
+    def _batch(self, sent: Tick) -> tuple[Batch, Tick]:
+        """All ticks in the queue, each as its changes, the last with its image; and the last tick itself."""
+        changes: list[dict[str, Any]] = []
+        step = 1
+        while self._queue:
+            tick = self._queue.popleft()
+            new = {name: getattr(tick, name) for name in self._shown if getattr(tick, name) is not getattr(sent, name)}
+            changes.append({"stamp_ns": tick.stamp_ns, **new})
+            sent = tick
+        frame = self._frame
+        if changes and frame is not None and sent.frame is not None and frame.index == sent.frame.index:
+            step = max(1, -(-max(frame.image.shape) // _PREVIEW_PX))
+            changes[-1]["frame"] = replace(frame, image=frame.image[::step, ::step])
+        return Batch(step, changes, self._remarks()), sent
+
+
+def _send(pipe: Any, what: object) -> None:
+    pickle.dump(what, pipe, pickle.HIGHEST_PROTOCOL)
+    pipe.flush()
