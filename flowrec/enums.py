@@ -81,6 +81,8 @@ class Action(StrEnum):
     RESUME = "resume"
     ZERO = "zero"
     END = "end"  # of the observation: its refinement is due
+    GOAL = "goal"  # another place to go to
+    SPEED = "speed"  # a speed limit, or none any more
 
 
 class Alarm(StrEnum):

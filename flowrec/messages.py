@@ -123,6 +123,8 @@ class OperatorEvent(Message):
     stamp_ns: int
     action: str  # enums.Action
     text: str
+    goal_um: Annotated[Vector, Shape("n")] = field(default_factory=lambda: np.zeros(0))  # (2,) of goal; (0,) of others
+    speed_limit_um_s: float | None = None  # of speed; None: the limit is taken away
 
 
 @dataclass(frozen=True, slots=True, eq=False)

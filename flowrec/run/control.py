@@ -13,17 +13,27 @@ import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
+
 from flowrec.enums import Action
+from flowrec.errors import UsageError
 from flowrec.messages import OperatorEvent
+from flowrec.units import NS_PER_S
 
 Result = TypeVar("Result")
 
+LONGEST_TEXT = 500  # characters of an event; what is longer is cut
 RAMP_PATIENCE_S = 0.8  # time for the coils to ramp down by ticks; the next tick then takes all of the field away
 _TICK_PATIENCE_S = 0.3  # time for that tick to come; then the loop is interrupted, and the rig switches the coils off
 _STUCK_S = 5.0  # time for the loop to be interrupted; then its thread is stuck
+
+_MOST_WAITING = 100  # events; each takes a tick, so more would be recorded seconds after they were asked for
+_STEERING_NS = NS_PER_S // 5  # of the session, from a goal or speed limit to the next one that is taken
+_FARTHEST_UM, _SPEEDS_UM_S = 1e9, (0.01, 1e6)  # as the ranges of mission.goal and robot.max_speed_um_s
 
 _HOLD = "hold"  # becomes pause or resume when the loop takes it
 
@@ -54,13 +64,48 @@ class RunControl:
         self._since_s = 0.0
         self._waiting: deque[tuple[str, str]] = deque()
         self._marks = itertools.count(1)
+        # Of those the latest counts; append and popleft of a deque need no lock, which a signal handler could not take.
+        self._steering: dict[Action, deque[OperatorEvent]] = {
+            action: deque(maxlen=1) for action in (Action.GOAL, Action.SPEED)
+        }
+        self._steered_ns = -_STEERING_NS
         self._zero_sent = self._at_work = self._looping = False
 
     # ---- for those who control the run, from any thread
 
-    def request(self, action: Action, text: str = "") -> None:
-        """Ask for an event in the record."""
-        self._waiting.append((action, text))
+    def request(self, action: Action, text: str = "") -> bool:
+        """Ask for an event in the record; False, and nothing is done, while too many wait."""
+        if len(self._waiting) >= _MOST_WAITING:
+            return False
+        self._waiting.append((action, text[:LONGEST_TEXT]))
+        return True
+
+    def set_goal(self, x_um: float, y_um: float) -> None:
+        """Send the robot to another place on the chip. Of several that wait for their tick the latest counts.
+
+        The mission decides, and records, whether a route leads there; if none does, the goal before stays.
+
+        Raises
+        ------
+        UsageError : not a place that a chip could have.
+        """
+        if not (abs(x_um) <= _FARTHEST_UM and abs(y_um) <= _FARTHEST_UM):  # false for NaN
+            raise UsageError(f"goal {x_um:g}, {y_um:g} um: both are numbers of at most {_FARTHEST_UM:g} um")
+        text, goal_um = f"{x_um:.0f}, {y_um:.0f} um", np.array([x_um, y_um])
+        self._steering[Action.GOAL].append(OperatorEvent(0, Action.GOAL, text, goal_um=goal_um))
+
+    def limit_speed(self, speed_um_s: float | None) -> None:
+        """Limit the robot's speed through the fluid, or with None no longer. Of several that wait the latest counts.
+
+        Raises
+        ------
+        UsageError : not a speed of a robot; to make it stand still, hold it.
+        """
+        least, most = _SPEEDS_UM_S
+        if speed_um_s is not None and not least <= speed_um_s <= most:
+            raise UsageError(f"speed limit {speed_um_s:g} um/s: it is {least:g} to {most:g} um/s, or none")
+        text, limit_um_s = ("no limit", None) if speed_um_s is None else (f"{speed_um_s:g} um/s", float(speed_um_s))
+        self._steering[Action.SPEED].append(OperatorEvent(0, Action.SPEED, text, speed_limit_um_s=limit_um_s))
 
     def mark(self) -> None:
         """Ask for the next numbered mark; keys and console share the numbers."""
@@ -92,11 +137,22 @@ class RunControl:
             self._zero_sent = True
             return OperatorEvent(stamp_ns, Action.ZERO, self.pending_zero or self.reason)
         if not self._waiting:
-            return None
+            return self._next_steering(stamp_ns)
         action, text = self._waiting.popleft()
         if action == _HOLD:
             action = Action.RESUME if held else Action.PAUSE
         return OperatorEvent(stamp_ns, action, text)
+
+    def _next_steering(self, stamp_ns: int) -> OperatorEvent | None:
+        """A goal or a speed limit, unless one was taken a moment ago or the run ends."""
+        if self.reason or stamp_ns < self._steered_ns + _STEERING_NS:
+            return None
+        for waiting in self._steering.values():
+            with suppress(IndexError):
+                event = replace(waiting.popleft(), stamp_ns=stamp_ns)
+                self._steered_ns = stamp_ns
+                return event
+        return None
 
     @property
     def pending(self) -> bool:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from flowrec.enums import Action
-from flowrec.run.control import RunControl
+from flowrec.run.control import LONGEST_TEXT, RunControl
 
-LONGEST_NOTE = 500  # characters
+LONGEST_NOTE = LONGEST_TEXT
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ https://protobuf.dev/programming-guides/encoding
 from __future__ import annotations
 
 import functools
+import json
 import math
 import operator
 from collections.abc import Callable, Container, Iterator, Mapping
@@ -299,23 +300,44 @@ def _event_codec() -> Codec:
 
 
 def _operator_codec() -> Codec:
-    """OperatorEvent <-> foxglove.Log with the name `operator.ACTION` and the message `ACTION: TEXT`."""
+    """OperatorEvent <-> foxglove.Log with the name `operator.ACTION` and the message `ACTION: TEXT`.
+
+    Its numbers, where it has any, are JSON in `file`, because a Log has no field for them.
+    """
     schema = foxglove_schema("Log")
 
     def encode(event: OperatorEvent) -> Payload:
         text, name = f"{event.action}: {event.text}", _OPERATOR_NAME + event.action
-        return _log(schema, event.stamp_ns, _LEVELS[Level.INFO], text, name)
+        numbers: dict[str, Any] = {"goal_um": event.goal_um.tolist(), "speed_limit_um_s": event.speed_limit_um_s}
+        stated = {key: value for key, value in numbers.items() if value not in ([], None)}
+        return _log(schema, event.stamp_ns, _LEVELS[Level.INFO], text, name, json.dumps(stated) if stated else "")
 
     def decode(payload: bytes | memoryview, _sequence: int) -> OperatorEvent:
         parsed = schema.wire.FromString(payload)
         action = parsed.name.removeprefix(_OPERATOR_NAME)
-        return OperatorEvent(stamp_of(parsed), action, parsed.message.removeprefix(f"{action}: "))
+        numbers = _operator_numbers(parsed.file) if parsed.file else {}
+        return OperatorEvent(stamp_of(parsed), action, parsed.message.removeprefix(f"{action}: "), **numbers)
 
     return Codec(schema, encode, decode, has_unix_time=True)
 
 
-def _log(schema: Schema, stamp_ns: int, level: int, text: str, name: str) -> Payload:
-    log = schema.wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name)
+def _operator_numbers(text: str) -> dict[str, Any]:
+    """The numbers of an OperatorEvent; ValueError where the text is no JSON of them."""
+    stated = json.loads(text)
+    if not isinstance(stated, dict) or stated.keys() - {"goal_um", "speed_limit_um_s"}:
+        raise ValueError(f"{text[:100]!r} are no numbers of an operator's event")
+    numbers: dict[str, Any] = {}
+    if "goal_um" in stated:
+        numbers["goal_um"] = np.array(stated["goal_um"], np.float64)
+        if numbers["goal_um"].ndim != 1:
+            raise ValueError(f"goal_um = {text[:100]!r} is no point")
+    if "speed_limit_um_s" in stated:
+        numbers["speed_limit_um_s"] = float(stated["speed_limit_um_s"])
+    return numbers
+
+
+def _log(schema: Schema, stamp_ns: int, level: int, text: str, name: str, file: str = "") -> Payload:
+    log = schema.wire(timestamp=timestamp(stamp_ns), level=level, message=text, name=name, file=file)
     return (log.SerializeToString(),)
 
 

@@ -43,6 +43,9 @@ def messages(draw, kind):
     for form in message_fields(kind):
         if form.optional and draw(st.booleans()):
             values[form.name] = None
+        elif kind is OperatorEvent and form.is_float:  # finite numbers as JSON; of a goal there are none or two
+            finite = st.floats(allow_nan=False, allow_infinity=False)
+            values[form.name] = draw(finite) if form.kind is float else np.array(draw(st.lists(finite, max_size=3)))
         elif form.name in dtypes:
             dims = {"vector": (1, 1), "array": (0, 3)}[form.kind] if kind is not Frame else (2, 2)
             shape = draw(hnp.array_shapes(min_dims=dims[0], max_dims=dims[1], min_side=0, max_side=4))
@@ -128,6 +131,14 @@ def test_an_action_with_colons_is_not_confused_with_its_text():
         assert decode(OperatorEvent, encode(event)).same_as(event)
 
 
+def test_an_event_with_numbers_that_are_none_of_an_operator_is_damaged():
+    log = message_codec(OperatorEvent).schema.wire
+    assert decode(OperatorEvent, log(name="operator.goal", message="goal: ").SerializeToString()).goal_um.size == 0
+    for forged in ('{"goal_um": [[1, 2]]}', '{"goal_um": "x"}', '{"speed_limit_um_s": null}', '{"a": 1}', "[1]", "{"):
+        with pytest.raises(SessionError, match="damaged"):
+            decode(OperatorEvent, log(name="operator.goal", file=forged).SerializeToString())
+
+
 def test_half_a_character_is_spelled_out_instead_of_ending_the_run():
     assert decode(Event, encode(Event(1, "info", "a\ud800b"))).text == r"a\ud800b"
 
@@ -172,8 +183,8 @@ def test_rubbish_is_a_session_error_or_a_message(kind, rubbish):
         assert isinstance(decode(kind, rubbish), kind)
 
 
-# The depth of a frame is no field of its schema, but in the metadata of the channel.
-OLDER = [kind for kind in TYPES if defaulted_fields(kind) and kind is not Frame]
+# The depth of a frame is no field of its schema, but in the metadata of the channel; events are of foxglove's Log.
+OLDER = [kind for kind in TYPES if defaulted_fields(kind) and kind not in (Frame, OperatorEvent)]
 
 
 @pytest.mark.parametrize("kind", OLDER, ids=lambda kind: kind.__name__)
