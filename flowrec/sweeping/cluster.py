@@ -31,6 +31,7 @@ except ModuleNotFoundError as error:
     raise UsageError("a sweep needs Dask, which is not installed: pip install 'flowrec[cluster]'") from error
 
 _CONNECT_S = 10.0
+_STARTS = 3
 _QUEUED = 16  # tasks at least that the scheduler of a cluster knows, by which it may ask for more workers
 _COMPARED = ("distributed", "dask")
 
@@ -55,20 +56,9 @@ def workers_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
         # What it logs of workers and connections that end is in the rows, or in one line.
         stack.enter_context(silence_logging_cmgr(logging.CRITICAL))
         if scheduler is None:
-            # No page of Dask, and no tasks of other users of this machine: the keys of TLS are only in memory.
-            stack.enter_context(dask.config.set({"distributed.scheduler.http.routes": []}))
-            cluster = distributed.LocalCluster(
-                n_workers=workers or os.cpu_count() or 1,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                scheduler_kwargs={"dashboard": False},
-                security=True,
-                silence_logs=logging.CRITICAL,
-            )
-            stack.enter_context(cluster)
+            stack.enter_context(dask.config.set({"distributed.scheduler.http.routes": []}))  # no page of Dask
+            cluster = stack.enter_context(_local_cluster(workers or os.cpu_count() or 1))
             client = stack.enter_context(distributed.Client(cluster))
-            client.register_plugin(_LeavesInterrupts())
             yield client
             return
         try:
@@ -84,6 +74,28 @@ def workers_of(scheduler: str | None, workers: int | None) -> Iterator[Any]:
             ) from error
         _check_workers(client, scheduler)
         yield client
+
+
+def _local_cluster(workers: int) -> Any:
+    """A scheduler and workers on 127.0.0.1; FlowrecError if they do not start."""
+    for attempt in range(1, _STARTS + 1):
+        try:
+            return distributed.LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
+                security=True,  # no tasks of other users of this machine: the keys of TLS are only in memory
+                silence_logs=logging.CRITICAL,
+                plugins=(_LeavesInterrupts(),),  # sent with each worker: a call of all would fail with one that dies
+            )
+        except RuntimeError as error:  # a worker was killed before it was ready
+            if attempt == _STARTS:
+                raise FlowrecError(
+                    f"the {workers} workers did not start in {_STARTS} tries ({error}); try fewer with --workers"
+                ) from error
+    raise AssertionError("the last try returns or raises")
 
 
 async def _versions_of(scheduler: str) -> Any:

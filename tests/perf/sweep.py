@@ -108,9 +108,11 @@ def measure(
 
 
 def _fly(mission: tuple[int, Path, float]) -> None:
+    from flowrec import terminal
     from flowrec.commands.record import record
     from flowrec.config import load_config
 
+    terminal.console.quiet = True
     seed, file, length_s = mission
     record(load_config(None, [*SMALL, f"simulated.seed={seed}", f"duration_s={length_s}"]), file)
 

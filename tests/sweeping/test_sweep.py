@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -146,7 +146,7 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "    what = task.session",
         "    while what == 'hang': pass",
         "    eaten = []",
-        "    while what == 'eat': eaten.append(bytearray(b'x' * 20_000_000))",
+        "    while what == 'eat' and len(eaten) < 50: eaten.append(bytearray(b'x' * 20_000_000))",
         "    if what == 'bomb': os.write(2, b'boom'); os.kill(os.getpid(), 9)",
         "    if what == 'orphan' and not killed.exists(): killed.touch(); os.kill(os.getppid(), 9)",
         "    if what == 'once' and not killed.exists(): killed.touch(); os.kill(os.getpid(), 9)",
@@ -278,6 +278,26 @@ def test_each_task_is_done_once_though_a_worker_is_killed_with_it(planted: None)
     assert [row["key"] for row in rows] == [task.key for task in tasks]
     first, orphan, _ = (row["pid"] for row in rows)
     assert first != orphan  # the process of the worker that was killed went with it
+
+
+def test_workers_that_are_killed_before_they_are_ready_are_started_again_but_not_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def starts_at(number: int) -> Callable[..., str]:
+        tries = iter(range(1, number + 1))
+
+        def start(**_: object) -> str:
+            if next(tries) < number:
+                raise RuntimeError("Nanny failed to start.")
+            return "cluster"
+
+        return start
+
+    monkeypatch.setattr(cluster.distributed, "LocalCluster", starts_at(3))
+    assert cluster._local_cluster(2) == "cluster"
+    monkeypatch.setattr(cluster.distributed, "LocalCluster", starts_at(5))
+    with pytest.raises(FlowrecError, match="the 2 workers did not start in 3 tries"):
+        cluster._local_cluster(2)
 
 
 def test_a_row_is_what_flowrec_replay_and_check_say(session: Path) -> None:
