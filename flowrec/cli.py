@@ -40,6 +40,7 @@ from flowrec.session_verbs import (
     report,
     view,
 )
+from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC
 from flowrec.sweep_verb import sweep
 from flowrec.units import amounts
 
@@ -66,8 +67,6 @@ def _version(asked: bool) -> None:
 
 def _timeout(seconds: float | None) -> None:
     if seconds is not None:
-        from flowrec.store.remote_file import TIMEOUT_KEY
-
         os.environ[TIMEOUT_KEY] = str(seconds)  # processes that a verb starts take it over
 
 
@@ -312,6 +311,7 @@ def main() -> None:
     """Entry point: run the command line, turn our errors into one line and an exit status."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # the locale's encoding may not have every character
+    TRAFFIC.reasons.clear()  # of a call before, in the same process
     # click's class, which typer has in its own package since 0.29.
     usage_error: Any = typer.BadParameter.__base__
     try:
@@ -329,6 +329,9 @@ def main() -> None:
         # The reader of the output has ended (flowrec info ... | head).
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    finally:
+        if TRAFFIC.line:
+            sys.stderr.write(f"{TRAFFIC.line}\n")
 
 
 if __name__ == "__main__":

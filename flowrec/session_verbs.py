@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperOption
 import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite
 from flowrec.errors import FlowrecError, UsageError, printable
+from flowrec.store.session_path import session_path
 
 # Options that select a method, and the table of its methods.
 METHODS = {
@@ -54,7 +55,9 @@ EXAMPLES = {
     "compare": ("flowrec compare a.mcap b.mcap",),
 }
 
-SessionFile = Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap), or its URL.")]
+SessionFile = Annotated[
+    Path, typer.Argument(metavar="SESSION", callback=session_path, help="Session (.mcap), or its URL.")
+]
 RrdOut = Annotated[
     Path | None,
     typer.Option(
@@ -269,15 +272,21 @@ def note(
 
 
 def check(
-    session: Annotated[Path, typer.Argument(metavar="FILE", help="Session (.mcap), or an unfinished one (.partial).")],
+    session: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", callback=session_path, help="Session (.mcap) or its URL, or an unfinished one (.partial)."
+        ),
+    ],
     as_json: AsJson = False,
 ) -> None:
     """Validate a session; exit status 0: good, 3: usable with losses or anomalies, 1: not usable."""
     from flowrec.commands.check import files_to_check
+    from flowrec.store.byte_source import size_of
     from flowrec.terminal import progress
 
-    nbytes = sum(file.stat().st_size for file in files_to_check(session) if file.is_file())
     try:
+        nbytes = sum(map(size_of, files_to_check(session)))
         with progress(f"reading {session.name}", max(nbytes, 1)) as done:
             verdict = flowrec.check(session, done)
     except FlowrecError as error:

@@ -18,6 +18,7 @@ from flowrec.enums import Outcome
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
 from flowrec.store.audit import audit
+from flowrec.store.byte_source import is_there
 from flowrec.store.channels import is_left_out
 from flowrec.store.run_files import continuity_fault, is_continued, part_number, part_path, run_files
 from flowrec.store.session_path import session_path
@@ -37,7 +38,7 @@ _NOT_EXACT = "yes, but not exact after the first missing message"
 
 def files_to_check(path: Path) -> list[Path]:
     """The file of that name or, if there is none, the existing parts of that run, finished or not."""
-    if path.exists():
+    if is_there(path):
         return [path]
     return sorted(filter(part_number, run_files(path)), key=part_number) or [path]
 
@@ -64,7 +65,7 @@ def check(session: Session | Path | str, progress: Callable[[int], None] | None 
     for file in files:
         done = (lambda at, before=before: progress(before + at)) if progress is not None else None
         checks.append(_FileCheck(file, done))
-        before += file.stat().st_size
+        before += checks[-1].found.size_bytes
     return _check_run(path, checks)
 
 

@@ -10,7 +10,9 @@ import difflib
 import json
 import sqlite3
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from flowrec.store.session_path import UrlPath, session_path
 from flowrec.summary import shown
 from flowrec.system.locks import is_growing
 
+_TOGETHER = 16  # sessions at URLs that are read at a time
 _NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)
 _SQL_LIMIT = 2**63  # of the integers of SQLite
 _NOTE_SHOWN = 60  # characters of a note in the table
@@ -83,7 +86,12 @@ def list_sessions(*places: Path, where: str = "", sort: str = "") -> list[Listed
         # Beside a file of that name the parts are not what opens under it: each is a session of its own.
         rows.setdefault(run if part_number(path) and run not in named else path, []).append(path)
     apart = len({path.parent for path in rows}) > 1
-    found = [_listed(path, parts, str(path) if apart else path.name) for path, parts in rows.items()]
+    read = [partial(_listed, path, parts, str(path) if apart else path.name) for path, parts in rows.items()]
+    if any(isinstance(path, UrlPath) for path in rows):
+        with ThreadPoolExecutor(_TOGETHER) as threads:  # each waits for its server
+            found = list(threads.map(lambda each: each(), read))
+    else:
+        found = [each() for each in read]
     return _chosen(found, where, sort) if where or sort else found
 
 
@@ -114,8 +122,10 @@ def _width(name: str, column: Sequence[str]) -> int:
 
 def _files(place: Path) -> list[Path]:
     place = session_path(place)
-    if isinstance(place, UrlPath) and place.suffix == SUFFIX:
-        return [place]
+    if isinstance(place, UrlPath):
+        from flowrec.store.remote_folder import files_at  # late: an extra
+
+        return files_at(place, _NAMES)
     if not place.is_dir():
         files = [place] if place.is_file() else run_files(place)
         if not files or not place.name.endswith(_NAMES):
@@ -141,7 +151,7 @@ def _listed(path: Path, files: list[Path], name: str) -> Listed:
             facts["duration_s"],
             facts["chip"],
             facts["recorded"],
-            parts,
+            facts["parts"] or parts,
             {**facts, "operator_events": session.topics.get("/operator/events", 0)},
         )
     except SessionError as error:

@@ -5,6 +5,7 @@ Another kind (an archive) is one class and one row of BYTE_SOURCES.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import threading
@@ -116,3 +117,23 @@ def open_bytes(path: Path) -> ByteSource:
     SessionError : they can not be opened.
     """
     return BYTE_SOURCES.get(type(path), LocalFile)(path)
+
+
+def is_there(path: Path) -> bool:
+    """Whether a path or URL names a file, which is not opened if it is on this machine.
+
+    Raises
+    ------
+    SessionError : a server does not say.
+    """
+    if not isinstance(path, UrlPath):
+        return path.exists()
+    from flowrec.store.remote_file import are_there
+
+    return are_there([path])[0]
+
+
+def size_of(path: Path) -> int:
+    """Number of bytes of a file; errors as of `open_bytes`."""
+    with contextlib.closing(open_bytes(path)) as source:
+        return source.size

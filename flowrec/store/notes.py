@@ -6,6 +6,7 @@ notes that lie beside another file are not its notes.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from flowrec.errors import SessionError, UsageError
-from flowrec.store.session_path import on_this_machine
+from flowrec.store.byte_source import open_bytes
+from flowrec.store.session_path import UrlPath, on_this_machine
+from flowrec.store.traffic import MissingError
 
 SUFFIX = ".notes.jsonl"
 TEXT_LIMIT = 10_000  # characters of a note
 _LINE_LIMIT = 200_000  # bytes; a longer line was not written by flowrec
+_FILE_LIMIT = 64 << 20  # bytes that are read
 _TAG_LIMIT = 60  # characters
 
 
@@ -50,14 +54,7 @@ def read_notes(session: Path, key: str) -> list[Note]:
     ------
     SessionError : the file can not be read.
     """
-    path = notes_file(session)
-    try:
-        with path.open("rb") as file:
-            return [note for line in _lines(file.read()) if (note := _parsed(line, key)) is not None]
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise SessionError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
+    return [note for line in _lines(_content(notes_file(session))) if (note := _parsed(line, key)) is not None]
 
 
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
@@ -87,6 +84,25 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
     except OSError as error:
         raise SessionError(f"{path}: the note can not be written ({error.strerror}); check folder and disk") from error
     return note
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of the file; none where there is no file."""
+    if isinstance(path, UrlPath):
+        try:
+            with contextlib.closing(open_bytes(path)) as source:
+                return source.read(0, min(source.size, _FILE_LIMIT))
+        except (
+            MissingError
+        ):  # also where access is refused: S3 does not tell who may not list a bucket what is not there
+            return b""
+    try:
+        with path.open("rb") as file:
+            return file.read(_FILE_LIMIT)
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise SessionError(f"{path}: can not be read ({error.strerror}); check its permissions") from error
 
 
 def _lines(content: bytes) -> Iterator[bytes]:

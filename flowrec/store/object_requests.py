@@ -1,7 +1,6 @@
 """Range requests for an object at a URL: obstore for buckets, urllib3 for http and https.
 
-Both have one verb, `get`, and raise one of three errors: of the object, of a passing state of the network or server, or
-because ranges are not served. Retries are the caller's (remote_file.py), so that they can be counted.
+Both have one verb, `get`, and raise errors of traffic.py, which repeats and counts requests. A bucket can be listed.
 """
 
 from __future__ import annotations
@@ -11,29 +10,26 @@ import os
 import re
 import socket
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any, Protocol
 from urllib.parse import urljoin, urlsplit
 
 from flowrec.errors import SessionError, UsageError
+from flowrec.store.traffic import AbsentError, RefusedError, TransientError
 
 CONNECTIONS = 32  # requests at a time
 _REDIRECTS = 3
 _PIECE_BYTES = 1 << 16
 _ENDPOINTS = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AZURE_STORAGE_ENDPOINT", "GOOGLE_BASE_URL")
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
-_OK, _PARTIAL, _NO_RANGE, _TOO_MANY = 200, 206, 416, 429
+_OK, _PARTIAL, _NO_RANGE = 200, 206, 416
+_LATER = (408, 425, 429)  # a time limit, too early, too many requests
 _REFUSED = "refuses access ({}); check the credentials in the environment"
+_NOT_INSTALLED = "{}: reading from a URL needs a package; pip install 'flowrec[remote]'"
 _MISSING = "is not there (404); check the name"
-
-
-class TransientError(Exception):
-    """A failure that may not come again: no connection, a time limit, a server in trouble, a body that was cut."""
-
-
-class RefusedError(Exception):
-    """A failure that the same request will meet again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +69,50 @@ def requests_for(url: str, timeout_s: float) -> ObjectRequests:
     UsageError : the packages of the extra `remote` are not installed.
     SessionError : the URL can not name an object.
     """
+    if not url.partition("://")[2].partition("/")[2]:
+        raise SessionError(f"{url}: names no object; name a session in it, as in {url.rstrip('/')}/run.mcap")
     try:
         return _Http(url) if url.startswith("http") else _Bucket(url, timeout_s)
     except ImportError as error:
-        raise UsageError(f"{url}: reading from a URL needs a package; pip install 'flowrec[remote]'") from error
+        raise UsageError(_NOT_INSTALLED.format(url)) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """An object of a bucket.
+
+    Attributes
+    ----------
+    name : after the folder that was listed.
+    size : in bytes.
+    version : as of an `Answer`.
+    """
+
+    name: str
+    size: int
+    version: str
+
+
+def listing(url: str, begin: str, timeout_s: float) -> list[Listed]:
+    """The objects of a folder in a bucket, without folders in it, in order of name.
+
+    Parameters
+    ----------
+    begin : only those whose names begin so; few are asked for, however many are in the folder.
+
+    Raises
+    ------
+    TransientError, RefusedError : it failed, in a few words.
+    """
+    try:
+        bucket = _Bucket(url, timeout_s)
+    except ImportError as error:
+        raise UsageError(_NOT_INSTALLED.format(url)) from error
+    return sorted(bucket.objects(begin), key=lambda each: each.name)
 
 
 class _Bucket:
-    """An object of s3, gs or az; credentials and endpoint come from the environment."""
+    """An object or folder of s3, gs or az; credentials and endpoint come from the environment."""
 
     def __init__(self, url: str, timeout_s: float) -> None:
         from obstore.exceptions import BaseError
@@ -110,30 +142,82 @@ class _Bucket:
 
     def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
         import obstore
-        from obstore import exceptions as faults
 
-        try:
+        with _bucket_faults() as faults:
             if first is None and self._without_suffix:
                 first = max(0, obstore.head(self._store, self._key)["size"] - length)
             wanted: Any = {"suffix": length} if first is None else (first, first + length)
             found = obstore.get(self._store, self._key, options={"range": wanted})
             meta, (begin, end) = found.meta, found.range
             data = bytes(found.bytes())
-        except (faults.NotFoundError, FileNotFoundError) as error:
-            raise RefusedError(_MISSING) from error
-        except (faults.PermissionDeniedError, faults.UnauthenticatedError, PermissionError) as error:
-            raise RefusedError(_REFUSED.format("403")) from error
-        except (faults.BaseError, OSError, ValueError) as error:
-            text = _in_a_line(error)
-            if "416" in text and "ange" in text:
-                return Answer(b"", 0, 0, "")
-            if "169.254.169.254" in text or "redential" in text:
-                raise RefusedError("can not be asked for: there are no credentials in the environment") from error
-            status = re.search(r"\b(?:status|Status|code)\D{0,20}([45]\d\d)\b", text)
-            raise TransientError(f"the server answers {status[1]}" if status else _reason(text)) from error
+        if faults.empty:
+            return Answer(b"", 0, 0, "")
         if len(data) != end - begin:
             raise TransientError(f"the server sent {len(data)} of {end - begin} bytes")
-        return Answer(data, begin, meta["size"], meta.get("e_tag") or str(meta.get("last_modified") or ""))
+        return Answer(data, begin, meta["size"], _version(meta))
+
+    def objects(self, begin: str) -> Iterator[Listed]:
+        import obstore
+
+        folder = f"{self._key}/" if self._key else ""
+        with _bucket_faults():
+            if not begin:
+                for meta in obstore.list_with_delimiter(self._store, self._key or None)["objects"]:
+                    yield Listed(meta["path"].removeprefix(folder), meta["size"], _version(meta))
+                return
+            # Keys come in their order, so those that begin alike come together.
+            for some in obstore.list(self._store, self._key or None, offset=folder + begin, chunk_size=1000):
+                for meta in some:
+                    name = meta["path"].removeprefix(folder)
+                    if not name.startswith(begin):
+                        return
+                    if "/" not in name:
+                        yield Listed(name, meta["size"], _version(meta))
+
+
+@dataclass(slots=True)
+class _Faults:
+    """Whether the object turned out to be empty, of which no range can be had."""
+
+    empty: bool = False
+
+
+@contextmanager
+def _bucket_faults() -> Iterator[_Faults]:
+    """Turn the errors of obstore into ours."""
+    from obstore import exceptions
+
+    faults = _Faults()
+    try:
+        yield faults
+    except (exceptions.NotFoundError, FileNotFoundError) as error:
+        raise AbsentError(_MISSING) from error
+    except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError) as error:
+        raise AbsentError(_REFUSED.format("403")) from error
+    except (exceptions.BaseError, OSError, ValueError) as error:
+        text = _in_a_line(error)
+        if "416" in text and "ange" in text:
+            faults.empty = True
+            return
+        if "169.254.169.254" in text or "redential" in text:
+            raise RefusedError("can not be asked for: there are no credentials in the environment") from error
+        status = re.search(r"\b(?:status|Status|code)\D{0,20}([45]\d\d)\b", text)
+        raise _of_status(int(status[1])) if status else TransientError(_reason(text)) from error
+
+
+def _of_status(status: int) -> Exception:
+    """The error of an answer that is none."""
+    if status in (401, 403):
+        return AbsentError(_REFUSED.format(status))
+    if status in (404, 410):
+        return AbsentError(_MISSING)
+    if status >= 500 or status in _LATER:
+        return TransientError(f"the server answers {status}")
+    return RefusedError(f"can not be read: the server answers {status}")
+
+
+def _version(meta: Mapping[str, Any]) -> str:
+    return meta.get("e_tag") or str(meta.get("last_modified") or "")
 
 
 class _Http:
@@ -180,12 +264,8 @@ def _answer(response: Any, first: int | None, length: int, end_s: float) -> Answ
     status = response.status
     if status == _NO_RANGE:
         return Answer(b"", 0, 0, "")
-    if status in (401, 403):
-        raise RefusedError(_REFUSED.format(status))
-    if status in (404, 410):
-        raise RefusedError(_MISSING)
-    if status >= 500 or status == _TOO_MANY:
-        raise TransientError(f"the server answers {status}")
+    if status >= 400:
+        raise _of_status(status)
     if status == _OK:
         raise RefusedError("can not be read in ranges, the server sends whole files only; copy it to this machine")
     found = _CONTENT_RANGE.fullmatch(response.headers.get("Content-Range", ""))

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
+from flowrec.store.byte_source import is_there
 from flowrec.store.channels import SessionContents
 from flowrec.store.file_reader import Cache, FileReader
 from flowrec.store.roi import Region
@@ -59,7 +60,7 @@ class SessionReader:
         self._cache: Cache = {}
         self._closed = False
         self._open: dict[int, FileReader] = {}  # the one that was used longest ago first
-        if contents is not None or self.path.exists():
+        if contents is not None or is_there(self.path):
             self._open[0] = first = FileReader(self.path, contents, skip, self._cache)
             self._run = Run(self.path, [RunFile.of(first.contents)])
         else:

@@ -7,59 +7,24 @@ once, a bounded number of bytes ahead. Each answer must be of the object that wa
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 import weakref
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.errors import SessionError, UsageError
-from flowrec.store.object_requests import (
-    CONNECTIONS,
-    Answer,
-    ObjectRequests,
-    RefusedError,
-    TransientError,
-    requests_for,
-)
+from flowrec.errors import SessionError
+from flowrec.store.object_requests import CONNECTIONS, Answer, ObjectRequests, requests_for
+from flowrec.store.traffic import TRAFFIC, MissingError, answered, timeout_s
 
-TIMEOUT_KEY = "FLOWREC_TIMEOUT_S"  # environment variable; the option --timeout sets it
-_TIMEOUT_S = 30.0
 _END_BYTES = 256 << 10
-_TRIES, _PAUSE_S = 4, 0.2
 _AHEAD_BYTES = 48 << 20
 _GAP_BYTES, _JOINED_BYTES = 64 << 10, 8 << 20
-_REMEMBERED, _REMEMBERED_S = 16, 60.0
-
-
-@dataclass(slots=True)
-class Traffic:
-    """What was asked of servers by this process.
-
-    Attributes
-    ----------
-    requests, repeated : number of requests, and how many of them repeated a failed one.
-    nbytes : bytes of content received.
-    """
-
-    requests: int = 0
-    repeated: int = 0
-    nbytes: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def add(self, requests: int = 0, repeated: int = 0, nbytes: int = 0) -> None:
-        """Count; from any thread."""
-        with self._lock:
-            self.requests += requests
-            self.repeated += repeated
-            self.nbytes += nbytes
-
-
-TRAFFIC = Traffic()
+_REMEMBERED, _REMEMBERED_S = 64, 60.0
+_TOGETHER = 8  # objects that are opened at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,14 +57,13 @@ class RemoteFile:
 
     Raises
     ------
-    SessionError : it is not there, access is refused, or the server does not answer, in one line.
+    SessionError : the server does not answer, in one line; MissingError: it is not there, or access is refused.
     UsageError : the extra `remote` is not installed, or the time limit is no number.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._url = str(path)
-        self._timeout_s = _timeout_s()
         self._threads = ThreadPoolExecutor(CONNECTIONS, "remote-file")
         self._closer = weakref.finalize(self, self._threads.shutdown, wait=False, cancel_futures=True)
         self._ahead: list[_Ahead] = []
@@ -184,7 +148,7 @@ class RemoteFile:
             known = _remembered.get(self._url)
         if known is not None and time.monotonic() < known.until_s:
             return known
-        asked = requests_for(self._url, self._timeout_s)
+        asked = requests_for(self._url, timeout_s())
         head = self._threads.submit(self._answer, asked, 0, _END_BYTES)
         tail = self._answer(asked, None, _END_BYTES)
         ends = (head.result(), tail)
@@ -212,32 +176,25 @@ class RemoteFile:
         return SessionError(f"{self.path}: was replaced while it was read; open it again")
 
     def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
-        """An answer, after several tries and within the time limit."""
-        end_s = time.monotonic() + self._timeout_s
-        for number in range(_TRIES):
-            TRAFFIC.add(requests=1, repeated=int(number > 0))
-            try:
-                answer = asked.get(first, length, max(0.1, end_s - time.monotonic()))
-            except RefusedError as error:
-                raise SessionError(f"{self.path}: {error}") from error
-            except TransientError as error:
-                pause_s = _PAUSE_S * 2.0**number
-                if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not self._closer.alive:
-                    tries = f"{number + 1} tries" if number else "one try"
-                    raise SessionError(f"{self.path}: can not be read ({error}, {tries})") from error
-                time.sleep(pause_s)
-            else:
-                TRAFFIC.add(nbytes=len(answer.data))
-                return answer
-        raise AssertionError("the last try raises or returns")
+        answer = answered(self.path, lambda limit_s: asked.get(first, length, limit_s), lambda: self._closer.alive)
+        TRAFFIC.add(nbytes=len(answer.data))
+        return answer
 
 
-def _timeout_s() -> float:
-    text = os.environ.get(TIMEOUT_KEY, "")
+def are_there(paths: Sequence[Path]) -> list[bool]:
+    """Whether objects can be opened, asked for together; those that can are opened again without a request.
+
+    Raises
+    ------
+    SessionError : a server does not say.
+    """
+    with ThreadPoolExecutor(_TOGETHER) as threads:
+        return list(threads.map(_is_there, paths))
+
+
+def _is_there(path: Path) -> bool:
     try:
-        timeout_s = float(text) if text else _TIMEOUT_S
-    except ValueError:
-        timeout_s = 0.0
-    if not 0.0 < timeout_s <= 3600.0:
-        raise UsageError(f"{TIMEOUT_KEY}={text}: the time limit of a request is a number of seconds up to 3600")
-    return timeout_s
+        RemoteFile(path).close()
+    except MissingError:
+        return False
+    return True

@@ -8,6 +8,8 @@ NAME.partial                     any of these while it is written, or what a kil
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,13 +19,16 @@ from typing import Self
 
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
+from flowrec.store.byte_source import is_there
 from flowrec.store.mcap_reader import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
+from flowrec.store.session_path import UrlPath
 from flowrec.system.locks import is_growing
 from flowrec.units import seconds
 
 SUFFIX = ".mcap"
 PARTIAL_SUFFIX = ".partial"
+_ASKED, _PROBED, _OPENED = 8, 1000, 64  # parts at a URL: asked for at a time, by number at most, opened at a time
 _NUMBERED = re.compile(r"(?P<stem>.+)\.(?P<kind>part|snap)(?P<number>\d{3,6})")
 
 
@@ -49,10 +54,34 @@ def run_path(path: Path) -> Path:
 
 
 def run_files(path: Path) -> list[Path]:
-    """Every existing file of the run X.mcap in order of name, finished or not, itself included."""
+    """Every existing file of the run X.mcap in order of name, finished or not, itself included; at a URL its parts."""
+    if isinstance(path, UrlPath):
+        return _parts_at(path)
     if not path.parent.is_dir():
         return []
     return sorted(other for other in path.parent.iterdir() if other.is_file() and run_path(other) == path)
+
+
+def _parts_at(path: UrlPath) -> list[Path]:
+    """The parts of a run at a URL: those that the server lists, else those that follow each other."""
+    from flowrec.store.remote_file import are_there
+    from flowrec.store.remote_folder import is_listed, objects_in
+    from flowrec.store.traffic import MissingError
+
+    folder = path.parent
+    assert isinstance(folder, UrlPath)
+    if is_listed(path):
+        with contextlib.suppress(MissingError):  # who may read may not always list
+            listed: list[Path] = [file for file, _ in objects_in(folder, f"{path.stem}.part") if run_path(file) == path]
+            are_there(listed[:_OPENED])  # together: each is read next
+            return listed
+    found: list[Path] = []
+    there = [True]
+    while all(there) and len(found) < _PROBED:
+        asked = [part_path(path, len(found) + more) for more in range(1, _ASKED if found else 2)]
+        there = are_there(asked)
+        found += itertools.takewhile(dict(zip(asked, there, strict=True)).get, asked)
+    return found
 
 
 def runs_in(folder: Path) -> set[Path]:
@@ -68,9 +97,11 @@ def is_snapshot(path: Path) -> bool:
 
 def parts(path: Path) -> list[Path]:
     """The finished parts of the run X.mcap, in order."""
-    return sorted(
-        (other for other in run_files(path) if part_number(other) and other.suffix == path.suffix), key=part_number
-    )
+    return _parts_among(run_files(path), path.suffix)
+
+
+def _parts_among(files: Sequence[Path], suffix: str) -> list[Path]:
+    return sorted((file for file in files if part_number(file) and file.suffix == suffix), key=part_number)
 
 
 def part_number(path: Path) -> int:
@@ -181,10 +212,11 @@ def files_of(path: Path) -> list[Path]:
     ------
     SessionError : the run has no end yet, or a part of it is missing.
     """
-    if path.exists():
+    if is_there(path):
         return [path]
-    found = parts(path)
-    _refuse_unfinished(path, found)
+    files = run_files(path)
+    found = _parts_among(files, path.suffix)
+    _refuse_unfinished(path, found, [file for file in files if file.name.endswith(PARTIAL_SUFFIX)])
     numbers = {part_number(file) for file in found}
     missing = next((number for number in range(1, max(numbers, default=0)) if number not in numbers), None)
     if missing is not None:
@@ -200,9 +232,9 @@ def unfinished_of(path: Path) -> list[Path]:
     return [file for file in run_files(path) if file.name.endswith(PARTIAL_SUFFIX)]
 
 
-def _refuse_unfinished(path: Path, found: Sequence[Path]) -> None:
+def _refuse_unfinished(path: Path, found: Sequence[Path], partial: Sequence[Path]) -> None:
     """Raise UnfinishedError if a part is unfinished: the finished parts are not the complete run."""
-    unfinished = [file for file in unfinished_of(path) if part_number(file) or file == partial_path(path)]
+    unfinished = [file for file in partial if part_number(file) or file == partial_path(path)]
     if not unfinished:
         return
     others = f", or name one of its {len(found)} finished parts" if found else ""

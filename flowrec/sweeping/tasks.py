@@ -126,19 +126,29 @@ def session_files(places: Sequence[str]) -> list[Path]:
     found: dict[Path, None] = {}
     for place in places:
         if isinstance(at := session_path(place), UrlPath):
-            found[at] = None
+            from flowrec.store.remote_folder import files_at  # late: an extra
+
+            files = files_at(at, (SUFFIX,))
+            if not files:
+                raise UsageError(f"{at}: no session (.mcap) is there")
+            found |= dict.fromkeys(_runs(files))
             continue
         folder = Path(place).is_dir()
         whole = glob.escape(place) + f"/*{SUFFIX}" if folder else place
         names = [place] if Path(place).is_file() else sorted(glob.glob(whole, recursive=True))  # noqa: PTH207 - text
         files = [Path(name).absolute() for name in names if name.endswith(SUFFIX)]
-        named = set(files)
-        runs = [run_path(file) if part_number(file) and run_path(file) not in named else file for file in files]
+        runs = _runs(files)
         run = Path(place).absolute()
         if not runs and not (run.name.endswith(SUFFIX) and run_files(run)):  # X.mcap may be a run in parts
             raise UsageError(f"{place}: no session (.mcap) is there; name files, folders or patterns as 'runs/*.mcap'")
         found |= dict.fromkeys(runs or [run])
     return list(found)
+
+
+def _runs(files: Sequence[Path]) -> list[Path]:
+    """The files, where parts stand for their run unless a file has its name."""
+    named = set(files)
+    return [run_path(file) if part_number(file) and run_path(file) not in named else file for file in files]
 
 
 def content_of(session: Session) -> str:

@@ -14,11 +14,11 @@ Fault = Callable[[BaseHTTPRequestHandler, int, int, int], bool]
 
 
 class RangeServer:
-    """Serves one file under any name.
+    """Serves one file under any name, or the files of a folder.
 
     Attributes
     ----------
-    url : of the file.
+    url : of the file or folder.
     fault : answers instead, where it wants to; None: no fault.
     requests : first byte and number of bytes of each range that was asked for.
     """
@@ -36,7 +36,11 @@ class RangeServer:
                 pass
 
             def do_GET(self) -> None:
-                size = outer.path.stat().st_size
+                path = outer.path / self.path.rpartition("/")[2] if outer.path.is_dir() else outer.path
+                if not path.is_file():
+                    status(404)(self, 0, 0, 0)
+                    return
+                size = path.stat().st_size
                 asked = re.fullmatch(r"bytes=(\d*)-(\d*)", self.headers["Range"])
                 assert asked is not None
                 last = min(int(asked[2]), size - 1) if asked[1] else size - 1
@@ -44,7 +48,7 @@ class RangeServer:
                 with lock:
                     outer.requests.append((first, last - first + 1))
                 if outer.fault is None or not outer.fault(self, first, last, size):
-                    with outer.path.open("rb") as file:
+                    with path.open("rb") as file:
                         file.seek(first)
                         answer(self, first, last, size, file.read(last - first + 1))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import socket
 import subprocess
@@ -14,14 +15,14 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
-from flowrec.cli import app
+from flowrec.cli import app, main
 from flowrec.commands.layout import write_layouts
 from flowrec.errors import FlowrecError, SessionError, UsageError
 from flowrec.session import session_sha256
-from flowrec.store import remote_file
-from flowrec.store.object_requests import RefusedError, _redirected
-from flowrec.store.remote_file import TIMEOUT_KEY, TRAFFIC
+from flowrec.store import remote_file, traffic
+from flowrec.store.object_requests import _redirected
 from flowrec.store.session_path import UrlPath, session_path
+from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError
 from tests.conftest import HANG_S
 from tests.store.range_server import RangeServer, answer, served, some, status
 
@@ -36,7 +37,7 @@ def session() -> Path:
 @pytest.fixture
 def server(session: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RangeServer]:
     monkeypatch.setenv(TIMEOUT_KEY, "30")
-    monkeypatch.setattr(remote_file, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(traffic, "_PAUSE_S", 0.01)
     remote_file._remembered.clear()
     with served(session) as found:
         yield found
@@ -104,6 +105,18 @@ def test_a_fault_that_passes_is_counted_and_does_no_harm(server: RangeServer, se
     before = TRAFFIC.repeated
     assert flowrec.compare(flowrec.open(session), flowrec.open(server.url)).identical
     assert TRAFFIC.repeated - before == 2
+
+
+def test_a_verb_says_which_requests_it_has_repeated(
+    server: RangeServer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["flowrec", "info", server.url, "--json"])
+    server.fault = some(FAULTS["broken"][0], after=0, count=3)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    printed = capsys.readouterr()
+    assert not ended.value.code and json.loads(printed.out)["session"] == server.url
+    assert printed.err.splitlines() == ["3 requests were repeated: the server answers 500 (3)"]
 
 
 def test_a_session_that_is_replaced_while_it_is_read_is_not_mixed_with_the_new_one(

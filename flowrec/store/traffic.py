@@ -1,0 +1,129 @@
+"""Requests to servers: repeated while a failure may pass, within a time limit, and counted."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+from flowrec.errors import SessionError, UsageError
+
+TIMEOUT_KEY = "FLOWREC_TIMEOUT_S"  # environment variable; the option --timeout sets it
+_TIMEOUT_S = 30.0
+_TRIES, _PAUSE_S = 4, 0.2
+_NAMED = 3  # causes of repetitions that are named
+_Answered = TypeVar("_Answered")
+
+
+class TransientError(Exception):
+    """A failure that may not come again: no connection, a time limit, a server in trouble, a body that was cut."""
+
+
+class RefusedError(Exception):
+    """A failure that the same request will meet again."""
+
+
+class AbsentError(RefusedError):
+    """There is no such object, or this user may not know of it."""
+
+
+class MissingError(SessionError):
+    """No object of that name can be read: there is none, or access is refused."""
+
+
+@dataclass(slots=True)
+class Traffic:
+    """What was asked of servers by this process.
+
+    Attributes
+    ----------
+    requests, repeated : number of requests, and how many of them repeated a failed one.
+    nbytes : bytes of content received.
+    reasons : why requests were repeated, and how often.
+    """
+
+    requests: int = 0
+    repeated: int = 0
+    nbytes: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, requests: int = 0, nbytes: int = 0, repeated: str = "") -> None:
+        """Count, from any thread; `repeated` says why a request is made again."""
+        with self._lock:
+            self.requests += requests
+            self.nbytes += nbytes
+            if repeated:
+                self.repeated += 1
+                self.reasons[repeated] += 1
+
+    @property
+    def line(self) -> str:
+        """How many requests were repeated and why; '' where none was."""
+        count = self.reasons.total()
+        if not count:
+            return ""
+        many = f"{count} requests were" if count > 1 else "1 request was"
+        named = self.reasons.most_common(_NAMED)
+        causes = [f"{reason} ({number})" for reason, number in named]
+        if (others := count - sum(number for _, number in named)) > 0:
+            causes.append(f"other causes ({others})")
+        return f"{many} repeated: {', '.join(causes)}"
+
+
+TRAFFIC = Traffic()
+
+
+def answered(
+    path: Path,
+    ask: Callable[[float], _Answered],
+    wanted: Callable[[], bool] = lambda: True,
+    limit_s: float | None = None,
+) -> _Answered:
+    """An answer, after several tries and within the time limit.
+
+    Parameters
+    ----------
+    path : what is asked for, for messages.
+    ask : makes the request, which may take a time in s.
+    wanted : whether it is still worth a try.
+    limit_s : time limit of all tries together in s; None: that of a request.
+
+    Raises
+    ------
+    SessionError : there is none, in one line; MissingError if that is because of this object.
+    """
+    end_s = time.monotonic() + (limit_s or timeout_s())
+    reason = ""
+    for number in range(_TRIES):
+        TRAFFIC.add(requests=1, repeated=reason)
+        try:
+            return ask(max(0.1, end_s - time.monotonic()))
+        except AbsentError as error:
+            raise MissingError(f"{path}: {error}") from error
+        except RefusedError as error:
+            raise SessionError(f"{path}: {error}") from error
+        except TransientError as error:
+            pause_s, reason = _PAUSE_S * 2.0**number, str(error)
+            if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not wanted():
+                tries = f"{number + 1} tries" if number else "one try"
+                raise SessionError(f"{path}: can not be read ({error}, {tries})") from error
+            time.sleep(pause_s)
+    raise AssertionError("the last try raises or returns")
+
+
+def timeout_s() -> float:
+    """Time limit of a request in s; UsageError where the environment holds something else."""
+    text = os.environ.get(TIMEOUT_KEY, "")
+    try:
+        limit_s = float(text) if text else _TIMEOUT_S
+    except ValueError:
+        limit_s = 0.0
+    if not 0.0 < limit_s <= 3600.0:
+        raise UsageError(f"{TIMEOUT_KEY}={text}: the time limit of a request is a number of seconds up to 3600")
+    return limit_s

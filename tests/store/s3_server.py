@@ -1,0 +1,85 @@
+"""moto's S3 server on the loopback interface, in this process, with faults on demand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Thread
+from typing import Any
+
+import pytest
+import urllib3
+
+KEYS = {"AWS_ACCESS_KEY_ID": "KEY-OF-THE-LAB", "AWS_SECRET_ACCESS_KEY": "SECRET-OF-THE-LAB", "AWS_REGION": "us-east-1"}
+BUCKET = "lab"
+# Method and URL with its query -> status to answer instead, or None.
+Fault = Callable[[str, str], int | None]
+
+
+class S3Server:
+    """One bucket.
+
+    Attributes
+    ----------
+    url : of the server.
+    fault : answers instead, where it returns a status.
+    requests : method and URL of each request.
+    client : boto3's.
+    """
+
+    def __init__(self) -> None:
+        from moto.server import DomainDispatcherApplication, create_backend_app
+        from werkzeug.serving import WSGIRequestHandler, make_server
+
+        self.fault: Fault = lambda *_: None
+        self.requests: list[tuple[str, str]] = []
+        app = DomainDispatcherApplication(create_backend_app)
+
+        def wrapped(environ: dict[str, Any], start: Any) -> Any:
+            url = f"{environ['PATH_INFO']}?{environ.get('QUERY_STRING', '')}".rstrip("?")
+            self.requests.append((environ["REQUEST_METHOD"], url))
+            status = self.fault(environ["REQUEST_METHOD"], url)
+            if status is None:
+                return app(environ, start)
+            environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
+            start(f"{status} No", [("Content-Length", "0")])
+            return [b""]
+
+        class Handler(WSGIRequestHandler):
+            def log(self, *_: object) -> None:
+                pass
+
+        self._server = make_server("127.0.0.1", 0, wrapped, threaded=True, request_handler=Handler)
+        self._server.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self._server.server_port}"
+        self._thread = Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        self._thread.start()
+
+    @property
+    def client(self) -> Any:
+        import boto3
+
+        return boto3.client(
+            "s3", endpoint_url=self.url, region_name="us-east-1", aws_access_key_id="a", aws_secret_access_key="b"
+        )
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+@contextmanager
+def s3_server(monkeypatch: pytest.MonkeyPatch) -> Iterator[S3Server]:
+    """A server with an empty bucket, and its credentials in the environment."""
+    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[s3]' flask flask-cors")
+    server = S3Server()
+    for name, value in {**KEYS, "AWS_ENDPOINT_URL": server.url}.items():
+        monkeypatch.setenv(name, value)
+    try:
+        server.client.create_bucket(Bucket=BUCKET)
+        server.requests.clear()
+        yield server
+    finally:
+        urllib3.request("POST", f"{server.url}/moto-api/reset", retries=False)  # moto keeps buckets beyond a server
+        server.close()
