@@ -149,6 +149,7 @@ _BEFORE: dict[str, Any] = {
     "health.step_out.learned": False,
     "sampler.without_map": False,
     "refine.place_robot": False,
+    "mission.wait_at_goal_s": 0.0,
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}

@@ -27,14 +27,14 @@ Matrix = Annotated[NDArray[np.float64], "array"]
 Raster = Annotated[NDArray[np.float32], "array"]
 Image = Annotated[NDArray[np.uint8 | np.uint16], "array"]  # frames keep either; see messages.Frame
 
-_MAY_BE_EMPTY = "nmo"
+_MAY_BE_EMPTY = "nmoq"
 
 
 @dataclass(frozen=True, slots=True, init=False)
 class Shape:
     """Annotation of an array field: its shape, and whether all of its numbers must be finite.
 
-    A letter stands for any length, the same one throughout a message. `n`, `m` and `o` may be zero, other letters not.
+    A letter stands for any length, the same one throughout a message. `n`, `m`, `o`, `q` may be zero, others not.
     """
 
     lengths: tuple[int | str, ...]

@@ -210,6 +210,8 @@ class Route(Message):
     stretches: Annotated[Matrix, Shape("m", 5)] | None = None
     # most probable flow when the latest stretch was chosen, at evenly spread fluid pixels
     survey_flow_um_s: Annotated[Matrix, Shape("o", 2)] | None = None
+    # (2,) the goal that was asked for, which its last point may be near only; (0,): none, or not stated
+    goal_um: Annotated[Vector, Shape("q")] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -366,6 +368,15 @@ class Mission(Message):
     # work orders so far that no disturbance has caused: stretches of a survey after the first, refinements on the way
     routine_orders: int = 0
     planned_um_s: float | None = None  # speed limit of the robot at the latest work order; None: not recorded
+    # (2,) the goal before, while the goal was set during the run and no route leads to it yet; (0,) otherwise
+    former_goal_um: Annotated[Vector, Shape("n")] = field(default_factory=lambda: np.zeros(0))
+    goal_set_ns: int | None = None  # stamp at which the operator set the latest goal; None: it is the configured one
+    goal_from_s: float = 0.0  # time along the route at which the way to the latest goal begins
+    speed_limit_um_s: float | None = None  # of the robot through the fluid, set by the operator; None: its own
+    speed_set_ns: int | None = None  # stamp at which the operator set or took away the limit; None: never
+    # duration of the phase, without holds, after which the robot began to wait at the goal for another one; None:
+    # it does not wait
+    arrived_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -127,6 +127,18 @@ def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
     return float(p.clearance_um[nearest_pixel(x, y, p.clearance_um.shape)])
 
 
+def _goal_fault(p: Pipeline, inputs: Inputs) -> str:
+    """Why the goal of the operator's event of this tick can be none; '' if a route may lead to it."""
+    event = inputs.operator
+    if event is None or event.stamp_ns != inputs.stamp_ns or event.goal_um.shape != (2,):
+        return ""
+    width_um, height_um = p.chip.size_um
+    x_um, y_um = event.goal_um + 0.5 * p.chip.um_per_px  # from the edge; the centre of the first pixel is 0, 0
+    if not (0.0 <= x_um <= width_um and 0.0 <= y_um <= height_um):
+        return "it is outside the chip"
+    return "" if _wall_um(p, event.goal_um) > 0.0 else "it is in a wall"
+
+
 def _placed(estimate: Estimate, refined: FlowField | None) -> Estimate:
     """The estimate with its position on the chip, by the registration that the refinement found."""
     if refined is None or refined.registration is None:
@@ -205,7 +217,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         p.tracker.not_found_note(appearance),
         appearance is not None and bool(appearance.note),
         observations,
+        _goal_fault(p, inputs),
     )
+    robot = robot.slowed_to(mission.speed_limit_um_s)
     demand = p.controller.control(
         last.demand,
         mission,

@@ -49,6 +49,10 @@ class Robot(RobotSettings):
         """The same robot, never driven at more than a frequency; None: without that limit."""
         return self if frequency_hz is None else replace(self, step_out_hz=frequency_hz / self.step_out_margin)
 
+    def slowed_to(self, speed_um_s: float | None) -> Robot:
+        """The same robot, never commanded to swim faster than a speed; None: without that limit."""
+        return self if speed_um_s is None else replace(self, max_speed_um_s=min(speed_um_s, self.max_speed_um_s))
+
     def speed_limit_at(self, strength: float) -> float:
         """Speed limit in a field of this fraction of the full amplitude, um/s: step-out falls with the torque."""
         return min(self.speed_limit_um_s, strength * self.step_out_margin * self.step_out_hz * self.um_per_rev)

@@ -19,6 +19,7 @@ from flowrec.messages import FlowField
 from flowrec.pipeline import assemble
 from flowrec.replay_figures import ReplayPair, before_after
 from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run.control import RunControl
 from flowrec.run.loop import RunReport, Sink, run
 from flowrec.run.workers import LockstepWorker, Preloaded
 from flowrec.session import files_behind
@@ -113,7 +114,8 @@ def replay_and_report(
 def refly(done: Replayed, out: Output | None) -> list[Row]:
     """Fly the recorded and the replayed plan in a simulator whose true flow is the replay's map.
 
-    Both flights begin where the recorded route does and have the same seed; rows as of `before_after`.
+    Both flights begin where the recorded route does and have the same seed; rows as of `before_after`. They go straight
+    to the last goal and keep the last speed limit that the operator has set.
 
     Parameters
     ----------
@@ -130,12 +132,22 @@ def refly(done: Replayed, out: Output | None) -> list[Row]:
         )
     session = done.session
     x_um, y_um = (float(value) for value in planned_from(done.recorded, done.replayed))
+    # Another flight passes the places at other times, so it is not sent on when the recorded robot was.
+    goal = (float(done.recorded.mission.goal_um[0]), float(done.recorded.mission.goal_um[1]))
+    limit_um_s = done.recorded.mission.speed_limit_um_s
     reports = []
     for name, config, tick, target in (
         ("recorded", session.config, done.recorded, None),
         ("replayed", done.config, done.replayed, out),
     ):
-        mission = replace(config.mission, phases=(Phase.PLAN, Phase.NAVIGATE), start=(x_um, y_um), replan_error_um=None)
+        mission = replace(
+            config.mission,
+            phases=(Phase.PLAN, Phase.NAVIGATE),
+            start=(x_um, y_um),
+            goal=goal,
+            replan_error_um=None,
+            wait_at_goal_s=0.0,
+        )
         flown = replace(config, mission=mission)
         pipeline = assemble(flown, session.chip)
         rig = SimulatedRig.of(pipeline, flown, true_field=flow)
@@ -147,7 +159,10 @@ def refly(done: Replayed, out: Output | None) -> list[Row]:
                 writer = session_writer(target, flown, session.chip, parent=session.path)
                 sinks.append(stack.enter_context(writer))
             say(f"reflying as {name} ...")
-            flight = run(pipeline, rig, worker, sinks)
+            control = RunControl()
+            if limit_um_s is not None:
+                control.limit_speed(limit_um_s)
+            flight = run(pipeline, rig, worker, sinks, control=control)
             if target is not None:
                 writer.close({"outcome": flight.outcome, "note": f"refly of {session.path.name}"})
         reports.append(flight)

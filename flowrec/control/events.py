@@ -8,15 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.enums import Action, Alarm, Level, Outcome, Phase
-from flowrec.messages import Event, Health
+from flowrec.messages import Event, Health, Mission, OperatorEvent
 from flowrec.topics import Tick
 from flowrec.units import seconds
 
 Line = tuple[str, Level | None]  # text and level; None leaves the level as it is
 # The mission reports other commands.
 _OPERATOR: dict[str, str] = {Action.MARK: "mark", Action.NOTE: "note", Action.ZERO: "field to zero at once"}
+_STEERING = (Action.GOAL, Action.SPEED)
 
 
 def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | None:
@@ -55,6 +57,14 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
     mission, before = tick.mission, last.mission
     if mission is not None and before is not None and mission.phase == before.phase in (Phase.SURVEY, Phase.NAVIGATE):
         yield f"{mission.phase}: {route.reason}", None  # ordered on the way
+        return
+    if (
+        mission is not None
+        and before is not None
+        and mission.phase == before.phase
+        and mission.request != route.request
+    ):
+        yield "the route to an earlier goal, or at an earlier speed limit, is not taken", None
         return
     length = float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
     yield f"route adopted ({route.method}): {length / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None
@@ -111,11 +121,40 @@ def _health(before: Health | None, health: Health | None) -> Iterator[Line]:
 
 
 def _operator(last: Tick, tick: Tick) -> Iterator[Line]:
-    """What the operator did."""
-    event = tick.operator
-    if event is not None and event is not last.operator and event.action in _OPERATOR:
+    """What the operator did, and a goal to which no route leads."""
+    event, mission, before = tick.operator, tick.mission, last.mission
+    if mission is not None and before is not None and _is_refused(before, mission):
+        yield f"goal {_place(before.goal_um)} refused: it stays {_place(mission.goal_um)}", Level.WARNING
+    if event is None or event is last.operator:
+        return
+    if event.action in _STEERING and mission is not None:
+        yield _steering(event, mission)
+    if event.action in _OPERATOR:
         text = f": {event.text}" if event.text and event.action != Action.ZERO else ""
         yield f"operator: {_OPERATOR[event.action]}{text}", None
+
+
+def _is_refused(before: Mission, mission: Mission) -> bool:
+    """Whether the mission has gone back to its former goal."""
+    asked = len(before.former_goal_um) > len(mission.former_goal_um) and not mission.finished
+    return asked and not np.array_equal(mission.goal_um, before.goal_um)
+
+
+def _steering(event: OperatorEvent, mission: Mission) -> Line:
+    """A goal or a speed limit, and why it is not taken."""
+    if event.action == Action.SPEED:
+        taken = mission.speed_set_ns == event.stamp_ns
+        said = "speed limit taken away" if event.speed_limit_um_s is None else f"speed limited to {event.text}"
+    else:
+        taken, said = mission.goal_set_ns == event.stamp_ns, f"goal set to {event.text}"
+    if taken:
+        return f"operator: {said}", None
+    why = f"{event.action} {event.text} refused: the mission is over" if mission.finished else mission.note
+    return f"operator: {why}", Level.WARNING
+
+
+def _place(point_um: NDArray[np.float64]) -> str:
+    return f"{point_um[0]:.0f}, {point_um[1]:.0f} um"
 
 
 def _mission(last: Tick, tick: Tick) -> Iterator[Line]:
@@ -150,7 +189,8 @@ def _hold(last: Tick, tick: Tick) -> Iterator[str]:
         return
     if since_ns is None:
         wait = f" (the {mission.wanted.replace('_', ' ')} that it waits for goes on)" if mission.wanted else ""
-        yield f"held by the operator{wait}"
+        no_route = mission.phase == Phase.PLAN and not mission.wanted
+        yield f"held: {mission.note}" if no_route else f"held by the operator{wait}"
     if before is not None and mission.swept != before.swept:
         off = f" by {demand.error_um:.0f} um" if demand is not None else ""
         why = ": the flow is faster than the robot" if demand is not None and demand.saturated else ""

@@ -11,6 +11,17 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 
+from flowrec.control.mission_goals import (
+    confirmed,
+    held_without_route,
+    is_asked,
+    is_current,
+    on_the_way,
+    refused,
+    routine_order,
+    with_goal,
+    with_speed_limit,
+)
 from flowrec.control.mission_steps import Frame, at_end, elapsed_s, finish, held, left_s, order, transition
 from flowrec.control.trajectory import position_at
 from flowrec.enums import Action, Outcome, Phase, WorkOrder
@@ -36,6 +47,7 @@ Point = tuple[Coordinate, Coordinate]
 Place = Point | str
 _IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
 _ON_THE_WAY = (Phase.SURVEY, Phase.NAVIGATE)  # the robot goes on while an order is under way
+_STEERING = (Action.GOAL, Action.SPEED)
 _SLOWER = 0.3  # of the planned time: a robot that steps out at 0.7 of its limit is later by about so much
 _WAITING_RADII = 2.5  # off a reference that then has a fifth of its pace (Controller.lag_full_radii)
 _EXTRA_S = 5.0  # on top of `patience` times the planned duration of a route
@@ -87,6 +99,8 @@ class MissionStateMachine:
     replan_slower: Share = 0.95
     # distance from the route beyond which a new one is planned; None: six radii
     replan_error_um: Annotated[float, Range(1.0, math.inf)] | None = None
+    # time for which the robot is held at the goal, for the operator to set another one; 0: the run ends there
+    wait_at_goal_s: Annotated[float, Range(0.0, 1e5)] = 0.0
 
     def update(
         self,
@@ -103,6 +117,7 @@ class MissionStateMachine:
         not_found_note: str = "",
         refused: bool = False,
         observations: Observations | None = None,
+        goal_fault: str = "",
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
@@ -110,10 +125,11 @@ class MissionStateMachine:
         does not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
 
         `not_found_note` is the tracker's advice for a robot that is not found; `refused`: it can not be found.
+        `goal_fault` says why the goal of `operator` can be none: it is in a wall, or outside the chip.
         """
         now = Frame(
             *(track, estimate, assumed, refined, route, operator, demand, robot, applied, not_found_note, refused),
-            observations,
+            *(observations, goal_fault),
         )
         if self.observes:
             return self._observe(previous if previous is not None else self._first(now), now)
@@ -124,6 +140,10 @@ class MissionStateMachine:
         commanded = self._after_command(previous, now)
         if commanded.finished:
             return commanded
+        if commanded.speed_limit_um_s is not None:
+            now = replace(now, robot=robot.slowed_to(commanded.speed_limit_um_s))
+        if now.command in _STEERING:
+            previous = commanded  # and goes on: a person who drags the goal stops nothing
         lost = self._lost(previous, now)
         if lost is not None:
             return lost
@@ -168,6 +188,8 @@ class MissionStateMachine:
         if now.command in (Action.STOP, Action.ZERO):
             note = operator.text if operator is not None else ""
             return finish(mission, now, Outcome.STOPPED, note or f"operator: {now.command}")
+        if now.command in _STEERING:
+            mission = replace(mission, stamp_ns=now.now_ns, note=f"{now.command} refused: the robot is only observed")
         if now.command == Action.END and not mission.input_ended:
             mission = replace(mission, stamp_ns=now.now_ns, input_ended=True)
         if now.refused:
@@ -190,7 +212,13 @@ class MissionStateMachine:
         command, since_ns = now.command, mission.held_since_ns
         if command in (Action.STOP, Action.ZERO):
             note = now.operator.text if now.operator is not None else ""
-            return finish(mission, now, Outcome.STOPPED, note or f"operator: {command}")
+            arrived = command == Action.STOP and mission.arrived_s is not None
+            outcome = Outcome.REACHED if arrived else Outcome.STOPPED
+            return finish(mission, now, outcome, note or f"operator: {command}")
+        if command == Action.GOAL:
+            return with_goal(mission, now)
+        if command == Action.SPEED:
+            return with_speed_limit(mission, now)
         if command == Action.PAUSE and since_ns is None:
             return replace(mission, stamp_ns=now.now_ns, held_since_ns=now.now_ns)
         if command == Action.RESUME and since_ns is not None:
@@ -273,14 +301,24 @@ class MissionStateMachine:
         if phase == Phase.REFINE:
             return self._next_phase(Phase.REFINE, previous, now)
         if phase == Phase.PLAN:
-            assert isinstance(result, Route)
-            if not result.reachable:
-                return finish(previous, now, Outcome.UNREACHABLE, result.reason)
-            return self._next_phase(Phase.PLAN, previous, now, result.reason)
+            return self._plan(previous, now, result)
         assert route is not None
         if phase == Phase.SURVEY:
             return self._survey(previous, now, route, result)
         return self._navigate(previous, now, route, result)
+
+    def _plan(self, previous: Mission, now: Frame, result: FlowField | Route | None) -> Mission:
+        """With a route on the way; where there is none to a new goal, back to the former one."""
+        if not isinstance(result, Route) or not is_current(previous):
+            return routine_order(previous, now, Phase.PLAN, previous.note)
+        if result.reachable:
+            return confirmed(self._next_phase(Phase.PLAN, previous, now, result.reason))
+        if is_asked(previous):
+            former = refused(previous, result.reason)
+            return routine_order(former, now, Phase.PLAN, former.note)
+        if previous.speed_limit_um_s is not None:
+            return held_without_route(previous, now, result.reason)
+        return finish(previous, now, Outcome.UNREACHABLE, result.reason)
 
     def _survey(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
         """On a stretch: the next one is ordered before its end; an order under way is waited for, at the end at rest.
@@ -292,9 +330,11 @@ class MissionStateMachine:
             return transition(previous, now, Phase.SURVEY, result.reason)
         if previous.wanted:
             return previous
-        if elapsed_s(previous, now) > self._time_limit_s(self.survey_limit_s, route):
+        slowed = previous.speed_set_ns is not None  # its times are those of another speed
+        limit_s = self.survey_limit_s if slowed else self._time_limit_s(self.survey_limit_s, route)
+        if elapsed_s(previous, now) > limit_s:
             return self._next_phase(Phase.SURVEY, previous, now, "survey cut short by its time limit")
-        if self._stuck(previous, now):
+        if not slowed and self._stuck(previous, now):
             return self._next_phase(Phase.SURVEY, previous, now, "survey cut short: something is in the way")
         near_end = left_s(now, route) <= self.lead_s
         if route.more:
@@ -320,25 +360,47 @@ class MissionStateMachine:
         late_s = elapsed_s(previous, now) - now.demand.progress_s
         return late_s > self.stuck_s + _SLOWER * now.demand.progress_s
 
-    def _time_limit_s(self, limit_s: float, route: Route) -> float:
-        """How long a route may be followed: for a robot that is stuck, waiting does not help."""
-        return min(limit_s, self.patience * float(route.arrival_s[-1]) + _EXTRA_S)
+    def _time_limit_s(self, limit_s: float, route: Route, from_s: float = 0.0) -> float:
+        """How long a route may be followed, `from_s` along it on: for a robot that is stuck, waiting does not help."""
+        return from_s + min(limit_s, self.patience * (float(route.arrival_s[-1]) - from_s) + _EXTRA_S)
+
+    def _other_speed(self, previous: Mission, now: Frame) -> str:
+        """Why to plan for another speed: the robot has become slower, or a person lets it be faster."""
+        planned_um_s, able_um_s = previous.planned_um_s, now.robot.speed_limit_um_s
+        if planned_um_s is None:
+            return ""
+        if able_um_s < self.replan_slower * planned_um_s:
+            return f"the robot reaches {able_um_s:.0f} um/s and not {planned_um_s:.0f}: planning anew"
+        set_since = previous.speed_set_ns is not None and previous.speed_set_ns > previous.requested_ns
+        if set_since and planned_um_s < self.replan_slower * able_um_s:
+            return f"the robot may reach {able_um_s:.0f} um/s and not only {planned_um_s:.0f}: planning anew"
+        return ""
 
     def _navigate(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
         """At the goal, too late, too far off the route, or still on the way."""
+        other_speed = self._other_speed(previous, now)
+        if is_asked(previous):
+            return on_the_way(previous, now, route, result, self.lead_s, other_speed)
         tolerance_um = self.goal_tolerance_um if self.goal_tolerance_um is not None else now.robot.radius_um
-        if math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
+        arrived_s = previous.arrived_s
+        if arrived_s is None and math.dist(now.estimate.position_um, previous.goal_um) <= tolerance_um:
+            if not self.wait_at_goal_s:
+                return finish(previous, now, Outcome.REACHED)
+            arrived_s = elapsed_s(previous, now)
+            note = f"at the goal: waits {self.wait_at_goal_s:g} s for another one"
+            return replace(previous, stamp_ns=now.now_ns, arrived_s=arrived_s, note=note)
+        if arrived_s is not None and elapsed_s(previous, now) - arrived_s >= self.wait_at_goal_s:
             return finish(previous, now, Outcome.REACHED)
-        limit_s = self._time_limit_s(self.navigate_limit_s, route)
-        if elapsed_s(previous, now) > limit_s:
+        limit_s = self._time_limit_s(self.navigate_limit_s, route, previous.goal_from_s)
+        if arrived_s is None and elapsed_s(previous, now) > limit_s:
             note = f"goal not reached in {limit_s:.0f} s, where {route.arrival_s[-1]:.0f} s were planned"
             return finish(previous, now, Outcome.TIMEOUT, note)
         if previous.wanted and result is None:
             return previous  # one order at a time
-        planned_um_s, able_um_s = previous.planned_um_s, now.robot.speed_limit_um_s
-        if planned_um_s is not None and able_um_s < self.replan_slower * planned_um_s:
-            note = f"the robot reaches {able_um_s:.0f} um/s and not {planned_um_s:.0f}: planning anew"
-            return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, note)
+        if other_speed and arrived_s is None:
+            if previous.speed_set_ns is not None:
+                return routine_order(previous, now, Phase.PLAN, other_speed)
+            return order(previous, now, Phase.PLAN, WorkOrder.ROUTE, other_speed)
         limit_um = self.replan_error_um if self.replan_error_um is not None else 6.0 * now.robot.radius_um
         stuck = self._stuck(previous, now, _WAITING_RADII)
         if now.demand is None or not (stuck or now.demand.error_um > limit_um):
@@ -357,10 +419,12 @@ class MissionStateMachine:
     def _look_again(self, previous: Mission, now: Frame, route: Route, result: FlowField | Route | None) -> Mission:
         """On the way: after some observations refine the map again, then ask whether another route is better now."""
         wanted = None
-        if isinstance(result, FlowField):
+        if isinstance(result, FlowField) and previous.arrived_s is None:
             wanted = WorkOrder.ROUTE
-        elif isinstance(result, Route):
-            return transition(previous, now, Phase.NAVIGATE, result.reason)
+        elif result is not None:
+            return transition(
+                previous, now, Phase.NAVIGATE, result.reason if isinstance(result, Route) else previous.note
+            )
         elif self._refines_again(now) and left_s(now, route) > 2.0 * self.lead_s:
             wanted = WorkOrder.REFINE
         if wanted is None:

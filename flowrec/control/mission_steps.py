@@ -40,6 +40,7 @@ class Frame:
     not_found_note: str
     refused: bool
     observations: Observations | None
+    goal_fault: str  # why the goal of the operator's event can be none
 
     def with_advice(self, note: str) -> str:
         """A note on a robot that was not found, with the tracker's advice."""
@@ -110,6 +111,8 @@ def transition(
         phase=phase.value,
         since_ns=now.now_ns if new else previous.since_ns,
         held_ns=0 if new else previous.held_ns,
+        goal_from_s=0.0 if new else previous.goal_from_s,
+        arrived_s=None if new else previous.arrived_s,
         wanted=wanted.value if wanted is not None else "",
         note=note,
         **changes,

@@ -1,4 +1,4 @@
-"""Another way to the goal while the robot is on one: taken only if it is better by more than the map is uncertain."""
+"""Another way while the robot is on one: to the same goal only if it is better by more than the map is uncertain."""
 
 from __future__ import annotations
 
@@ -40,8 +40,7 @@ def better_route(
     `planner.replan_deviations` standard deviations of that gain, both in the new map. The gain is uncertain as the map
     is, in the same way for what both routes share. Times before `from_s` stay, so that the reference goes on.
     """
-    from_s = min(max(from_s, 0.0), float(present.arrival_s[-1]))
-    at = np.array([np.interp(from_s, present.arrival_s, present.waypoints_um[:, c]) for c in (0, 1)])
+    from_s, at = _branch(present, from_s)
     ahead = present.arrival_s > from_s
     rest = np.concatenate([at[None], present.waypoints_um[ahead]])
     new = planner.plan(field, at, goal_um, chip, robot)
@@ -63,7 +62,33 @@ def better_route(
         if not gain > planner.replan_deviations * noise:
             return replace(present, reason=f"route kept: another would gain {gain:.1f} +- {noise:.1f} s")
         said = f"another route gains {gain:.1f} +- {noise:.1f} s"
-    before = ~ahead
+    return _joined(present, from_s, new, said)
+
+
+def route_elsewhere(
+    planner: Planner, field: FlowField, present: Route, from_s: float, goal_um: Points, chip: Chip, robot: Robot
+) -> Route:
+    """A route that leaves the present one after `from_s` along it for another goal (2,), stated as its `goal_um`.
+
+    The present one, with the reason, where there is none. Times before `from_s` stay, as in `better_route`.
+    """
+    from_s, at = _branch(present, from_s)
+    new = planner.plan(field, at, goal_um, chip, robot)
+    if not new.reachable:
+        return replace(present, reason=new.reason)
+    said = f"to {goal_um[0]:.0f}, {goal_um[1]:.0f} um in {new.arrival_s[-1]:.1f} s"
+    return replace(_joined(present, from_s, new, said), goal_um=goal_um)
+
+
+def _branch(present: Route, from_s: float) -> tuple[float, Points]:
+    """A time along a route and the place (2,) where it is then."""
+    from_s = min(max(from_s, 0.0), float(present.arrival_s[-1]))
+    return from_s, np.array([np.interp(from_s, present.arrival_s, present.waypoints_um[:, c]) for c in (0, 1)])
+
+
+def _joined(present: Route, from_s: float, new: Route, said: str) -> Route:
+    """The present route up to a time along it, then a new one."""
+    before = present.arrival_s <= from_s
     if before.any() and present.arrival_s[before][-1] >= from_s:  # the place itself is a waypoint
         before = present.arrival_s < from_s
     return replace(

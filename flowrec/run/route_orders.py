@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from flowrec.estimation.kalman import memory_s
 from flowrec.flow.uncertainty import FlowUncertainty
 from flowrec.messages import Mission, Observations, Route
 from flowrec.pipeline import Pipeline
-from flowrec.planning.replanning import better_route
+from flowrec.planning.replanning import better_route, route_elsewhere
 from flowrec.planning.survey_design import Sampling, SurveyOrder
 from flowrec.robot import Robot
 from flowrec.topics import Tick
@@ -48,7 +49,7 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
             field,
             mission.start_um,
             pipeline.chip,
-            _robot(pipeline, order),
+            _robot(pipeline, order, mission),
             mission.goal_um,
             _uncertainty(pipeline, order) if pipeline.survey.needs_uncertainty else None,
             _sampling(pipeline, order),
@@ -62,15 +63,19 @@ def survey_route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
 
 
 def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
-    """The way to the goal; on the way there the present one, unless another is better."""
+    """The way to the goal; on the way there the present one, unless another is better or the goal a new one."""
     field = order.field
     assert field is not None
-    robot = _robot(pipeline, order)
+    robot, planner = _robot(pipeline, order, mission), pipeline.planner
     if mission.phase != Phase.NAVIGATE:
-        return pipeline.planner.plan(field, mission.start_um, mission.goal_um, pipeline.chip, robot)
+        planned = planner.plan(field, mission.start_um, mission.goal_um, pipeline.chip, robot)
+        return replace(planned, goal_um=mission.goal_um)
     assert order.route is not None and order.demand is not None
-    return better_route(
-        pipeline.planner,
+    if len(mission.former_goal_um):
+        from_s = mission.goal_from_s
+        return route_elsewhere(planner, field, order.route, from_s, mission.goal_um, pipeline.chip, robot)
+    better = better_route(
+        planner,
         field,
         _uncertainty(pipeline, order),
         order.route,
@@ -79,11 +84,13 @@ def route(pipeline: Pipeline, order: Tick, mission: Mission) -> Route:
         pipeline.chip,
         robot,
     )
+    return replace(better, goal_um=mission.goal_um)
 
 
-def _robot(pipeline: Pipeline, order: Tick) -> Robot:
-    """The robot as it is known in the tick: slower where it has stepped out."""
-    return pipeline.robot.limited_to(order.health.limit_hz if order.health is not None else None)
+def _robot(pipeline: Pipeline, order: Tick, mission: Mission) -> Robot:
+    """The robot as it is known in the tick: slower where it has stepped out, or a person limits its speed."""
+    limit_hz = order.health.limit_hz if order.health is not None else None
+    return pipeline.robot.limited_to(limit_hz).slowed_to(mission.speed_limit_um_s)
 
 
 def _uncertainty(pipeline: Pipeline, order: Tick) -> FlowUncertainty | None:

@@ -69,6 +69,9 @@ class World:
         absent=None,
         progress=0.0,
         seen_flow=None,
+        goal=None,
+        limit_um_s=None,
+        fault="",
         **results,
     ) -> Mission:
         self.results |= results
@@ -77,7 +80,8 @@ class World:
         track = Track(stamp, seen, at, 0.9, lost, 5.0, np.zeros(4), self.seen_ns)
         estimate = Estimate(stamp, at, np.zeros(2), np.eye(4), math.nan, at, seen)
         demand = Demand(stamp, np.zeros(2), at, progress, error_um, False, np.zeros((0, 2)))
-        event = OperatorEvent(stamp, operator, "") if operator else None
+        event = OperatorEvent(stamp, operator, "", speed_limit_um_s=limit_um_s) if operator else None
+        event = OperatorEvent(stamp, "goal", "there", np.array(goal)) if goal is not None else event
         self.absent_ns = stamp if absent else self.absent_ns
         since_ns = self.seen_ns if not seen else stamp
         applied = Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2), since_ns, self.absent_ns)
@@ -91,6 +95,7 @@ class World:
             self.robot,  # type: ignore[arg-type]
             applied if self.absent_ns is not None else None,
             observations=seen_flow,
+            goal_fault=fault,
         )
         self.time_s += 1.0
         return self.mission

@@ -5,7 +5,7 @@ import pytest
 
 from flowrec.flow.uncertainty import FlowUncertainty
 from flowrec.planning import Planner
-from flowrec.planning.replanning import better_route
+from flowrec.planning.replanning import better_route, route_elsewhere
 from tests.planning.worlds import loop, robot
 
 WEST, EAST = (60.0, 205.0), (1330.0, 205.0)
@@ -64,3 +64,21 @@ def test_an_impossible_route_is_left_however_uncertain_the_map_and_kept_where_th
     chip, field = loop(fast=-300.0, slow=-300.0)
     kept = better_route(Planner(), field, None, present_route(140.0), 0.3, EAST, chip, SWIMMER)
     assert kept.reachable and kept.reason.startswith("route kept: ")
+
+
+def test_a_route_to_another_goal_leaves_the_present_one_at_its_time_and_none_leaves_it_as_it_is() -> None:
+    chip, field = loop(fast=0.0)
+    present = present_route(30.0)
+    back = np.array(WEST)
+    new = route_elsewhere(Planner(), field, present, 0.3, back, chip, SWIMMER)
+    shared = present.arrival_s < 0.3
+    np.testing.assert_array_equal(new.waypoints_um[: shared.sum()], present.waypoints_um[shared])
+    assert (np.diff(new.arrival_s) > 0.0).all()
+    assert new.arrival_s[shared.sum()] == 0.3
+    np.testing.assert_array_equal(new.goal_um, back)
+    np.testing.assert_allclose(new.waypoints_um[-1], back, atol=1.0)
+    late = route_elsewhere(Planner(), field, present, 1e9, back, chip, SWIMMER)  # at its end
+    np.testing.assert_array_equal(late.waypoints_um[: len(present.waypoints_um)], present.waypoints_um)
+    kept = route_elsewhere(Planner(), field, present, 0.3, np.array([700.0, 450.0]), chip, SWIMMER)
+    assert "wall" in kept.reason and kept.goal_um.size == 0
+    np.testing.assert_array_equal(kept.waypoints_um, present.waypoints_um)

@@ -7,12 +7,15 @@ import pytest
 
 from flowrec.enums import Phase
 from flowrec.estimation import Sampler
+from flowrec.planning.route import no_route
 from flowrec.planning.survey import SurveyPlanner
 from flowrec.run.route_orders import route, survey_route
 from tests.planning.worlds import robot
 
+NOWHERE = no_route("none", "")
 
-def ordered(survey, planner, limit_hz=None):
+
+def ordered(survey, planner, limit_hz=None, speed_limit_um_s=None):
     """A survey and a plan are asked for, of a pipeline that hands them on."""
     pipeline = SimpleNamespace(
         survey=survey,
@@ -26,7 +29,9 @@ def ordered(survey, planner, limit_hz=None):
         health=SimpleNamespace(limit_hz=limit_hz),
         **{"field": 1, "assumed": 1, "route": None, "demand": None, "observations": None, "stamp_ns": 0},
     )
-    mission = SimpleNamespace(phase=Phase.START, start_um=np.zeros(2), goal_um=np.ones(2))
+    mission = SimpleNamespace(
+        phase=Phase.START, start_um=np.zeros(2), goal_um=np.ones(2), speed_limit_um_s=speed_limit_um_s
+    )
     survey_route(pipeline, tick, mission)
     route(pipeline, tick, mission)
 
@@ -35,16 +40,25 @@ def ordered(survey, planner, limit_hz=None):
 def test_a_survey_and_a_plan_count_on_a_robot_as_slow_as_it_has_stepped_out(limit_hz):
     given = []
     survey = SimpleNamespace(needs_uncertainty=True, plan=lambda order: given.append(order.robot))
-    ordered(survey, SimpleNamespace(plan=lambda field, start, goal, chip, able: given.append(able)), limit_hz)
+    ordered(
+        survey, SimpleNamespace(plan=lambda field, start, goal, chip, able: given.append(able) or NOWHERE), limit_hz
+    )
     able = robot(600.0).limited_to(limit_hz)
     assert [one.speed_limit_um_s for one in given] == [able.speed_limit_um_s] * 2
     assert (able.speed_limit_um_s < robot(600.0).speed_limit_um_s) is (limit_hz is not None)
+    ordered(
+        survey,
+        SimpleNamespace(plan=lambda field, start, goal, chip, able: given.append(able) or NOWHERE),
+        limit_hz,
+        50.0,
+    )
+    assert [one.speed_limit_um_s for one in given[2:]] == [50.0] * 2  # or as a person allows
 
 
 def test_how_wrong_the_flow_may_be_is_computed_for_a_survey_that_asks_for_it_alone():
     given = []
     for needed in (True, False):
         survey = SimpleNamespace(needs_uncertainty=needed, plan=lambda order: given.append(order.uncertainty))
-        ordered(survey, SimpleNamespace(plan=lambda *_: None))
+        ordered(survey, SimpleNamespace(plan=lambda *_: NOWHERE))
     assert given == ["how wrong the flow may be", None]
     assert [SurveyPlanner(method).needs_uncertainty for method in ("information", "downstream")] == [True, False]
