@@ -1,7 +1,7 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in import_verb.py, doctor_verb.py, sweep_verb.py, session_verbs.py and calibrate_verbs.py. Each
-function parses, calls and prints, with late imports.
+The other verbs are in import_verb.py, doctor_verb.py, push_verb.py, sweep_verb.py, session_verbs.py and
+calibrate_verbs.py. Each function parses, calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
@@ -25,6 +25,7 @@ from flowrec.calibrate_verbs import calibrate
 from flowrec.doctor_verb import doctor, look_at_lab
 from flowrec.errors import FlowrecError, printable
 from flowrec.import_verb import import_movie
+from flowrec.push_verb import push
 from flowrec.session_verbs import (
     HelpWithMethods,
     SessionFile,
@@ -244,6 +245,7 @@ def replay(
 
 app.command("import", epilog=examples("import"))(import_movie)
 app.command("sweep", epilog=examples("sweep"))(sweep)
+app.command("push", epilog=examples("push"))(push)
 for _verb in (doctor, view, export, report, info, list_directory, note, check, recover, compare):
     _name = "ls" if _verb is list_directory else _verb.__name__
     app.command(_name, cls=HelpWithMethods, epilog=examples(_name))(_verb)

@@ -33,7 +33,9 @@ EXAMPLES = {
     "sweep": (
         "flowrec sweep 'runs/*.mcap' --grid refine=fvm,assimilate --grid observer=kalman,kalman_map -o sweep.parquet",
         "flowrec sweep runs --grid plan=astar_time,time_field --refly -o plans.parquet --scheduler tcp://10.0.0.1:8786",
+        "flowrec sweep s3://lab/runs/ --grid observer=kalman,kalman_map -o sweep.parquet",
     ),
+    "push": ("flowrec push a.mcap s3://lab/runs", "flowrec push runs/*.mcap s3://lab/2026"),
     "import": ("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap",),
     "doctor": ("flowrec doctor lab.toml",),
     "view": (
@@ -47,8 +49,12 @@ EXAMPLES = {
         "flowrec report a.mcap a_replay_001.mcap -o report.html --figures figures",
         "flowrec report sweep.parquet -o sweep.html",
     ),
-    "info": ("flowrec info a.mcap --json",),
-    "ls": ("flowrec ls runs", 'flowrec ls runs/*.mcap --where "refined_flow_error < 0.05" --sort -duration_s'),
+    "info": ("flowrec info a.mcap --json", "flowrec info s3://lab/runs/a.mcap"),
+    "ls": (
+        "flowrec ls runs",
+        "flowrec ls s3://lab/runs/",
+        'flowrec ls runs/*.mcap --where "refined_flow_error < 0.05" --sort -duration_s',
+    ),
     "note": ('flowrec note a.mcap "bubble at the outlet" --tag bubble', "flowrec note a.mcap"),
     "check": ("flowrec check a.mcap",),
     "recover": ("flowrec recover a.mcap.partial",),

@@ -54,7 +54,7 @@ def read_notes(session: Path, key: str) -> list[Note]:
     ------
     SessionError : the file can not be read.
     """
-    return [note for line in _lines(_content(notes_file(session))) if (note := _parsed(line, key)) is not None]
+    return [note for line in _lines(notes_content(notes_file(session))) if (note := _parsed(line, key)) is not None]
 
 
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
@@ -86,8 +86,8 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
     return note
 
 
-def _content(path: Path) -> bytes:
-    """The bytes of the file; none where there is no file."""
+def notes_content(path: Path) -> bytes:
+    """The bytes of a file of notes; none where there is no file. SessionError if it can not be read."""
     if isinstance(path, UrlPath):
         try:
             with contextlib.closing(open_bytes(path)) as source:

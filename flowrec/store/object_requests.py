@@ -138,7 +138,7 @@ class _Bucket:
                 raise SessionError(
                     f"{url}: the environment names no account; set AZURE_STORAGE_ACCOUNT_NAME"
                 ) from error
-            raise SessionError(f"{url}: is no URL of a bucket ({_in_a_line(error)})") from error
+            raise SessionError(f"{url}: is no URL of a bucket ({in_a_line(error)})") from error
 
     def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
         import obstore
@@ -195,17 +195,17 @@ def _bucket_faults() -> Iterator[_Faults]:
     except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError) as error:
         raise AbsentError(_REFUSED.format("403")) from error
     except (exceptions.BaseError, OSError, ValueError) as error:
-        text = _in_a_line(error)
+        text = in_a_line(error)
         if "416" in text and "ange" in text:
             faults.empty = True
             return
         if "169.254.169.254" in text or "redential" in text:
             raise RefusedError("can not be asked for: there are no credentials in the environment") from error
         status = re.search(r"\b(?:status|Status|code)\D{0,20}([45]\d\d)\b", text)
-        raise _of_status(int(status[1])) if status else TransientError(_reason(text)) from error
+        raise of_status(int(status[1])) if status else TransientError(reason(text)) from error
 
 
-def _of_status(status: int) -> Exception:
+def of_status(status: int) -> Exception:
     """The error of an answer that is none."""
     if status in (401, 403):
         return AbsentError(_REFUSED.format(status))
@@ -250,7 +250,7 @@ class _Http:
                 finally:
                     response.close()  # gives a connection back that was read to its end, and cuts any other
         except urllib3.exceptions.HTTPError as error:
-            raise TransientError(_reason(_in_a_line(error))) from error
+            raise TransientError(reason(in_a_line(error))) from error
         raise RefusedError(f"is redirected more than {_REDIRECTS} times")
 
 
@@ -265,7 +265,7 @@ def _answer(response: Any, first: int | None, length: int, end_s: float) -> Answ
     if status == _NO_RANGE:
         return Answer(b"", 0, 0, "")
     if status >= 400:
-        raise _of_status(status)
+        raise of_status(status)
     if status == _OK:
         raise RefusedError("can not be read in ranges, the server sends whole files only; copy it to this machine")
     found = _CONTENT_RANGE.fullmatch(response.headers.get("Content-Range", ""))
@@ -308,11 +308,12 @@ def _is_private(host: str | None) -> bool:
     return any(not ipaddress.ip_address(str(address[4][0]).partition("%")[0]).is_global for address in found)
 
 
-def _in_a_line(error: BaseException) -> str:
+def in_a_line(error: BaseException) -> str:
+    """The text of an error of a library."""
     return " ".join(str(error).split())
 
 
-def _reason(text: str) -> str:
+def reason(text: str) -> str:
     """What a library says about a failed connection, in a few words that can not hold a credential."""
     lower = text.lower()
     if "timed out" in lower or "kind: timeout" in lower:

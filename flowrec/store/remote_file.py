@@ -171,14 +171,19 @@ class RemoteFile:
         return answer
 
     def _changed(self) -> SessionError:
-        with _remembering:
-            _remembered.pop(self._url, None)
+        forget(self.path)
         return SessionError(f"{self.path}: was replaced while it was read; open it again")
 
     def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
         answer = answered(self.path, lambda limit_s: asked.get(first, length, limit_s), lambda: self._closer.alive)
         TRAFFIC.add(nbytes=len(answer.data))
         return answer
+
+
+def forget(path: Path) -> None:
+    """Ask again what an object holds when it is opened next."""
+    with _remembering:
+        _remembered.pop(str(path), None)
 
 
 def are_there(paths: Sequence[Path]) -> list[bool]:

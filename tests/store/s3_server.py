@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from threading import Thread
 from typing import Any
 
@@ -55,7 +56,7 @@ class S3Server:
         self._thread = Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         self._thread.start()
 
-    @property
+    @cached_property
     def client(self) -> Any:
         import boto3
 
