@@ -368,7 +368,8 @@ class Mission(Message):
     # work orders so far that no disturbance has caused: stretches of a survey after the first, refinements on the way
     routine_orders: int = 0
     planned_um_s: float | None = None  # speed limit of the robot at the latest work order; None: not recorded
-    # (2,) the goal before, while the goal was set during the run and no route leads to it yet; (0,) otherwise
+    # (2,) while the goal was set during the run and no route leads to it yet: the goal before, to which the present
+    # route leads; (0,) otherwise
     former_goal_um: Annotated[Vector, Shape("n")] = field(default_factory=lambda: np.zeros(0))
     goal_set_ns: int | None = None  # stamp at which the operator set the latest goal; None: it is the configured one
     goal_from_s: float = 0.0  # time along the route at which the way to the latest goal begins

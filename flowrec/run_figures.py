@@ -72,6 +72,10 @@ def figures_of(
         figures["planned_s"] = float(route.arrival_s[-1])
         if mission.outcome == Outcome.REACHED and navigating_ns is not None:
             figures["navigation_s"] = seconds(mission.since_ns - navigating_ns)
+    if mission is not None and mission.goal_set_ns is not None:
+        figures["latest_goal"] = f"{mission.goal_um[0]:.0f}, {mission.goal_um[1]:.0f} um"
+    if mission is not None and mission.speed_limit_um_s is not None:
+        figures["speed_limit_um_s"] = mission.speed_limit_um_s
     if true_field is not None:
         figures["contacts"] = contacts
         for name in FLOW_FIELDS:

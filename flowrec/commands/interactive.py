@@ -194,6 +194,7 @@ class StatusLine:
         mission, timing = tick.mission, tick.timing
         phase = mission.phase if mission is not None else Phase.START
         wait = f" ({mission.wanted.replace('_', ' ')} ...)" if mission is not None and mission.wanted else ""
+        limit_um_s = mission.speed_limit_um_s if mission is not None else None
         arrivals, latencies = list(self._arrivals), list(self._latency_ms)
         span = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0.0
         rate = (len(arrivals) - 1) / span if span > 0 else 0.0
@@ -204,6 +205,7 @@ class StatusLine:
         parts = [
             *(["HELD"] if mission is not None and mission.held_since_ns is not None else []),
             f"{phase}{wait}",
+            *([f"limit {limit_um_s:g} um/s"] if limit_um_s is not None else []),
             f"{seconds(tick.stamp_ns):.1f} s",
             *([f"{drops} images dropped"] if drops else []),
             f"error {error:.0f} um" if np.isfinite(error) else "no route",

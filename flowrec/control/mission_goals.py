@@ -97,13 +97,17 @@ def on_the_way(
         return previous
     demand = now.demand
     assert demand is not None
+    if isinstance(result, Route):
+        is_kept = np.array_equal(result.goal_um, previous.former_goal_um)
+        # The robot follows it from now on, be it to a goal that was set and is no longer asked for.
+        previous = replace(previous, former_goal_um=result.goal_um)
+        if not is_kept and demand.progress_s > previous.goal_from_s:
+            note = "the robot has passed the place where its way to the goal begins: planning anew"
+            return routine_order(previous, now, Phase.PLAN, note)
     if isinstance(result, Route) and is_current(previous):
         if not np.array_equal(result.goal_um, previous.goal_um):
             kept = refused(previous, result.reason)
             return transition(kept, now, Phase.NAVIGATE, kept.note)
-        if demand.progress_s > previous.goal_from_s:
-            note = "the robot has passed the place where its way to the goal begins: planning anew"
-            return routine_order(previous, now, Phase.PLAN, note)
         on_time_ns = now.now_ns - previous.since_ns - round(1e9 * demand.progress_s)
         adopted = transition(confirmed(previous), now, Phase.NAVIGATE, result.reason)
         return replace(adopted, held_ns=max(previous.held_ns, on_time_ns))

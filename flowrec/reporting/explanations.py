@@ -35,6 +35,8 @@ MEANINGS: dict[str, str] = {
     "route_length_um": "of the route to the goal",
     "planned_s": "of the route, as planned",
     "navigation_s": "taken for the route",
+    "latest_goal": "set by the operator during the run",
+    "speed_limit_um_s": "set by the operator, of the robot through the fluid",
     "contacts": "counted by the simulation",
     "assumed_method": "how the flow was computed before the run",
     "assumed_flow_error": "root mean square difference from the simulated true flow, relative to that flow",

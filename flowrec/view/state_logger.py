@@ -16,6 +16,7 @@ from flowrec.view.entities import EntityLogger
 _MARK_NS = NS_PER_S // 2  # a mark is drawn this long: it has no duration
 _STATES = 200  # of a lane that have a colour of their own: a session of hours may have many marks
 _PHASES = 9  # that have a name in `StateLogger.phases`
+_WITH_TEXT = (Action.MARK, Action.NOTE, Action.GOAL, Action.SPEED)
 _LETTERS = 40  # of a mark's text
 _PHASE_COLOURS: dict[str, Rgb] = {
     Phase.SURVEY: colours.PURPLE,
@@ -65,7 +66,8 @@ class StateLogger:
 
     def log_mark(self, event: OperatorEvent) -> None:
         """A mark or another action of the operator."""
-        text = event.text[:_LETTERS] if event.action in (Action.MARK, Action.NOTE) and event.text else event.action
+        said = f"{event.action} {event.text}" if event.action in (Action.GOAL, Action.SPEED) else event.text
+        text = said[:_LETTERS] if event.action in _WITH_TEXT and event.text else event.action
         self._mark_ends_ns = event.stamp_ns + _MARK_NS
         self._log_state(e.MARKS, text, colours.CYAN)
 

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from flowrec.messages import Mission, Route
 from tests.control.test_mission import GOAL, ROBOT, World, field, route
@@ -104,13 +106,14 @@ def test_the_latest_of_several_goals_wins_and_an_answer_to_an_earlier_one_is_nev
     assert (clicked.request, goal_of(clicked)) == (3, FARTHER)  # one order at a time
     late = world.tick(route=answer(3, AWAY), progress=0.7)
     assert (late.wanted, late.request, goal_of(late)) == ("route", 4, FARTHER)
-    assert late.former_goal_um.tolist() == list(GOAL)
+    assert late.former_goal_um.tolist() == list(AWAY)  # there the route leads that the robot follows meanwhile
     assert not world.tick(at=AWAY, progress=0.8).finished
     # The answer to the earlier goal may as well be that there is no way: that says nothing about this one.
-    world.tick(goal=AWAY, progress=0.9)
-    again = world.tick(route=replace(answer(4, GOAL), reason="too narrow"), progress=0.9)
-    assert (again.wanted, again.request, goal_of(again)) == ("route", 5, AWAY)
-    assert world.tick(route=answer(5, AWAY), progress=1.0).former_goal_um.size == 0
+    world.tick(goal=GOAL, progress=0.9)
+    again = world.tick(route=replace(answer(4, AWAY), reason="too narrow"), progress=0.9)
+    assert (again.wanted, again.request, goal_of(again)) == ("route", 5, GOAL)
+    # And where no way leads on, the goal is that of the route that the robot follows.
+    assert goal_of(world.tick(route=replace(answer(5, AWAY), reason="too narrow"), progress=1.0)) == AWAY
 
 
 def test_a_goal_in_the_very_second_of_an_answer_is_not_answered_by_it() -> None:
@@ -270,3 +273,52 @@ def test_a_survey_that_a_person_slows_is_not_cut_short_as_stuck() -> None:
     world.tick(operator="speed", limit_um_s=20.0)
     for _ in range(50):
         assert world.tick(progress=1.0, error_um=80.0).phase == "survey"
+
+
+ACTIONS = st.sampled_from(["goal", "goal", "wall", "limit", "no limit", "pause", "resume", "unseen", "", "", ""])
+SECONDS = st.tuples(ACTIONS, st.sampled_from([AWAY, FARTHER, GOAL, (100.0, 900.0)]), st.booleans(), st.booleans())
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(SECONDS, max_size=40))
+def test_whatever_a_person_does_one_order_is_under_way_and_only_a_planned_goal_is_reached(
+    script: list[tuple[str, tuple[float, float], bool, bool]],
+) -> None:
+    world = navigating(navigate_limit_s=1e5, patience=1e3)
+    mission, followed, ordered_for = world.mission, GOAL, GOAL
+    assert mission is not None
+    for action, place, answers, reachable in script:
+        results = {}
+        if mission.wanted and answers:
+            if reachable:
+                results["route"], followed = answer(mission.request, ordered_for), ordered_for
+            elif mission.phase == "navigate":  # the worker hands the present route back
+                results["route"] = replace(answer(mission.request, followed), reason="too narrow")
+            else:
+                results["route"] = route(mission.request, reachable=False)
+        before = mission
+        mission = world.tick(
+            at=place if action == "" else (0.0, 500.0),
+            seen=action != "unseen",
+            goal=place if action in ("goal", "wall") else None,
+            fault="it is in a wall" if action == "wall" else "",
+            operator={"limit": "speed", "no limit": "speed"}.get(
+                action, action if action in ("pause", "resume") else ""
+            ),
+            limit_um_s=200.0 if action == "limit" else None,
+            **results,
+        )
+        if mission.request != before.request:
+            assert mission.request == before.request + 1
+            assert not before.wanted or answers or before.request == world.results["route"].request  # type: ignore[attr-defined]
+            ordered_for = goal_of(mission)  # type: ignore[assignment]
+        if mission.finished:
+            # Only where a plan has told that no way is left to a goal that was reached by a plan before.
+            assert mission.outcome in ("reached", "unreachable")
+            if mission.outcome == "reached":
+                assert goal_of(mission) == followed == place
+            return
+        assert np.isfinite(mission.goal_um).all()
+        assert mission.phase in ("navigate", "plan")
+        if mission.phase == "navigate" and not len(mission.former_goal_um):
+            assert goal_of(mission) == followed
