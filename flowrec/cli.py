@@ -1,6 +1,6 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in import_verb.py, doctor_verb.py, push_verb.py, sweep_verb.py, session_verbs.py and
+The other verbs are in import_verb.py, doctor_verb.py, push_verb.py, sweep_verb.py, catalog_verbs.py, session_verbs.py and
 calibrate_verbs.py. Each function parses, calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
@@ -22,6 +22,7 @@ import typer
 import flowrec
 from flowrec.bench.verbs import HELP_WIDTH, AsJson, Overwrite, Sets, bench
 from flowrec.calibrate_verbs import calibrate
+from flowrec.catalog_verbs import catalog, find
 from flowrec.doctor_verb import doctor, look_at_lab
 from flowrec.errors import FlowrecError, printable
 from flowrec.import_verb import import_movie
@@ -246,6 +247,8 @@ def replay(
 app.command("import", epilog=examples("import"))(import_movie)
 app.command("sweep", epilog=examples("sweep"))(sweep)
 app.command("push", epilog=examples("push"))(push)
+app.command("catalog", epilog=examples("catalog"))(catalog)
+app.command("find", epilog=examples("find"))(find)
 for _verb in (doctor, view, export, report, info, list_directory, note, check, recover, compare):
     _name = "ls" if _verb is list_directory else _verb.__name__
     app.command(_name, cls=HelpWithMethods, epilog=examples(_name))(_verb)

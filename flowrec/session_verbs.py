@@ -36,6 +36,11 @@ EXAMPLES = {
         "flowrec sweep s3://lab/runs/ --grid observer=kalman,kalman_map -o sweep.parquet",
     ),
     "push": ("flowrec push a.mcap s3://lab/runs", "flowrec push runs/*.mcap s3://lab/2026"),
+    "catalog": ("flowrec catalog runs", "flowrec catalog runs s3://lab/2026 -o all.parquet"),
+    "find": (
+        "flowrec find \"outcome = 'reached' and refined_flow_error < 0.05\" --sort -duration_s",
+        "flowrec find \"sweep.place = 1 and sweep.refine = 'pi_unet'\" --paths",
+    ),
     "import": ("flowrec import movie.avi lab.toml --coils coils.csv -o a.mcap",),
     "doctor": ("flowrec doctor lab.toml",),
     "view": (
@@ -244,7 +249,8 @@ def list_directory(
     as_json: AsJson = False,
 ) -> None:
     """List sessions, unfinished and unreadable ones included."""
-    from flowrec.commands.ls import columns_for_people, list_sessions
+    from flowrec.commands.listed import columns_for_people
+    from flowrec.commands.ls import list_sessions
 
     places = places or [Path()]
     rows = list_sessions(*places, where=where, sort=sort)

@@ -15,6 +15,7 @@ _COUNTS = frozenset(
     {"ticks", "contacts", "observations", "frames_dropped", "dropped_frames", "frames_missing_from_camera", "seed"}
 )
 _UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns", "_error": "", "_rad": "rad"}
+_WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
@@ -42,7 +43,7 @@ def of_text(text: Mapping[str, str]) -> Figures:
 
     `frames_dropped` is the count of the writer, which older files hold under two names; the larger one is complete.
     """
-    figures = {key: _number(value) if _is_numeric(key) else value for key, value in text.items()}
+    figures = {key: _number(value) if is_numeric(key) else value for key, value in text.items()}
     counts = [figures.pop("dropped_frames", None), figures.get("frames_dropped")]
     numbers = [count for count in counts if isinstance(count, int)]
     return figures | ({"frames_dropped": max(numbers)} if numbers else {})
@@ -91,8 +92,14 @@ def shown(key: str, value: Value) -> str:
     return f"{value:.1f} {_UNITS[suffix]}"
 
 
-def _is_numeric(key: str) -> bool:
+def is_numeric(key: str) -> bool:
+    """Whether the value of a key is a number, by its name."""
     return key in _COUNTS or key.endswith(tuple(_UNITS))
+
+
+def is_count(key: str) -> bool:
+    """Whether that number is whole."""
+    return key in _COUNTS or key.endswith(_WHOLE)
 
 
 def _number(text: str) -> Value:

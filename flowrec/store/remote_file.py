@@ -55,6 +55,10 @@ _remembering = threading.Lock()
 class RemoteFile:
     """An object at a URL (ByteSource).
 
+    Attributes
+    ----------
+    version : the server's word for its content.
+
     Raises
     ------
     SessionError : the server does not answer, in one line; MissingError: it is not there, or access is refused.
@@ -76,6 +80,7 @@ class RemoteFile:
             self.close()
             raise
         self.size = self._object.size
+        self.version = self._object.version
 
     def read(self, offset: int, length: int) -> bytes:
         if not self._closer.alive:

@@ -191,10 +191,19 @@ def read_rows(path: Path) -> list[Row]:
     except (OSError, pa.ArrowException) as error:
         reason = str(error).partition("\n")[0]
         raise SessionError(f"{path}: can not be read as Parquet ({reason}); flowrec sweep writes such files") from error
-    ours = (table.schema.metadata or {}).get(_OURS)
-    if ours is None:
+    if not is_sweep(table.schema):
         raise OutputError(f"{path}: was not written by flowrec sweep, and stays; choose another name")
-    names = json.loads(ours)
+    return rows_of(table)
+
+
+def is_sweep(schema: pa.Schema) -> bool:
+    """Whether a file of this schema was written by `flowrec sweep`."""
+    return _OURS in (schema.metadata or {})
+
+
+def rows_of(table: pa.Table) -> list[Row]:
+    """The rows of the table of a sweep; KeyError or ValueError if it was changed since."""
+    names = json.loads(table.schema.metadata[_OURS])
     rows = []
     for columns in table.to_pylist():
         row = {name: columns[name] for name in COLUMNS}

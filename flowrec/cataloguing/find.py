@@ -1,0 +1,131 @@
+"""`flowrec find`: the sessions of a catalog that fulfil an SQL expression. Reads the catalog and nothing else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flowrec.cataloguing.format import RELATIONS, About, catalog_above, path_of
+from flowrec.cataloguing.sql import AS_LIST, CatalogQuery
+from flowrec.commands.listed import LISTS, Listed, columns_for_people, joined
+from flowrec.errors import printable
+from flowrec.store.session_path import UrlPath
+from flowrec.summary import shown
+
+_SHOWN_ALWAYS = ("name", "outcome", "duration_s", "size_bytes", "chip", "recorded", "path", "tags", "notes_added")
+_IN_FLOW_ERROR = ("assumed_flow_error", "refined_flow_error")
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSessions:
+    """What an expression finds.
+
+    Attributes
+    ----------
+    catalog : the file.
+    rows : values by column, of the session and, where the expression mentions them, of a replay or an event each.
+    mentioned : columns that the expression names.
+    """
+
+    catalog: Path
+    about: About
+    rows: list[dict[str, Any]]
+    mentioned: list[str]
+
+    def paths(self) -> list[str]:
+        """The sessions, each once, as they are named from this folder."""
+        return list(dict.fromkeys(self._path(row) for row in self.rows))
+
+    def as_json(self) -> dict[str, Any]:
+        """All known values of the rows, and what they are from."""
+        rows = [
+            # A list takes the place of its text.
+            {name.removesuffix(AS_LIST): value for name, value in row.items() if value is not None}
+            | {"path": self._path(row)}
+            for row in self.rows
+        ]
+        return {"catalog": str(self.catalog), "made": self.about.made, "of": self.about.sessions, "sessions": rows}
+
+    def remarks(self) -> list[str]:
+        """Why sessions that are no whole ones are not, a line each."""
+        broken = {self._path(row): row["note"] for row in self.rows if row["duration_s"] is None}
+        return [f"{path}: {note}" for path, note in broken.items()]
+
+    def title(self) -> str:
+        """What was found, in what, and how old that is."""
+        number = len({row["path"] for row in self.rows})
+        left = f", {self.about.left} not read yet" if self.about.left else ""
+        made = self.about.made[:16].replace("T", " ")
+        return f"{number} of {self.about.sessions} sessions, as of {made} UTC{left} ({self._relative(self.catalog)})"
+
+    def cells(self, width: int) -> tuple[list[str], list[list[str]]]:
+        """Names of the columns and the cells as `flowrec ls` has them, and what else the expression mentions."""
+        own = ("notes", "replay_of", *_IN_FLOW_ERROR)
+        listed = [
+            Listed(
+                self._path(row),
+                row["outcome"] or "",
+                row["note"] or "",
+                row["size_bytes"] or 0,
+                row["duration_s"],
+                row["chip"] or "",
+                row["recorded"] or "",
+                row["parts"] or 0,
+                {name: row.get(name) for name in own} | {name: row.get(name + AS_LIST) or () for name in LISTS},
+            )
+            for row in self.rows
+        ]
+        more = [name for name in self.mentioned if name not in (*_SHOWN_ALWAYS, *_IN_FLOW_ERROR, *RELATIONS)]
+        values = {name: [_cell(name, row) for row in self.rows] for name in more}
+        taken = sum(3 + max(map(len, (name, *column))) for name, column in values.items())
+        names, lines = columns_for_people(listed, width - taken)
+        at = names.index("notes") if "notes" in names else len(names)  # the notes are last
+        names[at:at] = more
+        for number, line in enumerate(lines):
+            line[at:at] = [column[number] for column in values.values()]
+        return names, lines
+
+    def _path(self, row: Mapping[str, Any]) -> str:
+        return self._relative(path_of(row["path"], self.catalog.parent))
+
+    @staticmethod
+    def _relative(path: Path) -> str:
+        """A path as it is named from this folder, if it is below it."""
+        here = Path().absolute()
+        below = not isinstance(path, UrlPath) and path.is_relative_to(here)
+        return printable(os.path.relpath(path, here) if below else str(path))
+
+
+def find(where: str = "", catalog: Path | None = None, sort: str = "", limit: int | None = None) -> FoundSessions:
+    """The sessions of a catalog for which an SQL expression holds, of the columns of `flowrec ls --where` and more.
+
+    `sweep.refine`, `sweep.replayed_refined_flow_error` and so on are of the session's replays in tables of `flowrec
+    sweep`, `sweep.place` is 1 for the best of them; `events.time_s`, `events.action` and `events.text` are of what the
+    operator did. A session then has a row for each replay or event.
+
+    Parameters
+    ----------
+    catalog : the file, or its folder; None: the one of this folder, or of the next one above that has one.
+    sort : a column, with a leading `-` from the largest.
+    limit : of the number of rows.
+
+    Raises
+    ------
+    UsageError : there is no catalog, or the expression is refused.
+    """
+    path = catalog_above(catalog).absolute()
+    with CatalogQuery(path) as query:
+        mentioned, rows = query.rows(where, sort, limit)
+        return FoundSessions(path, query.about, rows, mentioned)
+
+
+def _cell(name: str, row: Mapping[str, Any]) -> str:
+    relation, _, member = name.partition(".")
+    value = row.get(name)
+    if member:
+        found = {key.lower(): each for key, each in (row.get(relation) or {}).items()}
+        value = found.get(member)
+    return shown(member or name, joined(map(str, value)) if isinstance(value, list) else value)

@@ -1,0 +1,137 @@
+"""What lies in the places of a catalog: sessions with all their files, and what tells whether they have changed.
+
+Folders are searched with all folders below them, but for those that are hidden: file servers keep old versions there.
+Nothing is opened, so ten thousand files take a fraction of a second. A folder in a bucket is listed without those below
+it, a thousand objects a request.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import glob
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flowrec.cataloguing.format import PARQUET
+from flowrec.commands.ls import NAMES, runs_of
+from flowrec.errors import SessionError, UsageError
+from flowrec.store.notes import SUFFIX as NOTES
+from flowrec.store.run_files import run_files, run_path
+from flowrec.store.session_path import UrlPath, session_path
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A session, or a run with all its parts.
+
+    Attributes
+    ----------
+    files : its own, as `commands.ls.runs_of` returns them.
+    signature : text that changes where size or time, at a URL the version, of a file or of its notes does.
+    has_notes : there are notes beside it.
+    """
+
+    path: Path
+    files: Sequence[Path]
+    signature: str
+    has_notes: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What places hold: sessions in order of name, and tables that may be those of sweeps."""
+
+    sessions: list[Found] = field(default_factory=list)
+    tables: list[Path] = field(default_factory=list)
+
+
+def contents_of(places: Iterable[Path], without: Path) -> Contents:
+    """What lies in folders, and the sessions and tables that are named.
+
+    Parameters
+    ----------
+    without : the catalog itself.
+
+    Raises
+    ------
+    SessionError : a place is not there, or can not be listed.
+    UsageError : a place is neither a folder nor a session.
+    """
+    marks: dict[Path, str] = {}
+    for place in places:
+        marks.update(_listed(session_path(place)))
+    tables = [path for path in marks if path.name.endswith(PARQUET) and path != without]
+    found = []
+    for path, files in runs_of(path for path in marks if path.name.endswith(NAMES)).items():
+        notes = path.with_name(path.name + NOTES)
+        marked = [f"{file.name} {marks[file]}" for file in (*files, *((notes,) if notes in marks else ()))]
+        signature = hashlib.sha256("\n".join(marked).encode(errors="surrogateescape")).hexdigest()[:32]
+        found.append(Found(path, files, signature, notes in marks))
+    return Contents(found, sorted(tables))
+
+
+def _listed(place: Path) -> Mapping[Path, str]:
+    """Size and time, or version, of the files of a place: sessions, notes and tables."""
+    if isinstance(place, UrlPath):
+        return _versions(place)
+    place = place.absolute()
+    if place.is_dir():
+        return {Path(entry.path): _mark(entry.stat()) for entry in _entries(str(place))}
+    files = [place] if place.is_file() else run_files(place)
+    if not files:
+        raise SessionError(f"{place}: no such directory or session; flowrec catalog takes directories and sessions")
+    if not all(_is_wanted(file.name) for file in files):
+        raise UsageError(f"{place}: is no session and no table of flowrec sweep; name .mcap files and directories")
+    notes = [file for file in (place.with_name(place.name + NOTES),) if file.is_file()]
+    return {file: _mark(file.stat()) for file in (*files, *notes)}
+
+
+def _versions(place: UrlPath) -> Mapping[Path, str]:
+    """Size and version of what a URL names: a folder in a bucket without those below it, a pattern, or a session."""
+    from flowrec.store.remote_file import RemoteFile
+    from flowrec.store.remote_folder import is_listed, objects_in
+
+    if not is_listed(place):
+        with contextlib.closing(RemoteFile(place)) as file:
+            return {place: f"{file.size} {file.version}"}
+    pattern = place.name if glob.has_magic(place.name) else ""
+    single = not pattern and place.name.endswith((*NAMES, *PARQUET))
+    folder = place.parent if pattern or single else place
+    assert isinstance(folder, UrlPath)
+    found: dict[Path, str] = {}
+    for path, listed in objects_in(folder, place.stem if single else ""):
+        session = path.name.removesuffix(NOTES)
+        named = not single or path.with_name(session) == place or run_path(path) == place
+        if _is_wanted(path.name) and named and (not pattern or fnmatch.fnmatchcase(session, pattern)):
+            found[path] = f"{listed.size} {listed.version}"
+    if single and not found:
+        raise SessionError(f"{place}: is not there (404); check the name")
+    return found
+
+
+def _entries(folder: str) -> Iterator[os.DirEntry[str]]:
+    """The files of a folder and of all below it; a link to a folder is not followed, it may lead in a circle."""
+    try:
+        with os.scandir(folder) as listing:
+            entries = list(listing)
+    except OSError as error:
+        raise SessionError(f"{folder}: can not be listed ({error.strerror}); check its permissions") from error
+    for entry in entries:
+        if entry.name.startswith("."):
+            continue
+        if entry.is_dir(follow_symlinks=False):
+            yield from _entries(entry.path)
+        elif _is_wanted(entry.name) and entry.is_file():
+            yield entry
+
+
+def _is_wanted(name: str) -> bool:
+    return name.endswith((*NAMES, NOTES, *PARQUET))
+
+
+def _mark(stat: os.stat_result) -> str:
+    return f"{stat.st_size} {stat.st_mtime_ns}"
