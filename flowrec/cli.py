@@ -1,7 +1,7 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in import_verb.py, doctor_verb.py, push_verb.py, sweep_verb.py, catalog_verbs.py, session_verbs.py and
-calibrate_verbs.py. Each function parses, calls and prints, with late imports.
+The other verbs are in import_verb.py, doctor_verb.py, push_verb.py, sweep_verb.py, catalog_verbs.py, session_verbs.py
+and calibrate_verbs.py. Each function parses, calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
