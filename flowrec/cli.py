@@ -96,6 +96,9 @@ def record(
     ] = None,
     sets: Sets = None,
     view: Annotated[View, typer.Option(help="Watch live (spawn, serve) or write an .rrd at the end.")] = "none",
+    console: Annotated[
+        bool, typer.Option("--console", help="Serve a page on this machine: buttons, goal by a click, large stop.")
+    ] = False,
     realtime: Annotated[bool, typer.Option("--realtime", help="Run the simulated rig in real time.")] = False,
     duration: Annotated[float | None, typer.Option(metavar="S", help="Stop after this many seconds.")] = None,
     dry_run: Annotated[
@@ -146,7 +149,7 @@ def record(
         raise typer.Exit(int(failed))
     inputs = [config] if config is not None else []
     realtime = realtime or chosen.rig == MOVIE  # `import` takes a movie as fast as it can be read
-    recorded = flowrec.record(chosen, out, view, realtime, overwrite, AtTerminal(), inputs)
+    recorded = flowrec.record(chosen, out, view, realtime, overwrite, AtTerminal(), inputs, console=console)
 
     def summarize() -> None:
         if as_json:

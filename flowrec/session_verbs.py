@@ -28,7 +28,11 @@ METHODS = {
 
 # What a person may type, at the end of the help of each verb.
 EXAMPLES = {
-    "record": ("flowrec record --goal 5200,1400", "flowrec record lab.toml -o run.mcap --split 2GB,10min"),
+    "record": (
+        "flowrec record --goal 5200,1400",
+        "flowrec record lab.toml -o run.mcap --split 2GB,10min",
+        "flowrec record --console --realtime",
+    ),
     "replay": ("flowrec replay a.mcap --refine", "flowrec replay a.mcap --plan astar_time --refly -o b.mcap"),
     "sweep": (
         "flowrec sweep 'runs/*.mcap' --grid refine=fvm,assimilate --grid observer=kalman,kalman_map -o sweep.parquet",

@@ -9,7 +9,7 @@ from contextlib import ExitStack, nullcontext, suppress
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,10 @@ from flowrec.clocks import ClockMonitor
 from flowrec.commands.auto_recovery import recover_leftovers
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded, figures_of, files_text
+from flowrec.commands.watching import View, Watching
 from flowrec.config import Config, ResolvedConfig, registration_of
+from flowrec.console.console import refuse_without_packages
+from flowrec.console.messages import Ended
 from flowrec.enums import Outcome, Phase
 from flowrec.errors import MovieError, SessionError, UnreachableError, UsageError
 from flowrec.estimation.sampler import SAMPLERS
@@ -47,16 +50,11 @@ from flowrec.system.processes import realtime_priority
 from flowrec.terminal import say, warn
 from flowrec.topics import Tick
 
-if TYPE_CHECKING:
-    from flowrec.view.live import LiveView
-
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
 VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last messages
 _GIVE_UP_TIMEOUT_S = 1.0  # to close the file while the main thread hangs
 _LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
-
-View = Literal["spawn", "serve", "rrd", "none"]
 
 
 class Prepared(NamedTuple):
@@ -209,6 +207,7 @@ def record(
     inputs: Sequence[Path] = (),
     keep_failed: bool = True,
     given_facts: Mapping[str, str] | None = None,
+    console: bool = False,
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -223,11 +222,14 @@ def record(
     inputs : files that were read besides those that `config` names; no output may be one of them.
     keep_failed : False: a run that ends by an exception leaves no file, and one that it was to replace stays.
     given_facts : more for the provenance in the head of the file.
+    console : serve a page on this machine that shows the run and steers it.
 
     Raises
     ------
     FlowrecError : any of its kinds; a stage, a rig or a worker may raise others.
     """
+    if console:
+        refuse_without_packages()
     inputs = (*inputs, *_files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
@@ -275,23 +277,21 @@ def record(
         )
         opened.append(writer)
         sinks: list[Sink] = [writer, statistics]
-        live: LiveView | None = None
         worker: Worker
-        if view in ("spawn", "serve"):
-            # Imported here because importing Rerun takes a second and most runs do not need it.
-            from flowrec.exports.rrd import scene_of
-            from flowrec.view.live import LiveView
-
-            live = LiveView(scene_of(resolved, chip, pipeline, path), view)
-            stack.callback(_say_what_stays, live)  # after it is closed
-            stack.enter_context(live)
-            say(live.message)
-            sinks.append(live)
         worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, resolved.worker.adopt_after_s)
         stack.callback(worker.close)
         if fields:
             worker = Preloaded(worker, fields)
         disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
+        watching = stack.enter_context(
+            Watching(
+                view,
+                (resolved, chip, pipeline, path),
+                run_control if console else None,
+                lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": resolved.duration_s},
+            )
+        )
+        sinks += watching.sinks
         # A run that is not in real time never waits: with real-time priority it would occupy a core.
         priority = realtime_priority() if realtime else nullcontext(enter_result=False)
         with control.shown(writer, disk) as show, priority as first:
@@ -326,8 +326,9 @@ def record(
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
         writer.close(outcome, CLOSE_TIMEOUT_S if run_control.reason else None, why=bad)
         _report_remarks(writer)
-        if live is not None and run_control.reason:
-            live.close(VIEW_TIMEOUT_S)
+        told = report.outcome + (f" ({report.note})" if report.note else "")
+        ended = Ended(told, files_text(path, tuple(writer.files)), good=not bad)
+        watching.close(ended, VIEW_TIMEOUT_S if run_control.reason else None)
     facts["frames_dropped"] = writer.dropped_frames  # the writer has added it to the outcome of the file
     files = tuple(writer.files)
     recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason), source)
@@ -385,11 +386,6 @@ def _files_of(config: Config) -> list[Path]:
         files += files_behind(Path(config.start.field))
     movie = config.movie
     return [*files, *(Path(name) for name in (movie.path, movie.times, movie.coils) if name)]
-
-
-def _say_what_stays(live: LiveView) -> None:
-    if live.afterwards:
-        say(live.afterwards)
 
 
 def _report_remarks(writer: SessionWriter) -> None:

@@ -1,0 +1,162 @@
+"""The routes of the console: its page, the connection of each page, and Rerun's web viewer."""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import json
+import math
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.resources import files
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.types import ASGIApp
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from flowrec.console.access import Access
+from flowrec.console.board import MOST_PAGES, Board, Shown
+from flowrec.console.console import GOAL, SPEED
+from flowrec.console.rerun_viewer import RerunViewer
+from flowrec.run.operator_commands import COMMANDS, LONGEST_NOTE
+
+_PERIOD_S = 0.1  # from one state to the next of a page
+_FROZEN_S = 30.0  # a page that takes nothing for so long is let go
+_MOST_PER_S = 10  # commands of all pages together, except those that end the run
+_ALWAYS = frozenset({"stop", "zero"})
+_PAGE = files("flowrec.console") / "page"
+_TYPES = {"css": "text/css", "js": "text/javascript", "html": "text/html"}
+
+Answer = Callable[[dict[str, Any]], None]
+
+
+def application(board: Board, token: str, port: int, rerun_port: int | None, answer: Answer) -> ASGIApp:
+    """The ASGI application.
+
+    Parameters
+    ----------
+    port : of this server.
+    rerun_port : of Rerun's server; None without one.
+    answer : hands a command to the run.
+    """
+    commands = _Commands(board, answer)
+    viewer = RerunViewer(rerun_port)
+
+    async def page(_request: Request) -> Response:
+        rows = [
+            {"name": row.name, "key": row.key, "words": row.words, "meaning": row.meaning} for row in COMMANDS.values()
+        ]
+        facts = json.dumps({"commands": rows, "longest_note": LONGEST_NOTE, "rerun": rerun_port is not None})
+        return _file("console.html", {"FACTS": html.escape(facts), "NAME": html.escape(board.name)})
+
+    async def part(request: Request) -> Response:
+        return _file(request.path_params["name"])
+
+    async def live(socket: WebSocket) -> None:
+        await socket.accept()
+        if not board.enter():
+            await socket.close(1013, f"{MOST_PAGES} pages are open already: close one")
+            return
+        sending = asyncio.create_task(_send(board, socket))
+        try:
+            while True:
+                await socket.send_text(json.dumps(commands.take(await socket.receive_text())))
+        except WebSocketDisconnect:
+            pass
+        finally:
+            sending.cancel()
+            board.leave()
+
+    routes = [
+        Route("/", page),
+        Route("/page/{name}", part),
+        WebSocketRoute("/live", live),
+        *viewer.routes(lambda: _file("viewer.html")),
+    ]
+    return Access(Starlette(routes=routes), token, port)
+
+
+async def _send(board: Board, socket: WebSocket) -> None:
+    """Send a page what is new, at most some times per second, until the run has ended."""
+    shown = Shown()
+    with suppress(WebSocketDisconnect, RuntimeError):  # the page was closed
+        while True:
+            news = await board.news(shown)
+            shown = news.shown
+            frozen = False
+            try:
+                async with asyncio.timeout(_FROZEN_S):
+                    await socket.send_text(news.words)
+                    if news.picture is not None:
+                        await socket.send_bytes(news.picture)
+            except TimeoutError:
+                frozen = True
+            if frozen or news.last:
+                await socket.close()
+                return
+            await asyncio.sleep(_PERIOD_S)
+
+
+class _Commands:
+    """What pages ask for, checked and handed on at once: nothing that is sent to a page is before it in a queue."""
+
+    def __init__(self, board: Board, answer: Answer) -> None:
+        self._board, self._answer = board, answer
+        self._given_s: list[float] = []
+
+    def take(self, text: str) -> dict[str, Any]:
+        """Hand a message of a page to the run; what to answer the page."""
+        number: Any = None
+        try:
+            asked = json.loads(text)
+            number = asked.get("number")
+            words = self._words(asked)
+            self._answer(words)
+        except OSError:
+            refusal = "the run has ended"
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            refusal = f"not understood: {error}"
+        else:
+            refusal = ""
+        return {"answers": number, "refusal": refusal}
+
+    def _words(self, asked: dict[str, Any]) -> dict[str, Any]:
+        name = asked["command"]
+        if name not in _ALWAYS:
+            now_s = time.monotonic()
+            self._given_s = [given_s for given_s in self._given_s if now_s - given_s < 1.0]
+            if len(self._given_s) >= _MOST_PER_S:
+                raise ValueError("too many at once; wait a second")
+            self._given_s.append(now_s)
+        if name == GOAL:
+            x_um, y_um = self._board.chip_um(*_finite(asked["x_px"], asked["y_px"]))
+            return {"command": name, "x_um": x_um, "y_um": y_um}
+        if name == SPEED:
+            limit = asked["limit_um_s"]
+            return {"command": name, "limit_um_s": None if limit is None else _finite(limit)[0]}
+        return {"command": COMMANDS[name].name, "text": str(asked.get("text", ""))[:LONGEST_NOTE]}
+
+
+def _finite(*given: Any) -> tuple[float, ...]:
+    numbers = tuple(float(each) for each in given)
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("not a number")
+    return numbers
+
+
+def _file(name: str, words: dict[str, str] | None = None) -> Response:
+    """A file of the page."""
+    suffix = name.rpartition(".")[2]
+    # The name comes from a browser: it is looked up, never joined to a path.
+    found = next((each for each in _PAGE.iterdir() if each.name == name), None)
+    if found is None or suffix not in _TYPES:
+        return PlainTextResponse("no such file\n", 404)
+    text = found.read_text(encoding="utf-8")
+    for word, value in (words or {}).items():
+        text = text.replace(f"{{{{{word}}}}}", value)
+    return Response(text, media_type=_TYPES[suffix])

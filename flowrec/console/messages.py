@@ -1,0 +1,33 @@
+"""What the run tells the process of the console, besides its ticks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from flowrec.view.scene import Scene
+
+STAYS = "flowrec: shows its pages how the run ended"  # what the process says last; it ends by itself a moment later
+
+
+class Begin(NamedTuple):
+    """The first.
+
+    Attributes
+    ----------
+    token : that a browser must know.
+    name : of the session's file.
+    rerun_port : of Rerun's server on this machine; None without one.
+    """
+
+    token: str
+    name: str
+    scene: Scene
+    rerun_port: int | None
+
+
+class Ended(NamedTuple):
+    """The last: how the run ended, and where its file is."""
+
+    outcome: str
+    files: str = ""
+    good: bool = False  # it reached its end, or was ended on purpose

@@ -1,0 +1,139 @@
+"""What the console's page shows of a run: numbers and words, the camera's image, and what is drawn over it.
+
+All that is drawn lies where the image shows it, also where a refinement has found another registration than stated.
+Pixels are those of the camera's image, counted from the corner of the first one, as a browser counts them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.enums import Phase
+from flowrec.errors import printable
+from flowrec.store.viewer_scene import ChipCamera
+from flowrec.topics import Tick
+from flowrec.units import seconds
+from flowrec.view.feed import Batch
+from flowrec.view.scene import Scene
+from flowrec.view.status_bar import state_text
+
+# What the page shows depends on these fields of a tick.
+SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
+_QUALITY = 80  # of the JPEG
+_EDGE_PX = 3  # of the mask's border, so that its openings are not drawn as walls
+_SMOOTHING_PX = 0.7  # of the walls, in pixels of the mask
+
+Drawing = dict[str, Any]
+
+
+class PageState:
+    """The ticks so far of one run."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.tick = Tick()
+        self.remarks: dict[str, Any] = {}
+        self._scene = scene
+        self._camera = ChipCamera(scene.calibration, _size_px(scene), scene.robot.radius_um)
+        self._image = self._camera.picture(None)
+        self._walls_um = _outlines(scene)
+        self._step = 1
+
+    def take(self, batch: Batch) -> list[dict[str, Any]]:
+        """Take over what has happened; the events for people among it."""
+        events = []
+        for changes in batch.changes:
+            self.tick = replace(self.tick, **changes)
+            event = changes.get("event")
+            if event is not None:
+                events.append({"s": round(seconds(event.stamp_ns), 2), "level": event.level, "text": event.text})
+            if changes.get("refined") is not None:
+                self._image = self._camera.picture(self.tick.refined.registration)  # type: ignore[union-attr]
+        self._step = batch.step
+        self.remarks = batch.remarks
+        return events
+
+    def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
+        """The place on the chip that the image shows there."""
+        x, y = (self._image.matrix @ np.array([x_px - 0.5, y_px - 0.5, 1.0])).tolist()
+        return x, y
+
+    def drawing(self) -> Drawing:
+        """What moves rarely: walls, route, goal; and the sizes."""
+        width, height = self._camera.size_px
+        route, mission = self.tick.route, self.tick.mission
+        goal = mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
+        return {
+            "width": width,
+            "height": height,
+            "um_per_px": self._scene.calibration.um_per_px,
+            "radius": round(self._scene.length_px(self._scene.robot.radius_um), 2),
+            "top_speed": self._scene.robot.max_speed_um_s,
+            "walls": [self._pixels(line) for line in self._walls_um],
+            "route": self._pixels(route.waypoints_um) if route is not None and route.reachable else [],
+            "goal": None if goal is None else self._pixels(goal[None])[0],
+            "goal_um": None if goal is None else [round(each) for each in goal.tolist()],
+        }
+
+    def state(self) -> dict[str, Any]:
+        """What changes with each tick."""
+        tick, mission, estimate = self.tick, self.tick.mission, self.tick.estimate
+        field = tick.currents
+        at = None if estimate is None else self._scene.to_plane(estimate.position_um).tolist()
+        error_um = tick.demand.error_um if tick.demand is not None else math.nan
+        return {
+            "time_s": round(seconds(max(tick.stamp_ns, 0)), 2),
+            "state": state_text(mission, estimate) or Phase.START.value,
+            "waits_for": mission.wanted.replace("_", " ") if mission is not None else "",
+            "held": mission is not None and mission.held_since_ns is not None,
+            "observing": mission is not None and mission.phase == Phase.OBSERVE,
+            "robot": None if at is None or not np.isfinite(at).all() else [round(each, 1) for each in at],
+            "seen": estimate is not None and estimate.seen,
+            "error_um": round(error_um) if math.isfinite(error_um) else None,
+            "field": "off"
+            if field is None or field.amplitude_mt == 0.0
+            else f"{field.amplitude_mt:.1f} mT, {field.frequency_hz:.1f} Hz",
+            "speed_limit_um_s": mission.speed_limit_um_s if mission is not None else None,
+            "losses": self._losses(),
+            **self.remarks,
+        }
+
+    def picture(self) -> bytes | None:
+        """The last image as JPEG, each `step`-th pixel of it; None without one."""
+        frame = self.tick.frame
+        if frame is None or not frame.image.size:
+            return None
+        image = frame.image if frame.bits == 8 else (frame.image >> (frame.bits - 8)).astype(np.uint8)
+        done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        assert done
+        return bytes([min(self._step, 255)]) + data.tobytes()
+
+    def _losses(self) -> list[str]:
+        timing, losses = self.tick.timing, self.tick.losses
+        counts = {"not written": 0 if timing is None else timing.dropped_frames}
+        if losses is not None:
+            counts |= {"link": losses.link, "incomplete": losses.incomplete}
+            counts |= {"driver": losses.driver, "too late": losses.backlog}
+        return [printable(f"{count} {what}") for what, count in counts.items() if count]
+
+    def _pixels(self, points_um: NDArray[np.float64]) -> list[list[float]]:
+        found: list[list[float]] = np.round(self._image.to_px(np.asarray(points_um, np.float64)), 1).tolist()
+        return found
+
+
+def _size_px(scene: Scene) -> tuple[int, int]:
+    left, top, right, bottom = scene.image_bounds()
+    return round(right - left), round(bottom - top)
+
+
+def _outlines(scene: Scene) -> list[NDArray[np.float64]]:
+    """The walls (n, 2) in um: outlines of the fluid, which go on beyond the mask at its openings."""
+    padded = np.pad(scene.chip.mask.astype(np.uint8), _EDGE_PX, mode="edge")
+    found, _ = cv2.findContours(padded, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    lines = [cv2.approxPolyDP(line, _SMOOTHING_PX, closed=True)[:, 0] for line in found]
+    return [(line.astype(np.float64) - _EDGE_PX) * scene.chip.um_per_px for line in lines if len(line) > 2]

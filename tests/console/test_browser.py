@@ -1,0 +1,157 @@
+"""The console in Chromium: a run is steered by clicks, its recording replays the same, and other pages get nothing."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowrec.chip import load_chip
+from flowrec.commands import replay as again
+from flowrec.config import calibration_of, load_config
+from flowrec.console.console import PACKAGES
+from flowrec.messages import OperatorEvent
+from flowrec.resolve import resolve
+from flowrec.session import Session
+from flowrec.store.reader import SessionReader
+from tests.conftest import HANG_S
+from tests.short_missions import LONG
+
+for _package in ("playwright.sync_api", *PACKAGES):
+    pytest.importorskip(_package)
+CHROMIUM = next(
+    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
+)
+pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium")
+
+# The camera is turned and mirrored, so that a click is nowhere where it would be without its calibration.
+CAMERA = ["camera.angle_deg=90", "camera.mirror=true", "camera.width_px=256", "camera.height_px=320"]
+GOAL_UM = np.array([3140.0, 1220.0])  # in the upper channel
+HANG_MS = 1000.0 * HANG_S
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=CHROMIUM)
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    words = [word for setting in [*LONG, *CAMERA] for word in ("--set", setting)]
+    command = [sys.executable, "-m", "flowrec", "record", "--realtime", "--console", "--out", str(tmp_path / "a.mcap")]
+    with subprocess.Popen([*command, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        yield process
+        process.kill()
+
+
+def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
+    run: subprocess.Popen[str], tmp_path: Path, browser: Any
+) -> None:
+    out = tmp_path / "a.mcap"
+    assert run.stdout is not None
+    said = next(line for line in run.stdout if line.startswith("console: "))
+    url = said.split()[1]
+    address, _, token = url.partition("?token=")
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    context.set_default_timeout(HANG_MS)
+    page = context.new_page()
+    faults: list[str] = []
+    page.on("pageerror", lambda error: faults.append(str(error)))
+    page.on("console", lambda line: faults.append(line.text) if line.type == "error" else None)
+    page.goto(url)
+    page.wait_for_url(address)  # the token has left the address bar
+    page.locator("#robot[cx]").wait_for()
+    page.locator("#events li").first.wait_for()
+    assert token not in page.evaluate("document.cookie + document.documentElement.outerHTML")
+
+    closed, frozen = context.new_page(), context.new_page()
+    for other in (closed, frozen):
+        other.goto(address)
+        other.locator("#robot[cx]").wait_for()
+    closed.close()
+    context.new_cdp_session(frozen).send("Page.setWebLifecycleState", {"state": "frozen"})
+
+    # A page of another program of this machine has the cookie, but not the origin.
+    strange = context.new_page()
+    strange.route(
+        "http://127.0.0.1:1/", lambda route: route.fulfill(body="<title>strange</title>", content_type="text/html")
+    )
+    strange.goto("http://127.0.0.1:1/")
+    tried = strange.evaluate(
+        """(address) => new Promise((done) => {
+            const socket = new WebSocket(address.replace("http", "ws") + "live");
+            socket.onopen = () => done("open");
+            socket.onerror = () => done("refused");
+        })""",
+        address,
+    )
+    assert tried == "refused"
+    strange.close()
+
+    def event(words: str) -> Any:
+        return page.locator("#events li", has_text=words).first
+
+    for width, height in ((1280, 800), (820, 1180), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        box = page.locator("#stop").bounding_box()
+        assert box["y"] >= 0.0
+        assert box["y"] + box["height"] <= height  # without scrolling
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.set_viewport_size({"width": 1280, "height": 800})
+    page.keyboard.press("m")
+    event("mark: 1").wait_for()
+    page.get_by_role("button", name="mark (key m)").click()
+    event("mark: 2").wait_for()
+    page.keyboard.press("n")
+    page.get_by_role("textbox", name="Note").fill("m q ! look")  # the keys are letters here
+    page.keyboard.press("Enter")
+    event("note: m q ! look").wait_for()
+    page.keyboard.press("Space")  # although the last click was on a button
+    event("held by the operator").wait_for()
+    page.get_by_role("button", name="hold, go on").click()
+    event("goes on after").wait_for()
+    page.get_by_role("spinbutton", name="Speed limit").fill("90")
+    page.get_by_role("button", name="Set", exact=True).click()
+    page.locator("#limit", has_text="90 µm/s").wait_for()
+    asked_for = load_config(None, [*LONG, *CAMERA])
+    chip = load_chip(asked_for.chip)
+    column, row = calibration_of(resolve(asked_for, chip), chip).to_px(GOAL_UM) + 0.5
+    scale = page.locator("#drawing").bounding_box()["width"] / 256.0
+    page.locator("#drawing").click(position={"x": column * scale, "y": row * scale})
+    event("goal set to").wait_for()
+    page.get_by_role("button", name=re.compile("^STOP")).click()
+    page.locator("#alert", has_text=str(out)).wait_for()
+    assert page.get_by_role("button", name=re.compile("^STOP")).is_disabled()
+    text, _ = run.communicate(timeout=HANG_S)
+    assert run.returncode == 0, text
+    assert faults == []
+    context.close()
+
+    ticks = list(SessionReader(out).ticks(with_frames=False))
+    asked: list[OperatorEvent] = []
+    for before, tick in pairwise(ticks):
+        if tick.operator is None or tick.operator is before.operator:
+            continue
+        asked.append(tick.operator)
+        if tick.operator.action == "zero":  # on that very tick
+            assert before.currents.amplitude_mt > 0.0  # type: ignore[union-attr]
+            assert tick.currents.amplitude_mt == 0.0  # type: ignore[union-attr]
+    assert [each.action for each in asked] == ["mark", "mark", "note", "pause", "resume", "speed", "goal", "zero"]
+    speed, goal, stop = asked[-3:]
+    assert (speed.speed_limit_um_s, stop.text) == (90.0, "operator: zero field (console)")
+    np.testing.assert_allclose(goal.goal_um, GOAL_UM, atol=Session(out).calibration.um_per_px)
+    done = again.replay(out, again.Change(), verify=True)
+    assert done.comparison.identical, str(done.comparison.first)
