@@ -18,6 +18,7 @@ from flowrec.config import load_config
 from flowrec.messages import OperatorEvent
 from flowrec.run.control import RunControl
 from flowrec.store.reader import SessionReader
+from flowrec.system.outputs import MCAP, Output
 from flowrec.topics import Tick
 from flowrec.units import seconds
 from tests.short_missions import SMALL
@@ -148,7 +149,8 @@ def test_it_replays_identically_from_every_tick_at_which_something_was_set_order
     starts = [None, *sorted(after)]
     assert len(starts) > 15
     ends = [stamp - 1 for stamp in sorted(after)] + [stamps[-1]]
-    for start, end in zip(starts, ends, strict=True):
+    # The last segment first: what a stage hides would otherwise be as the segment before has left it.
+    for start, end in reversed(list(zip(starts, ends, strict=True))):
         done = replay(path, verify=True, segment_ns=(start, end))
         assert done.identical, (seconds(start or 0), done.lines())
 
@@ -162,5 +164,10 @@ def test_another_planner_and_a_flight_in_the_simulator_go_to_the_goals_that_were
     assert ticks[-1].mission is not None
     np.testing.assert_array_equal(done.replayed.mission.goal_um, ticks[-1].mission.goal_um)
     assert {route.method for route in (done.replayed.route,) if route is not None} == {"astar_time"}
-    rows = {key: (was, now) for key, was, now in refly(done, None)}
+    out = path.with_name("reflown.mcap")
+    rows = {key: (was, now) for key, was, now in refly(done, Output(out, MCAP))}
     assert rows["reflown_outcome"] == ("reached", "reached")
+    flight = SessionReader(out)
+    mission = flight.tick_before(flight.last_ns + 1).mission
+    assert mission is not None
+    np.testing.assert_array_equal(mission.goal_um, ticks[-1].mission.goal_um)
