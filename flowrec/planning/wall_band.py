@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.planning.cost_rasters import NEIGHBOUR_X, NEIGHBOUR_Y, Mask, Raster
 from flowrec.system.numba_setup import compiled
@@ -27,7 +28,11 @@ def extend_to_walls(times: Raster, free: Mask, clearance: Raster, need: float, s
     # A border of solid pixels without a time spares the kernel the question whether a neighbour exists.
     padded = np.pad(times, 1, constant_values=np.inf)
     solid = np.pad(clearance, 1, constant_values=-1.0)
-    _fill_band(padded, np.pad(free, 1), solid, need, _BAND_TOLL / speed, _TORN_PX / speed)
+    inside = np.pad(free, 1)
+    # Breadth-first from the free pixels beside the band: the number of steps from them, -1 before they are counted.
+    # Made here, because numba takes seconds to compile `where`.
+    layer = np.where(inside, 0, -1)
+    _fill_band(padded, inside, layer, solid, need, _BAND_TOLL / speed, _TORN_PX / speed)
     band = padded[1:-1, 1:-1]
     # Beyond the border nothing is known, and no camera looks there: half a pixel counts as lacking.
     half = 0.5 * _BAND_TOLL / speed
@@ -37,11 +42,11 @@ def extend_to_walls(times: Raster, free: Mask, clearance: Raster, need: float, s
 
 
 @compiled
-def _fill_band(times: Raster, free: Mask, clearance: Raster, need: float, toll: float, torn: float) -> None:
+def _fill_band(
+    times: Raster, free: Mask, layer: NDArray[np.int64], clearance: Raster, need: float, toll: float, torn: float
+) -> None:
     h, w = free.shape
     fluid = clearance > 0.0
-    # Breadth-first from the free pixels beside the band; `layer` is the number of steps from them.
-    layer = np.where(free, 0, -1)
     rows = np.empty(h * w, np.int64)
     columns = np.empty(h * w, np.int64)
     tail = 0

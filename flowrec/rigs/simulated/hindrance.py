@@ -82,7 +82,11 @@ def carried(gap: float) -> float:
     gap = max(gap, _LEAST_GAP)
     if gap > 9.0:
         return 1.0 - 5.0 / 16.0 / (1.0 + gap) ** 3
-    return float(np.interp(math.log(gap), _LAG_AT, _LAG))
+    at = math.log(gap)
+    k = 0  # np.interp takes seconds to compile
+    while at >= _LAG_AT[k + 1]:
+        k += 1
+    return (_LAG[k + 1] - _LAG[k]) / (_LAG_AT[k + 1] - _LAG_AT[k]) * (at - _LAG_AT[k]) + _LAG[k]
 
 
 @compiled
