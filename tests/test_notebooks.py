@@ -6,9 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
@@ -31,6 +29,9 @@ def kinds(notebook: Any) -> list[list[str]]:
 def test_the_notebook_runs_from_top_to_bottom_and_shows_what_is_stored(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import nbformat  # seconds, with jsonschema: not in each worker
+    from nbclient import NotebookClient
+
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))  # not every user may write to a home
     notebook = nbformat.read(path, as_version=4)
     # Minutes of work, by benches that have tests of their own: it is enough that they are stored with what they drew.

@@ -48,6 +48,7 @@ _HOPELESS = 0.4  # part of the walls found by grey levels below which local cont
 _RELIEF_FOUND, _RELIEF_MORE = 0.9, 0.1  # part of the walls found by local contrast, and by how much less by grey levels
 _KNOTS = 12  # of f on either side of the wall
 _ALL_KNOTS = 2 * _KNOTS + 1
+_BEND = np.diff(np.eye(_ALL_KNOTS), 2, axis=0).T @ np.diff(np.eye(_ALL_KNOTS), 2, axis=0)
 _TUKEY = 4.685
 _LIKE = 0.5  # correlation of a patch's profile with f from which on the patch counts as found
 _LEAST_PIXELS = 30  # of a patch
@@ -289,20 +290,32 @@ class _Model:
         self, weight: NDArray[np.float64], values: NDArray[np.float64], gain: NDArray[np.float64] | float = 1.0
     ) -> NDArray[np.float64]:
         """The g at the knots that minimises sum weight / gain (values - gain g(d))^2, with a little smoothness."""
-        low, part = self._low, self._part
-        own = weight * gain
-        upper = np.bincount(low, own * (1 - part) ** 2, _ALL_KNOTS)
-        diagonal = np.asarray(upper + np.bincount(low + 1, own * part**2, _ALL_KNOTS), np.float64)
-        beside = np.bincount(low, own * part * (1 - part), _ALL_KNOTS)[:-1]
-        right = np.bincount(low, weight * (1 - part) * values, _ALL_KNOTS)
-        right = right + np.bincount(low + 1, weight * part * values, _ALL_KNOTS)
+        return np.asarray(np.linalg.solve(self._normal(weight * gain), self._on_knots(weight * values)))
+
+    def _normal(self, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(knots, knots) matrix of the normal equations for g at the knots, with a little smoothness."""
+        upper = weight * self._part
+        both = upper * self._part
+        # (1 - part)^2, part^2 and part (1 - part) from the sums of 1, part and part^2 between two knots.
+        one, first, second = (
+            np.asarray(np.bincount(self._low, each, _ALL_KNOTS), np.float64) for each in (weight, upper, both)
+        )
+        diagonal = one - 2.0 * first + second
+        diagonal[1:] += second[:-1]
+        beside = (first - second)[:-1]
         matrix: NDArray[np.float64] = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
-        bend = np.diff(np.eye(_ALL_KNOTS), 2, axis=0)
-        matrix += 1e-4 * max(float(diagonal.mean()), 1e-9) * (bend.T @ bend) + 1e-9 * np.eye(_ALL_KNOTS)
-        return np.asarray(np.linalg.solve(matrix, right))
+        matrix += 1e-4 * max(float(diagonal.mean()), 1e-9) * _BEND
+        return matrix + 1e-9 * np.eye(_ALL_KNOTS)
+
+    def _on_knots(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(knots,) sums of values (n,), of which each knot gets its share."""
+        upper = np.bincount(self._low, self._part * values, _ALL_KNOTS)
+        found = np.bincount(self._low, values, _ALL_KNOTS) - upper
+        found[1:] += upper[:-1]
+        return np.asarray(found, np.float64)
 
     def _at(self, profile: NDArray[np.float64]) -> NDArray[np.float64]:
-        return (1 - self._part) * profile[self._low] + self._part * profile[self._low + 1]
+        return profile.take(self._low) + self._part * np.diff(profile).take(self._low)
 
     def _light(
         self, f: NDArray[np.float64], values: NDArray[np.float64]
@@ -330,11 +343,15 @@ class _Model:
         slope = np.gradient(self._profile) * _KNOTS / self._reach_um
         gain = self.gain[self._patch]
         jacobian: NDArray[np.float64] = (gain * self._at(slope))[:, None] * self._of_d
+        weighted = self._weight * gain
+        inverse = np.linalg.inv(self._normal(weighted * gain))
+        total = np.bincount(self._patch, self._weight, self._count) + 1e-9
         for column in range(4):
             values = jacobian[:, column]
             for _ in range(2):
-                values = values - gain * self._at(self._solve(self._weight * gain, values, gain))
-                values = values - _mean(self._patch, self._weight, values, self._count)[self._patch]
+                values = values - gain * self._at(inverse @ self._on_knots(weighted * values))
+                mean = np.bincount(self._patch, self._weight * values, self._count) / total
+                values = values - mean[self._patch]
             jacobian[:, column] = values
         return jacobian
 

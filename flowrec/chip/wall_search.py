@@ -252,7 +252,8 @@ class Search:
         normals = self._normals[inside] @ calibration.axes.T
         across = (normals[:, 0] + 1j * normals[:, 1]) ** 2
         cells = cells_at(at[inside], z.shape)
-        agreement = across.real * cells.interpolate(z.real) + across.imag * cells.interpolate(z.imag)
+        real, imaginary = cells.interpolate(z.view(np.float32).reshape(height, width, 2)).T
+        agreement = across.real * real + across.imag * imaginary
         return float(agreement.mean()) * math.sqrt(float(inside.mean()))
 
 

@@ -7,9 +7,7 @@ import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import nbformat
 import pytest
-from nbclient import NotebookClient
 from typer.testing import CliRunner
 
 import flowrec
@@ -38,6 +36,9 @@ def payloads(path: Path) -> dict[str, list[tuple[int, bytes]]]:
 
 
 def test_replays_in_threads_and_in_a_notebook_make_the_bytes_that_the_verb_makes(tmp_path: Path) -> None:
+    import nbformat  # seconds, with jsonschema: not in each worker
+    from nbclient import NotebookClient
+
     by_verb = tmp_path / "verb.mcap"
     words = ["replay", str(GOLDEN), "--plan", "astar_length", "--out", str(by_verb), "--json"]
     done = CliRunner().invoke(app, words)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pynwb
 
 import flowrec
 
@@ -11,6 +10,8 @@ GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
 
 def test_images_pose_coils_and_flow_are_those_of_the_session_with_units(tmp_path):
+    import pynwb  # most of a second: not in each worker
+
     session = flowrec.open(GOLDEN)
     path = flowrec.export(GOLDEN, tmp_path / "x.nwb", file_format="nwb")
     with pynwb.NWBHDF5IO(str(path), "r") as io:

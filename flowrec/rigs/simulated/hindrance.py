@@ -86,7 +86,7 @@ def carried(gap: float) -> float:
     k = 0  # np.interp takes seconds to compile
     while at >= _LAG_AT[k + 1]:
         k += 1
-    return (_LAG[k + 1] - _LAG[k]) / (_LAG_AT[k + 1] - _LAG_AT[k]) * (at - _LAG_AT[k]) + _LAG[k]
+    return float((_LAG[k + 1] - _LAG[k]) / (_LAG_AT[k + 1] - _LAG_AT[k]) * (at - _LAG_AT[k]) + _LAG[k])
 
 
 @compiled
