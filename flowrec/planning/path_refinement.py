@@ -48,6 +48,7 @@ def refine_path(
     """
     if weight is None:
         weight = np.ones_like(rasters.clearance)
+    path = np.ascontiguousarray(path)  # kernels are compiled for each layout
     for step in dict.fromkeys((max(spacing, SPACING_PX), spacing)):
         chords = _with_chords(path, rasters, weight)
         # Every vertex stays: to omit one would cut the corner of a wall. A single step would have no point to move.
@@ -104,7 +105,7 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
     chord_costs = np.empty(len(chord))
     costs, floors = _legs(path, rasters, weight)
     kept = np.empty((n, 2))
-    kept[0] = path[0]
+    kept[0, 0], kept[0, 1] = path[0, 0], path[0, 1]
     count = 1
     i = 0
     while i < n - 1:
@@ -125,7 +126,7 @@ def _with_chords(path: Points, rasters: CostRasters, weight: Raster) -> Points:
                     chord[k, 1] = y0 + (y1 - y0) * k / legs
                 if _cost(chord, legs, rasters, weight, math.inf, chord_costs) <= spent:
                     best = j
-        kept[count] = path[best]
+        kept[count, 0], kept[count, 1] = path[best, 0], path[best, 1]
         count += 1
         i = best
     return kept[:count]
@@ -181,8 +182,10 @@ def _with_bumps(
                         x0, y0, x1, y1 = moved[k, 0], moved[k, 1], moved[k + 1, 0], moved[k + 1, 1]
                         good = lowest_clearance(clearance, x0, y0, x1, y1) >= floors[first + k] - 1e-9
                     if good:
-                        points[first : last + 1] = moved[: last - first + 1]
-                        costs[first:last] = new_costs[: last - first]
+                        for k in range(last - first):
+                            costs[first + k] = new_costs[k]
+                        for k in range(last - first + 1):
+                            points[first + k, 0], points[first + k, 1] = moved[k, 0], moved[k, 1]
                         accepted += 1
                         break
             # A height at which hardly any bump is kept has done its work.

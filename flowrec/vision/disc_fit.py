@@ -80,12 +80,18 @@ def fit_disc(
         rim_std = 0.5 * abs(trial[_DARKNESS]) + 1.0
         cost += _prior(normal, slope, _RIM, RIM_RATIO * trial[_DARKNESS] - trial[_RIM], rim_std, unit)
         if cost <= best_cost:
-            best[:], best_normal[:], best_slope[:] = trial, normal, slope
+            for a in range(_PARAMETERS):
+                best[a], best_slope[a] = trial[a], slope[a]
+                for b in range(_PARAMETERS):
+                    best_normal[a, b] = normal[a, b]
             best_cost, best_variance, likeness = cost, variance, candidate_likeness
             damping = max(0.2 * damping, 1e-6)
         else:
             damping = min(10.0 * damping, 1e3)
-        normal[:], move[:] = best_normal, best_slope
+        for a in range(_PARAMETERS):
+            move[a] = best_slope[a]
+            for b in range(_PARAMETERS):
+                normal[a, b] = best_normal[a, b]
         _solve(normal, move, damping)
         length = math.hypot(move[_X], move[_Y])
         shrink = min(1.0, 0.5 * radius_px / max(length, 1e-9))
@@ -100,7 +106,8 @@ def fit_disc(
             scale2 = _CAUCHY * max(best_variance, 1.0)
             best_cost = math.inf
         elif strict and length < _CONVERGED_PX * step:
-            best[:] = trial
+            for a in range(_PARAMETERS):
+                best[a] = trial[a]
             break
     return best[_X] + x, best[_Y] + y, best[_RADIUS], best[_DARKNESS], likeness
 
