@@ -25,9 +25,19 @@ def catalog(
             "--out", "-o", help="Catalog to write (.parquet); by default flowrec-catalog.parquet in the directory."
         ),
     ] = None,
+    serve: Annotated[
+        bool,
+        typer.Option("--serve", help="Then serve sessions to Rerun's viewer and catalog clients of this machine."),
+    ] = False,
+    where: Annotated[str, typer.Option(metavar="SQL", help="With --serve: of which sessions, as of find.")] = "",
+    port: Annotated[
+        int | None, typer.Option(metavar="PORT", min=1, max=65535, help="With --serve; by default a free one.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write one table about all sessions of some places, which find searches; only what has changed is read again."""
+    if not serve and (where or port is not None):
+        raise typer.BadParameter("--where and --port go with --serve; flowrec find searches a catalog")
     from flowrec.cataloguing.refresh import refresh
     from flowrec.terminal import progress, say
 
@@ -37,7 +47,10 @@ def catalog(
         typer.echo(json.dumps(refreshed.as_json()))
     for line in refreshed.lines():
         say(line)
-    raise typer.Exit(130 if refreshed.left else 0)
+    if refreshed.left:
+        raise typer.Exit(130)
+    if serve:
+        _serve(refreshed.path, where, port)
 
 
 def find(
@@ -78,3 +91,23 @@ def find(
         table(found.title(), *found.cells(width()), text="notes")
         for line in found.remarks():
             say(line)
+
+
+def _serve(catalog: Path, where: str, port: int | None) -> None:
+    """Serve until Ctrl-C or a signal to end."""
+    import signal
+    import threading
+
+    from flowrec.cataloguing.serve import recordings_of
+    from flowrec.terminal import say
+    from flowrec.view.catalog_server import DATASET, served
+
+    recordings = recordings_of(catalog, where, say)
+    with served(recordings, port) as url:
+        ended = threading.Event()
+        before = {each: signal.signal(each, lambda *_: ended.set()) for each in (signal.SIGINT, signal.SIGTERM)}
+        say(f"{url}: dataset {DATASET} of {len(recordings)}; open it with: rerun {url}")
+        say("Ctrl-C ends the server")
+        ended.wait()
+        for each, handler in before.items():
+            signal.signal(each, handler)

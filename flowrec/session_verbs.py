@@ -40,7 +40,11 @@ EXAMPLES = {
         "flowrec sweep s3://lab/runs/ --grid observer=kalman,kalman_map -o sweep.parquet",
     ),
     "push": ("flowrec push a.mcap s3://lab/runs", "flowrec push runs/*.mcap s3://lab/2026"),
-    "catalog": ("flowrec catalog runs", "flowrec catalog runs s3://lab/2026 -o all.parquet"),
+    "catalog": (
+        "flowrec catalog runs",
+        "flowrec catalog runs s3://lab/2026 -o all.parquet",
+        "flowrec catalog runs --serve --where \"sweep.place = 1 and sweep.refine = 'pi_unet'\"",
+    ),
     "find": (
         "flowrec find \"outcome = 'reached' and refined_flow_error < 0.05\" --sort -duration_s",
         "flowrec find \"sweep.place = 1 and sweep.refine = 'pi_unet'\" --paths",

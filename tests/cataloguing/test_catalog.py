@@ -35,6 +35,7 @@ from flowrec.system.locks import open_new
 from flowrec.system.outputs import OutputError
 from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
+from tests.store.s3_server import BUCKET, s3_server
 
 PROVENANCE = {"operator": "Zoë", "wall_time": "2026-05-04T10:00:00+00:00"}
 
@@ -425,3 +426,29 @@ def test_find_needs_neither_pyarrow_nor_numpy(catalogued: Path) -> None:
 @pytest.fixture(autouse=True)
 def _no_catalog_above(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+
+
+def test_sessions_in_a_bucket_are_catalogued_by_a_listing_and_read_again_where_the_version_differs(
+    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with s3_server(monkeypatch) as server:
+        for path in (lab / "a.mcap", lab / "a.mcap.notes.jsonl", lab / "may" / "b.mcap", lab / "sweep.parquet"):
+            server.client.upload_file(str(path), BUCKET, f"runs/{path.name}")
+        made_up(tmp_path / "near.mcap", 9)
+        out = tmp_path / "c.parquet"
+        assert refresh.refresh([f"s3://{BUCKET}/runs", tmp_path], out).new == 3
+        assert find("outcome = 'reached' and tags like '%bubble%'", out).paths() == [f"s3://{BUCKET}/runs/a.mcap"]
+        assert find("sweep.refine = 'pi_unet'", out).paths() == [f"s3://{BUCKET}/runs/a.mcap"]
+        server.requests.clear()
+        assert refresh.refresh([], out).changed == 0
+        assert not [url for _, url in server.requests if url.endswith(".mcap")]
+        server.client.upload_file(str(tmp_path / "near.mcap"), BUCKET, "runs/b.mcap")
+        assert refresh.refresh([], out).changed == 1
+        before = out.read_bytes()
+        server.fault = lambda *_: 403
+        for place in (f"s3://{BUCKET}/runs", f"s3://{BUCKET}/runs/a.mcap"):
+            with pytest.raises(FlowrecError, match="credentials"):
+                refresh.refresh([place], out)
+        assert out.read_bytes() == before
+    with pytest.raises(UsageError, match="a query, a user or a password"):
+        refresh.refresh(["s3://key:secret@lab/runs"], out)
