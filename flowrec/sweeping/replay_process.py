@@ -55,15 +55,17 @@ def replayed(task: Task, memory_bytes: int | None = None) -> Row:
     task = replace(task, memory_bytes=task.memory_bytes or memory_bytes)
     row: Row = {}
     for _ in range(_ATTEMPTS):
-        process: _Process = getattr(_of_thread, "process", None) or _Process()
-        _of_thread.process = process
+        process: _Process | None = getattr(_of_thread, "process", None)
         try:
+            process = _of_thread.process = process or _Process()
             return process.row(task)
         except _EndedError as ended:
             _of_thread.process = None
             limited = isinstance(ended, _LimitError)
             text = str(ended) if limited else f"it has ended {_ATTEMPTS} processes ({ended}), and is set aside"
-            row = failed(task, text) | {"wall_s": process.lasted_s, "peak_memory_bytes": process.peak_bytes}
+            row = failed(task, text)
+            if process is not None:  # None: it has ended before it was ready
+                row |= {"wall_s": process.lasted_s, "peak_memory_bytes": process.peak_bytes}
             if limited:
                 break
     return row

@@ -7,11 +7,13 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flowrec.commands.ls import TOGETHER
 from flowrec.errors import SessionError, UsageError
 from flowrec.session import Session, session_sha256
 from flowrec.store.run_files import SUFFIX, part_number, run_files, run_path
@@ -194,21 +196,35 @@ class Sessions:
         found: dict[str, Path] = {}
         left_out: list[str] = []
         unreadable = 0
-        for number, path in enumerate(files):
-            progress(number)
-            try:
-                session = Session(path)
-                if session.header.parent:
+        with ThreadPoolExecutor(TOGETHER) as threads:
+            # Each at a URL waits for its server; files of this machine are read faster one after the other.
+            read = (
+                threads.map(_content, files)
+                if any(isinstance(file, UrlPath) for file in files)
+                else map(_content, files)
+            )
+            for number, (path, content) in enumerate(zip(files, read, strict=True)):
+                progress(number)
+                if isinstance(content, SessionError):
+                    left_out.append(str(content))
+                    unreadable += 1
+                    continue
+                if not content:
                     left_out.append(f"{path.name}: is a replay, and is passed over")
                     continue
-                first = found.setdefault(content_of(session), path)
-            except SessionError as error:
-                left_out.append(str(error))
-                unreadable += 1
-                continue
-            if first is not path:
-                left_out.append(f"{path.name}: holds the same as {first.name}, and is replayed once")
+                first = found.setdefault(content, path)
+                if first is not path:
+                    left_out.append(f"{path.name}: holds the same as {first.name}, and is replayed once")
         if not found:
             more = f"; {left_out[0]}" if left_out else ""
             raise UsageError(f"no session that can be replayed is among {len(files)} files{more}")
         return cls(found, left_out, unreadable)
+
+
+def _content(path: Path) -> str | SessionError:
+    """Hash of the content of a session; '' of a replay."""
+    try:
+        session = Session(path)
+        return "" if session.header.parent else content_of(session)
+    except SessionError as error:
+        return error

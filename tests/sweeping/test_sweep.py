@@ -151,9 +151,13 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         "    if what == 'orphan' and not killed.exists(): killed.touch(); os.kill(os.getppid(), 9)",
         "    if what == 'once' and not killed.exists(): killed.touch(); os.kill(os.getpid(), 9)",
         "    return {'key': task.key, 'session': what, 'pid': os.getpid()}",
+        "def ready():",
+        f"    at_start = pathlib.Path({str(tmp_path / 'at_start')!r})",
+        "    if at_start.exists(): at_start.unlink(); os.kill(os.getpid(), 9)",
+        "    sys.modules['__main__']._row = row",
         "for name, content in (",
         "    ('flowrec.commands.replay', {'FIXED': (), 'Change': None}), ('flowrec.commands.replay_report', {}),",
-        "    ('flowrec.planning', {'warm_up': lambda: setattr(sys.modules['__main__'], '_row', row)}),",
+        "    ('flowrec.planning', {'warm_up': ready}),",
         "):",
         "    sys.modules[name] = Hazard(name)",
         "    vars(sys.modules[name]).update(content)",
@@ -167,9 +171,13 @@ def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         process._end()
 
 
-def test_what_hangs_eats_memory_or_kills_its_process_is_named_and_the_rest_is_done(planted: None) -> None:
+def test_what_hangs_eats_memory_or_kills_its_process_is_named_and_the_rest_is_done(
+    planted: None, tmp_path: Path
+) -> None:
     good = Task("good", "c", ())
-    pid = replayed(good)["pid"]
+    (tmp_path / "at_start").touch()
+    pid = replayed(good)["pid"]  # of the second process; the first was killed before it was ready
+    assert not (tmp_path / "at_start").exists()
     assert replayed(good)["pid"] == pid  # warm
     assert "took longer than 0.3 s" in replayed(Task("hang", "c", (), timeout_s=0.3))["error"]
     eaten = replayed(Task("eat", "c", ()), memory_bytes=300_000_000)
