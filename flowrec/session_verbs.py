@@ -85,6 +85,10 @@ RrdOut = Annotated[
 ]
 
 
+def _places(named: list[Path] | None) -> list[Path]:
+    return [session_path(place) for place in named or [Path()]]
+
+
 def examples(verb: str) -> str:
     """The examples of a verb as the end of its help."""
     return "\n\n".join(["Examples:", *EXAMPLES[verb]])
@@ -248,7 +252,12 @@ def info(
 
 def list_directory(
     places: Annotated[
-        list[Path] | None, typer.Argument(metavar="[PLACE]...", help="Directories and sessions; by default this one.")
+        list[Path] | None,
+        typer.Argument(
+            metavar="[PLACE]...",
+            callback=_places,
+            help="Directories and sessions, also in a bucket (s3://lab/runs/); by default this one.",
+        ),
     ] = None,
     where: Annotated[
         str, typer.Option(metavar="SQL", help="Only sessions for which this holds, of the facts of flowrec info.")
@@ -260,14 +269,13 @@ def list_directory(
     from flowrec.commands.listed import columns_for_people
     from flowrec.commands.ls import list_sessions
 
-    places = places or [Path()]
-    rows = list_sessions(*places, where=where, sort=sort)
+    rows = list_sessions(*(places or ()), where=where, sort=sort)
     if as_json:
         typer.echo(json.dumps([row.as_json() for row in rows]))
         return
     from flowrec.terminal import say, table, width
 
-    table(", ".join(map(str, places)), *columns_for_people(rows, width()), text="notes")
+    table(", ".join(map(str, places or ())), *columns_for_people(rows, width()), text="notes")
     for row in rows:
         if row.duration_s is None:
             say(f"{row.name}: {row.note}")

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowrec.commands.check import check
 from flowrec.errors import SessionError, UsageError
 from flowrec.session import session_sha256
 from flowrec.store.bucket_upload import Bucket, Content, StoreError, content_of_file
@@ -124,7 +123,7 @@ def _advance(bar: Progress, before: int, nbytes: int) -> None:
 
 
 def _folder(target: str) -> UrlPath:
-    folder = session_path(target.rstrip("/") + "/")
+    folder = session_path(target)
     if not isinstance(folder, UrlPath) or not str(folder).startswith("s3://"):
         raise UsageError(
             f"{target}: is no folder of S3, as in s3://lab/runs (AWS_ENDPOINT_URL names any store with its interface); "
@@ -158,6 +157,8 @@ def _pushed(bucket: Bucket, session: Path, file: Path, done: Callable[[int], Non
         return _pushed_notes(bucket, file)
     stored = bucket.stored(file.name)
     if stored is None:
+        from flowrec.commands.check import check  # late: it takes a second
+
         verdict = check(file)
         if verdict.exit_status == 1:
             worst = next(each.text for each in verdict.findings if each.level == "bad")

@@ -66,11 +66,11 @@ def requests_for(url: str, timeout_s: float) -> ObjectRequests:
 
     Raises
     ------
-    UsageError : the packages of the extra `remote` are not installed.
+    UsageError : the packages of the extra `remote` are not installed, or the URL names a bucket or host alone.
     SessionError : the URL can not name an object.
     """
     if not url.partition("://")[2].partition("/")[2]:
-        raise SessionError(f"{url}: names no object; name a session in it, as in {url.rstrip('/')}/run.mcap")
+        raise UsageError(f"{url}: names no object; name a session in it, as in {url.rstrip('/')}/run.mcap")
     try:
         return _Http(url) if url.startswith("http") else _Bucket(url, timeout_s)
     except ImportError as error:

@@ -1,8 +1,9 @@
 """A session at a URL as a source of bytes: few requests, many at a time, and one version of the object.
 
-Opening asks for the first and the last 256 KiB together: they hold head, index and outcome of most sessions. Both are
-remembered for a while, because a session is opened several times in a row. What `prefetch` announces is fetched at
-once, a bounded number of bytes ahead. Each answer must be of the object that was opened.
+Opening asks for the first and the last 256 KiB together: they hold head, index and outcome of most sessions. Both, and
+the rest of a longer index, are remembered for a while, because a session is opened several times in a row. What
+`prefetch` announces is fetched at once, a bounded number of bytes ahead. Each answer must be of the object that was
+opened.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flowrec.errors import SessionError
@@ -23,6 +24,7 @@ from flowrec.store.traffic import TRAFFIC, MissingError, answered, timeout_s
 _END_BYTES = 256 << 10
 _AHEAD_BYTES = 48 << 20
 _GAP_BYTES, _JOINED_BYTES = 64 << 10, 8 << 20
+_NEAR_BYTES = 1 << 20  # what is read so near before the known end is fetched up to it
 _REMEMBERED, _REMEMBERED_S = 64, 60.0
 _TOGETHER = 8  # objects that are opened at a time
 
@@ -88,11 +90,17 @@ class RemoteFile:
         end = min(offset + length, self.size)
         if end <= offset:
             return b""
-        for known in self._object.ends:
+        opened = self._object
+        for known in opened.ends:
             if known.first <= offset and end <= known.first + len(known.data):
                 return known.data[offset - known.first : end - known.first]
         ahead = self._taken(offset, end)
-        answer = ahead.result() if ahead is not None else self._unannounced(offset, end)
+        if ahead is not None:
+            answer = ahead.result()
+        elif end > opened.ends[1].first - _NEAR_BYTES and opened.ends[1].first - offset <= _JOINED_BYTES:
+            answer = self._longer_tail(opened, offset)
+        else:
+            answer = self._unannounced(offset, end)
         return answer.data[offset - answer.first : end - answer.first]
 
     def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
@@ -147,6 +155,18 @@ class RemoteFile:
         with self._lock:
             self._block = block
         return block
+
+    def _longer_tail(self, opened: _Opened, offset: int) -> Answer:
+        """The end of the object from an offset on, remembered: a long index, and what stands before it."""
+        head, tail = opened.ends
+        first = max(0, offset - _GAP_BYTES)
+        more = self._range(first, tail.first - first)
+        longer = replace(tail, data=more.data + tail.data, first=first)
+        self._object = replace(opened, ends=(head, longer))
+        with _remembering:
+            if _remembered.get(self._url) is opened:
+                _remembered[self._url] = self._object
+        return longer
 
     def _opened(self) -> _Opened:
         with _remembering:

@@ -10,7 +10,7 @@ from pathlib import Path
 from flowrec.errors import SessionError
 from flowrec.store.object_requests import Listed, listing
 from flowrec.store.session_path import UrlPath
-from flowrec.store.traffic import answered
+from flowrec.store.traffic import MissingError, answered
 
 _WEB = ("http://", "https://")
 
@@ -46,7 +46,7 @@ def files_at(place: UrlPath, suffixes: Sequence[str]) -> list[Path]:
 
     Raises
     ------
-    SessionError : the folder can not be listed, or a pattern is not in the last part of the URL.
+    SessionError : the folder can not be listed, holds nothing, or a pattern is not in the last part of the URL.
     """
     if glob.has_magic(str(place.parent)):
         raise SessionError(f"{place}: a pattern at a URL stands after its last slash, as in s3://lab/runs/*.mcap")
@@ -56,6 +56,8 @@ def files_at(place: UrlPath, suffixes: Sequence[str]) -> list[Path]:
     folder = place.parent if pattern else place
     assert isinstance(folder, UrlPath)
     found = [path for path, _ in objects_in(folder, pattern.partition("*")[0] if "[" not in pattern else "")]
+    if not found:
+        raise MissingError(f"{place}: no file is there; check the name, or name a folder in it")
     return [
         path
         for path in found

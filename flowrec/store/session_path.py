@@ -46,8 +46,6 @@ def session_path(named: Path | str) -> Path:
             f"{found[1].lower()}://{host.rpartition('@')[2].partition('?')[0]}/...: a URL with a query, a user or a "
             "password is not taken, because names of sessions are recorded; give credentials in the environment"
         )
-    if "/" not in rest:
-        raise UsageError(f"{text}: names no object; name a session in it, as in {text}/run.mcap, or {text}/ to list it")
     return UrlPath(f"{found[1].lower()}://{rest}")
 
 

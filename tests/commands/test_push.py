@@ -94,20 +94,21 @@ def test_the_same_again_sends_nothing_and_other_content_is_never_replaced(server
         assert len(refused.files) == 1 and content(server, "large.mcap") == changed
 
 
-@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize(("parts", "same"), [(LARGE_PARTS, True), (LARGE_PARTS, False), (1, False)])
 def test_an_object_that_comes_during_the_push_is_compared_and_not_replaced(
-    server: S3Server, large: Path, same: bool
+    server: S3Server, large: Path, parts: int, same: bool
 ) -> None:
-    other = large.read_bytes() if same else b"of somebody else"
+    path = large if parts > 1 else SESSION
+    other = path.read_bytes() if same else b"of somebody else"
 
     def meanwhile(method: str, url: str) -> None:
-        if method == "POST" and "uploadId" in url:
+        if method == ("POST" if parts > 1 else "PUT") and url.endswith(".mcap") != ("uploadId" in url):
             server.fault = lambda *_: None
-            server.client.put_object(Bucket=BUCKET, Key="runs/large.mcap", Body=other)
+            server.client.put_object(Bucket=BUCKET, Key=f"runs/{path.name}", Body=other)
 
     server.fault = meanwhile
-    done = push([large], TARGET)
-    assert (done.exit_status, content(server, "large.mcap")) == (int(not same), other)
+    done = push([path], TARGET)
+    assert (done.exit_status, content(server, path.name)) == (int(not same), other)
     assert not server.client.list_multipart_uploads(Bucket=BUCKET).get("Uploads")
 
 

@@ -115,6 +115,12 @@ def show(figures: dict[str, Any]) -> None:
         )
 
 
+def write_sparse(path: Path, load: Load, gigabytes: float) -> None:
+    """Write a session of that size."""
+    for _ in _write(path, load, gigabytes * 1e9 / (load.width_px * load.height_px * load.rate_hz), True):
+        pass
+
+
 def _write(path: Path, load: Load, seconds_long: float, with_frames: bool) -> Iterator[float]:
     """Write chunks as the writer does, without the pixels; yields the time written, s."""
     draft: Draft = small_draft()

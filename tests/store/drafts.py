@@ -169,7 +169,7 @@ _UNTROUBLED = {"rate": 1.0, "unit": 0.0, "bits": 8} | dict.fromkeys(_COUNTS_OF_F
 
 def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Generator) -> Message:
     """A message of some type with shapes that fit and numbers that mean nothing."""
-    lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4, "o": 2, "p": 6}
+    lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4, "o": 2, "p": 6, "q": 2}
     shapes = {each.name: each.shape.lengths for each in message_fields(kind) if each.shape is not None}
     arrays = dict(array_fields(kind))
     values: dict[str, Any] = {}

@@ -10,10 +10,12 @@ from flowrec.errors import SessionError, printable
 from flowrec.store.channels import SLOTS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
+from flowrec.store.session_path import session_path
 from tests.store.drafts import (
     small_draft,
     text,
 )
+from tests.store.range_server import served
 
 _CHUNK_OPCODE = 6
 
@@ -34,8 +36,14 @@ def file_of(tmp_path, draft):
 
 
 def refused(path, match):
-    """Reading says so in one line."""
+    """Reading says so in one line, of the file and of the file at a URL, of which no more is asked for than it has."""
+    with served(path.parent) as server:
+        for place in (path, session_path(f"{server.url}/{path.name}")):
+            _refused(place, match)
+        assert sum(nbytes for _, nbytes in server.requests) <= 3 * path.stat().st_size
 
+
+def _refused(path, match):
     def read():
         with SessionReader(path) as reader:
             _ = reader.header

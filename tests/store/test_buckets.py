@@ -128,14 +128,15 @@ def test_a_folder_and_a_pattern_in_a_bucket_are_listed_and_swept(bucket: S3Serve
     assert [content_of(Session(url)) for url in both] == [content_of(Session(SESSION)), content_of(Session(run))]
     for wrong, said in [
         (f"s3://{BUCKET}/*/x.mcap", "stands after its last slash"),
-        (f"s3://{BUCKET}/none/", "no session"),
+        (f"s3://{BUCKET}/none/", "no file is there"),
+        (f"s3://{BUCKET}/runs/x.partial*", "no session"),
         ("s3://other/runs/", r"is not there \(404\)"),
     ]:
         with pytest.raises(FlowrecError, match=said) as caught:
             session_files([wrong])
         assert not any(secret in str(caught.value) for secret in KEYS.values())
     with pytest.raises(UsageError, match="names no object"):
-        session_path("s3://lab")
+        flowrec.open(f"s3://{BUCKET}")
 
 
 def test_the_notes_of_a_session_in_a_bucket_are_printed_and_none_is_added(bucket: S3Server) -> None:

@@ -57,6 +57,17 @@ def test_a_session_is_opened_in_two_requests(server: RangeServer) -> None:
     assert len(server.requests) == 2
 
 
+def test_an_index_longer_than_the_end_that_is_fetched_first_is_fetched_once(
+    server: RangeServer, session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(remote_file, "_END_BYTES", 4 << 10)
+    near = flowrec.open(session)
+    for far in (flowrec.open(server.url), flowrec.open(server.url)):
+        assert (far.header, far.outcome, far.topics) == (near.header, near.outcome, near.topics)
+    of_the_end = [first for first, _ in server.requests if first > session.stat().st_size - (1 << 20)]
+    assert len(of_the_end) == 2
+
+
 def test_a_second_of_ticks_is_fetched_alone(server: RangeServer, session: Path) -> None:
     far = flowrec.open(server.url)
     near = [tick.stamp_ns for tick in flowrec.open(session).ticks(2.0, with_frames=False) if tick.stamp_ns < 3e9]
