@@ -13,6 +13,7 @@ import urllib3
 
 KEYS = {"AWS_ACCESS_KEY_ID": "KEY-OF-THE-LAB", "AWS_SECRET_ACCESS_KEY": "SECRET-OF-THE-LAB", "AWS_REGION": "us-east-1"}
 BUCKET = "lab"
+_NO_UPLOAD = b"<Error><Code>NoSuchUpload</Code></Error>"  # how S3 answers 404 for an upload that has ended
 # Method and URL with its query -> status to answer instead, or None.
 Fault = Callable[[str, str], int | None]
 
@@ -43,8 +44,9 @@ class S3Server:
             if status is None:
                 return app(environ, start)
             environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
-            start(f"{status} No", [("Content-Length", "0")])
-            return [b""]
+            body = _NO_UPLOAD if status == 404 else b""
+            start(f"{status} No", [("Content-Length", str(len(body)))])
+            return [body]
 
         class Handler(WSGIRequestHandler):
             def log(self, *_: object) -> None:
