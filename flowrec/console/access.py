@@ -26,7 +26,9 @@ _POLICY = (
 )
 # A page of its own rather than a redirect: a browser sends a cookie of SameSite=Strict with a request that this page
 # makes, not with a redirect of one that a link elsewhere has made. It replaces the address with the token.
-_WELCOME = '<!doctype html><title>flowrec</title><meta http-equiv="refresh" content="0; url=/">'
+_WELCOME = (
+    '<!doctype html><title>flowrec</title><link rel="icon" href="data:,"><meta http-equiv="refresh" content="0; url=/">'
+)
 REFUSED = "flowrec: refused; open the address that the terminal shows, with its token\n"
 
 

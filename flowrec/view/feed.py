@@ -28,6 +28,7 @@ from flowrec.topics import Tick
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
 _POLL_S = 0.02
+_AFTER_TICK_S = 0.001  # for the loop to end it
 _NO_IMAGE = np.zeros((0, 0), np.uint8)
 _FIELDS = tuple(field.name for field in fields(Tick))
 
@@ -80,7 +81,7 @@ class Feed:
         self._frame: Frame | None = None  # the latest, with its image
         self.dropped = 0  # ticks that were not shown, because the process could not keep up or has ended
         self.ended = False
-        self._closing = threading.Event()
+        self._closing, self._ticked = threading.Event(), threading.Event()
         with tempfile.NamedTemporaryFile(prefix="flowrec-view-", suffix=".log", delete=False) as log:
             self._log = Path(log.name)
             try:
@@ -109,6 +110,7 @@ class Feed:
         if len(self._queue) == _QUEUE_TICKS:
             self.dropped += 1
         self._queue.append(tick)
+        self._ticked.set()
 
     @property
     def closing(self) -> bool:
@@ -134,6 +136,7 @@ class Feed:
         """
         self._last = last
         self._closing.set()
+        self._ticked.set()
         end = time.monotonic() + timeout_s
         self._thread.join(timeout_s)
         while self.process.poll() is None and not (stays and self.said(stays)) and time.monotonic() < end:
@@ -161,7 +164,12 @@ class Feed:
         try:
             _send(pipe, self._first)
             while not self.ended:
-                closing = self._closing.wait(self._period_s)
+                if not self._closing.wait(self._period_s):
+                    # Just after a tick, while the loop waits for the camera: to pickle holds the interpreter's lock.
+                    self._ticked.clear()
+                    self._ticked.wait(self._period_s)
+                    time.sleep(_AFTER_TICK_S)
+                closing = self._closing.is_set()
                 if closing or self._queue:
                     batch, sent = self._batch(sent)
                     _send(pipe, batch)
