@@ -59,8 +59,8 @@ def written(path: Path, base: Path) -> str:
     """A path as the catalog in the folder `base` states it: relative below that folder, so that both can be moved."""
     if isinstance(path, UrlPath):
         return str(path)
-    absolute = path.absolute()
-    return (absolute.relative_to(base) if absolute.is_relative_to(base) else absolute).as_posix()
+    text, above = path.absolute().as_posix(), base.as_posix().rstrip("/") + "/"
+    return text.removeprefix(above) if path != base else "."
 
 
 def path_of(text: str, base: Path) -> Path:

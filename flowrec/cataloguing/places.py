@@ -32,13 +32,11 @@ class Found:
     ----------
     files : its own, as `commands.ls.runs_of` returns them.
     signature : text that changes where size or time, at a URL the version, of a file or of its notes does.
-    has_notes : there are notes beside it.
     """
 
     path: Path
     files: Sequence[Path]
     signature: str
-    has_notes: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +63,14 @@ def contents_of(places: Iterable[Path], without: Path) -> Contents:
     for place in places:
         marks.update(_listed(session_path(place)))
     tables = [path for path in marks if path.name.endswith(PARQUET) and path != without]
+    noted = any(path.name.endswith(NOTES) for path in marks)
     found = []
     for path, files in runs_of(path for path in marks if path.name.endswith(NAMES)).items():
-        notes = path.with_name(path.name + NOTES)
-        marked = [f"{file.name} {marks[file]}" for file in (*files, *((notes,) if notes in marks else ()))]
+        marked = [f"{file.name} {marks[file]}" for file in files]
+        if noted and (notes := path.with_name(path.name + NOTES)) in marks:
+            marked.append(marks[notes])
         signature = hashlib.sha256("\n".join(marked).encode(errors="surrogateescape")).hexdigest()[:32]
-        found.append(Found(path, files, signature, notes in marks))
+        found.append(Found(path, files, signature))
     return Contents(found, sorted(tables))
 
 

@@ -199,7 +199,9 @@ class CatalogQuery:
         text = str(error)
         if (found := _UNKNOWN_COLUMN.search(text)) is not None:
             names = [*self.columns, *(one for name in RELATIONS for one in _full(name, self.members))]
-            return UsageError(unknown_name("find", found[1], names) + "; a text is written 'so'")
+            return UsageError(
+                unknown_name("find", found[1], names) + f" (a text stands in single quotes: '{found[1]}')"
+            )
         if (found := _UNKNOWN_MEMBER.search(text)) is not None:
             relation = next((name for name in RELATIONS if f"{name}.{found[1]}".lower() in where.lower()), "")
             names = _full(relation, self.members) if relation else []

@@ -60,9 +60,11 @@ def runs_of(files: Iterable[Path]) -> dict[Path, list[Path]]:
     rows: dict[Path, list[Path]] = {}
     named = set(files)
     for path in sorted(named):
-        run = run_path(path)
-        # Beside a file of that name the parts are not what opens under it: each is a session of its own.
-        rows.setdefault(run if part_number(path) and run not in named else path, []).append(path)
+        run = path
+        if ".part" in path.name and part_number(path):
+            # Beside a file of that name the parts are not what opens under it: each is a session of its own.
+            run = run_path(path) if run_path(path) not in named else path
+        rows.setdefault(run, []).append(path)
     return rows
 
 

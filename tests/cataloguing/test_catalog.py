@@ -347,7 +347,7 @@ def test_what_a_file_states_can_neither_fill_the_catalog_nor_change_a_column(tmp
         ("exists (from somebody)", "does not exist"),
         ("getenv('HOME') = ''", "getenv does not exist"),
         ("outcom = 'reached'", "no session states outcom; did you mean outcome"),
-        ('outcome = "reached"', "a text is written 'so'"),
+        ('outcome = "reached"', "a text stands in single quotes"),
         ("sweep.refin = 'fvm'", "no replay states sweep.refin; did you mean sweep.refine"),
         ("refined_flow_error <", "syntax error"),
         ("outcome + 1 > 2", "No function matches|Could not convert"),
