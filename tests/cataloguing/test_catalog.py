@@ -156,6 +156,7 @@ def test_replays_of_sweeps_and_marks_of_the_operator_are_found_with_their_sessio
     best = find("sweep.place = 1 and sweep.refine = 'pi_unet'")
     assert [Path(path).name for path in best.paths()] == ["a.mcap", "copy.mcap"]  # the same content
     assert best.mentioned == ["sweep.place", "sweep.refine"]
+    assert not find("sweep.place = 1 and sweep.refine = 'fvm'").rows
     cells = typed("find", "sweep.refine = 'fvm'", "--sort", "-sweep.replayed_refined_flow_error").stdout
     assert "sweep.replayed_refined_flow_error" in cells and "20.0 %" in cells
     assert names("sweep.key is null and verdict is null and outcome = 'reached'") == ["b.mcap", "run.mcap"]
@@ -271,7 +272,7 @@ def test_a_damaged_catalog_or_one_of_another_version_is_made_anew_and_no_other_f
     for damage in (b"", path.read_bytes()[:-100]):
         path.write_bytes(damage)
         assert "is damaged" in refresh.refresh([catalogued]).remarks[0]
-    about = json.loads(whole.schema.metadata[KEY.encode()]) | {"format": 99, "more": 1}
+    about = json.loads(whole.schema.metadata[KEY.encode()]) | {"format": 99}
     pq.write_table(whole.replace_schema_metadata({KEY: json.dumps(about)}), path)
     with pytest.raises(UsageError, match="another version"):
         find()
@@ -442,7 +443,8 @@ def test_sessions_in_a_bucket_are_catalogued_by_a_listing_and_read_again_where_t
         server.requests.clear()
         assert refresh.refresh([], out).changed == 0
         assert not [url for _, url in server.requests if url.endswith(".mcap")]
-        server.client.upload_file(str(tmp_path / "near.mcap"), BUCKET, "runs/b.mcap")
+        other = (lab / "may" / "b.mcap").read_bytes()[:-1] + b"x"  # of the same size
+        server.client.put_object(Bucket=BUCKET, Key="runs/b.mcap", Body=other)
         assert refresh.refresh([], out).changed == 1
         before = out.read_bytes()
         server.fault = lambda *_: 403
