@@ -115,14 +115,14 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
     event("mark: 1").wait_for()
     page.get_by_role("button", name="mark (key m)").click()
     event("mark: 2").wait_for()
+    page.keyboard.press("Space")  # although the last click was on another button
+    event("held by the operator").wait_for()
+    page.get_by_role("button", name="hold, go on").click()
+    event("goes on after").wait_for()
     page.keyboard.press("n")
     page.get_by_role("textbox", name="Note").fill("m q ! look")  # the keys are letters here
     page.keyboard.press("Enter")
     event("note: m q ! look").wait_for()
-    page.keyboard.press("Space")  # although the last click was on a button
-    event("held by the operator").wait_for()
-    page.get_by_role("button", name="hold, go on").click()
-    event("goes on after").wait_for()
     page.get_by_role("spinbutton", name="Speed limit").fill("90")
     page.get_by_role("button", name="Set", exact=True).click()
     page.locator("#limit", has_text="90 µm/s").wait_for()
@@ -149,7 +149,7 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
         if tick.operator.action == "zero":  # on that very tick
             assert before.currents.amplitude_mt > 0.0  # type: ignore[union-attr]
             assert tick.currents.amplitude_mt == 0.0  # type: ignore[union-attr]
-    assert [each.action for each in asked] == ["mark", "mark", "note", "pause", "resume", "speed", "goal", "zero"]
+    assert [each.action for each in asked] == ["mark", "mark", "pause", "resume", "note", "speed", "goal", "zero"]
     speed, goal, stop = asked[-3:]
     assert (speed.speed_limit_um_s, stop.text) == (90.0, "operator: zero field (console)")
     np.testing.assert_allclose(goal.goal_um, GOAL_UM, atol=Session(out).calibration.um_per_px)
