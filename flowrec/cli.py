@@ -1,7 +1,7 @@
 """The command line: the verbs record and replay, the entry point, and its errors in one line.
 
-The other verbs are in import_verb.py, doctor_verb.py, push_verb.py, sweep_verb.py, catalog_verbs.py, session_verbs.py
-and calibrate_verbs.py. Each function parses, calls and prints, with late imports.
+The other verbs are in import_verb.py, doctor_verb.py, session_verbs.py, archive_verbs.py and calibrate_verbs.py. Each
+function parses, calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
 3 done but something was lost or differs.
@@ -20,13 +20,12 @@ from typing import Annotated, Any, Literal
 import typer
 
 import flowrec
+from flowrec.archive_verbs import catalog, find, push, sweep
 from flowrec.bench.verbs import HELP_WIDTH, AsJson, Overwrite, Sets, bench
 from flowrec.calibrate_verbs import calibrate
-from flowrec.catalog_verbs import catalog, find
 from flowrec.doctor_verb import doctor, look_at_lab
 from flowrec.errors import FlowrecError, printable
 from flowrec.import_verb import import_movie
-from flowrec.push_verb import push
 from flowrec.session_verbs import (
     HelpWithMethods,
     SessionFile,
@@ -43,7 +42,6 @@ from flowrec.session_verbs import (
     view,
 )
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC
-from flowrec.sweep_verb import sweep
 from flowrec.units import amounts
 
 app = typer.Typer(

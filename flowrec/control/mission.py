@@ -22,6 +22,7 @@ from flowrec.control.mission_goals import (
     with_goal,
     with_speed_limit,
 )
+from flowrec.control.mission_sight import IN_VIEW, lost, without_sight
 from flowrec.control.mission_steps import Frame, at_end, elapsed_s, finish, held, left_s, order, transition
 from flowrec.control.trajectory import position_at
 from flowrec.enums import Action, Outcome, Phase, WorkOrder
@@ -45,7 +46,6 @@ PHASES: tuple[PhaseName, ...] = get_args(PhaseName)[:4]  # of a robot that is dr
 Coordinate = Annotated[float, Range(-1e9, 1e9)]
 Point = tuple[Coordinate, Coordinate]
 Place = Point | str
-_IN_VIEW = "is it in view (camera.um_per_px), and of the size in robot.radius_um?"
 _ON_THE_WAY = (Phase.SURVEY, Phase.NAVIGATE)  # the robot goes on while an order is under way
 _STEERING = (Action.GOAL, Action.SPEED)
 _SLOWER = 0.3  # of the planned time: a robot that steps out at 0.7 of its limit is later by about so much
@@ -144,14 +144,14 @@ class MissionStateMachine:
             now = replace(now, robot=robot.slowed_to(commanded.speed_limit_um_s))
         if now.command in _STEERING:
             previous = commanded  # and goes on: a person who drags the goal stops nothing
-        lost = self._lost(previous, now)
-        if lost is not None:
-            return lost
+        ended = lost(previous, now, self.find_limit_s, self.lost_limit_frames)
+        if ended is not None:
+            return ended
         if commanded is not previous:
             return commanded
-        without_sight = self._without_sight(previous, now)
-        if without_sight is not previous or previous.blind_since_ns is not None:
-            return without_sight
+        unseen = without_sight(previous, now, self.hold_after_s, self.zero_after_s, self.find_limit_s)
+        if unseen is not previous or previous.blind_since_ns is not None:
+            return unseen
         if previous.held_since_ns is not None:
             return held(previous, now)
         result = now.result(previous)
@@ -201,7 +201,7 @@ class MissionStateMachine:
         if not mission.input_ended:
             return replace(mission, stamp_ns=now.now_ns, wanted="") if mission.wanted else mission
         if now.track.seen_ns is None:
-            return finish(mission, now, Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {_IN_VIEW}"))
+            return finish(mission, now, Outcome.NOT_FOUND, now.with_advice(f"the robot was never seen; {IN_VIEW}"))
         return order(mission, now, Phase.OBSERVE, WorkOrder.REFINE)
 
     def _after_command(self, mission: Mission, now: Frame) -> Mission:
@@ -225,61 +225,6 @@ class MissionStateMachine:
             held_ns = mission.held_ns + now.now_ns - since_ns
             return replace(mission, stamp_ns=now.now_ns, held_since_ns=None, held_ns=held_ns, swept=False)
         return mission
-
-    def _lost(self, previous: Mission, now: Frame) -> Mission | None:
-        """The end of a run whose robot was not found, or not seen for too many frames.
-
-        A camera that was absent and is back has as much time to find the robot as in the beginning.
-        """
-        absent_ns = now.applied.absent_until_ns if now.applied is not None else None
-        if now.track.seen or (absent_ns is not None and seconds(now.now_ns - absent_ns) <= self.find_limit_s):
-            return None
-        if previous.phase == Phase.START:
-            if now.refused:
-                return finish(previous, now, Outcome.NOT_FOUND, now.not_found_note)
-            seen_ns = now.track.seen_ns
-            if seen_ns is not None and seconds(now.now_ns - seen_ns) <= self.find_limit_s:
-                return None  # it was found, and this image does not show it
-            if elapsed_s(previous, now) > self.find_limit_s:
-                note = f"no robot seen in the image for {self.find_limit_s:g} s; {_IN_VIEW}"
-                return finish(previous, now, Outcome.NOT_FOUND, now.with_advice(note))
-        elif now.track.lost_frames > self.lost_limit_frames:
-            why = f"{previous.blind}, " if previous.blind else "robot not seen in "
-            return finish(previous, now, Outcome.LOST, f"{why}{now.track.lost_frames} frames")
-        return None
-
-    def _without_sight(self, previous: Mission, now: Frame) -> Mission:
-        """Without sight of the robot: hold it, then switch the field off, then end; continue when it is seen again.
-
-        If it was carried too far off its route meanwhile, a new one is planned as after any other disturbance. While
-        the camera is absent the field is off; the rig says when that has lasted too long.
-        """
-        applied, now_ns, seen_ns = now.applied, now.now_ns, now.track.seen_ns
-        if applied is None or seen_ns is None or applied.image_since_ns is None:  # never seen yet, or an older session
-            return previous
-        if now.track.seen:
-            if previous.blind_since_ns is None:
-                return previous
-            return replace(previous, stamp_ns=now_ns, blind_since_ns=None, blind="", field_off=False)
-        absent_ns = applied.absent_until_ns
-        if applied.without_image:
-            if previous.field_off:
-                return previous
-            since_ns = now_ns if previous.blind_since_ns is None else previous.blind_since_ns
-            why = f"no image since {seconds(applied.image_since_ns):.1f} s: the camera is absent"
-            return replace(previous, stamp_ns=now_ns, blind_since_ns=since_ns, blind=why, field_off=True)
-        unseen_s = seconds(now_ns - (seen_ns if absent_ns is None else max(seen_ns, absent_ns)))
-        why = f"robot not seen since {seconds(seen_ns):.1f} s"
-        if applied.repeats_image:
-            why = f"the camera repeats one image since {seconds(applied.image_since_ns):.1f} s"
-        if unseen_s >= self.zero_after_s + self.find_limit_s:
-            return finish(previous, now, Outcome.LOST, why)
-        if unseen_s >= self.zero_after_s and not previous.field_off:
-            since_ns = now_ns if previous.blind_since_ns is None else previous.blind_since_ns
-            return replace(previous, stamp_ns=now_ns, blind_since_ns=since_ns, blind=why, field_off=True)
-        if unseen_s >= self.hold_after_s and previous.blind_since_ns is None:
-            return replace(previous, stamp_ns=now_ns, blind_since_ns=now_ns, blind=why)
-        return previous
 
     def _advance(self, previous: Mission, now: Frame, result: FlowField | Route | None) -> Mission:
         """The next state when no work is pending, or its result has just arrived."""
