@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import socket
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -25,6 +23,7 @@ from flowrec.store.session_path import UrlPath, session_path
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError
 from tests.conftest import HANG_S
 from tests.store.range_server import RangeServer, answer, served, some, status
+from tests.store.s3_server import BUCKET, s3_server
 
 SESSION = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 
@@ -205,41 +204,15 @@ def test_a_session_in_a_bucket_is_the_file_and_credentials_are_never_printed(
     session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With moto's S3 server, and boto3 for the upload."""
-    pytest.importorskip("moto", reason="moto is not installed: pip install 'moto[s3]' flask flask-cors")
-    import boto3
-
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        port = found.getsockname()[1]
-    endpoint = f"http://127.0.0.1:{port}"
-    process = subprocess.Popen(
-        [sys.executable, "-c", f"from moto.server import main; main(['-p', '{port}'])"],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        end_s = time.monotonic() + HANG_S
-        while time.monotonic() < end_s:
-            try:
-                socket.create_connection(("127.0.0.1", port), 0.2).close()
-                break
-            except OSError:
-                time.sleep(0.05)
-        keys = {"AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "SECRET", "AWS_REGION": "us-east-1"}
-        for name, value in {**keys, "AWS_ENDPOINT_URL": endpoint}.items():
-            monkeypatch.setenv(name, value)
-        client = boto3.client("s3", endpoint_url=endpoint, region_name="us-east-1")
-        client.create_bucket(Bucket="lab")
-        client.upload_file(str(session), "lab", "runs/a.mcap")
-        assert flowrec.compare(flowrec.open(session), flowrec.open("s3://lab/runs/a.mcap")).identical
-        for missing in ("s3://lab/none.mcap", "s3://other/a.mcap"):
+    with s3_server(monkeypatch) as server:
+        server.client.upload_file(str(session), BUCKET, "runs/a.mcap")
+        assert flowrec.compare(flowrec.open(session), flowrec.open(f"s3://{BUCKET}/runs/a.mcap")).identical
+        for missing in (f"s3://{BUCKET}/none.mcap", "s3://other/a.mcap"):
             with pytest.raises(FlowrecError, match=r"is not there \(404\)") as caught:
                 flowrec.open(missing)
-            assert not re.search("SECRET|key", str(caught.value))
-    finally:
-        process.terminate()
-        process.wait(HANG_S)
+            assert not re.search("SECRET|KEY", str(caught.value))
     with pytest.raises(FlowrecError, match="no connection") as caught:
-        flowrec.open("s3://lab/runs/b.mcap")
+        flowrec.open(f"s3://{BUCKET}/runs/b.mcap")
     assert "SECRET" not in str(caught.value)
 
 
