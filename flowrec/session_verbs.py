@@ -31,7 +31,7 @@ EXAMPLES = {
     "record": (
         "flowrec record --goal 5200,1400",
         "flowrec record lab.toml -o run.mcap --split 2GB,10min",
-        "flowrec record --console --realtime",
+        "flowrec record --console --realtime --set mission.wait_at_goal_s=600",
     ),
     "replay": ("flowrec replay a.mcap --refine", "flowrec replay a.mcap --plan astar_time --refly -o b.mcap"),
     "sweep": (
