@@ -187,9 +187,9 @@ def main(kind: str, out: str, log_path: str, *sets: str) -> None:
             STAGES[kind]()
         return step(*arguments)  # type: ignore[arg-type]
 
-    def logged(*arguments: object) -> object:
+    def logged(*arguments: object, **named: object) -> object:
         try:
-            return record(*arguments)  # type: ignore[arg-type]
+            return record(*arguments, **named)  # type: ignore[arg-type]
         finally:
             log("returns")
 
