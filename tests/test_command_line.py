@@ -202,3 +202,11 @@ def test_a_replay_states_the_path_of_its_session(
     assert json.loads(capsys.readouterr().out)["out"] == str(out)
     assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--overwrite"], monkeypatch) == 0
     assert "".join(capsys.readouterr().err.split()).find(f"->{out}") > 0
+
+
+def test_the_names_in_a_table_are_readable_beside_a_value_that_fills_many_lines() -> None:
+    printed = io.StringIO()
+    words = [f"robot.setting_{number}=1.5" for number in range(60)]
+    terminal.table("a.mcap", ("", "value"), [("derived", " ".join(words))], to=printed)
+    assert "derived" in printed.getvalue()
+    assert [word for word in words if word not in printed.getvalue()] == []
