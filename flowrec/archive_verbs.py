@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,8 @@ import typer
 
 from flowrec.bench.verbs import AsJson, Sets
 from flowrec.units import amounts
+
+_SHOWN_ROWS = 200  # of a table that find prints, unless more are asked for
 
 
 def sweep(
@@ -186,7 +189,9 @@ def find(
         Path | None, typer.Option(metavar="FILE", help="Catalog; by default that of this directory or the next above.")
     ] = None,
     sort: Annotated[str, typer.Option(metavar="FACT", help="Sort by this fact; -FACT: the largest first.")] = "",
-    limit: Annotated[int | None, typer.Option(metavar="N", min=1, help="Only the first N rows.")] = None,
+    limit: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Only the first N rows; a table has 200 unless stated.")
+    ] = None,
     paths: Annotated[
         bool, typer.Option("--paths", help="Only the paths, one a line, as for xargs -d '\\n' flowrec check.")
     ] = False,
@@ -209,9 +214,13 @@ def find(
     else:
         from flowrec.terminal import say, table, width
 
-        table(found.title(), *found.cells(width()), text="notes")
+        title, count = found.title(), len(found.rows)
+        found = replace(found, rows=found.rows[: limit or _SHOWN_ROWS])  # a table of thousands takes seconds
+        table(title, *found.cells(width()), text="notes")
         for line in found.remarks():
             say(line)
+        if count > len(found.rows):
+            say(f"{count - len(found.rows)} rows more: --limit {count}, --paths and --json have all of them")
 
 
 def _serve(catalog: Path, where: str, port: int | None) -> None:

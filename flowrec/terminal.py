@@ -101,7 +101,10 @@ def table(
     for number, column in enumerate(columns):
         words = number == 0 or column == text
         shown.add_column(
-            column, justify="left" if words else "right", overflow="fold", no_wrap=bool(text) and text in columns and not words
+            column,
+            justify="left" if words else "right",
+            overflow="fold",
+            no_wrap=bool(text) and text in columns and not words,
         )
     for row in rows:
         shown.add_row(*(escape(printable(cell)) for cell in row))

@@ -19,6 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
+from flowrec import archive_verbs
 from flowrec.cataloguing import catalog_file, refresh, session_rows, sql
 from flowrec.cataloguing.find import find
 from flowrec.cataloguing.format import KEY, NAME
@@ -398,7 +399,9 @@ def test_what_duckdb_does_not_interrupt_is_ended_by_the_process(catalogued: Path
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
 
 
-def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(catalogued: Path) -> None:
+def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(
+    catalogued: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shown = typed("find", "contacts > 0 and name like 'a%'").stdout
     assert "1 of 7 sessions, as of 20" in shown and "contacts" in shown and "#bubble #talk" in shown
     assert typed("find", "outcome = 'reached'", "--paths", "--sort", "-name", "--limit", 2).stdout.split() == [
@@ -409,6 +412,10 @@ def test_find_shows_a_table_json_or_paths_and_says_how_old_the_catalog_is(catalo
     assert (found["of"], found["sessions"][0]["seed"], found["sessions"][0]["path"]) == (7, 2, "may/b.mcap")
     assert typed("find", "seed = 77").exit_code == 0
     assert "unreadable" in typed("find", "outcome = 'unreadable'").stdout
+    monkeypatch.setattr(archive_verbs, "_SHOWN_ROWS", 3)
+    assert typed("find").stdout.count(".mcap") == 3 and "7 of 7 sessions" in typed("find").stdout
+    assert typed("find", "--limit", 5).stdout.count(".mcap") == 5
+    assert len(json.loads(typed("find", "--json").stdout)["sessions"]) == 7
     with pytest.raises(UsageError, match="did you mean outcome"):
         find(sort="-outcom")
     with pytest.raises(UsageError, match="no such catalog"):
