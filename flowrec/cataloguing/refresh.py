@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +14,7 @@ from flowrec.cataloguing.format import NAME, SIGNATURE, About, path_of, written
 from flowrec.cataloguing.places import Contents, Found, contents_of
 from flowrec.cataloguing.session_rows import row_of
 from flowrec.cataloguing.sweeps import lists_of, sweep_rows
-from flowrec.commands.ls import TOGETHER
+from flowrec.commands.ls import read_each
 from flowrec.errors import SessionError, UsageError
 from flowrec.store.session_path import UrlPath, session_path
 from flowrec.version import __version__
@@ -154,30 +152,15 @@ def _read(due: dict[str, Found], progress: Callable[[float], None]) -> tuple[lis
     """The rows of sessions, and how many were not read before an interruption."""
     rows: list[dict[str, Any]] = []
     try:
-        with _rows(due) as found:
-            for row in found:
+        far = any(isinstance(found.path, UrlPath) for found in due.values())
+        with read_each(lambda text: row_of(due[text], text), due, far) as read:
+            for row in read:
                 rows.append(row)
                 progress(len(rows) / len(due))
     except KeyboardInterrupt:
         if not rows:
             raise
     return rows, len(due) - len(rows)
-
-
-@contextmanager
-def _rows(due: dict[str, Found]) -> Iterator[Iterable[dict[str, Any]]]:
-    """The rows of sessions one after the other; of those at URLs many are asked for at a time."""
-    far = {text: found for text, found in due.items() if isinstance(found.path, UrlPath)}
-    near = {text: found for text, found in due.items() if text not in far}
-    if not far:
-        yield (row_of(found, text) for text, found in near.items())
-        return
-    pool = ThreadPoolExecutor(TOGETHER, "catalog")
-    try:
-        asked = pool.map(lambda item: row_of(item[1], item[0]), far.items())
-        yield (row for each in (asked, (row_of(found, text) for text, found in near.items())) for row in each)
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _counted(number: int) -> str:

@@ -7,10 +7,11 @@ Reads heads and indexes only, however large the sessions are. A choice is an SQL
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from flowrec.commands.info import info
 from flowrec.commands.listed import ALWAYS, LISTS, Listed, columns_of, joined, unknown_name
@@ -20,8 +21,10 @@ from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX, part_number, run_fil
 from flowrec.store.session_path import UrlPath, session_path
 from flowrec.system.locks import is_growing
 
-TOGETHER = 16  # sessions at URLs that are read at a time
+_TOGETHER = 16  # sessions at URLs that are read at a time
 NAMES = (SUFFIX, SUFFIX + PARTIAL_SUFFIX)  # ends of the names of sessions, finished or not
+T = TypeVar("T")
+R = TypeVar("R")
 _EXACT = 2**53  # integers below are exact as floating-point numbers
 # What an expression of --where may do: read the table and call functions, nothing else.
 _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION)
@@ -47,12 +50,29 @@ def list_sessions(*places: Path, where: str = "", sort: str = "") -> list[Listed
     def read(path: Path) -> Listed:
         return describe(path, rows[path], str(path) if apart else path.name)[0]
 
-    if any(isinstance(path, UrlPath) for path in rows):
-        with ThreadPoolExecutor(TOGETHER) as threads:  # each waits for its server
-            found = dict(zip(rows, threads.map(read, rows), strict=True))
-    else:
-        found = {path: read(path) for path in rows}
+    with read_each(read, rows, far=any(isinstance(path, UrlPath) for path in rows)) as listed:
+        found = dict(zip(rows, listed, strict=True))
     return _chosen(found, where, sort) if where or sort else list(found.values())
+
+
+@contextmanager
+def read_each(read: Callable[[T], R], sessions: Iterable[T], far: bool) -> Iterator[Iterator[R]]:
+    """Context with what `read` returns of each session, in their order.
+
+    What has not begun when the context is left is not read: a person who interrupts does not wait for it.
+
+    Parameters
+    ----------
+    far : some are at URLs, where each waits for its server: many are read at a time.
+    """
+    if not far:
+        yield map(read, sessions)
+        return
+    threads = ThreadPoolExecutor(_TOGETHER, "sessions")
+    try:
+        yield threads.map(read, sessions)
+    finally:
+        threads.shutdown(wait=False, cancel_futures=True)
 
 
 def runs_of(files: Iterable[Path]) -> dict[Path, list[Path]]:

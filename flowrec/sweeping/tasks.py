@@ -7,13 +7,12 @@ import hashlib
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flowrec.commands.ls import TOGETHER
+from flowrec.commands.ls import read_each
 from flowrec.errors import SessionError, UsageError
 from flowrec.session import Session, session_sha256
 from flowrec.store.run_files import SUFFIX, part_number, run_files, run_path
@@ -196,13 +195,7 @@ class Sessions:
         found: dict[str, Path] = {}
         left_out: list[str] = []
         unreadable = 0
-        with ThreadPoolExecutor(TOGETHER) as threads:
-            # Each at a URL waits for its server; files of this machine are read faster one after the other.
-            read = (
-                threads.map(_content, files)
-                if any(isinstance(file, UrlPath) for file in files)
-                else map(_content, files)
-            )
+        with read_each(_content, files, far=any(isinstance(file, UrlPath) for file in files)) as read:
             for number, (path, content) in enumerate(zip(files, read, strict=True)):
                 progress(number)
                 if isinstance(content, SessionError):

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from flowrec.cli import app
-from flowrec.commands.ls import list_sessions
+from flowrec.commands.ls import list_sessions, read_each
 from flowrec.errors import SessionError, UsageError
 from flowrec.store.notes import notes_file
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
+from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 
 
@@ -176,3 +178,21 @@ def test_a_line_that_was_cut_or_is_damaged_costs_only_itself(flown: list[Path]) 
     for words in (["x" * 10_001], ["", "--tag", ""], [" ", "--tag", "t" * 61]):
         with pytest.raises(UsageError, match="a note"):
             typed("note", path, *words)
+
+
+def test_an_interruption_leaves_sessions_at_urls_unread_that_still_wait() -> None:
+    begun: list[int] = []
+    answered = threading.Event()
+
+    def read(number: int) -> int:
+        begun.append(number)
+        answered.wait(HANG_S)
+        return number
+
+    with pytest.raises(KeyboardInterrupt), read_each(read, range(1000), far=True):
+        raise KeyboardInterrupt
+    answered.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("sessions"):
+            thread.join(HANG_S)
+    assert len(begun) < 100
