@@ -4,7 +4,8 @@ The other verbs are in import_verb.py, doctor_verb.py, session_verbs.py, archive
 function parses, calls and prints, with late imports.
 
 Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
-3 done but something was lost or differs.
+3 done but something was lost or differs, 130 stopped by Ctrl-C or a key, 143 by SIGTERM, 129 by a closed terminal.
+A recording that is stopped has ended as it was meant to: 0.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from typer.core import TyperGroup
 
 import flowrec
 from flowrec.archive_verbs import catalog, find, push, sweep
@@ -42,9 +44,22 @@ from flowrec.session_verbs import (
     view,
 )
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC
+from flowrec.system.endings import Ended, StoppedError
 from flowrec.units import amounts
 
+
+class _Verbs(TyperGroup):
+    """The verbs; a signal that ends one of them is an error in one line, and not Typer's."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise StoppedError(Ended.of(error)) from error
+
+
 app = typer.Typer(
+    cls=_Verbs,
     name="flowrec",
     help="Record, replay and view missions of magnetic micro-robots in flow.",
     no_args_is_help=True,
@@ -225,7 +240,7 @@ def replay(
         else:
             for line in done.lines():
                 typer.echo(printable(line))
-        raise typer.Exit(0 if done.same else 3)
+        raise typer.Exit(done.exit_status)
     from flowrec.commands.replay_report import Outputs, refinement_remarks, replay_and_report
     from flowrec.summary import comparison_for_people
     from flowrec.terminal import say, table
@@ -237,12 +252,16 @@ def replay(
         figures = {"wall_s": report.wall_s, "duration_s": report.duration_s, "ticks": report.ticks}
         named = [dict(zip(("quantity", "recorded", "replayed"), row, strict=True)) for row in rows]
         result = {"session": str(session), "out": str(outputs.session.path), "refinement": remarks, "rows": named}
-        typer.echo(json.dumps(result | figures))
-        return
-    table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
-    say(f"{report.ticks} ticks ({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s -> {outputs.session.path}")
-    for line in remarks:
-        say(line)
+        typer.echo(json.dumps(result | figures | {"covered": done.covered.as_json()}))
+    else:
+        table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
+        length = f"({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s"
+        of_these = "; the figures are of those" if done.covered.stopped else ""
+        say(f"{done.covered.text} {length}{of_these} -> {outputs.session.path}")
+        for line in remarks:
+            say(line)
+    if done.covered.stopped:
+        raise typer.Exit(done.covered.status)
 
 
 app.command("import", epilog=examples("import"))(import_movie)
@@ -328,7 +347,11 @@ def main() -> None:
             verb = error.ctx.command_path if error.ctx is not None else "flowrec"
             sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")
         sys.exit(error.exit_code)
+    except typer.Abort as error:  # of a signal while the arguments were read
+        raise (error.__cause__ or error) from None
     except FlowrecError as error:
+        if isinstance(error, StoppedError) and "--json" in sys.argv:
+            print(json.dumps(error.as_json()))
         sys.stderr.write(f"flowrec: {error}\n")
         sys.exit(error.exit_status)
     except BrokenPipeError:

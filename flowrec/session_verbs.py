@@ -16,6 +16,7 @@ import flowrec
 from flowrec.bench.verbs import AsJson, Overwrite
 from flowrec.errors import FlowrecError, UsageError, printable
 from flowrec.store.session_path import session_path
+from flowrec.system.endings import Ended
 
 # Options that select a method, and the table of its methods.
 METHODS = {
@@ -308,15 +309,23 @@ def check(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Validate a session; exit status 0: good, 3: usable with losses or anomalies, 1: not usable."""
+    """Validate a session; exit status 0: good, 3: usable with losses or anomalies, 1: not usable.
+
+    It finds damage, and edits that leave the digest as it was. Sessions are not signed: whoever can edit the file can
+    edit the digest.
+    """
     from flowrec.commands.check import files_to_check
     from flowrec.store.byte_source import size_of
     from flowrec.terminal import progress
 
     try:
         nbytes = sum(map(size_of, files_to_check(session)))
-        with progress(f"reading {session.name}", max(nbytes, 1)) as done:
+        with progress(f"reading {session.name}", max(nbytes, 1), "bytes") as done:
             verdict = flowrec.check(session, done)
+    except Ended as ended:
+        if ended.result is None:
+            raise
+        verdict = ended.result
     except FlowrecError as error:
         if not as_json:
             raise

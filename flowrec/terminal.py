@@ -13,7 +13,9 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from flowrec.coverage import Coverage
 from flowrec.errors import printable
+from flowrec.system.endings import Ended
 from flowrec.system.stderr import Outlet
 
 _STALE_S = 1.0  # without an advance, an estimate of the time left no longer holds
@@ -39,18 +41,45 @@ def warn(text: str) -> None:
 
 
 class Progress:
-    """Takes how far work is, and shows it nowhere."""
+    """Takes how far work is, and shows it nowhere.
+
+    Attributes
+    ----------
+    done : how much of the total is done, as it was said last.
+    """
+
+    done: float = 0.0
 
     def __call__(self, done: float) -> None:
         """How much of the total is done."""
+        self.done = done
 
     def stage(self, name: str) -> None:
         """What is done meanwhile, which may take long; '': nothing in particular."""
 
 
 @contextmanager
-def progress(what: str, total: float) -> Iterator[Progress]:
-    """A progress bar, which takes how much of `total` is done. Prints nothing without a terminal."""
+def progress(what: str, total: float, unit: str = "parts") -> Iterator[Progress]:
+    """A progress bar, which takes how much of `total` is done. Prints nothing without a terminal.
+
+    An interruption by Ctrl-C or a signal leaves it as `Ended`, with how far the work was; of bars within each other
+    the outer one says it.
+
+    Parameters
+    ----------
+    unit : of the total, as of `Coverage`.
+    """
+    with _shown(what, total) as shown:
+        try:
+            yield shown
+        except KeyboardInterrupt as error:
+            ended = Ended.of(error)
+            ended.covered = Coverage(min(shown.done, total), total, unit, stopped=ended.why, status=ended.status)
+            raise ended from error.__cause__
+
+
+@contextmanager
+def _shown(what: str, total: float) -> Iterator[Progress]:
     if not console.is_terminal:
         yield Progress()
         return
@@ -66,6 +95,7 @@ def progress(what: str, total: float) -> Iterator[Progress]:
     class Shown(Progress):
         def __call__(self, done: float) -> None:
             nonlocal advanced_s
+            super().__call__(done)
             advanced_s = time.monotonic()
             bar.update(task, completed=done)
 

@@ -106,7 +106,7 @@ def measure(
         paths = vessel_cases(cases)
         if case is not None:
             chosen("bench flow: no case", case, [path.stem for path in paths])
-        done = stack.enter_context(progress("refining", len(paths) * len(names)))
+        done = stack.enter_context(progress("refining", len(paths) * len(names), "refinements"))
         for first, method in zip(range(0, len(paths) * len(names), len(paths)), names, strict=True):
             with pool(1) as worker:
                 before_mb = worker.submit(_prepare).result()

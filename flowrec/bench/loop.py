@@ -67,7 +67,7 @@ def prepare_inputs(config: ResolvedConfig, pipeline: Pipeline, ticks: int) -> li
     rig = SimulatedRig.of(pipeline, config, ticks / (config.camera.rate_hz or RATE_HZ))
     prepared: list[Inputs] = []
     before = Tick()
-    with progress("preparing frames", ticks) as done:
+    with progress("preparing frames", ticks, "frames") as done:
 
         def collect(tick: Tick) -> None:
             nonlocal before

@@ -203,7 +203,7 @@ def measure(
     ]
     rows: list[Row] = []
     with (
-        progress("flying", len(missions)) as done,
+        progress("flying", len(missions), "missions") as done,
         pool(jobs) as workers,
     ):
         columns = zip(*missions, strict=True)

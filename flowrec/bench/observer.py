@@ -164,7 +164,7 @@ def measure(
     """
     rows: list[dict[str, Any]] = []
     drawn: tuple[Floats, Floats, dict[str, Floats]] | None = None
-    with progress("observing", len(CASES)) as done:
+    with progress("observing", len(CASES), "cases") as done:
         for number, case in enumerate(CASES):
             run = drive(case, seed)
             found, best_gain = estimates_of(case, run)

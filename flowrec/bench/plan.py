@@ -77,7 +77,7 @@ def measure(
     robust: list[dict[str, Any]] = []
     policy: list[dict[str, Any]] = []
     examples = []
-    with progress("planning", trips) as done:
+    with progress("planning", trips, "trips") as done:
         drawn = ((world, draw_trip(world, np.random.default_rng([k, seed, 5]))) for k, world in enumerate(source))
         with_trip = ((world, trip) for world, trip in drawn if trip is not None)
         for number, (world, trip) in enumerate(itertools.islice(with_trip, trips)):

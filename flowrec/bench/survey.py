@@ -182,7 +182,7 @@ def measure(
             cases = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             make_up(cases, count, seed)
         paths = vessel_cases(cases)
-        done = stack.enter_context(progress("surveying", len(paths)))
+        done = stack.enter_context(progress("surveying", len(paths), "cases"))
         for number, path in enumerate(paths, 1):
             rows += surveyed(path, names, noise, share, draws)
             done(number)

@@ -85,7 +85,7 @@ def measure(
     step_out: list[dict[str, Any]] = []
     bounded = ("paper, with compensation", "vector, kalman_map")
     total = len(LAWS) * len(WORLDS) + len(bounded) * len(STEP_OUTS_UM_S) * len(PACES)
-    with progress("tracking", total) as done:
+    with progress("tracking", total, "runs") as done:
         for world_name, world in WORLDS.items():
             for name, law in LAWS.items():
                 flown[name, world_name] = flights(law, _FIXED, world, seeds)

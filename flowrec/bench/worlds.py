@@ -71,7 +71,7 @@ def measure(
         say(f"{rows}: {len(cases) - len(left)} of {len(cases)} flights are there")
     work = partial(flown, methods=wanted, again=again)
     with ExitStack() as stack:
-        done = stack.enter_context(progress("flying", len(left)))
+        done = stack.enter_context(progress("flying", len(left), "missions"))
         file = stack.enter_context(_appended(rows)) if rows is not None else None
         for count, flight in enumerate(_each(work, [(case, flights.get(case.key())) for case in left], jobs), 1):
             flight.code = flight.code or code

@@ -11,18 +11,20 @@ from pathlib import Path
 from flowrec.chip import chip_from_files
 from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_summary, irregular_frames, skew_ppm
 from flowrec.commands.check_tally import GAP_PERIODS, Tally
-from flowrec.commands.verdict import Finding, Gap, Verdict
+from flowrec.commands.verdict import CONSISTENT, DAMAGED, NO_DIGEST, UNFINISHED, Finding, Gap, Verdict
 from flowrec.config import ResolvedConfig, config_from_toml
+from flowrec.coverage import Coverage
 from flowrec.declarations import Role
 from flowrec.enums import Outcome
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
-from flowrec.store.audit import audit
-from flowrec.store.byte_source import is_there
+from flowrec.store.audit import Audit, audit
+from flowrec.store.byte_source import is_there, size_of
 from flowrec.store.channels import is_left_out
 from flowrec.store.run_files import continuity_fault, is_continued, part_number, part_path, run_files
 from flowrec.store.session_path import session_path
 from flowrec.summary import finite
+from flowrec.system.endings import Ended
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS
 from flowrec.units import NS_PER_S, seconds
@@ -31,6 +33,7 @@ from flowrec.version import NUMERICS_VERSION, __version__
 _LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
 _RATE_TOLERANCE = 0.05
 _CLOCK_JUMP_S = 1.0
+_HEAD = ("configuration", "chip", "provenance", "outcome")
 _CLOCKS = ("wall_ns", "monotonic_ns")
 _EXACT = "yes: configuration, chip, and the inputs of every tick"
 _NOT_EXACT = "yes, but not exact after the first missing message"
@@ -56,28 +59,89 @@ def check(session: Session | Path | str, progress: Callable[[int], None] | None 
     Raises
     ------
     SessionError : it is no session that this flowrec can read; the text says what it is.
+    Ended : Ctrl-C or a signal; its `result` is the verdict on what had been read.
     """
     path = session.path if isinstance(session, Session) else session_path(session)
     files = files_to_check(path)
-    if files == [path]:
-        return _FileCheck(path, progress).verdict
-    checks, before = [], 0
+    total = sum(map(size_of, files))
+    checks: list[_FileCheck] = []
     for file in files:
-        done = (lambda at, before=before: progress(before + at)) if progress is not None else None
-        checks.append(_FileCheck(file, done))
-        before += checks[-1].found.size_bytes
-    return _check_run(path, checks)
+        before = sum(check.read_bytes for check in checks)
+        check = _FileCheck(file, (lambda at, before=before: progress(before + at)) if progress is not None else None)
+        try:
+            check.read()
+        except KeyboardInterrupt as error:
+            ended = Ended.of(error)
+            covered = Coverage(before + check.read_bytes, total, "bytes", stopped=ended.why, status=ended.status)
+            ended.result = _verdict_so_far(path, covered, [*checks, check])
+            raise ended from error
+        checks.append(check)
+    verdict = checks[0].verdict if files == [path] else _check_run(path, checks)
+    verdict.covered = Coverage(sum(check.read_bytes for check in checks), total, "bytes", topics=tuple(verdict.topics))
+    if all(check.found.header is not None for check in checks):
+        verdict.covered = replace(verdict.covered, head=_HEAD)
+    amount, topics = verdict.covered.amount, len(verdict.topics)
+    verdict.fact("covered", f"{amount}, {topics} topics, {', '.join(verdict.covered.head) or 'no head'}")
+    return verdict
+
+
+def _verdict_so_far(path: Path, covered: Coverage, checks: Sequence[_FileCheck]) -> Verdict:
+    """What is wrong in the bytes that were read before a signal."""
+    verdict = Verdict(path, covered)
+    for check in checks:
+        verdict.findings += check.faults_of_messages()
+        for topic, count in check.topics.items():
+            verdict.topics[topic] = verdict.topics.get(topic, 0) + count
+    return verdict
 
 
 class _FileCheck:
-    """Reads one file and fills its verdict, one method for each subject."""
+    """Reads one file and fills its verdict, one method for each subject.
+
+    Attributes
+    ----------
+    read_bytes : how far it is.
+    """
 
     def __init__(self, path: Path, progress: Callable[[int], None] | None) -> None:
         self.tally = Tally()
-        self.found = audit(path, self.tally.add, progress, self.tally.begin)
+        self.found = Audit(path, 0)
+        self.read_bytes = 0
+        self._progress = progress
+        self.verdict = Verdict(path, Coverage(0, 0, "bytes"))
+
+    def _begin(self, found: Audit) -> None:
+        self.found = found
+        self.tally.begin(found)
+
+    def _at(self, read_bytes: int) -> None:
+        self.read_bytes = read_bytes
+        if self._progress is not None:
+            self._progress(read_bytes)
+
+    @property
+    def topics(self) -> dict[str, int]:
+        """Messages by topic that were read."""
+        return {BY_FIELD[name].path: count for name, count in self.found.counts.items()}
+
+    def faults_of_messages(self) -> list[Finding]:
+        """What is wrong in the messages that were read so far, each on its own."""
+        so_far = Verdict(self.found.path, self.verdict.covered)
+        if undecodable := self.found.undecodable.total():
+            so_far.bad(
+                "content", f"{undecodable} messages can not be decoded, the first is {self.found.first_undecodable}"
+            )
+        for what, count in self.tally.not_finite.most_common(_LISTED):
+            so_far.odd("numbers", f"NaN or infinity in {what}, {count} times")
+        return so_far.findings
+
+    def read(self) -> None:
+        """Read the file and judge it."""
+        self.found = audit(self.found.path, self.tally.add, self._at, self._begin)
+        self._at(self.found.size_bytes)
         self.tally.close()
-        self.verdict = Verdict(path)
-        self.verdict.topics = {BY_FIELD[name].path: count for name, count in self.found.counts.items()}
+        self.verdict.topics = self.topics
+        self.verdict.covered = Coverage(self.read_bytes, self.found.size_bytes, "bytes")
         self._config = self._header()
         self._end()
         self._content()
@@ -144,9 +208,7 @@ class _FileCheck:
             verdict.bad("index", f"{text}; `flowrec recover {found.path}` makes a new index")
         for text in found.disagreements:
             verdict.odd("index", text)
-        undecodable = found.undecodable.total()
-        if undecodable:
-            verdict.bad("content", f"{undecodable} messages can not be decoded, the first is {found.first_undecodable}")
+        verdict.findings += [fault for fault in self.faults_of_messages() if fault.about == "content"]
         for name, count in (+found.missing).items():
             verdict.odd("content", f"{count} messages of {BY_FIELD[name].path} are missing in the middle")
         agrees = found.finished and not (found.contradictions or found.disagreements or found.lost)
@@ -159,11 +221,18 @@ class _FileCheck:
         verdict, found = self.verdict, self.found
         if found.edits is None:
             verdict.fact("digest", "none: recorded by an older flowrec" if found.finished else "none: not finished")
-            return
-        for text in found.edits:
-            verdict.bad("digest", f"{text}: edited or damaged after the recording")
-        if not found.edits:
-            verdict.fact("digest", "header and messages are those that were recorded")
+            verdict.integrity = NO_DIGEST if found.finished else UNFINISHED
+        else:
+            for place in found.edits:
+                verdict.bad("digest", f"{DAMAGED} at {place}")
+            if found.edits:
+                verdict.integrity = f"{DAMAGED} at {found.edits[0]}"
+            else:
+                verdict.fact("digest", f"{CONSISTENT}: whoever can edit the file can edit its digest")
+        if found.finished and found.lost:
+            verdict.integrity = f"{DAMAGED} at byte {found.first_lost}"
+        elif found.contradictions:
+            verdict.integrity = f"{DAMAGED} at its index"
 
     def _times(self) -> None:
         verdict, found, tally = self.verdict, self.found, self.tally
@@ -233,8 +302,7 @@ class _FileCheck:
                 verdict.odd("drops", f"the camera was absent {losses.reconnections} times, and came back")
 
     def _numbers(self) -> None:
-        for what, count in self.tally.not_finite.most_common(_LISTED):
-            self.verdict.odd("numbers", f"NaN or infinity in {what}, {count} times")
+        self.verdict.findings += [fault for fault in self.faults_of_messages() if fault.about == "numbers"]
         if not self.tally.not_finite:
             self.verdict.fact("numbers", "finite wherever they must be")
 
@@ -291,7 +359,10 @@ class _FileCheck:
 
 def _check_run(path: Path, checks: Sequence[_FileCheck]) -> Verdict:
     """The verdict on all parts of a run together."""
-    run = Verdict(path, parts=[check.verdict for check in checks])
+    run = Verdict(path, checks[0].verdict.covered, parts=[check.verdict for check in checks])
+    apart = [check.verdict for check in checks if check.verdict.integrity != CONSISTENT]
+    if apart:
+        run.integrity = f"{apart[0].path.name} is {apart[0].integrity}"
     first_ns, last = checks[0].found.first_ns, checks[-1].found
     parts_with: dict[Finding, list[int]] = {}
     counts = Counter[str]()

@@ -102,7 +102,7 @@ def push(sessions: Sequence[Path], target: str) -> Pushed:
     _check_names([file for some in files.values() for file in some])
     total = sum(file.stat().st_size for some in files.values() for file in some)
     before = 0
-    with progress("pushing", max(total, 1)) as bar:
+    with progress("pushing", max(total, 1), "bytes") as bar:
         for path, some in files.items():
             try:
                 for file in some:

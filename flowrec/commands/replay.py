@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from flowrec.commands.replay_result import Replayed, WorkerCheck, WorkerResults,
 from flowrec.commands.run_summary import figures_of
 from flowrec.config import ResolvedConfig, with_sets
 from flowrec.control.controller import CONTROLLERS
+from flowrec.coverage import Coverage
 from flowrec.enums import Outcome, Phase, WorkOrder
 from flowrec.errors import SessionError, UsageError
 from flowrec.estimation.observer import OBSERVERS
@@ -30,6 +32,7 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.planning.planner import PLANNERS
 from flowrec.replay_figures import CommandDifference
 from flowrec.rigs.recorded import RecordedRig
+from flowrec.run.control import RunControl
 from flowrec.run.loop import Sink, run
 from flowrec.run.workers import ReplayWorker, work
 from flowrec.session import Session, files_behind, input_blamed
@@ -158,7 +161,8 @@ def replay(
     out : session file of the replay.
     overwrite : `out` may replace an existing file.
     frames : copy the camera's images to `out`.
-    control : who attends the replay; None: nobody, it takes no signals and shows no progress.
+    control : who attends the replay; None: nobody, it takes no signals and shows no progress. A replay that it stops
+        returns what was done by then, and `covered` of the result says so.
     segment_ns : replay a segment of a verification: stamps of its first and its last tick, None for the beginning. Its
         start is compared in the segment before, and digests are not.
 
@@ -214,10 +218,12 @@ def replay(
     first_ns = start_ns if start_ns is not None else reader.first_ns
 
     def on_tick(tick: Tick) -> None:
+        if check is not None:  # it takes as long as the mission's slow stages did
+            control.run_control.unless_stopped(partial(check.add, tick), None)
+            if control.run_control.reason:
+                return  # perhaps not all of this tick was looked at, so it does not count
         comparison.add(rig.recorded, tick)
         commands.add(rig.recorded.demand, tick.demand)
-        if check is not None:
-            check.add(tick)
         progress(seconds(tick.stamp_ns - first_ns))
 
     with ExitStack() as stack:
@@ -233,25 +239,53 @@ def replay(
             report = run(
                 pipeline, rig, worker, sinks, start=start, control=control.run_control, on_tick=on_tick, live=False
             )
-        if report.ticks == 0:
+        if report.ticks == 0 and not control.run_control.reason:
             raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
-        stopped, last = control.run_control.reason, report.last
-        if stale and not stopped:
+        last = report.last
+        if stale:
             progress.stage("work that was under way")
-            last = _closing_work(pipeline, config, last, rig.recorded, stale)
+            with control.armed():
+                closing = partial(_closing_work, pipeline, config, last, rig.recorded, stale)
+                last = control.run_control.unless_stopped(closing, last)
             if last is not report.last and sinks:
                 sinks[0].write(last)
+        covered = coverage_of(session, comparison.ticks, (start_ns, end_ns), from_s, control.run_control)
         if writer is not None:
-            ended = Outcome.STOPPED if stopped else Outcome.REPLAYED
-            note = f"replay of {path.name}" + (f", {stopped}" if stopped else "")
+            ended = Outcome.STOPPED if covered.stopped else Outcome.REPLAYED
+            note = f"replay of {path.name}" + (f", {covered.text}" if covered.stopped else "")
             figures = figures_of(session.chip, replace(report, last=last), rig.recorded.true_field)
-            writer.close(as_text(figures | {"outcome": ended, "note": note}))
-    result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing)
+            writer.close(as_text(figures | {"outcome": ended, "note": note, "covered": covered.amount}))
+    result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing, covered)
     if verify:
         result.worker = results
         if segment_ns is None:
-            result.digest = digest_lines(path)
+            with control.armed():
+                result.digest = control.run_control.unless_stopped(partial(digest_lines, path), None)
+            if control.run_control.reason:
+                result.covered = _stopped(covered, control.run_control)
     return result
+
+
+def coverage_of(
+    session: Session, ticks: int, between_ns: tuple[int | None, int], from_s: float | None, control: RunControl
+) -> Coverage:
+    """What a replay has looked at of the ticks that it was asked for, which have inputs."""
+    reader, (start_ns, end_ns) = session.reader, between_ns
+    total = reader.counts.get("applied", 0)
+    asked, left_out = total, {}
+    if start_ns is not None or end_ns < reader.last_ns:
+        asked = sum((start_ns or 0) <= stamp_ns <= end_ns for stamp_ns in reader.stamps("applied"))
+    part = ""
+    if from_s is not None:
+        part, left_out = f"from {from_s:g} s on", {f"{total - asked} ticks before {from_s:g} s": "not asked for"}
+    elif ticks < asked and not control.reason:
+        left_out = {f"{asked - ticks} ticks": "hold neither image nor track, so there is nothing to replay"}
+    covered = Coverage(ticks, asked, "ticks", part, left_out=left_out)
+    return _stopped(covered, control) if control.reason else covered
+
+
+def _stopped(covered: Coverage, control: RunControl) -> Coverage:
+    return replace(covered, stopped=control.reason.removeprefix("stopped by "), status=control.stop_status)
 
 
 def _with_recorded_region(session: Session, config: ResolvedConfig) -> ResolvedConfig:

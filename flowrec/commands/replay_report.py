@@ -27,7 +27,7 @@ from flowrec.session_writer import session_writer
 from flowrec.store.session_path import named_beside
 from flowrec.summary import Row
 from flowrec.system.outputs import MCAP, RRD, Output
-from flowrec.terminal import say
+from flowrec.terminal import progress, say
 from flowrec.topics import FLOW_FIELDS
 from flowrec.units import seconds
 
@@ -98,10 +98,15 @@ def replay_and_report(
     frames: bool = False,
     control: Unattended | None = None,
 ) -> tuple[Replayed, list[Row]]:
-    """Replay a session, report on it, and write all outputs; arguments and errors as of `replay` and `refly`."""
+    """Replay a session, report on it, and write all outputs; arguments and errors as of `replay` and `refly`.
+
+    Of a replay that was stopped nothing else is made.
+    """
     output = outputs.session
     done = replay(path, change, from_s, False, output.path, output.overwrite, frames, control)
     rows = before_after(done)
+    if done.covered.stopped:
+        return done, rows
     if outputs.refly is not None:
         rows += refly(done, outputs.refly)
     if outputs.rrd is not None:
@@ -125,54 +130,56 @@ def refly(done: Replayed, out: Output | None) -> list[Row]:
     ------
     UsageError : there is no map or no route to fly.
     """
-    flow = done.replayed.field
-    if flow is None or done.recorded.mission is None or done.recorded.route is None:
+    if done.replayed.field is None or done.recorded.mission is None or done.recorded.route is None:
         raise UsageError(
             "--refly: the session has no map or no route to fly; replay it with --refine --plan astar_time"
         )
-    session = done.session
     x_um, y_um = (float(value) for value in planned_from(done.recorded, done.replayed))
-    # Another flight passes the places at other times, so it is not sent on when the recorded robot was.
-    goal = (float(done.recorded.mission.goal_um[0]), float(done.recorded.mission.goal_um[1]))
-    limit_um_s = done.recorded.mission.speed_limit_um_s
-    reports = []
-    for name, config, tick, target in (
-        ("recorded", session.config, done.recorded, None),
-        ("replayed", done.config, done.replayed, out),
-    ):
-        mission = replace(
-            config.mission,
-            phases=(Phase.PLAN, Phase.NAVIGATE),
-            start=(x_um, y_um),
-            goal=goal,
-            replan_error_um=None,
-            wait_at_goal_s=0.0,
-        )
-        flown = replace(config, mission=mission)
-        pipeline = assemble(flown, session.chip)
-        rig = SimulatedRig.of(pipeline, flown, true_field=flow)
-        known = {key: field for key in FLOW_FIELDS if (field := getattr(tick, key)) is not None}
-        worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
-        sinks: list[Sink] = []
-        with ExitStack() as stack:
-            if target is not None:
-                writer = session_writer(target, flown, session.chip, parent=session.path)
-                sinks.append(stack.enter_context(writer))
-            say(f"reflying as {name} ...")
-            control = RunControl()
-            if limit_um_s is not None:
-                control.limit_speed(limit_um_s)
-            flight = run(pipeline, rig, worker, sinks, control=control)
-            if target is not None:
-                writer.close({"outcome": flight.outcome, "note": f"refly of {session.path.name}"})
-        reports.append(flight)
-    was, now = reports
+    start_um = (x_um, y_um)
+    with progress("reflying", 2, "flights") as flights:
+        was = _flown(done, "recorded", start_um, None)
+        flights(1)
+        now = _flown(done, "replayed", start_um, out)
     return [
         ("reflown_outcome", was.outcome, now.outcome),
         ("reflown_navigation_s", _navigation_s(was), _navigation_s(now)),
         ("reflown_planned_s", _planned_s(was), _planned_s(now)),
         ("reflown_contacts", was.contacts, now.contacts),
     ]
+
+
+def _flown(done: Replayed, name: str, start_um: tuple[float, float], out: Output | None) -> RunReport:
+    """The flight of the "recorded" or the "replayed" plan, written to `out` if it is given."""
+    session, last = done.session, done.recorded.mission
+    config, tick = (session.config, done.recorded) if name == "recorded" else (done.config, done.replayed)
+    assert last is not None
+    mission = replace(
+        config.mission,
+        phases=(Phase.PLAN, Phase.NAVIGATE),
+        start=start_um,
+        # Another flight passes the places at other times, so it is not sent on when the recorded robot was.
+        goal=(float(last.goal_um[0]), float(last.goal_um[1])),
+        replan_error_um=None,
+        wait_at_goal_s=0.0,
+    )
+    flown = replace(config, mission=mission)
+    pipeline = assemble(flown, session.chip)
+    rig = SimulatedRig.of(pipeline, flown, true_field=done.replayed.field)
+    known = {key: field for key in FLOW_FIELDS if (field := getattr(tick, key)) is not None}
+    worker = Preloaded(LockstepWorker(pipeline, config.worker.adopt_after_s), known)
+    sinks: list[Sink] = []
+    with ExitStack() as stack:
+        if out is not None:
+            writer = session_writer(out, flown, session.chip, parent=session.path)
+            sinks.append(stack.enter_context(writer))
+        say(f"reflying as {name} ...")
+        control = RunControl()
+        if last.speed_limit_um_s is not None:
+            control.limit_speed(last.speed_limit_um_s)
+        flight = run(pipeline, rig, worker, sinks, control=control)
+        if out is not None:
+            writer.close({"outcome": flight.outcome, "note": f"refly of {session.path.name}"})
+    return flight
 
 
 def _largest_change(was: FlowField, now: FlowField) -> float:

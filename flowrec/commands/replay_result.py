@@ -9,6 +9,7 @@ from typing import Any
 
 from flowrec.commands.compare import Comparison
 from flowrec.config import ResolvedConfig
+from flowrec.coverage import Coverage
 from flowrec.enums import WorkOrder
 from flowrec.errors import printable
 from flowrec.messages import Mission
@@ -19,6 +20,8 @@ from flowrec.run.workers import work
 from flowrec.session import Session
 from flowrec.store.audit import digest_faults
 from flowrec.topics import ANSWERED_BY, BY_FIELD, WORKER_FIELDS, Tick
+
+CONSISTENT = "head and messages: consistent with their digest, unsigned: whoever can edit the file can edit both"
 
 
 @dataclass(slots=True)
@@ -106,8 +109,8 @@ def digest_lines(path: Path) -> tuple[bool, list[str]]:
             lines.append(printable(f"{file.name}: no digest, recorded by an older flowrec"))
         elif faults:
             intact = False
-            lines += [printable(f"{file.name}: DIFFERENT from its digest: {fault}") for fault in faults]
-    return intact, lines or ["all messages and the header match the digest"]
+            lines += [printable(f"{file.name}: damaged or edited at {fault}") for fault in faults]
+    return intact, lines or [CONSISTENT]
 
 
 @dataclass(slots=True)
@@ -123,8 +126,9 @@ class Replayed:
     comparison : of the outputs of both, tick by tick.
     commands : of the demands of both.
     frames_missing : images that are not in the file.
+    covered : the ticks that were replayed and compared, of those that were asked for.
     worker : of --verify: the results of the worker.
-    digest : of --verify: whether the files match their digests, and lines of text about it.
+    digest : of --verify: whether the files match their digests, and lines of text about it; None: they were not read.
     """
 
     session: Session
@@ -135,18 +139,37 @@ class Replayed:
     comparison: Comparison
     commands: CommandDifference
     frames_missing: int
+    covered: Coverage
     worker: WorkerResults | None = None
-    digest: tuple[bool, list[str]] = (True, [])
+    digest: tuple[bool, list[str]] | None = None
 
     @property
-    def same(self) -> bool:
-        """Whether everything that was compared is the same within its tolerance, and the files are unchanged."""
-        return self.digest[0] and all(comparison.same for comparison in self._comparisons)
+    def same(self) -> bool | None:
+        """Whether all that was asked for is the same within its tolerance, and the files match their digests.
+
+        None if it was stopped before a difference was found.
+        """
+        return self._judged(self._same_so_far)
 
     @property
-    def identical(self) -> bool:
-        """The same bit for bit."""
-        return self.digest[0] and all(comparison.identical for comparison in self._comparisons)
+    def identical(self) -> bool | None:
+        """The same bit for bit; None as of `same`."""
+        return self._judged(self._identical_so_far)
+
+    @property
+    def exit_status(self) -> int:
+        """0 the same, 3 something differs, 130 or 143 stopped."""
+        return self.covered.status if self.covered.stopped else 0 if self.same else 3
+
+    def _judged(self, compared: bool) -> bool | None:
+        if not compared or not self._intact:
+            return False
+        return None if self.covered.stopped else True
+
+    @property
+    def _intact(self) -> bool:
+        """No difference from a digest is known."""
+        return self.digest is None or self.digest[0]
 
     @property
     def _comparisons(self) -> list[Comparison]:
@@ -157,29 +180,54 @@ class Replayed:
         lines = self.comparison.lines()
         if self.worker is not None:
             lines += self.worker.lines
-        lines += self.digest[1]
+        if self.digest is not None:
+            lines += self.digest[1]
+        elif self.worker is not None:
+            lines.append("not looked at: its digest")
         if self.frames_missing:
             lines.append(f"{self.frames_missing} frames are not in the file; the recorded tracks were used instead")
+        lines += [printable(f"not looked at: {what}, {why}") for what, why in self.covered.left_out.items()]
         first = next((each.first for each in self._comparisons if each.first is not None), None)
         if first is not None:
             lines.append(f"first difference: {first}")
-        differs = self.comparison.other_numerics if self.digest[0] else ""
-        conclusion = "every tick identical" if self.identical else "the same within tolerance"
-        if not self.same:
-            conclusion = differs or "NOT the same"
-            if differs and self.comparison.same:
-                conclusion = f"the same within tolerance; results of the worker {differs}"
-        lines.append(f"{self.comparison.ticks} ticks: {conclusion}")
-        return lines
+        return [*lines, self.covered.sentence(self._conclusion)]
+
+    @property
+    def _conclusion(self) -> str:
+        """What is true of the ticks that were looked at."""
+        if self.covered.stopped and self._same_so_far and self._intact:
+            return "identical" if self._identical_so_far else "the same within tolerance"
+        if self.identical:
+            return "every tick identical"
+        if self.same:
+            return "the same within tolerance"
+        differs = self.comparison.other_numerics if self._intact else ""
+        if differs and self.comparison.same:
+            return f"the same within tolerance; results of the worker {differs}"
+        return differs or "NOT the same"
+
+    @property
+    def _same_so_far(self) -> bool:
+        return all(comparison.same for comparison in self._comparisons)
+
+    @property
+    def _identical_so_far(self) -> bool:
+        return all(comparison.identical for comparison in self._comparisons)
 
     def as_json(self) -> dict[str, Any]:
-        """The same in numbers, with the lines."""
+        """The same in numbers, with the lines; `same` and `identical` are null where a part was not looked at."""
         found = [comparison.as_json() for comparison in self._comparisons]
+        topics = {name: count for each in found for name, count in each["topics"].items()}
+        same, identical = self.same, self.identical
+        whole = self.covered.whole
+        covered = replace(self.covered, topics=tuple(topics), head=("digest",) if self.digest is not None else ())
+        of_covered = {"same": self._same_so_far, "identical": self._identical_so_far}
         return found[0] | {
-            "same": self.same,
-            "identical": self.identical,
-            "topics": {name: count for each in found for name, count in each["topics"].items()},
+            "same": same if whole or same is False else None,
+            "identical": identical if whole or identical is False else None,
+            "covered": covered.as_json() | of_covered,
+            "topics": topics,
             "first": next((each["first"] for each in found if each["first"] is not None), None),
-            "digest_faults": [] if self.digest[0] else self.digest[1],
+            "digest_faults": None if self.digest is None else [] if self.digest[0] else self.digest[1],
             "lines": self.lines(),
         }

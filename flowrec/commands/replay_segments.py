@@ -9,17 +9,19 @@ because the next segment starts from the recording again.
 from __future__ import annotations
 
 import os
-from concurrent.futures import Future, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from flowrec.commands.compare import Comparison
+from flowrec.commands.compare import Comparison, Side
 from flowrec.commands.interactive import Unattended
-from flowrec.commands.replay import replay
+from flowrec.commands.replay import coverage_of, replay
 from flowrec.commands.replay_result import Replayed, WorkerResults, digest_lines
 from flowrec.errors import SessionError, UsageError
 from flowrec.replay_figures import CommandDifference
+from flowrec.run.control import RunControl
 from flowrec.run.loop import RunReport
 from flowrec.session import Session
 from flowrec.system.processes import pool
@@ -29,6 +31,7 @@ from flowrec.version import NUMERICS_VERSION
 _TICKS = 300  # of a segment at least: restoring its start takes as long as a few of them
 _PER_JOB = 4  # segments, because those with work orders take longer
 _JOBS_LIMIT = 256
+_POLL_S = 0.2  # until a request to stop is seen
 
 Segment = tuple[int | None, int]  # stamps of the first and the last tick; None: the beginning of the session
 
@@ -53,7 +56,7 @@ def verify(
     ----------
     jobs : processes at a time; 1: one pass in this process, as for a session of other numerics; 0: one for each core.
     from_s : session time in s to start at.
-    control : as of `replay`.
+    control : as of `replay`. Of a verification that it stops, the segments count that were done by then.
 
     Raises
     ------
@@ -67,20 +70,40 @@ def verify(
     segments = _segments(session, jobs, from_s) if jobs > 1 else []
     if len(segments) < 2:
         return replay(session, from_s=from_s, verify=True, control=control)
+    tasks: list[Future[_Verified]] = []
+    digest: Future[tuple[bool, list[str]]] | None = None
+    stopped = control.run_control
     try:
         with (
+            control.armed(),
             pool(min(jobs, len(segments))) as executor,
             control.progress(f"replaying {session.path.name}", float(len(segments))) as progress,
         ):
-            tasks = [executor.submit(_verified, session.path, segment) for segment in segments]
-            digest: Future[tuple[bool, list[str]]] = executor.submit(digest_lines, session.path)
-            for count, task in enumerate(as_completed(tasks), 1):
-                task.result()  # a failure ends the others
-                progress(float(count))
-            found = [task.result() for task in tasks]
-            return _joined(session, found, digest.result())
+            tasks += [executor.submit(_verified, session.path, segment) for segment in segments]
+            digest = executor.submit(digest_lines, session.path)
+            waiting: set[Future[Any]] = {*tasks, digest}
+            while waiting:
+                done, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+                for task in done:
+                    task.result()  # a failure ends the others
+                progress(float(sum(task.done() for task in tasks)))
+                if stopped.reason:
+                    raise _StoppedError
     except BrokenProcessPool as error:
         raise SessionError(f"{session.path}: a process of the replay was killed; try fewer --jobs") from error
+    except _StoppedError:
+        pass
+    found = [task.result() for task in tasks if _succeeded(task)]
+    known = digest.result() if digest is not None and _succeeded(digest) else None
+    return _joined(session, found, known, from_s, stopped)
+
+
+class _StoppedError(Exception):
+    """Leaves the pool, whose processes then end at once."""
+
+
+def _succeeded(task: Future[Any]) -> bool:
+    return task.done() and not task.cancelled() and task.exception() is None
 
 
 def _segments(session: Session, jobs: int, from_s: float | None) -> list[Segment]:
@@ -104,22 +127,32 @@ def _verified(path: Path, segment: Segment) -> _Verified:
     return _Verified(done.report, done.recorded, done.comparison, done.worker, done.frames_missing)
 
 
-def _joined(session: Session, found: list[_Verified], digest: tuple[bool, list[str]]) -> Replayed:
-    """The segments, in order, as one replay."""
-    first, *others = found
-    for each in others:
-        first.comparison.followed_by(each.comparison)
-        first.worker.followed_by(each.worker)
-    last = found[-1]
+def _joined(
+    session: Session,
+    found: list[_Verified],
+    digest: tuple[bool, list[str]] | None,
+    from_s: float | None,
+    stopped: RunControl,
+) -> Replayed:
+    """The segments that are done, in order, as one replay."""
+    sides = Side.of("recorded", session), Side("replayed", "the replay")
+    comparison, worker = Comparison(sides=sides), WorkerResults(Comparison(sides=sides))
+    for each in found:
+        comparison.followed_by(each.comparison)
+        worker.followed_by(each.worker)
+    report = replace(found[-1].report if found else RunReport(), ticks=comparison.ticks, duration_s=session.duration_s)
+    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
+    between_ns = start_ns, session.reader.last_ns
     return Replayed(
         session,
         session.config,
-        replace(last.report, ticks=first.comparison.ticks, duration_s=session.duration_s),
-        last.recorded,
-        last.report.last,
-        first.comparison,
+        report,
+        found[-1].recorded if found else Tick(),
+        report.last,
+        comparison,
         CommandDifference(),
         sum(each.frames_missing for each in found),
-        first.worker,
+        coverage_of(session, comparison.ticks, between_ns, from_s, stopped),
+        worker,
         digest,
     )

@@ -88,7 +88,7 @@ def report(
     _check_parents(session, parts)
     config = session.config
     with ExitStack() as stack:
-        done = stack.enter_context(progress(f"reading {path.name}", max(session.duration_s, 1e-3)))
+        done = stack.enter_context(progress(f"reading {path.name}", max(session.duration_s, 1e-3), "s"))
         stack.enter_context(input_blamed(session, config, "reported on"))
         verdict = check(session)
         data = ReportData.of(session, done)

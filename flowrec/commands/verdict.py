@@ -7,14 +7,20 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
+from flowrec.coverage import Coverage
 from flowrec.errors import printable
 from flowrec.summary import Figures
 
 _JUDGEMENTS = {
-    "good": (0, "GOOD: whole, and can be replayed"),
-    "usable": (3, "USABLE: can be replayed, but something was lost or is odd"),
-    "bad": (1, "NOT USABLE as it is"),
+    "good": (0, "GOOD: {integrity}; can be replayed"),
+    "usable": (3, "USABLE: {integrity}; can be replayed, but something was lost or is odd"),
+    "bad": (1, "NOT USABLE as it is ({integrity})"),
 }
+# Never more than this is said: whoever can edit the file can edit its digest.
+CONSISTENT = "consistent, unsigned"
+NO_DIGEST = "no digest to be consistent with"
+DAMAGED = "damaged or edited"
+UNFINISHED = "not finished"
 _MARKS = {"bad": "!!", "odd": "! "}
 
 
@@ -55,9 +61,12 @@ class Verdict:
     topics : messages read, by topic.
     gaps : the longest times without a frame, in order of time; `gap_count` is the number of all.
     parts : the verdicts on the parts of a run that was split.
+    covered : how much of the file was read.
+    integrity : whether it agrees with itself: one of the words above.
     """
 
     path: Path
+    covered: Coverage
     findings: list[Finding] = field(default_factory=list)
     facts: dict[str, str] = field(default_factory=dict)
     figures: Figures = field(default_factory=dict)
@@ -65,17 +74,28 @@ class Verdict:
     gaps: list[Gap] = field(default_factory=list)
     gap_count: int = 0
     parts: list[Verdict] = field(default_factory=list)
+    integrity: str = CONSISTENT
 
     @property
-    def word(self) -> Literal["good", "usable", "bad"]:
-        """The judgement."""
+    def word(self) -> Literal["good", "usable", "bad", "stopped"]:
+        """The judgement; none where the file was not read to its end."""
+        if self.covered.stopped:
+            return "stopped"
         levels = {finding.level for finding in self.findings}
         return "bad" if Severity.BAD in levels else "usable" if levels else "good"
 
     @property
     def exit_status(self) -> int:
-        """0 good, 3 usable but something was lost or is odd, 1 not readable or not to be replayed."""
-        return _JUDGEMENTS[self.word][0]
+        """0 good, 3 usable but something was lost or is odd, 1 not to be replayed, 130 or 143 stopped."""
+        return self.covered.status if self.covered.stopped else _JUDGEMENTS[self.word][0]
+
+    @property
+    def judgement(self) -> str:
+        """The judgement in a line."""
+        if self.covered.stopped:
+            found = "with what is below" if self.findings else "without a fault"
+            return self.covered.sentence(found)
+        return _JUDGEMENTS[self.word][1].format(integrity=self.integrity)
 
     def odd(self, about: str, text: str) -> None:
         """Add a finding: something was lost or is unusual."""
@@ -91,7 +111,7 @@ class Verdict:
 
     def lines(self) -> list[str]:
         """The verdict as lines of text, the judgement first."""
-        lines = [printable(f"{self.path.name}: {_JUDGEMENTS[self.word][1]}")]
+        lines = [printable(f"{self.path.name}: {self.judgement}")]
         ordered = sorted(self.findings, key=lambda finding: list(_MARKS).index(finding.level))
         lines += [f"  {_MARKS[finding.level]} {finding.text}" for finding in ordered]
         width = max(map(len, self.facts), default=0)
@@ -102,4 +122,5 @@ class Verdict:
         content = asdict(self)
         del content["path"]
         head = {"session": str(self.path), "verdict": self.word, "exit_status": self.exit_status}
-        return head | content | {"parts": [part.as_json() for part in self.parts]}
+        parts = [part.as_json() for part in self.parts]
+        return head | content | {"parts": parts, "covered": self.covered.as_json()}

@@ -35,6 +35,7 @@ _MOST_WAITING = 100  # events; each takes a tick, so more would be recorded seco
 _STEERING_NS = NS_PER_S // 5  # of the session, from a goal or speed limit to the next one that is taken
 _FARTHEST_UM, _SPEEDS_UM_S = 1e9, (0.01, 1e6)  # as the ranges of mission.goal and robot.max_speed_um_s
 
+_STOPPED = 130  # exit status, as after Ctrl-C
 _HOLD = "hold"  # becomes pause or resume when the loop takes it
 
 
@@ -52,12 +53,14 @@ class RunControl:
     Attributes
     ----------
     reason : why the run must end; empty before.
+    stop_status : exit status of a program that judges and was stopped by that (Ctrl-C and a key are the same).
     ticking : whether the loop has begun; before, nothing is driven, and the end need not wait for anything.
     interruptible : context for the loop: inside it an overdue shutdown raises `Interrupted`.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.reason = ""
+        self.stop_status = _STOPPED
         self.ticking = False
         self.interruptible = _Block()
         self._clock = clock
@@ -115,7 +118,7 @@ class RunControl:
         """Hold the robot, or let it go on if it is held."""
         self._waiting.append((_HOLD, ""))
 
-    def stop(self, reason: str, *, zero: bool = False) -> None:
+    def stop(self, reason: str, *, zero: bool = False, status: int = _STOPPED) -> None:
         """End the run; with `zero` the field is switched off on the next tick, before every other event."""
         if zero:
             self._waiting.appendleft((Action.ZERO, reason))
@@ -123,7 +126,7 @@ class RunControl:
             self._waiting.append((Action.STOP, reason))
         if not self.reason:
             self._since_s = self._clock()
-            self.reason = reason
+            self.stop_status, self.reason = status, reason
 
     def skip_ramp(self) -> None:
         """Leave no time for a ramp."""

@@ -12,7 +12,8 @@ coils' zero() or leaves a lock taken. The exception is SIGALRM: the thread sends
 | SIGTSTP (Ctrl-Z) | zero() at once; then the process stops, and ends the run after `fg` |
 
 This thread ends the process if a signal or the watchdog has ended the run and its loop is stuck for 5 s, or if the run
-was stopped at once and has not ended 3 s later: the field off, the file closed if its thread answers, os._exit(1).
+was stopped at once and has not ended 3 s later: the field off, the file closed if its thread answers, os._exit(1). A
+replay, which drives nothing, ends with the status of its signal.
 """
 
 from __future__ import annotations
@@ -30,16 +31,13 @@ from typing import Any
 
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
+from flowrec.system.endings import status_of, stopped_by
 from flowrec.system.processes import realtime_priority
 from flowrec.system.stderr import said_within
 
 assert sys.platform != "win32"  # there is no SIGHUP, SIGTSTP or pthread_kill
 
-_ENDING = {
-    signal.SIGINT: "stopped by SIGINT: Ctrl-C",
-    signal.SIGTERM: "stopped by SIGTERM",
-    signal.SIGHUP: "stopped by SIGHUP: the terminal was closed",
-}
+_ENDING = {number: f"stopped by {stopped_by(number)}" for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
 _AT_ONCE = {
     signal.SIGTSTP: "operator: zero field (SIGTSTP: Ctrl-Z)",
     signal.SIGQUIT: "operator: zero field (SIGQUIT)",
@@ -130,7 +128,7 @@ class Signals:
             insists = number == signal.SIGINT or (number == signal.SIGTERM and self._by == signal.SIGTERM)
             if self._by is None or not insists:
                 self._by = number if self._by is None else self._by
-                self._control.stop(_ENDING[signal.Signals(number)])
+                self._control.stop(_ENDING[signal.Signals(number)], status=status_of(number))
                 return
             self._at_once(f"{signal.Signals(number).name} again: zero field")
         elif number == signal.SIGTSTP:
@@ -168,7 +166,7 @@ class Signals:
         lines.append(self._give_up())
         self._leave_terminal()
         said_within(_PRINT_S, lambda: print(f"flowrec: {'; '.join(filter(None, lines))}", file=sys.stderr))
-        os._exit(1)
+        os._exit(1 if watchdog is not None or self._by is None else status_of(self._by))
 
 
 def _nothing(_number: int, _frame: FrameType | None) -> None:

@@ -1,7 +1,8 @@
 """The digest of what a session file holds: one per topic over its messages, and one over its head.
 
 It detects damage and edits after the recording, also where a replay can not: in inputs, truth, diagnostics, views and
-the configuration. It does not detect a forgery, because anybody can compute it.
+the configuration. It does not detect a forgery, because whoever can write the file can write the digest: a file that
+agrees with it is consistent, and unsigned.
 
 The digest of a topic is the sum, modulo 2^256, of the SHA-256 of each message: MCAP sequence, log time, and payload. So
 it does not depend on the order, the chunks or the compression: a file that another MCAP tool has rewritten with the
@@ -27,6 +28,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from flowrec.errors import SessionError, printable
 from flowrec.store.mcap_format import Record
 from flowrec.store.session_metadata import DIGEST, SessionMetadata, is_header_file
+from flowrec.units import seconds
 
 _MODULUS = 1 << 256
 _MESSAGE = struct.Struct("<IQ")  # sequence, log time
@@ -89,24 +91,28 @@ class FileDigest:
     start_unix_ns: int = 0
     counts: Counter[int] = field(default_factory=Counter)
     sums: Counter[int] = field(default_factory=Counter)
+    first: dict[int, tuple[int, int]] = field(default_factory=dict)  # by channel, session time in ns and chunk's offset
+    last: dict[int, tuple[int, int]] = field(default_factory=dict)
 
-    def add(self, _offset: int, records: Iterable[Record]) -> None:
+    def add(self, offset: int, records: Iterable[Record]) -> None:
         """Add the messages of one chunk."""
         for record in records:
             assert isinstance(record.payload, memoryview)
             self.counts[record.channel] += 1
+            self.last[record.channel] = at = (record.log_ns, offset)
+            self.first.setdefault(record.channel, at)
             log_ns = record.log_ns + self.start_unix_ns
             self.sums[record.channel] += message_digest(record.sequence, log_ns, record.payload)
 
     def faults(self, file: SessionMetadata) -> list[str] | None:
-        """What differs from the digest that a finished file contains, as text without advice; None: it contains none.
+        """Where a finished file differs from the digest that it contains, as far as known; None: it contains none.
 
         Topics and records that flowrec has not written are passed over.
         """
         recorded = file.digest
         if recorded is None:
             # Files of the first release have neither a digest nor a start.
-            return ["the digest that was recorded is missing"] if self.start_unix_ns and file.outcome else None
+            return ["the digest, which was taken out"] if self.start_unix_ns and file.outcome else None
         counts: Counter[str] = Counter()
         sums: Counter[str] = Counter()
         declared: dict[str, set[str]] = {}
@@ -121,20 +127,28 @@ class FileDigest:
                 ours.add(channel.topic)
         faults = []
         if not _head_matches(file, recorded.get(_HEAD)):
-            faults.append("configuration, chip, origin or outcome are not those that were recorded")
+            faults.append("the head (configuration, chip, origin or outcome)")
         for topic in sorted((recorded.keys() | {topic for topic in ours if counts[topic]}) - {_HEAD}):
             expected, found = recorded.get(topic, "0").split(" "), _topic_text(counts[topic], sums[topic]).split(" ")
             if declared.get(topic, set()) - set(expected[2:]) and expected[2:]:
-                faults.append(
-                    printable(f"schema or metadata of {topic} are not those that were recorded"[:_TEXT_LIMIT])
-                )
+                faults.append(printable(f"{topic[:_TEXT_LIMIT]}, in its schema or metadata"))
             if found == expected[:2]:
                 continue
-            count, expected_count = found[0], expected[0]
-            numbers = f", {count} where {expected_count} were recorded" if expected_count != count else ""
-            faults.append(printable(f"the messages of {topic} are not those that were recorded{numbers}"[:_TEXT_LIMIT]))
+            numbers = f", {found[0]} where {expected[0][:_TEXT_LIMIT]} were" if expected[0] != found[0] else ""
+            here = {number for number, channel in file.channels.items() if channel.topic == topic}
+            faults.append(printable(f"{topic[:_TEXT_LIMIT]}, in its messages{numbers}{self._extent(here)}"))
         more = len(faults) - _FAULTS_LIMIT
         return faults if more <= 0 else [*faults[:_FAULTS_LIMIT], f"and so on, {more} more"]
+
+    def _extent(self, channels: set[int]) -> str:
+        """From when to when, and in which bytes of the file, the messages of some channels are; '' without one."""
+        ends = [self.first[number] for number in channels & self.first.keys()]
+        ends += [self.last[number] for number in channels & self.last.keys()]
+        if not ends:
+            return ""
+        times, offsets = [seconds(at_ns) for at_ns, _ in ends], [offset for _, offset in ends]
+        place = f"byte {min(offsets)}" if len(set(offsets)) == 1 else f"bytes {min(offsets)} to {max(offsets)}"
+        return f" ({min(times):.3f} to {max(times):.3f} s, chunks at {place})"
 
 
 def _head_matches(file: SessionMetadata, recorded: str | None) -> bool:

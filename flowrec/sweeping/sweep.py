@@ -105,7 +105,7 @@ def sweep(
     """
     chosen = combinations(grid, sets, tuple(COLUMNS))
     files = session_files(places)
-    with progress("reading heads and indexes", len(files)) as done:
+    with progress("reading heads and indexes", len(files), "sessions") as done:
         sessions = Sessions.of(files, done)
     _check_settings(next(iter(sessions.by_content.values())), chosen)
     _tell(sessions.left_out)
@@ -121,7 +121,7 @@ def sweep(
         waiting = [task for key, task in tasks.items() if key not in failed or (retry and failed[key])]
         if waiting:
             say(f"{len(waiting)} replays to do, {len(tasks) - len(waiting)} are done")
-            with workers_of(scheduler, workers) as client, progress("sweeping", len(waiting)) as done:
+            with workers_of(scheduler, workers) as client, progress("sweeping", len(waiting), "replays") as done:
                 for row in rows_of(client, _judged_once(waiting, results.judged), local=scheduler is None):
                     results.put(row)
                     computed += 1

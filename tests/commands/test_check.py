@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import signal
 import struct
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
+from flowrec.system.endings import Ended
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from tests.store.made_up import HEADER, ticks_of
 
@@ -59,11 +61,28 @@ def test_a_real_mission_is_good_and_its_verdict_comes_first(session):
     done = typed("check", session)
     assert done.exit_code == 0
     lines = done.stdout.splitlines()
-    assert lines[0] == f"{session.name}: GOOD: whole, and can be replayed" and len(lines) < 24
+    assert lines[0] == f"{session.name}: GOOD: consistent, unsigned; can be replayed" and len(lines) < 24
     assert "index and statistics agree with what was read" in done.stdout
     told = json.loads(typed("check", session, "--json").stdout)
     assert (told["verdict"], told["exit_status"], told["findings"], told["gap_count"]) == ("good", 0, [], 0)
     assert told["topics"] == json.loads(typed("info", session, "--json").stdout)["topics"]
+    covered = told["covered"]
+    assert covered["whole"] and covered["done"] == covered["total"] == session.stat().st_size
+    assert covered["topics"] == list(told["topics"]) and covered["head"]
+
+
+def test_a_check_that_is_stopped_judges_what_it_has_read_and_no_more(session):
+    def stopped_half_way(at):
+        if at > session.stat().st_size / 2:
+            raise Ended(signal.SIGTERM)
+
+    with pytest.raises(Ended) as stopped:
+        check(session, stopped_half_way)
+    verdict = stopped.value.result
+    assert (verdict.word, verdict.exit_status, verdict.findings) == ("stopped", 143, [])
+    assert 0.5 < verdict.covered.done / session.stat().st_size < 1.0 and not verdict.as_json()["covered"]["whole"]
+    assert "(SIGTERM); those are without a fault" in verdict.lines()[0]
+    assert all(word not in " ".join(verdict.lines()) for word in ("GOOD", "consistent", "can be replayed"))
 
 
 def cut_off(session, channel, path):

@@ -116,7 +116,7 @@ def test_the_page_states_outcome_numbers_with_units_refinement_and_provenance(ht
         "refined flow error 8.9 %",
         "tracking error 53.7 µm",
         "the robot moves 12 +- 2 % less per revolution than stated",
-        "GOOD: whole, and can be replayed",
+        "GOOD: consistent, unsigned; can be replayed",
         "by flowrec 0.1.0 (6421a40395)",
         "mean inward speed 220 µm/s",
     ):

@@ -95,7 +95,7 @@ def test_every_value_of_a_message_is_under_the_digest(topic: str, small: Path, t
 
         edited = tmp_path / f"{number}.mcap"
         assert rewrite(small, edited, edit) == 1
-        assert any(f"messages of {topic} are not" in text for text in digest_findings(edited)), name
+        assert any(f"damaged or edited at {topic}, in its messages" in text for text in digest_findings(edited)), name
         edited.unlink()
 
 
@@ -142,7 +142,7 @@ def test_every_record_of_the_head_is_under_the_digest(name: str, small: Path, tm
     rewrite(small, tmp_path / "edited.mcap", None, edit_head)
     assert check(tmp_path / "edited.mcap").exit_status == 1
     assert digest_findings(tmp_path / "edited.mcap") == [
-        "configuration, chip, origin or outcome are not those that were recorded: edited or damaged after the recording"
+        "damaged or edited at the head (configuration, chip, origin or outcome)"
     ]
 
 
@@ -158,25 +158,18 @@ def test_what_is_declared_of_a_topic_is_under_the_digest(what: str, small: Path,
             record.data = record.data.replace(b"frame_id", b"frame_it")
 
     rewrite(small, tmp_path / "edited.mcap", None, edit_head)
-    assert any(
-        "schema or metadata of /camera/frame are not" in text for text in digest_findings(tmp_path / "edited.mcap")
-    )
+    assert "damaged or edited at /camera/frame, in its schema or metadata" in digest_findings(tmp_path / "edited.mcap")
 
 
 def test_a_message_that_was_taken_out_is_missed_by_number(small: Path, tmp_path: Path) -> None:
     rewrite(small, tmp_path / "edited.mcap", drop="/operator/events")
     found = digest_findings(tmp_path / "edited.mcap")
-    assert found == [
-        "the messages of /operator/events are not those that were recorded, 0 where 1 were recorded: edited or damaged"
-        " after the recording"
-    ]
+    assert found == ["damaged or edited at /operator/events, in its messages, 0 where 1 were"]
 
 
 def test_a_digest_that_was_taken_out_is_missed(small: Path, tmp_path: Path) -> None:
     rewrite(small, tmp_path / "edited.mcap", keep_digest=False)
-    assert digest_findings(tmp_path / "edited.mcap") == [
-        "the digest that was recorded is missing: edited or damaged after the recording"
-    ]
+    assert digest_findings(tmp_path / "edited.mcap") == ["damaged or edited at the digest, which was taken out"]
 
 
 def test_what_another_program_adds_is_no_edit(small: Path, tmp_path: Path) -> None:
@@ -295,7 +288,7 @@ def test_each_part_of_a_run_has_a_digest_of_its_own(tmp_path: Path) -> None:
     parts = sorted(tmp_path.glob("run.part*.mcap"))
     assert len(parts) > 1
     for part in parts:
-        assert check(part).facts["digest"] == "header and messages are those that were recorded"
+        assert check(part).facts["digest"].startswith("consistent, unsigned")
 
 
 def test_a_session_of_the_first_release_is_said_to_have_no_digest() -> None:
