@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
+
+from flowrec.store.digest import channel_digest, digest_record, head_digest, message_digest
 
 Edit = Callable[[Channel, Message, Any], bool]  # edits the decoded message; True where it did
 EditHead = Callable[[Attachment | Metadata | Schema | Channel], None]
@@ -31,14 +34,18 @@ def rewrite(
     edit_head: EditHead = lambda _: None,
     *,
     keep_digest: bool = True,
+    redigest: bool = False,
     drop: str = "",
+    until_ns: int | None = None,
     notes: dict[str, str] | None = None,
 ) -> int:
     """Copy a session message by message; returns how many messages were edited.
 
-    `drop` names a topic whose messages are left out, `notes` are added as a metadata record of another program.
+    `drop` names a topic of which nothing is left, messages later than `until_ns` are left out, `notes` are added as a
+    metadata record of another program. `redigest`: the digest is made again, as whoever can write the file can.
     """
-    edited = 0
+    edited, head = 0, 0
+    counts, sums = Counter[int](), Counter[int]()
     with source.open("rb") as read, target.open("wb") as write:
         reader = make_reader(read)
         header, summary = reader.get_header(), reader.get_summary()
@@ -47,12 +54,14 @@ def rewrite(
         writer.start(header.profile, header.library)
         for attachment in reader.iter_attachments():
             edit_head(attachment)
+            head += head_digest(attachment)
             writer.add_attachment(
                 attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
             )
         for record in reader.iter_metadata():
             edit_head(record)
-            if keep_digest or record.name != "flowrec.digest":
+            head += head_digest(record)
+            if record.name != "flowrec.digest" or (keep_digest and not redigest):
                 writer.add_metadata(record.name, record.metadata)
         for declared in (*summary.schemas.values(), *summary.channels.values()):
             edit_head(declared)
@@ -61,11 +70,12 @@ def rewrite(
         channels = {
             n: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id], c.metadata)
             for n, c in summary.channels.items()
+            if c.topic != drop
         }
         if notes is not None:
             writer.add_metadata("lab.notes", notes)
         for _, channel, message in reader.iter_messages():
-            if channel.topic == drop:
+            if channel.topic == drop or (until_ns is not None and message.log_time > until_ns):
                 continue
             data = message.data
             if edit is not None:
@@ -73,9 +83,30 @@ def rewrite(
                 if edit(channel, message, wire):
                     edited += 1
                     data = wire.SerializeToString(deterministic=True)
+            counts[channel.id] += 1
+            sums[channel.id] += message_digest(message.sequence, message.log_time, data)
             writer.add_message(channels[channel.id], message.log_time, data, message.publish_time, message.sequence)
+        if redigest:
+            topics = [
+                (c.topic, counts[n], sums[n], channel_digest(c, summary.schemas[c.schema_id]))
+                for n, c in summary.channels.items()
+            ]
+            record = digest_record(head, topics)
+            writer.add_metadata(record.name, record.metadata)
         writer.finish()
     return edited
+
+
+def edit_of_head(name: str, **values: str) -> EditHead:
+    """Sets values of a metadata record, or appends an empty line to an attachment."""
+
+    def edit(record: Attachment | Metadata | Schema | Channel) -> None:
+        if isinstance(record, Metadata) and record.name == name:
+            record.metadata.update(values)
+        elif isinstance(record, Attachment) and record.name == name:
+            record.data += b"\n"
+
+    return edit
 
 
 def array_of(wire: Any) -> np.ndarray:

@@ -67,7 +67,7 @@ def check(session: Session | Path | str, progress: Callable[[int], None] | None 
     checks: list[_FileCheck] = []
     for file in files:
         before = sum(check.read_bytes for check in checks)
-        check = _FileCheck(file, (lambda at, before=before: progress(before + at)) if progress is not None else None)
+        check = _FileCheck(file, progress, before)
         try:
             check.read()
         except KeyboardInterrupt as error:
@@ -103,11 +103,11 @@ class _FileCheck:
     read_bytes : how far it is.
     """
 
-    def __init__(self, path: Path, progress: Callable[[int], None] | None) -> None:
+    def __init__(self, path: Path, progress: Callable[[int], None] | None, before: int) -> None:
         self.tally = Tally()
         self.found = Audit(path, 0)
         self.read_bytes = 0
-        self._progress = progress
+        self._progress, self._before = progress, before  # of the files before
         self.verdict = Verdict(path, Coverage(0, 0, "bytes"))
 
     def _begin(self, found: Audit) -> None:
@@ -117,7 +117,7 @@ class _FileCheck:
     def _at(self, read_bytes: int) -> None:
         self.read_bytes = read_bytes
         if self._progress is not None:
-            self._progress(read_bytes)
+            self._progress(self._before + read_bytes)
 
     @property
     def topics(self) -> dict[str, int]:

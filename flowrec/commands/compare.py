@@ -1,374 +1,408 @@
-"""`flowrec compare`: element-wise comparison of two sessions, or of a replay with its recording."""
+"""`flowrec compare`: whether two sessions hold the same, in all that a session holds.
+
+Compared are the head, the messages of every tick, and every other topic (drawings for viewers, other programs'
+messages). What only one of the two holds is a difference. Two runs differ by nature in when, where and how quickly they
+ran; that is told as every other difference is, with the option that leaves it out.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+import difflib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from flowrec.declarations import Message, Role, Topic
-from flowrec.errors import printable
+from flowrec.commands.comparison import Comparison, Difference, Side
+from flowrec.commands.session_parts import (
+    HEAD,
+    PartOfHead,
+    at_text,
+    compared_heads,
+    declared_topics,
+    digest_of,
+    head_of,
+    raw_topics,
+)
+from flowrec.coverage import Coverage
+from flowrec.declarations import Role
+from flowrec.errors import UsageError, printable
 from flowrec.session import Session
-from flowrec.store.channels import is_left_out
-from flowrec.topics import BY_FIELD, TOPICS, Tick
+from flowrec.store.byte_source import open_bytes
+from flowrec.system.endings import Ended
+from flowrec.topics import BY_PATH, TOPICS
 from flowrec.units import seconds
-from flowrec.version import NUMERICS_VERSION
 
-Fields = Mapping[str, frozenset[str]]  # names of message fields, by field of Tick
-_Deviation = tuple[float, tuple[int, ...] | None, object, object]  # excess over the tolerance, index, both values
-_ALL: Fields = {topic.field: frozenset(each.name for each in fields(topic.type)) for topic in TOPICS}  # type: ignore[arg-type]
+_BLOCK_BYTES = 4 << 20
+_ROLES = {"inputs": Role.INPUT, "outputs": Role.OUTPUT, "truth": Role.TRUTH, "diagnostics": Role.DIAGNOSTIC}
+_DRAWINGS = "drawings"
+# Words for several topics or parts of the head at a time.
+GROUPS = (*_ROLES, _DRAWINGS, "head")
+# What differs between any two runs, and between a recording and its replay: when, where and how quickly they ran.
+_BY_NATURE = ("provenance", "parent", "outcome", "start", "diagnostics")
+_NAMED = 6  # topics and parts of the head that the verdict names
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
-    """One of the two sides of a comparison.
+class Choice:
+    """Which topics and items of the head are compared, by names, patterns such as `/robot/*`, and words of GROUPS."""
 
-    Attributes
-    ----------
-    word : what its values are called.
-    name : what it is called as a whole.
-    recorded : the fields that it records.
-    copy : it is a replay, into which images are copied on request only.
-    numerics : version of the numerics that computed it.
-    """
-
-    word: str
-    name: str
-    recorded: Fields = field(default_factory=lambda: _ALL)
-    copy: bool = False
-    numerics: str = field(default_factory=lambda: str(NUMERICS_VERSION))
+    only: tuple[str, ...] = ()
+    ignore: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, word: str, session: Session) -> Side:
-        """A session, without the topics that it leaves out and the fields that its schemas do not have."""
-        patterns = session.setting("recording", "leave_out")
-        left_out = list(map(str, patterns)) if isinstance(patterns, list) else []
-        copy = bool(session.header.parent)
-        recorded = dict(session.reader.recorded_fields)
-        for name in recorded.keys() - session.reader.counts.keys():
-            if (copy and name == "frame") or is_left_out(BY_FIELD[name].path, left_out):
-                del recorded[name]
-        return cls(word, session.path.name, recorded, copy, session.numerics)
+    def of(cls, only: Sequence[str], ignore: Sequence[str]) -> Choice:
+        """Of texts, each of which may be several with commas between them."""
+        return cls(*(tuple(name for text in texts for name in text.split(",") if name) for texts in (only, ignore)))
 
-    def lacks(self, topic: Topic) -> dict[str, str]:
-        """Parts of a topic that this side does not record, as `/topic` or `/topic field`, each with a text about it."""
-        if topic.field not in self.recorded:
-            copied = self.copy and topic.field == "frame"
-            return {topic.path: f"not copied into {self.name}" if copied else f"not recorded in {self.name}"}
-        missing = _ALL[topic.field] - self.recorded[topic.field]
-        return {f"{topic.path} {name}": f"not recorded in {self.name}" for name in sorted(missing)}
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """Where two messages of a topic differ most: one element of one field.
-
-    Attributes
-    ----------
-    stamp_ns : of the tick.
-    index : of the element in an array; None for other values.
-    values : of the element, or text about a whole message or array; in the order of `words`.
-    excess : the difference divided by the tolerance of the field; inf if the tolerance is zero or the values have no
-        difference.
-    words : what the two sides are called.
-    """
-
-    topic: str
-    stamp_ns: int
-    field: str
-    index: tuple[int, ...] | None
-    values: tuple[object, object]
-    excess: float
-    words: tuple[str, str] = ("recorded", "replayed")
+    def __call__(self, name: str) -> bool:
+        """Whether something of this name is compared."""
+        chosen = not self.only or any(_means(pattern, name) for pattern in self.only)
+        return chosen and not any(_means(pattern, name) for pattern in self.ignore)
 
     @property
-    def beyond(self) -> bool:
-        """Whether it is larger than the tolerance."""
-        return not self.excess <= 1.0
+    def text(self) -> str:
+        """For the verdict: "; only /robot/*; without provenance"; '' where all is compared."""
+        parts = [("only", self.only), ("without", self.ignore)]
+        return "".join(f"; {word} {', '.join(names)}" for word, names in parts if names)
 
-    def __str__(self) -> str:
-        place = "" if self.index is None else str(list(self.index))
-        values = ", ".join(f"{word} {_text(value)}" for word, value in zip(self.words, self.values, strict=True))
-        return printable(f"{self.topic} at {seconds(self.stamp_ns):.3f} s: {self.field}{place} {values}")
+    def check(self, names: Sequence[str]) -> None:
+        """Refuse a pattern that means nothing that is there: UsageError."""
+        for option, patterns in (("--only", self.only), ("--ignore", self.ignore)):
+            for pattern in patterns:
+                known = (*names, *GROUPS, *HEAD)
+                if pattern in (*GROUPS, *HEAD) or any(_means(pattern, name) for name in names):
+                    continue
+                near = difflib.get_close_matches(pattern, known, 3, 0.5)
+                meant = f"did you mean {' or '.join(near)}?" if near else f"words for several are {', '.join(GROUPS)}"
+                raise UsageError(f"{option} {pattern}: is no topic and no part of the head of the two; {meant}")
 
-    def as_json(self) -> dict[str, Any]:
-        """The difference for JSON; values that JSON can not hold are text."""
-        values = [value if _is_json(value) else _text(value) for value in self.values]
-        return {
-            "topic": self.topic,
-            "stamp_s": seconds(self.stamp_ns),
-            "field": self.field,
-            "index": None if self.index is None else list(self.index),
-            **dict(zip(self.words, values, strict=True)),
-        }
+
+def _means(pattern: str, name: str) -> bool:
+    topic = name.startswith("/")
+    if pattern in _ROLES:
+        return name in BY_PATH and BY_PATH[name].role is _ROLES[pattern]
+    if pattern in ("head", _DRAWINGS):
+        return (topic and name not in BY_PATH) if pattern == _DRAWINGS else not topic
+    return fnmatchcase(name, pattern) or name.startswith(f"{pattern}{'/' if topic else '.'}")
 
 
 @dataclass(slots=True)
-class TopicCount:
-    """Counts of the compared messages of one topic; `first`: the first difference, beyond the tolerance if any is."""
-
-    identical: int = 0
-    within_tolerance: int = 0
-    different: int = 0
-    first: Difference | None = None
-
-    def see(self, difference: Difference) -> None:
-        """Keep a difference if it is the first, or the first beyond the tolerance."""
-        if self.first is None or (difference.beyond and not self.first.beyond):
-            self.first = difference
-
-    def followed_by(self, later: TopicCount) -> None:
-        """Add the counts of later messages."""
-        self.identical += later.identical
-        self.within_tolerance += later.within_tolerance
-        self.different += later.different
-        if later.first is not None:
-            self.see(later.first)
-
-    def as_json(self) -> dict[str, Any]:
-        """The result for JSON."""
-        return {
-            "identical": self.identical,
-            "within_tolerance": self.within_tolerance,
-            "different": self.different,
-            "first": self.first.as_json() if self.first is not None else None,
-        }
-
-
-@dataclass(slots=True)
-class Comparison:
-    """Compares pairs of ticks: messages that are new in either tick and recorded on both sides.
+class SessionComparison:
+    """The result of comparing two sessions.
 
     Attributes
     ----------
-    roles : of the topics that `add` compares.
-    sides : what is compared.
-    not_recorded : topics, and fields of a topic as `/topic field`, that one side lacks, with the words for it.
-    first : the first difference beyond a tolerance.
+    names : of the two files.
+    choice : what was asked for.
+    covered : the ticks, topics and parts of the head that were compared.
+    bytes_alike : size of two files that are the same byte for byte, of which nothing else was compared; else None.
+    head : its parts.
+    comparison : of the messages, tick by tick.
+    apart : topics, or fields of topics, that differ as a whole: held by one file only, declared otherwise. A text each.
+    raw : topics that are compared as they are in the file: messages that are the same, that differ, and text.
+    by_nature : what differs between any two runs, and does here; as names for --ignore.
     """
 
-    roles: tuple[Role, ...] = (Role.OUTPUT,)
-    sides: tuple[Side, Side] = (Side("recorded", "the recording"), Side("replayed", "the replay"))
-    ticks: int = 0
-    different_ticks: int = 0
-    topics: dict[str, TopicCount] = field(default_factory=dict)
-    not_recorded: dict[str, str] = field(default_factory=dict)
-    first: Difference | None = None
-    _before: tuple[Tick, Tick] = (Tick(), Tick())
-    _names: dict[str, list[str]] = field(default_factory=dict)
-    _compared: list[Topic] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self._compared = [topic for topic in TOPICS if topic.role in self.roles]
-        for topic in TOPICS:
-            lacking = self.sides[0].lacks(topic) | self.sides[1].lacks(topic)
-            names = [each.name for each in fields(topic.type) if f"{topic.path} {each.name}" not in lacking]  # type: ignore[arg-type]
-            self._names[topic.field] = [] if topic.path in lacking else names
-            if topic.role is not Role.DIAGNOSTIC:
-                self.not_recorded |= lacking
+    names: tuple[str, str]
+    choice: Choice
+    covered: Coverage
+    bytes_alike: int | None = None
+    head: list[PartOfHead] = field(default_factory=list)
+    comparison: Comparison = field(default_factory=Comparison)
+    apart: dict[str, str] = field(default_factory=dict)
+    raw: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    by_nature: tuple[str, ...] = ()
 
     @property
-    def other_numerics(self) -> str:
-        """Text if the two sides were computed by different versions of the numerics, else ''."""
-        if self.sides[0].numerics == self.sides[1].numerics:
-            return ""
-        versions = ", ".join(f"{side.word}: version {side.numerics}" for side in self.sides)
-        return printable(f"made by other numerics ({versions})")
+    def ticks(self) -> int:
+        """Ticks that were compared."""
+        return self.comparison.ticks
 
     @property
-    def different_word(self) -> str:
-        """The word for messages beyond their tolerance."""
-        return "by other numerics" if self.other_numerics else "DIFFERENT"
+    def first(self) -> Difference | None:
+        """The first difference beyond a tolerance in the messages of the ticks."""
+        return self.comparison.first
 
     @property
-    def words(self) -> tuple[str, str]:
-        """The words for the values of the two sides."""
-        return self.sides[0].word, self.sides[1].word
-
-    def begin_after(self, tick: Tick) -> None:
-        """Take a tick that both sides have in common: its messages are compared elsewhere."""
-        self._before = (tick, tick)
-
-    def followed_by(self, later: Comparison) -> None:
-        """Add what was compared in the ticks that follow."""
-        self.ticks += later.ticks
-        self.different_ticks += later.different_ticks
-        self.first = self.first or later.first
-        for path, count in later.topics.items():
-            self.topics.setdefault(path, TopicCount()).followed_by(count)
-
-    def add(self, recorded: Tick, replayed: Tick) -> None:
-        """Compare all topics of the chosen roles in one tick."""
-        self.ticks += 1
-        differs = False
-        stamp_ns = max(recorded.stamp_ns, replayed.stamp_ns)
-        for topic in self._compared:
-            was, now = getattr(recorded, topic.field), getattr(replayed, topic.field)
-            new = was is not getattr(self._before[0], topic.field) or now is not getattr(self._before[1], topic.field)
-            if new and (was is not None or now is not None):
-                found = self.add_pair(topic, was, now, stamp_ns)
-                differs |= found is not None and found.beyond
-        self.different_ticks += differs
-        self._before = (recorded, replayed)
-
-    def add_lone(self, stamp_ns: int, side: int) -> None:
-        """Count a tick that only one side has (0 or 1)."""
-        self.ticks += 1
-        self.different_ticks += 1
-        values = ("present", "absent") if side == 0 else ("absent", "present")
-        if self.first is None:
-            self.first = Difference("tick", stamp_ns, "tick", None, values, math.inf, self.words)
-
-    def add_pair(self, topic: Topic, was: Message | None, now: Message | None, stamp_ns: int) -> Difference | None:
-        """Compare two messages of a topic: where they differ most; None if they are identical bit for bit."""
-        names = self._names[topic.field]
-        if not names:
-            return None
-        count = self.topics.setdefault(topic.path, TopicCount())
-        difference = first_difference(topic, was, now, stamp_ns, names, self.words)
-        if difference is None:
-            count.identical += 1
-            return None
-        if difference.beyond:
-            count.different += 1
-            self.first = self.first or difference
-        else:
-            count.within_tolerance += 1
-        count.see(difference)
-        return difference
+    def _others_same(self) -> bool:
+        return not (
+            self.apart or any(part.differences for part in self.head) or any(wrong for _, wrong, _ in self.raw.values())
+        )
 
     @property
-    def identical(self) -> bool:
-        """Every message bit for bit."""
-        return self.same and all(count.within_tolerance == 0 for count in self.topics.values())
+    def same_so_far(self) -> bool:
+        """Nothing that was compared differs beyond its tolerance."""
+        return self._others_same and self.comparison.same
 
     @property
-    def same(self) -> bool:
-        """Every message within its topic's tolerance."""
-        return self.different_ticks == 0 and all(count.different == 0 for count in self.topics.values())
+    def same(self) -> bool | None:
+        """All that was asked for is the same within its tolerance; None if it was stopped before a difference."""
+        return None if self.covered.stopped and self.same_so_far else self.same_so_far
+
+    @property
+    def identical(self) -> bool | None:
+        """The same bit for bit; None as of `same`."""
+        alike = self._others_same and self.comparison.identical
+        return None if self.covered.stopped and alike else alike
+
+    @property
+    def exit_status(self) -> int:
+        """0 the same, 3 something differs, 130 or 143 stopped."""
+        return self.covered.status if self.covered.stopped else 0 if self.same else 3
 
     def lines(self) -> list[str]:
-        """A line of text for each topic."""
-        lines = []
-        width = max(map(len, (*self.topics, *self.not_recorded)), default=0)
-        for topic, count in self.topics.items():
-            total = count.identical + count.within_tolerance + count.different
+        """A line for each topic and part of the head, hints, and the verdict."""
+        if self.bytes_alike is not None:
+            size_mb = self.bytes_alike / 1e6
+            return [printable(f"{' and '.join(self.names)}: identical byte for byte ({size_mb:.1f} MB)")]
+        width = max(map(len, (*self.comparison.topics, *self.apart, *self.raw, *HEAD)))
+        lines = [part.line(width) for part in self.head]
+        lines += self.comparison.lines(width)
+        for topic, (same, wrong, where) in self.raw.items():
+            lines.append(f"{topic:{width}s}  {same} of {same + wrong} identical" + where)
+        for topic, text in self.apart.items():
+            told = next((number for number, line in enumerate(lines) if line.startswith(f"{topic} ")), None)
+            if told is None:
+                lines.append(f"{topic:{width}s}  {text}")
+            else:
+                lines[told] += f"; {text}"
+        if self.first is not None:
+            lines.append(f"first difference: {self.first}")
+        if self.by_nature:
             lines.append(
-                f"{topic:{width}s}  {count.identical} of {total} identical"
-                + (f", {count.within_tolerance} within tolerance" if count.within_tolerance else "")
-                + (f", {count.different} {self.different_word}" if count.different else "")
+                f"{', '.join(self.by_nature)}: differ between any two runs and between a recording and its replay; "
+                f"--ignore {','.join(self.by_nature)} leaves them out"
             )
-        return lines + [printable(f"{what:{width}s}  {why}") for what, why in self.not_recorded.items()]
+        return [printable(line) for line in (*lines, self._verdict)]
+
+    @property
+    def _verdict(self) -> str:
+        found = "identical" if self._others_same and self.comparison.identical else "the same within tolerance"
+        if not self.same_so_far:
+            other = self.comparison.other_numerics
+            different = self._different
+            more = [f"{len(different) - _NAMED} more"] if len(different) > _NAMED else []
+            found = f"DIFFERENT in {', '.join([*different[:_NAMED], *more])}" + (f"; {other}" if other else "")
+        topics = len(self.covered.topics)
+        what = f"{topics} topic{'s' * (topics != 1)} and {self._parts_of_head} of the head"
+        return f"{self.covered.sentence(found)} ({what}{self.choice.text})"
+
+    @property
+    def _parts_of_head(self) -> str:
+        count = len(self.covered.head)
+        return f"{count} part{'s' * (count != 1)}"
+
+    @property
+    def _different(self) -> list[str]:
+        """Names of what differs."""
+        topics = [topic for topic, count in self.comparison.topics.items() if count.different]
+        topics += [topic for topic, (_, wrong, _) in self.raw.items() if wrong] + list(self.apart)
+        lone = ["ticks"] if self.comparison.lone else []
+        return [*(part.name for part in self.head if part.differences), *lone, *dict.fromkeys(topics)]
 
     def as_json(self) -> dict[str, Any]:
         """The result for JSON."""
-        return {
+        return self.comparison.as_json() | {
             "same": self.same,
             "identical": self.identical,
-            "ticks": self.ticks,
-            "different_ticks": self.different_ticks,
-            "other_numerics": self.other_numerics,
-            "topics": {topic: count.as_json() for topic, count in self.topics.items()},
-            "not_recorded": self.not_recorded,
-            "first": self.first.as_json() if self.first is not None else None,
+            "covered": self.covered.as_json(),
+            "bytes_alike": self.bytes_alike,
+            "different": self._different,
+            "head": {part.name: dict(part.differences) for part in self.head},
+            "apart": self.apart,
+            "raw": {topic: {"identical": same, "different": wrong} for topic, (same, wrong, _) in self.raw.items()},
+            "only": list(self.choice.only),
+            "ignore": list(self.choice.ignore),
+            "by_nature": list(self.by_nature),
         }
 
 
-def first_difference(
-    topic: Topic,
-    was: Message | None,
-    now: Message | None,
-    stamp_ns: int,
-    names: Iterable[str] | None = None,
-    words: tuple[str, str] = ("recorded", "replayed"),
-) -> Difference | None:
-    """The largest difference between two messages of a topic relative to its tolerance; None if they are identical.
+def compare(
+    first: Session | Path | str,
+    second: Session | Path | str,
+    *,
+    only: Sequence[str] = (),
+    ignore: Sequence[str] = (),
+    progress: Callable[[float], None] = lambda _: None,
+) -> SessionComparison:
+    """Compare two sessions: their heads, every message of every tick, and every other topic.
+
+    Ticks are paired by their stamps.
 
     Parameters
     ----------
-    names : of the fields to compare; None: all.
+    only, ignore : narrow it: topics (`/robot/track`, `/robot/*`), parts of the head (`provenance`,
+        `configuration.plan`, `outcome.wall_s`), and words for several: inputs, outputs, truth, diagnostics, drawings,
+        head.
+    progress : takes the session time in s since the first tick.
+
+    Raises
+    ------
+    SessionError : one of the two can not be read.
+    UsageError : a name of `only` or `ignore` means nothing that is there.
+    Ended : Ctrl-C or a signal; its `result` is what was compared by then.
     """
-    if was is None or now is None:
-        values = tuple("absent" if message is None else "present" for message in (was, now))
-        return Difference(topic.path, stamp_ns, "message", None, (values[0], values[1]), math.inf, words)
-    worst: Difference | None = None
-    for name in names if names is not None else _ALL[topic.field]:
-        before, after = getattr(was, name), getattr(now, name)
-        if type(before) is type(after) and not isinstance(before, np.ndarray) and before == after:
-            continue  # most fields of a replay, without the search for the tolerance
-        deviation = _deviation(before, after, topic.rtol, topic.atol_of(name))
-        if deviation is not None and (worst is None or deviation[0] > worst.excess):
-            excess, index, first, second = deviation
-            worst = Difference(topic.path, stamp_ns, name, index, (first, second), excess, words)
-    return worst
+    sessions, choice = (Session.of(first), Session.of(second)), Choice.of(only, ignore)
+    names = _names(*sessions)
+    found = SessionComparison(names, choice, Coverage(0, max(map(_ticks_of, sessions))))
+    try:
+        size_bytes = None if choice.text else _same_bytes(*sessions)
+        if size_bytes is not None:
+            found.bytes_alike = size_bytes
+            topics = tuple(sessions[0].topics)
+            found.covered = replace(found.covered, done=found.covered.total, topics=topics, head=HEAD)
+            return found
+        _compare_heads(found, sessions)
+        _compare_raw(found, sessions)
+        _compare_ticks(found, sessions, progress)
+        _compare_declared(found, sessions)
+        _compare_digests(found, sessions)
+    except KeyboardInterrupt as error:
+        ended = Ended.of(error)
+        done, total = found.ticks, max(found.ticks, found.covered.total)
+        found.covered = replace(found.covered, done=done, total=total, stopped=ended.why, status=ended.status)
+        ended.result = found
+        raise ended from error
+    found.covered = replace(found.covered, done=found.ticks, total=found.ticks)
+    found.by_nature = _by_nature(found)
+    return found
 
 
-def _deviation(was: object, now: object, rtol: float, atol: float) -> _Deviation | None:
-    """Deviation of two values relative to the tolerance, by |was - now| <= atol + rtol |was|; None if bit-identical."""
-    if isinstance(was, np.ndarray) and isinstance(now, np.ndarray):
-        if was.shape != now.shape or was.dtype.kind != now.dtype.kind:
-            return math.inf, None, _form(was), _form(now)
-        if was.dtype == now.dtype and was.tobytes() == now.tobytes():
-            return None
-        excess = _excess(was, now, rtol, atol)
-        index = tuple(int(i) for i in np.unravel_index(int(np.argmax(excess)), excess.shape))
-        return float(excess[index]), index, was[index].item(), now[index].item()
-    if isinstance(was, float) and isinstance(now, float | int) and not isinstance(now, bool):
-        if was == now or (was != was and now != now):
-            return None
-        return float(_excess(np.array(was), np.array(now), rtol, atol)), None, was, now
-    if isinstance(was, np.ndarray) or isinstance(now, np.ndarray):
-        return math.inf, None, _form(was), _form(now)
-    return None if was == now else (math.inf, None, was, now)
+def _names(first: Session, second: Session) -> tuple[str, str]:
+    """What the two are called: by their file names where these differ."""
+    if first.path.name != second.path.name:
+        return first.path.name, second.path.name
+    return str(first.path), str(second.path)
 
 
-def _excess(was: NDArray[Any], now: NDArray[Any], rtol: float, atol: float) -> NDArray[np.float64]:
-    """|was - now| / (atol + rtol |was|) per element; values that are not finite equal only the same value."""
-    a, b = np.asarray(was, np.float64), np.asarray(now, np.float64)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        same = (a == b) | (np.isnan(a) & np.isnan(b))
-        ratio = np.abs(a - b) / (atol + rtol * np.abs(a))
-    excess: NDArray[np.float64] = np.where(same, 0.0, np.where(np.isfinite(a) & np.isfinite(b), ratio, np.inf))
-    return excess
+def _ticks_of(session: Session) -> int:
+    return session.reader.counts.get("applied", 0)
 
 
-def _form(value: object) -> object:
-    return f"{value.dtype} of shape {value.shape}" if isinstance(value, np.ndarray) else value
+def _same_bytes(first: Session, second: Session) -> int | None:
+    """The size of two sessions whose files are the same byte for byte; None of others."""
+    files = [[file.path for file in session.run.files] for session in (first, second)]
+    sizes = [[file.size_bytes for file in session.run.files] for session in (first, second)]
+    if sizes[0] != sizes[1]:
+        return None
+    for one, other in zip(*files, strict=True):
+        with closing(open_bytes(one)) as here, closing(open_bytes(other)) as there:
+            for offset in range(0, here.size, _BLOCK_BYTES):
+                length = min(_BLOCK_BYTES, here.size - offset)
+                if here.read(offset, length) != there.read(offset, length):
+                    return None
+    return sum(sizes[0])
 
 
-def _text(value: object) -> str:
-    return "absent" if value is None else str(value) if value in ("absent", "present") else repr(value)
+def _compare_heads(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+    heads = [head_of(session) for session in sessions]
+    found.choice.check([*heads[0], *heads[1], *(name for each in sessions for name in declared_topics(each))])
+    found.head = compared_heads(heads, found.names, found.choice)
+    found.covered = replace(found.covered, head=tuple(part.name for part in found.head))
 
 
-def _is_json(value: object) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
+def _compare_raw(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+    """Compare the topics that are no field of `Tick`."""
+    was, now = (raw_topics(session, found.choice) for session in sessions)
+    for topic in dict.fromkeys((*was, *now)):
+        if topic not in was or topic not in now:
+            found.apart[topic] = f"only in {found.names[topic not in was]}"
+            continue
+        same, wrong, stamp_ns = was[topic].same_as(now[topic])
+        found.raw[topic] = (same, wrong, f", {wrong} DIFFERENT{at_text(stamp_ns)}" if wrong else "")
+    found.covered = replace(found.covered, topics=tuple(dict.fromkeys((*was, *now))))
 
 
-def compare(first: Session | Path | str, second: Session | Path | str) -> Comparison:
-    """Compare every message of every tick of two sessions, inputs and truth included, diagnostics left out.
+def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+    """Compare what the topics declare that both hold: encoding, depth, region, role, and the schema."""
+    was, now = (declared_topics(session) for session in sessions)
+    for topic in found.covered.topics:
+        if topic not in was or topic not in now or topic in found.apart:
+            continue
+        keys = [key for key in {**was[topic], **now[topic]} if was[topic].get(key) != now[topic].get(key)]
+        texts = [f"{key} {was[topic].get(key, '-')}, {now[topic].get(key, '-')}" for key in keys if key != "schema"]
+        if keys:
+            found.apart[topic] = f"declared otherwise: {'; '.join(texts) or 'another schema'}"
 
-    Ticks are paired by their stamps. Raises SessionError where one of the two can not be read.
-    """
-    sessions = Session.of(first), Session.of(second)
+
+def _compare_digests(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+    """Two digests that differ although all is the same: of numbers and order of messages, which no reader returns."""
+    if not found.identical or found.choice.text or any(session.run.in_parts for session in sessions):
+        return
+    was, now = (digest_of(session) for session in sessions)
+    if was is not None and now is not None and was != now:
+        topics = [key for key in {**was, **now} if was.get(key) != now.get(key)]
+        told = {"": f"states others for {', '.join(topics)}: the numbers of the messages differ"}
+        found.head.append(PartOfHead("digest", 1, told))
+
+
+def _compare_ticks(
+    found: SessionComparison, sessions: tuple[Session, Session], progress: Callable[[float], None]
+) -> None:
+    """Compare the messages tick by tick; a topic or a field that one file does not have is told once."""
+    counts = [session.reader.counts for session in sessions]
+    fields_of = [session.reader.recorded_fields for session in sessions]
+    left_out, compared = set(), []
+    for topic in TOPICS:
+        there = [bool(each.get(topic.field)) for each in counts]
+        if not found.choice(topic.path) or not all(there):
+            left_out.add(topic.path)
+        if not found.choice(topic.path) or not any(there):
+            continue
+        compared.append(topic.path)
+        if not all(there):
+            number = counts[not there[0]].get(topic.field, 0)
+            holder = found.names[not there[0]]
+            found.apart[topic.path] = f"only in {holder}, {number} message{'s' * (number != 1)}"
+            continue
+        known = [fields_of[side].get(topic.field, frozenset()) for side in (0, 1)]
+        for side in (0, 1):
+            lone = sorted(known[side] - known[1 - side])
+            if lone:
+                found.apart[topic.path] = f"{', '.join(lone)}: only in {found.names[side]}"
+    found.covered = replace(found.covered, topics=(*compared, *found.covered.topics))
     sides = Side.of("first", sessions[0]), Side.of("second", sessions[1])
-    comparison = Comparison(roles=(Role.INPUT, Role.OUTPUT, Role.TRUTH), sides=sides)
-    with_frames = all("frame" in side.recorded for side in sides)
+    found.comparison = comparison = Comparison(tuple(Role), sides, frozenset(left_out))
+    comparison.not_recorded.clear()  # told above, where one of the two has it
+    with_frames = "/camera/frame" not in left_out
+    if left_out >= {topic.path for topic in TOPICS}:
+        return
+    first_ns = min(session.run.first_ns for session in sessions)
+    for stamp_ns in _paired(comparison, sessions, with_frames=with_frames):
+        progress(seconds(stamp_ns - first_ns))
+
+
+def _paired(comparison: Comparison, sessions: tuple[Session, Session], *, with_frames: bool) -> Iterator[int]:
+    """Compare tick by tick; yields the stamp of each in ns."""
     ticks = [session.ticks(with_frames=with_frames) for session in sessions]
     was, now = next(ticks[0], None), next(ticks[1], None)
     while was is not None or now is not None:
         if was is not None and now is not None and was.stamp_ns == now.stamp_ns:
             comparison.add(was, now)
+            yield was.stamp_ns
             was, now = next(ticks[0], None), next(ticks[1], None)
         elif now is None or (was is not None and was.stamp_ns < now.stamp_ns):
             assert was is not None
             comparison.add_lone(was.stamp_ns, 0)
+            yield was.stamp_ns
             was = next(ticks[0], None)
         else:
             comparison.add_lone(now.stamp_ns, 1)
+            yield now.stamp_ns
             now = next(ticks[1], None)
-    return comparison
+
+
+def _by_nature(found: SessionComparison) -> tuple[str, ...]:
+    """Names for --ignore of what differs here and differs between any two runs."""
+    different = {part.name for part in found.head if part.differences}
+    topics = [*(topic for topic, count in found.comparison.topics.items() if count.different), *found.apart]
+    names = [word for word in _BY_NATURE if word in different or any(_means(word, topic) for topic in topics)]
+    drawn = [topic for topic, (_, wrong, _) in found.raw.items() if wrong]
+    if "start" in different and drawn:
+        names.append(_DRAWINGS)  # their timestamps are of the wall clock
+    if any(side.copy for side in found.comparison.sides) and "/camera/frame" in found.apart:
+        names.append("/camera/frame")  # flowrec replay --frames copies them
+    return tuple(names)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec import topics
-from flowrec.commands.compare import Comparison, Side
+from flowrec.commands.comparison import Comparison, Side
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay_result import Replayed, WorkerCheck, WorkerResults, digest_lines
 from flowrec.commands.run_summary import figures_of

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from flowrec.commands.compare import Comparison
+from flowrec.commands.comparison import Comparison
 from flowrec.config import ResolvedConfig
 from flowrec.coverage import Coverage
 from flowrec.enums import WorkOrder

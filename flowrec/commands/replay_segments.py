@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from flowrec.commands.compare import Comparison, Side
+from flowrec.commands.comparison import Comparison, Side
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.replay import coverage_of, replay
 from flowrec.commands.replay_result import Replayed, WorkerResults, digest_lines

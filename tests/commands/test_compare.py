@@ -12,14 +12,16 @@ import pytest
 from typer.testing import CliRunner
 
 from flowrec.cli import app
-from flowrec.commands.compare import Comparison
+from flowrec.commands.compare import compare
+from flowrec.commands.comparison import Comparison
 from flowrec.config import load_config, to_toml
 from flowrec.messages import Demand, FlowField
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.writer import SessionWriter
+from flowrec.system.endings import Ended
 from flowrec.topics import Tick, topics_of
-from tests.rewritten import array_of, rewrite
+from tests.rewritten import array_of, edit_of_head, rewrite
 from tests.store.made_up import HEADER, ticks_of
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
@@ -150,32 +152,83 @@ def test_a_tick_that_only_one_session_has_is_a_difference_of_that_tick_alone(tmp
     assert json.loads(said)["different_ticks"] == 1
 
 
-def test_images_that_a_replay_did_not_copy_are_not_a_difference(tmp_path: Path, ticks: list[Tick]) -> None:
+def test_images_that_a_replay_did_not_copy_are_told_with_what_leaves_them_out(
+    tmp_path: Path, ticks: list[Tick]
+) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", [replace(tick, frame=None) for tick in ticks], parent=True)
     status, said = run("compare", first, second)
+    assert status == 3
+    assert "/camera/frame only in a.mcap, 20 messages" in " ".join(said.split())
+    assert "--ignore parent,/camera/frame leaves them out" in said
+    status, said = run("compare", first, second, "--ignore", "parent,/camera/frame,drawings")
     assert status == 0, said
-    assert "/camera/frame not copied into b.mcap" in " ".join(said.split())
-    # In a session that is no replay they were lost.
-    third = small_session(tmp_path / "c.mcap", [replace(tick, frame=None) for tick in ticks])
-    assert run("compare", first, third)[0] == 3
+    assert "without parent, /camera/frame, drawings" in said.splitlines()[-1]
 
 
-def test_what_was_left_out_of_a_recording_is_not_a_difference(tmp_path: Path, ticks: list[Tick]) -> None:
+def test_what_is_in_one_session_only_is_one_line_a_topic(tmp_path: Path, ticks: list[Tick]) -> None:
     first = small_session(tmp_path / "a.mcap", ticks)
     second = small_session(tmp_path / "b.mcap", ticks, sets=("recording.leave_out=['/truth/*']",))
     status, said = run("compare", first, second, "--json")
-    assert status == 0, said
-    assert json.loads(said)["not_recorded"] == {
-        "/truth/robot": "not recorded in b.mcap",
-        "/truth/flow": "not recorded in b.mcap",
+    found = json.loads(said)
+    assert status == 3 and not found["same"]
+    assert found["apart"] == {
+        "/truth/robot": "only in a.mcap, 20 messages",
+        "/truth/flow": "only in a.mcap, 1 message",
     }
-
-
-def test_a_replay_of_a_whole_mission_compares_as_the_same(session: Path, tmp_path: Path) -> None:
-    assert run("replay", session, "--out", tmp_path / "again.mcap", "--json")[0] == 0
-    status, said = run("compare", session, tmp_path / "again.mcap")
+    assert found["head"]["configuration"].keys() == {"recording.leave_out"}
+    status, said = run("compare", first, second, "--ignore", "truth", "--ignore", "configuration.recording")
     assert status == 0, said
+
+
+def test_a_byte_copy_is_one_line(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    (tmp_path / "b.mcap").write_bytes(first.read_bytes())
+    status, said = run("compare", first, tmp_path / "b.mcap")
+    assert status == 0
+    assert said == f"a.mcap and b.mcap: identical byte for byte ({first.stat().st_size / 1e6:.1f} MB)\n"
+
+
+def test_another_origin_is_a_difference_that_can_be_left_out(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    rewrite(first, tmp_path / "b.mcap", edit_head=edit_of_head("flowrec.provenance", host="elsewhere"), redigest=True)
+    status, said = run("compare", first, tmp_path / "b.mcap")
+    assert status == 3
+    assert "provenance 1 of 3 DIFFERENT: host (lab, elsewhere)" in " ".join(said.split())
+    assert "DIFFERENT in provenance (" in said.splitlines()[-1]
+    assert run("compare", first, tmp_path / "b.mcap", "--ignore", "provenance.host")[0] == 0
+    assert run("compare", first, tmp_path / "b.mcap", "--only", "/robot/*")[0] == 0
+    status, said = run("compare", first, tmp_path / "b.mcap", "--ignore", "provenace")
+    assert status != 0 and "0 of" not in said
+
+
+def test_a_comparison_that_is_stopped_says_what_it_compared(tmp_path: Path, ticks: list[Tick]) -> None:
+    first = small_session(tmp_path / "a.mcap", ticks)
+    rewrite(first, tmp_path / "b.mcap")
+    seen: list[float] = []
+
+    def stopped_at_the_seventh(done_s: float) -> None:
+        seen.append(done_s)
+        if len(seen) == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Ended) as stopped:
+        compare(first, tmp_path / "b.mcap", progress=stopped_at_the_seventh)
+    found = stopped.value.result
+    assert (found.same, found.identical, found.exit_status) == (None, None, 130)
+    assert found.lines()[-1].startswith("stopped after 7 of 20 ticks (SIGINT: Ctrl-C); those are identical")
+    assert found.as_json()["covered"]["whole"] is False
+
+
+def test_a_replay_differs_from_its_recording_by_nature_only_and_this_is_said(session: Path, tmp_path: Path) -> None:
+    assert run("replay", session, "--out", tmp_path / "again.mcap", "--json")[0] == 0
+    status, said = run("compare", session, tmp_path / "again.mcap", "--json")
+    found = json.loads(said)
+    assert status == 3
+    assert found["by_nature"] == ["provenance", "parent", "outcome", "diagnostics", "/camera/frame"]
+    status, said = run("compare", session, tmp_path / "again.mcap", "--ignore", ",".join(found["by_nature"]))
+    assert status == 0, said
+    assert "ticks: identical" in said
 
 
 def test_fields_that_an_older_file_does_not_have_are_not_compared() -> None:

@@ -34,7 +34,7 @@ def other_numerics(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(estimate, flow_um_s=estimate.flow_um_s + 1.0)
 
     monkeypatch.setattr(Kalman, "estimate", shifted)
-    monkeypatch.setattr("flowrec.commands.compare.NUMERICS_VERSION", NUMERICS_VERSION + 1)
+    monkeypatch.setattr("flowrec.commands.comparison.NUMERICS_VERSION", NUMERICS_VERSION + 1)
     monkeypatch.setattr("flowrec.commands.check.NUMERICS_VERSION", NUMERICS_VERSION + 1)
     monkeypatch.setattr("flowrec.provenance.NUMERICS_VERSION", NUMERICS_VERSION + 1)
 
