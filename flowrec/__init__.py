@@ -15,11 +15,13 @@ Every name is imported when it is first used: `import flowrec` takes millisecond
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
 from flowrec.version import __version__ as __version__
 
+TYPE_CHECKING = False  # as in typing, whose import takes longer than all the rest
 if TYPE_CHECKING:  # the same names as in the table below, for type checkers and editors
+    from typing import Any
+
     from flowrec.commands.check import check as check
     from flowrec.commands.compare import compare as compare
     from flowrec.commands.export import export as export

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from flowrec.bench.verbs import AsJson, Sets
+from flowrec.system.endings import Ended, StoppedError
 from flowrec.units import amounts
 
 _SHOWN_ROWS = 200  # of a table that find prints, unless more are asked for
@@ -85,9 +86,9 @@ def sweep(
             timeout_s=timeout_s,
             memory_bytes=memory_bytes,
         )
-    except KeyboardInterrupt:
-        say(f"interrupted; what is done is kept in {out}, and the same command goes on")
-        raise typer.Exit(130) from None
+    except KeyboardInterrupt as error:
+        left = f"what is done is kept in {out}, and the same command goes on"
+        raise StoppedError(Ended.of(error), left) from None
     if as_json:
         typer.echo(json.dumps(done.as_json()))
     else:
@@ -124,10 +125,11 @@ def push(
 
     try:
         done = run(sessions, target)
-    except KeyboardInterrupt:
-        say("interrupted; what was sent stays in the bucket, and the same command goes on")
+    except KeyboardInterrupt as error:
+        stopped = StoppedError(Ended.of(error), "what was sent stays in the bucket, and the same command goes on")
+        say(str(stopped))
         sys.stdout.flush()
-        os._exit(130)  # not after the parts that are being sent, which may take minutes
+        os._exit(stopped.exit_status)  # not after the parts that are being sent, which may take minutes
     if as_json:
         typer.echo(json.dumps(done.as_json()))
     for text in done.failed.values():
@@ -172,7 +174,7 @@ def catalog(
     for line in refreshed.lines():
         say(line)
     if refreshed.left:
-        raise typer.Exit(130)
+        raise typer.Exit(refreshed.stop_status)
     if serve:
         _serve(refreshed.path, where, port)
 

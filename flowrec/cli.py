@@ -44,18 +44,20 @@ from flowrec.session_verbs import (
     view,
 )
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC
-from flowrec.system.endings import Ended, StoppedError
+from flowrec.system.endings import StoppedError, stopped_in_one_line
 from flowrec.units import amounts
 
 
 class _Verbs(TyperGroup):
-    """The verbs; a signal that ends one of them is an error in one line, and not Typer's."""
+    """The verbs; a signal that ends one of them is an error in one line, which Typer would swallow."""
+
+    def make_context(self, *args: Any, **named: Any) -> Any:
+        with stopped_in_one_line():
+            return super().make_context(*args, **named)
 
     def invoke(self, ctx: Any) -> Any:
-        try:
+        with stopped_in_one_line():
             return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            raise StoppedError(Ended.of(error)) from error
 
 
 app = typer.Typer(
@@ -347,8 +349,6 @@ def main() -> None:
             verb = error.ctx.command_path if error.ctx is not None else "flowrec"
             sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")
         sys.exit(error.exit_code)
-    except typer.Abort as error:  # of a signal while the arguments were read
-        raise (error.__cause__ or error) from None
     except FlowrecError as error:
         if isinstance(error, StoppedError) and "--json" in sys.argv:
             print(json.dumps(error.as_json()))

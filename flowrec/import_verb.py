@@ -64,7 +64,9 @@ def import_movie(
     if as_json:
         files = [str(file) for file in recorded.files]
         aligned = json.loads(recorded.source.get("alignment", "null"))
-        typer.echo(json.dumps({"path": str(recorded.path), **recorded.facts, "files": files, "alignment": aligned}))
+        covered = recorded.covered.as_json() if recorded.covered is not None else None
+        found = {"path": str(recorded.path), **recorded.facts, "files": files, "alignment": aligned}
+        typer.echo(json.dumps(found | {"covered": covered}))
     else:
         print_summary(recorded)
     raise typer.Exit(recorded.exit_status)

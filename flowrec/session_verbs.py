@@ -202,9 +202,11 @@ def export(
     """Convert a session to another format, such as a recording for Rerun (.rrd)."""
     if out is not None and directory is not None:
         raise UsageError(f"{directory} and --out {out}: name the output once")
-    made = flowrec.export(session, out or directory, overwrite, file_format)
+    from flowrec.commands.export import exported
+
+    made, covered = exported(session, out or directory, overwrite, file_format)
     if as_json:
-        typer.echo(_export_json(session, made, file_format))
+        typer.echo(_export_json(session, made, file_format, covered=covered.as_json()))
 
 
 def report(
@@ -418,7 +420,7 @@ def _write_layouts(session: Path, folder: Path, overwrite: bool, as_json: bool) 
         say(line)
 
 
-def _export_json(session: Path, made: Path, file_format: str = "rrd") -> str:
+def _export_json(session: Path, made: Path, file_format: str = "rrd", **more: Any) -> str:
     files = [made] if made.is_file() else [file for file in made.rglob("*") if file.is_file()]
     nbytes = sum(file.stat().st_size for file in files)
-    return json.dumps({"session": str(session), file_format: str(made), "bytes": nbytes})
+    return json.dumps({"session": str(session), file_format: str(made), "bytes": nbytes} | more)

@@ -58,6 +58,16 @@ class Progress:
         """What is done meanwhile, which may take long; '': nothing in particular."""
 
 
+_looked_at: list[Coverage] = []
+
+
+def looked_at() -> list[Coverage]:
+    """What the work has covered whose bars have ended since the last call, in order."""
+    found = list(_looked_at)
+    _looked_at.clear()
+    return found
+
+
 @contextmanager
 def progress(what: str, total: float, unit: str = "parts") -> Iterator[Progress]:
     """A progress bar, which takes how much of `total` is done. Prints nothing without a terminal.
@@ -72,6 +82,7 @@ def progress(what: str, total: float, unit: str = "parts") -> Iterator[Progress]
     with _shown(what, total) as shown:
         try:
             yield shown
+            _looked_at.append(Coverage(min(shown.done, total), total, unit))
         except KeyboardInterrupt as error:
             ended = Ended.of(error)
             ended.covered = Coverage(min(shown.done, total), total, unit, stopped=ended.why, status=ended.status)

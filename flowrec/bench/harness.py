@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_origin
 import typer
 
 from flowrec.errors import FlowrecError, UsageError
+from flowrec.system.endings import stopped_in_one_line
 from flowrec.system.outputs import FIGURE, JSON, Output
 
 if TYPE_CHECKING:
@@ -78,16 +79,24 @@ def _command(measure: Callable[..., Results], show: Callable[[Any], None]) -> Ca
 
     def command(as_json: bool, out: Path | None, overwrite: bool, **options: Any) -> None:
         inputs = tuple(value for name, value in options.items() if isinstance(value, Path) and name != "figure")
+        from flowrec.terminal import looked_at, say  # late: every verb imports this file
+
         with ExitStack() as stack:
             file = out and stack.enter_context(Output(out, JSON, inputs, overwrite).new_file())
             if figure := options.get("figure"):
                 need_matplotlib()
                 options["figure"] = stack.enter_context(Output(figure, FIGURE, inputs, overwrite).new_file())
-            results = {"machine": machine(), **measure(**options)}
+            looked_at()
+            with stopped_in_one_line():  # else it is Typer's, which says nothing
+                measured = measure(**options)
+            covered = looked_at()
+            results = {"machine": machine(), **measured, "covered": [each.as_json() for each in covered]}
             if as_json:
                 typer.echo(json.dumps(results))
             else:
                 show(results)
+                for each in covered:
+                    say(each.text)
             if file is not None:
                 file.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         if results.get("fault_count"):

@@ -17,6 +17,7 @@ from flowrec.cataloguing.sweeps import lists_of, sweep_rows
 from flowrec.commands.ls import read_each
 from flowrec.errors import SessionError, UsageError
 from flowrec.store.session_path import UrlPath, session_path
+from flowrec.system.endings import Ended
 from flowrec.version import __version__
 
 _BROKEN = ("unreadable", "unfinished", "recording")
@@ -32,6 +33,7 @@ class Refreshed:
     gone : sessions that were in the catalog and are no longer there.
     replays : of sweeps.
     left : sessions that were not read before an interruption.
+    stop_status : exit status of that interruption.
     remarks : lines about what could not be used.
     """
 
@@ -43,6 +45,7 @@ class Refreshed:
     broken: int
     replays: int
     left: int = 0
+    stop_status: int = 0
     remarks: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
@@ -104,7 +107,8 @@ def refresh(
         named = {written(found.path, base): found for found in contents.sessions}
         before = dict(zip(known.sessions["path"].to_pylist(), known.sessions[SIGNATURE].to_pylist(), strict=True))
         due = {text: found for text, found in named.items() if before.get(text) != found.signature}
-        rows, left = _read(due, progress)
+        rows, stop_status = _read(due, progress)
+        left = len(due) - len(rows)
         read = {row["path"] for row in rows}
         # A changed session that was not read before an interruption is left out: what is known of it is out of date.
         kept = [text in named and text not in due for text in before]
@@ -125,6 +129,7 @@ def refresh(
         broken=sum(outcomes[word] for word in _BROKEN),
         replays=len(lists.flatten()),
         left=left,
+        stop_status=stop_status,
         remarks=tuple(remarks),
     )
 
@@ -149,18 +154,20 @@ def _refuse_if_emptied(places: Sequence[Path], contents: Contents, known: catalo
 
 
 def _read(due: dict[str, Found], progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], int]:
-    """The rows of sessions, and how many were not read before an interruption."""
+    """The rows of sessions, and the exit status of an interruption before all were read; 0 without one."""
     rows: list[dict[str, Any]] = []
+    stop_status = 0
     try:
         far = any(isinstance(found.path, UrlPath) for found in due.values())
         with read_each(lambda text: row_of(due[text], text), due, far) as read:
             for row in read:
                 rows.append(row)
                 progress(len(rows) / len(due))
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         if not rows:
             raise
-    return rows, len(due) - len(rows)
+        stop_status = Ended.of(error).status
+    return rows, stop_status
 
 
 def _counted(number: int) -> str:

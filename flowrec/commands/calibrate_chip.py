@@ -238,6 +238,7 @@ def figures(done: PictureChip) -> dict[str, Any]:
         "fluid_share": round(float(done.mask.mean()), 4),
         "openings": openings,
         "remarks": remarks(done),
+        "covered": done.picture.covered.as_json(),
     }
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from flowrec.control.coil_calibration import CoilFit, advice, fit_coils, read_excitations
 from flowrec.control.coils import Coils
+from flowrec.coverage import Coverage
 from flowrec.system.outputs import TOML, Output
 from flowrec.terminal import say, table
 from flowrec.version import __version__
@@ -81,6 +82,7 @@ def figures(fit: CoilFit) -> dict[str, Any]:
         "standard_error_of_4_mt": fit.uncertainty_mt,
         "advice": advice(fit),
         "set": as_sets(fit),
+        "covered": Coverage(len(lines), len(lines), "rows").as_json(),
     }
 
 

@@ -147,7 +147,7 @@ def figures(done: ImageRegistration) -> dict[str, Any]:
         }
         poses.append(settings_of(done, fit) | quality)
     chosen = next((n for n, fit in enumerate(done.poses) if fit is done.chosen), None)
-    return {"chip": done.chip.name, "poses": poses, "chosen": chosen}
+    return {"chip": done.chip.name, "poses": poses, "chosen": chosen, "covered": done.picture.covered.as_json()}
 
 
 def show(done: ImageRegistration, out: Path | None) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flowrec.control.coil_log import read_coil_log
 from flowrec.control.field_log import FieldLog
 from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.coverage import Coverage
 from flowrec.errors import UsageError
 from flowrec.estimation.motion_fit import MotionFit, fit_motion
 from flowrec.estimation.motion_search import Range
@@ -45,6 +46,7 @@ class Motion:
     shared_clock: bool  # of the log and the session
     sets: dict[str, float | bool]  # settings by key
     advice: tuple[str, ...]
+    covered: Coverage  # images in which the robot was seen, of all
 
 
 def calibrate_motion(path: Path, coils: Path | None = None, out: Path | None = None, overwrite: bool = False) -> Motion:
@@ -63,7 +65,8 @@ def calibrate_motion(path: Path, coils: Path | None = None, out: Path | None = N
     output = Output(out, TOML, tuple(files_behind(path)), overwrite) if out is not None else None
     if output is not None:
         output.check()
-    tracks = [track for track in session.messages("track") if track.seen]
+    every = list(session.messages("track"))
+    tracks = [track for track in every if track.seen]
     imported = session.config.rig == MOVIE
     if coils is not None:
         log = read_coil_log(coils, session.config.movie.columns, session.config.coils)
@@ -77,7 +80,8 @@ def calibrate_motion(path: Path, coils: Path | None = None, out: Path | None = N
     if fit.refusal:
         raise UsageError(f"{path}: {fit.refusal}")
     shared = coils is None and not imported
-    motion = Motion(fit, name, shared, *_proposed(fit, session, shared_clock=shared, own_log=coils is None))
+    sets, advice = _proposed(fit, session, shared_clock=shared, own_log=coils is None)
+    motion = Motion(fit, name, shared, sets, advice, Coverage(len(tracks), len(every), "images", "show the robot"))
     if output is not None:
         with output.new_file() as part:
             part.write_text(fragment(motion, path), encoding="utf-8")
@@ -293,6 +297,7 @@ def figures(motion: Motion) -> dict[str, Any]:
         "shared_clock": motion.shared_clock,
         "advice": list(motion.advice),
         "set": as_sets(motion),
+        "covered": motion.covered.as_json(),
     }
 
 
@@ -325,6 +330,7 @@ def show(motion: Motion, path: Path, out: Path | None) -> None:
     table(f"{path.name} against {motion.log}", ("", "value and standard error"), rows)
     for sentence in motion.advice:
         say(f"- {sentence}")
+    say(motion.covered.amount)
     if out is not None:
         say(f"{out} written")
     say("With any configuration: " + " ".join(f"--set {text}" for text in as_sets(motion)))

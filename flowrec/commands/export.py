@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+from flowrec.coverage import Coverage
 from flowrec.errors import UsageError
 from flowrec.exports.formats import EXPORTS, Exporter, FileExporter
 from flowrec.session import Session, files_behind, input_blamed
@@ -41,6 +42,17 @@ def export(
     UsageError : there is no such format, or what it needs is not installed.
     SessionError : the session can not be read, or the output not be written; OutputError if it may not be.
     """
+    return exported(session, out, overwrite, file_format, beside)[0]
+
+
+def exported(
+    session: Session | Path | str,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    file_format: str = "rrd",
+    beside: Session | Path | str | None = None,
+) -> tuple[Path, Coverage]:
+    """The same; the file or folder, and how much of the session's time was read for it."""
     exporter: Exporter = EXPORTS[file_format].load()()
     session = Session.of(session)
     named = out is not None
@@ -54,15 +66,17 @@ def export(
     if second is not None and isinstance(output, Output):
         output = replace(output, inputs=(*output.inputs, *files_behind(second.path)))
     output.check()
-    began_s = time.perf_counter()
+    began_s, length_s = time.perf_counter(), max(session.duration_s, 1e-3)
     with (
-        progress(f"writing {target.name}", max(session.duration_s, 1e-3)) as done,
+        progress(f"writing {target.name}", length_s, "s") as done,
         input_blamed(session, None, "exported"),
         _opened(output) as part,
     ):
         exporter.write(session, part, done)
-    say(f"{target} written in {time.perf_counter() - began_s:.1f} s; {exporter.advice} {target}")
-    return target
+    covered = Coverage(min(done.done, length_s), length_s, "s")
+    took_s = time.perf_counter() - began_s
+    say(f"{target} written in {took_s:.1f} s, {covered.amount} of the session; {exporter.advice} {target}")
+    return target, covered
 
 
 def _beside(file_format: str, session: Session, second: Session) -> Exporter:

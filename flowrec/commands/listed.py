@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from flowrec.enums import Outcome
 from flowrec.errors import printable
 from flowrec.summary import is_count, is_numeric, shown
 
@@ -98,7 +99,7 @@ def columns_for_people(rows: Sequence[Listed], width: int) -> tuple[list[str], l
     """Names of the columns and the cells, as many as fit into a width in characters; empty columns are left out."""
     cells = {
         "name": [row.name + (f" ({row.parts} parts)" if row.parts else "") for row in rows],
-        "outcome": [row.outcome for row in rows],
+        "outcome": [_outcome(row) for row in rows],
         "duration": ["" if row.duration_s is None else f"{row.duration_s:.1f} s" for row in rows],
         "size": [f"{row.size_bytes / 1e6:.1f} MB" for row in rows],
         "chip": [row.chip for row in rows],
@@ -146,6 +147,12 @@ def _text(value: Any) -> str:
     else:
         text = joined(map(str, value)) if isinstance(value, list | tuple) else str(value)
     return printable(text[:TEXT_LIMIT])
+
+
+def _outcome(row: Listed) -> str:
+    """How it ended; of a replay or an import that was stopped, after how much."""
+    covered = row.facts.get("covered")
+    return f"{row.outcome}, {covered}" if covered and row.outcome == Outcome.STOPPED else row.outcome
 
 
 def _errors(facts: Mapping[str, Any]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flowrec.coverage import Coverage
 from flowrec.declarations import Image
 from flowrec.errors import UsageError
 from flowrec.movies import ReadOptions, open_movie
@@ -26,12 +27,14 @@ class Picture:
     bits : depth of a pixel.
     source : name of the file, and what was made of it.
     sha256 : of the file.
+    covered : the images of which it is the median, of all.
     """
 
     image: Image
     bits: int
     source: str
     sha256: str
+    covered: Coverage
 
 
 def read_picture(path: Path, channel: str | None = None) -> Picture:
@@ -46,15 +49,16 @@ def read_picture(path: Path, channel: str | None = None) -> Picture:
     if not path.exists():
         raise UsageError(f"{path}: no such picture; it is an image file, a movie, or a session")
     if path.suffix == ".mcap":
-        image, bits, count = _of_session(path)
+        image, bits, covered = _of_session(path)
     else:
         with open_movie(path, options=ReadOptions(channel)) as movie:
-            image, bits, count = movie.median_image(), movie.facts.bits, movie.facts.frames
-    source = path.name if count == 1 else f"{path.name}, median of images"
-    return Picture(image, bits, source, sha256_of(path))
+            image, bits, frames = movie.median_image(), movie.facts.bits, movie.facts.frames
+            covered = Coverage(len(movie.median_indices()), frames, "images")
+    source = path.name if covered.total == 1 else f"{path.name}, median of {covered.amount}"
+    return Picture(image, bits, source, sha256_of(path), covered)
 
 
-def _of_session(path: Path) -> tuple[Image, int, int]:
+def _of_session(path: Path) -> tuple[Image, int, Coverage]:
     session = open_session(path)
     times = np.unique(np.linspace(0.0, session.duration_s, _IMAGES))
     frames = {}
@@ -66,4 +70,5 @@ def _of_session(path: Path) -> tuple[Image, int, int]:
         raise UsageError(f"{path}: holds no images; take a session that was recorded with them")
     stack = np.stack([frame.image for frame in frames.values()])
     image: Image = np.median(stack, axis=0, overwrite_input=True).round().astype(stack.dtype)
-    return image, next(iter(frames.values())).bits, len(frames)
+    covered = Coverage(len(frames), session.topics.get("/camera/frame", len(frames)), "images")
+    return image, next(iter(frames.values())).bits, covered

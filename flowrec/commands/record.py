@@ -23,6 +23,7 @@ from flowrec.commands.watching import View, Watching
 from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.console.console import refuse_without_packages
 from flowrec.console.messages import Ended
+from flowrec.coverage import Coverage
 from flowrec.enums import Outcome, Phase
 from flowrec.errors import MovieError, SessionError, UnreachableError, UsageError
 from flowrec.estimation.sampler import SAMPLERS
@@ -320,6 +321,11 @@ def record(
             facts["note_not_finished"] = control.note
         if isinstance(rig, MovieRig) and rig.noticed:
             facts["note_movie"] = "; ".join(rig.noticed)
+        covered = None
+        if isinstance(rig, MovieRig):
+            stopped = run_control.reason.removeprefix("stopped by ")
+            covered = Coverage(rig.taken, rig.images, "images", stopped=stopped, status=run_control.stop_status)
+            facts["covered"] = covered.amount
         outcome = as_text(facts) | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
@@ -331,7 +337,8 @@ def record(
         watching.close(ended, VIEW_TIMEOUT_S if run_control.reason else None)
     facts["frames_dropped"] = writer.dropped_frames  # the writer has added it to the outcome of the file
     files = tuple(writer.files)
-    recorded = Recorded(path, report, facts, files, made, low[0] if low else "", bool(run_control.reason), source)
+    ended_early, stopped_by = (low[0] if low else ""), bool(run_control.reason)
+    recorded = Recorded(path, report, facts, files, made, ended_early, stopped_by, source, covered)
     if view == "rrd" and run_control.reason:
         say(f"the run was stopped: no .rrd was made; flowrec export {path} makes it")
     elif view == "rrd":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from flowrec import run_figures
 from flowrec.chip.chip import Chip
+from flowrec.coverage import Coverage
 from flowrec.enums import Outcome
 from flowrec.messages import FlowField
 from flowrec.run.loop import RunReport
@@ -35,6 +36,7 @@ class Recorded:
     lost : why the run was ended early by the disk monitor; '' if it was not.
     stopped : a person or a signal ended it.
     source : of a movie: facts about it, and the alignment of its log as JSON; as in the head of the session.
+    covered : of a movie: how many of its images were taken; None of a run, which ends when somebody ends it.
     """
 
     path: Path
@@ -45,6 +47,7 @@ class Recorded:
     lost: str = ""
     stopped: bool = False
     source: Mapping[str, str] = field(default_factory=dict)
+    covered: Coverage | None = None
 
     @property
     def sessions(self) -> tuple[Path, ...]:
@@ -53,9 +56,11 @@ class Recorded:
 
     @property
     def exit_status(self) -> int:
-        """0 reached its end, 1 did not, 3 was ended early by the disk monitor."""
+        """0 reached its end, 1 did not, 3 was ended early by the disk monitor; 130 or 143 an import was stopped."""
         if self.lost:
             return 3
+        if self.covered is not None and self.covered.stopped:
+            return self.covered.status
         return 0 if self.report.outcome in GOOD_ENDS else 1
 
 
@@ -86,11 +91,13 @@ def print_summary(recorded: Recorded) -> None:
     """Print the table at the end of a run, and what to do next."""
     files = ("file", files_text(recorded.path, recorded.files))
     table("Session", ("", "value"), [*rows_for_people(recorded.facts), files])
-    sessions, report = recorded.sessions, recorded.report
+    sessions, report, covered = recorded.sessions, recorded.report, recorded.covered
     if recorded.lost:
         say(
             f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
         )
+    elif covered is not None and covered.stopped:
+        say(f"flowrec: {covered.text}; the session holds those, and no more is known of the movie")
     elif recorded.exit_status and sessions:
         say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
     if sessions:

@@ -170,13 +170,17 @@ class Movie(ABC):
 
     def median_image(self, count: int = 31) -> Image:
         """Median of at most `count` images spread over the movie: what does not move, such as the chip."""
+        images = np.stack([self.image(index) for index in self.median_indices(count)])
+        median: Image = np.median(images, axis=0, overwrite_input=True).round().astype(images.dtype)
+        return median
+
+    def median_indices(self, count: int = 31) -> list[int]:
+        """The images that `median_image` takes."""
         facts = self.facts
         affordable = _MEDIAN_BYTES // (facts.width_px * facts.height_px * pixel_type(facts.bits).itemsize)
         count = max(min(count, facts.frames, affordable), 1)
-        chosen = np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int))
-        images = np.stack([self.image(int(index)) for index in chosen])
-        median: Image = np.median(images, axis=0, overwrite_input=True).round().astype(images.dtype)
-        return median
+        indices: list[int] = np.unique(np.linspace(0, facts.frames - 1, count).round().astype(int)).tolist()
+        return indices
 
     def __enter__(self) -> Self:
         return self

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from flowrec.coverage import Coverage
 from flowrec.session import Session
 from flowrec.sweeping.cluster import rows_of, workers_of
 from flowrec.sweeping.ranking import Ranking
@@ -44,6 +45,11 @@ class Swept:
         return [row for row in self.rows if row.get("error")]
 
     @property
+    def covered(self) -> Coverage:
+        """The tasks with a result, of all of this call."""
+        return Coverage(len(self.rows) - len(self.failed), self.tasks, "replays")
+
+    @property
     def exit_status(self) -> int:
         """0 all done, 3 a task has failed or a file is no whole session."""
         return 3 if self.failed or self.unreadable else 0
@@ -52,7 +58,7 @@ class Swept:
         """What was done and what has failed, as text."""
         failed = self.failed
         passed = f", {self.tasks - self.computed} were done before" if self.computed < self.tasks else ""
-        lines = [f"{self.computed} replays done{passed} -> {self.path}"]
+        lines = [f"{self.computed} replays done{passed}; {self.covered.amount} have a result -> {self.path}"]
         for row in failed[:_NAMED]:
             settings = ", ".join(f"{key}={value}" for key, value in row["settings"].items())
             lines.append(f"failed: {row['session']} with {settings}: {row['error']}")
@@ -66,7 +72,9 @@ class Swept:
         failed = [{name: row[name] for name in ("session", "settings", "error")} for row in self.failed]
         counts = {"sessions": self.sessions, "unreadable": self.unreadable}
         counts |= {"tasks": self.tasks, "computed": self.computed, "passed_over": self.tasks - self.computed}
-        return {"out": str(self.path), **counts, "failed": failed, "ranking": self.ranking.as_json()}
+        return {"out": str(self.path), **counts, "failed": failed, "ranking": self.ranking.as_json()} | {
+            "covered": self.covered.as_json()
+        }
 
 
 def sweep(

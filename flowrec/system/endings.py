@@ -7,9 +7,11 @@ all that cleans up after Ctrl-C cleans up after them. A run that must end in ord
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -18,6 +20,7 @@ from typing import Any, NoReturn, Self
 from flowrec.coverage import Coverage
 from flowrec.errors import FlowrecError
 
+_AGAIN_S = 0.02  # after an interruption that Python could not raise
 _STATUS = 128  # plus the number of the signal, as shells count it
 _WORDS = {"SIGINT": "SIGINT: Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "SIGHUP: the terminal was closed"}
 
@@ -70,6 +73,15 @@ class StoppedError(FlowrecError):
         return {"stopped": str(self), "exit_status": self.exit_status, "covered": covered}
 
 
+@contextmanager
+def stopped_in_one_line() -> Iterator[None]:
+    """Context of a verb: Ctrl-C or a signal leaves it as StoppedError."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise StoppedError(Ended.of(error)) from error
+
+
 def status_of(number: int) -> int:
     """The exit status of a program that a signal has ended: 130 for SIGINT, 143 for SIGTERM."""
     return _STATUS + number
@@ -86,8 +98,10 @@ def one_line_at_the_end() -> Iterator[None]:
     """Context of a whole program, from before its imports: a signal that ends it ends it in one line.
 
     An exception that an import makes of an interruption counts as one, and an interruption that is swallowed where
-    Python can not raise it (the end of an object, a callback from C) is raised again.
+    Python can not raise it (the end of an object, a callback from C) is sent again a moment later. Once the work is
+    done, a signal can not undo it: the status stays its own.
     """
+    atexit.register(_set_all, signal.SIG_IGN)  # the first that is registered is the last that is called
     arrived: list[int] = []
 
     def handle(number: int, _frame: FrameType | None) -> NoReturn:
@@ -96,18 +110,19 @@ def one_line_at_the_end() -> Iterator[None]:
 
     def unraisable(found: Any) -> None:
         if isinstance(found.exc_value, KeyboardInterrupt) and arrived:
-            signal.raise_signal(arrived[-1])
+            again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), arrived[-1]))
+            again.daemon = True
+            again.start()
         else:
             sys.__unraisablehook__(found)
 
     sys.unraisablehook = unraisable
-    for name in _WORDS:
-        number = getattr(signal, name, None)  # Windows has no SIGHUP
-        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # nohup
-            signal.signal(number, handle)
+    _set_all(handle)
     try:
         yield
-    except SystemExit:
+    except SystemExit as done:
+        status = done.code if isinstance(done.code, int) else int(done.code is not None)
+        _set_all(lambda *_: os._exit(status))  # the rest of Python may wait for threads
         raise
     except BaseException as error:
         if not arrived and not isinstance(error, KeyboardInterrupt):
@@ -116,11 +131,16 @@ def one_line_at_the_end() -> Iterator[None]:
         _exit(ended)
 
 
+def _set_all(handler: Any) -> None:
+    for name in _WORDS:
+        number = getattr(signal, name, None)  # Windows has no SIGHUP
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:  # nohup
+            signal.signal(number, handler)
+
+
 def _exit(ended: Ended) -> NoReturn:
     """One line, and the end of the process without the rest of Python: nothing is open, and atexit may take long."""
-    for name in _WORDS:
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_DFL)
+    _set_all(signal.SIG_DFL)
     with suppress(OSError, ValueError):
         sys.stdout.flush()
     with suppress(OSError, ValueError):

@@ -22,6 +22,7 @@ _LETTERS = 200  # of one cell: names and notes come from the file
 FIGURES = (
     "outcome",
     "duration_s",
+    "covered",  # of a replay or an import
     "assumed_flow_error",
     "refined_flow_error",
     "planned_s",

@@ -159,4 +159,6 @@ def test_the_verb_takes_the_folder_as_a_word_and_says_what_it_made(tmp_path: Pat
     done = CliRunner().invoke(app, ["export", str(GOLDEN), str(tmp_path / "t"), "--format", "parquet", "--json"])
     facts = json.loads(done.stdout)
     nbytes = sum(path.stat().st_size for path in (tmp_path / "t").iterdir())
+    covered = facts.pop("covered")
+    assert covered["whole"] and covered["unit"] == "s"
     assert facts == {"session": str(GOLDEN), "parquet": str(tmp_path / "t"), "bytes": nbytes}

@@ -38,6 +38,10 @@ class MovieRig:
     delay_s : from the log to the motion.
     duration_s : None: all of it.
     realtime : pace the images by their stamps.
+
+    Attributes
+    ----------
+    taken, images : images that were read, and that the movie states for the time that was asked for.
     """
 
     @classmethod
@@ -57,6 +61,9 @@ class MovieRig:
         self._end_ns = None if duration_s is None else nanoseconds(duration_s)
         self._realtime = realtime
         self._known = len(source.remarks)
+        stamps_ns = source.stamps_ns
+        self.taken = 0
+        self.images = len(stamps_ns) if self._end_ns is None else int((stamps_ns <= self._end_ns).sum())
 
     @property
     def noticed(self) -> list[str]:
@@ -78,6 +85,7 @@ class MovieRig:
                 return
             if self._realtime:
                 time.sleep(max(0.0, began_s + seconds(frame.stamp_ns) - time.monotonic()))
+            self.taken += 1
             yield Inputs(frame.stamp_ns, frame, self._log.applied(frame.stamp_ns, before_ns))
             before_ns = frame.stamp_ns
 
