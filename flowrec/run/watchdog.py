@@ -106,11 +106,20 @@ class Watchdog:
 
     @contextmanager
     def running(self) -> Iterator[Watchdog]:
-        """Context in which the thread runs; to be entered before the rig."""
+        """Context in which the thread runs; to be entered before the rig.
+
+        Raises
+        ------
+        RigError : the block ends by an exception, of the rig or its driver too, while zero() still fails.
+        """
         self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
         self._thread.start()
         try:
             yield self
+        except Exception as error:
+            if self.off:
+                raise
+            raise self._left_on() from error
         finally:
             self._over = True
             self._wake.set()
@@ -133,7 +142,7 @@ class Watchdog:
             except BaseException as error:  # noqa: BLE001  Ctrl-C in a user's program: raised below
                 interrupted = error
         if not self.off:
-            raise RigError(f"the coils may still carry a field: {self.failure}; switch the amplifiers off by hand")
+            raise self._left_on()
         if interrupted is not None:
             raise interrupted
 
@@ -168,6 +177,9 @@ class Watchdog:
     def failure(self) -> str:
         """Error text: zero() has failed, how often, and how."""
         return f"zero() raised {self.failures} times: {self._error}" if self._error else "zero() does not return"
+
+    def _left_on(self) -> RigError:
+        return RigError(f"the coils may still carry a field: {self.failure}; switch the amplifiers off by hand")
 
     # ---- the thread
 

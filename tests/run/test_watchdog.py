@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -144,6 +145,23 @@ def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repea
     driver.in_zero = lambda: None
     until(lambda: watchdog.off)
     assert driver.log == [("zero", 0.0)]
+
+
+def test_a_driver_that_also_fails_when_it_is_left_does_not_hide_that_the_coils_may_carry_a_field() -> None:
+    driver = Driver()
+
+    def refuse() -> None:
+        driver.now_s += 0.1
+        raise OSError("no answer")
+
+    driver.in_zero = refuse
+    watchdog = Watchdog(driver, clock=driver.clock)
+    with pytest.raises(RigError, match=r"the coils may still carry a field: .*no answer.*by hand"), ExitStack() as run:
+        run.enter_context(watchdog.running())
+        run.callback(driver.zero)  # as drivers do when they are closed
+        run.callback(watchdog.field_off)
+    driver.in_zero = lambda: None
+    until(lambda: watchdog.off)
 
 
 def test_ctrl_c_while_zero_is_at_work_comes_after_it() -> None:
