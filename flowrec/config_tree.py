@@ -15,10 +15,11 @@ from typing import Any, Literal, get_args, get_origin
 from flowrec.errors import UsageError
 from flowrec.methods import Methods
 from flowrec.ranges import Fault, hints, range_of
-from flowrec.system.toml_file import read_toml
+from flowrec.system.toml_file import parse_toml, read_toml
 
 REGISTRATION = "camera.registration"
 IMAGE_SIZE = ("width_px", "height_px")
+_SHOWN = 40  # characters of a value
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +41,11 @@ class Origin:
 def _value(text: str) -> Any:
     """A value in TOML syntax; a bare word is a string, so that shells need no double quoting."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
+    except ValueError as error:  # a number or text beyond all measure
+        raise UsageError(f"--set ...={text[:_SHOWN]}: {error}") from error
 
 
 def apply_sets(tree: dict[str, Any], sets: Iterable[str]) -> dict[str, str]:

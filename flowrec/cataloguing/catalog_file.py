@@ -19,6 +19,7 @@ from flowrec.commands.listed import ALWAYS, LISTS, kind_of
 from flowrec.errors import FlowrecError, UsageError
 from flowrec.system.locks import open_new
 from flowrec.system.outputs import Output, OutputError, put_in_place
+from flowrec.system.regular_file import refuse_irregular
 from flowrec.units import unit_of
 
 try:
@@ -58,6 +59,7 @@ def read(path: Path, remark: str = "is made anew") -> tuple[Known, str]:
     """
     if not os.path.lexists(path):
         return Known.nothing(), ""
+    refuse_irregular(path)
     try:
         table = pq.read_table(path, partitioning=None)
     except (OSError, pa.ArrowException) as error:

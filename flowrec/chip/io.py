@@ -64,6 +64,7 @@ from flowrec.chip.vessel_case import read_vessel_case
 from flowrec.errors import ChipError
 from flowrec.movies.notes import MovieNotes
 from flowrec.ranges import hints
+from flowrec.system.regular_file import refuse_irregular
 from flowrec.system.toml_file import parse_toml
 
 MAX_PIXELS = 3_600_000  # a field on more does not fit into a chunk that the reader of a session takes
@@ -207,6 +208,8 @@ def _read_chip(path: Path, um_per_px: float | None) -> Chip:
             f"{path}: a chip is a .png with a .toml beside it, or a vessel case .npz; convert it to one of these"
         )
     png, toml = path if kind == ".png" else path.with_suffix(".png"), path.with_suffix(".toml")
+    for each in (png, toml):
+        refuse_irregular(each, ChipError)
     try:
         data = png.read_bytes()
         text = toml.read_text(encoding="utf-8") if toml.exists() or path == toml else ""

@@ -20,6 +20,7 @@ from flowrec.chip.chip import Chip, Opening, Side
 from flowrec.chip.openings import check_chip
 from flowrec.errors import ChipError
 from flowrec.messages import Observations
+from flowrec.system.regular_file import refuse_irregular
 
 # Noise levels and shares of the skeleton that cases hold, by the names in their keys.
 NOISES = {"00": 0.0, "02": 0.02, "05": 0.05, "10": 0.1}
@@ -138,6 +139,7 @@ def _refuse_large(case: zipfile.ZipFile, keys: tuple[str, ...]) -> None:
 
 def _read(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Some arrays of a case, and no others."""
+    refuse_irregular(path, ChipError)
     try:
         with np.load(path, allow_pickle=False) as case:
             missing = [key for key in keys if key not in case.files]

@@ -13,6 +13,7 @@ from scipy.stats import t as student
 
 from flowrec.control.amplifier import WORST_CONDITION, direction_name
 from flowrec.errors import UsageError
+from flowrec.system.regular_file import refuse_irregular
 
 CURRENTS = ("i_x_a", "i_y_a", "i_z_a")
 FIELDS = ("b_x_mt", "b_y_mt", "b_z_mt")
@@ -48,6 +49,7 @@ def read_excitations(path: Path) -> Excitations:
     ------
     UsageError : a file that can not be read, with the line.
     """
+    refuse_irregular(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -55,7 +57,7 @@ def read_excitations(path: Path) -> Excitations:
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: can not be read as a CSV file ({error})") from error
     rows = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
+        (number, _cells(line, f"{path}:{number}"))
         for number, line in enumerate(text.splitlines(), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
@@ -66,6 +68,13 @@ def read_excitations(path: Path) -> Excitations:
     values = [_numbers(cells, columns, len(header), f"{path}:{number}") for number, cells in rows[1:]]
     table = np.array(values, np.float64).reshape(-1, 6)
     return Excitations(table[:, :3], table[:, 3:], tuple(number for number, _ in rows[1:]), path.name)
+
+
+def _cells(line: str, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:
+        raise UsageError(f"{where}: {error}; is it no table?") from error
 
 
 def _columns(header: list[str], where: str) -> list[int]:

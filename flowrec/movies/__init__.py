@@ -5,4 +5,4 @@ from flowrec.movies.movie import Movie as Movie
 from flowrec.movies.movie import MovieFacts as MovieFacts
 from flowrec.movies.movie import MovieFrame as MovieFrame
 from flowrec.movies.movie import ReadOptions as ReadOptions
-from flowrec.movies.movie import open_movie as open_movie
+from flowrec.movies.opening import open_movie as open_movie

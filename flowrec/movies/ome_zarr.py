@@ -23,6 +23,7 @@ from flowrec.movies.movie import (
     whole_ns,
 )
 from flowrec.movies.ome import OmeFacts, ome_facts, seconds_per, um_per
+from flowrec.system.regular_file import refuse_irregular
 
 _LARGEST_CHUNK_BYTES = 1 << 30
 _XML = Path("OME", "METADATA.ome.xml")
@@ -33,6 +34,9 @@ class ZarrMovie(Movie):
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)
+        for each in path.rglob("*"):
+            if not each.is_dir():
+                refuse_irregular(each, MovieError)
         try:
             self._array, axes, scale, self._ome = _found(path)
         except MovieError:
@@ -47,6 +51,8 @@ class ZarrMovie(Movie):
         self._along = long[0] if long else None
         height, width = array.shape[-2:]
         checked_size(path, width, height)
+        if min(array.chunks) < 1:
+            raise MovieError(f"{path}: has chunks of shape {array.chunks}, which hold nothing; its head is damaged")
         chunk_bytes = int(np.prod(array.chunks, dtype=np.float64)) * array.dtype.itemsize
         if chunk_bytes > _LARGEST_CHUNK_BYTES:
             raise MovieError(f"{path}: one of its chunks has {chunk_bytes / 1e9:.1f} GB; write it with smaller ones")

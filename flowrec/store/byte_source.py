@@ -16,6 +16,7 @@ from typing import Protocol
 
 from flowrec.errors import SessionError
 from flowrec.store.session_path import UrlPath
+from flowrec.system.regular_file import refuse_irregular
 
 
 class ByteSource(Protocol):
@@ -58,6 +59,7 @@ class LocalFile:
         if path.is_dir():
             raise SessionError(f"{path}: is a directory, not a session; name a .mcap file in it (`flowrec ls {path}`)")
         try:
+            refuse_irregular(path, SessionError)
             self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         except FileNotFoundError as error:
             raise SessionError(f"{path}: no such file; `flowrec ls {path.parent}` shows the sessions there") from error

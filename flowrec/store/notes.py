@@ -18,6 +18,7 @@ from flowrec.errors import SessionError, UsageError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.session_path import UrlPath, on_this_machine
 from flowrec.store.traffic import MissingError
+from flowrec.system.regular_file import refuse_irregular
 
 SUFFIX = ".notes.jsonl"
 TEXT_LIMIT = 10_000  # characters of a note
@@ -73,6 +74,7 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
     note = Note(datetime.now(UTC).isoformat(timespec="seconds"), author, text.strip(), tags)
     line = json.dumps({"session": key, **asdict(note)}).encode()
     path = on_this_machine(notes_file(session), "no note is added to")
+    refuse_irregular(path, SessionError)
     try:
         with path.open("ab+", buffering=0) as file:
             if file.seek(0, os.SEEK_END):
@@ -96,6 +98,7 @@ def notes_content(path: Path) -> bytes:
             MissingError
         ):  # also where access is refused: S3 does not tell who may not list a bucket what is not there
             return b""
+    refuse_irregular(path, SessionError)
     try:
         with path.open("rb") as file:
             return file.read(_FILE_LIMIT)

@@ -38,6 +38,7 @@ from flowrec.store.session_path import on_this_machine
 from flowrec.store.writer import SessionWriter
 from flowrec.system.locks import held
 from flowrec.system.outputs import MCAP, Output, OutputError, put_in_place
+from flowrec.system.regular_file import refuse_irregular
 from flowrec.topics import BY_PATH, Tick
 from flowrec.units import seconds
 
@@ -107,6 +108,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     ------
     SessionError : nothing can be saved, the run is still going on, or `out` is taken or can not be written.
     """
+    refuse_irregular(path, SessionError)
     try:
         with held(path):
             return _recover(path, out)

@@ -6,6 +6,7 @@ A column `time_s` may also be called `Time [s]` or `TIME (s)`: case, spaces and 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import io
 import re
 from collections.abc import Iterable, Iterator
@@ -18,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.errors import UsageError
+from flowrec.system.bounded_process import BoundedProcess
+from flowrec.system.regular_file import refuse_irregular
 
 # Columns of times, and what their numbers are in s.
 TIME_UNITS = {"time_s": 1.0, "time_ms": 1e-3, "time_us": 1e-6, "time_ns": 1e-9}
@@ -27,6 +30,8 @@ _BRACKETS = re.compile(r"[\[(]\s*(.*?)\s*[\])]")
 _ZIP = b"PK\x03\x04"
 _LIMIT_BYTES = 1 << 31
 _UNPACKED_LIMIT_BYTES = 1 << 30  # of an Excel file, which is compressed
+_EXCEL_ROWS = 1 << 20  # of a sheet, by Excel itself
+_EXCEL_S, _EXCEL_S_PER_MB = 20.0, 20.0  # CPU time; openpyxl takes some 3 s for a MB of numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,6 +174,7 @@ def read_table(path: Path) -> Table:
     ------
     UsageError : one line: no such file, no table, rows of unequal length, or a missing package.
     """
+    refuse_irregular(path)
     try:
         if path.stat().st_size > _LIMIT_BYTES:
             raise UsageError(f"{path}: has {path.stat().st_size / 1e9:.1f} GB; a table of at most 2 GB is read")
@@ -179,8 +185,6 @@ def read_table(path: Path) -> Table:
         text = _text(path.read_bytes())
     except FileNotFoundError as error:
         raise UsageError(f"{path}: no such table") from error
-    except IsADirectoryError as error:
-        raise UsageError(f"{path}: is a folder; a table is a file") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{path}: is no text that can be read; save it as CSV in UTF-8, or as .xlsx") from error
     except OSError as error:
@@ -189,7 +193,7 @@ def read_table(path: Path) -> Table:
         raise UsageError(f"{path}: is no text; save it as CSV in UTF-8, or as .xlsx")
     begin = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     separator = max(",;\t", key=begin.count)
-    return _checked(path, _text_rows(text, separator), separator == ";")
+    return _checked(path, _text_rows(path, text, separator), separator == ";")
 
 
 def _text(data: bytes) -> str:
@@ -202,23 +206,35 @@ def _text(data: bytes) -> str:
         return data.decode("cp1252")  # numbers are the same in all of them
 
 
-def _text_rows(text: str, separator: str) -> Iterator[tuple[int, list[Any]]]:
-    lines = csv.reader(io.StringIO(text), delimiter=separator)
-    for cells in lines:
-        if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#"):
-            yield lines.line_num, [cell.strip() for cell in cells]
-
-
-def _excel_rows(path: Path) -> Iterator[tuple[int, list[Any]]]:
-    """Rows of the first sheet; of formulas their values."""
+def _text_rows(path: Path, text: str, separator: str) -> Iterator[tuple[int, list[Any]]]:
+    lines, read = csv.reader(io.StringIO(text), delimiter=separator), 0
     try:
-        import openpyxl
-    except ModuleNotFoundError as error:
+        for cells in lines:
+            read = lines.line_num
+            if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#"):
+                yield read, [cell.strip() for cell in cells]
+    except csv.Error as error:
         raise UsageError(
-            f"{path}: Excel files need openpyxl: pip install 'flowrec[movies]', or save it as CSV"
+            f"{path}: line {read + 1}: {error}; is a quotation mark left open there, or is it no table?"
         ) from error
+
+
+def _excel_rows(path: Path) -> list[tuple[int, list[Any]]]:
+    """Rows of the first sheet; of formulas their values."""
+    if importlib.util.find_spec("openpyxl") is None:
+        raise UsageError(f"{path}: Excel files need openpyxl: pip install 'flowrec[movies]', or save it as CSV")
+    megabytes = path.stat().st_size / 1e6
+    with BoundedProcess(str(path), _EXCEL_S + _EXCEL_S_PER_MB * megabytes) as process:
+        return process.call(_sheet_rows, path)
+
+
+def _sheet_rows(path: Path) -> list[tuple[int, list[Any]]]:
+    """Rows of the first sheet, with their numbers; an empty one for each that is left out before a later one."""
     import zipfile
 
+    import openpyxl
+
+    rows: list[tuple[int, list[Any]]] = []
     try:
         with zipfile.ZipFile(path) as parts:
             if sum(part.file_size for part in parts.infolist()) > _UNPACKED_LIMIT_BYTES:
@@ -228,19 +244,21 @@ def _excel_rows(path: Path) -> Iterator[tuple[int, list[Any]]]:
     except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
         raise UsageError(f"{path}: is no Excel file that can be read ({error}); save it as CSV in UTF-8") from error
     try:
-        sheet, count = book.worksheets[0], 0
+        sheet = book.worksheets[0]
         for number, row in enumerate(sheet.iter_rows(values_only=True), 1):
+            if number > _EXCEL_ROWS:
+                raise UsageError(f"{path}: names a row beyond {_EXCEL_ROWS}, the last one of a sheet; it is damaged")
             cells = list(row)
             if any(cell not in (None, "") for cell in cells) and not str(cells[0]).lstrip().startswith("#"):
-                count += 1
-                yield number, cells
-        if count < 2 and len(book.worksheets) > 1:
+                rows.append((number, cells))
+        if len(rows) < 2 and len(book.worksheets) > 1:
             raise UsageError(
                 f"{path}: its first sheet, {sheet.title!r}, holds no table, and only that is read; move the sheet with "
                 "the table to the front"
             )
     finally:
         book.close()
+    return rows
 
 
 def _checked(path: Path, rows: Iterable[tuple[int, list[Any]]], decimal_comma: bool = False) -> Table:

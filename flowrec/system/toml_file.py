@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import UsageError
+from flowrec.system.regular_file import refuse_irregular
 
 _NOT_TOML = {
     ".yaml": "YAML",
@@ -20,6 +21,7 @@ _NOT_TOML = {
 
 # Ours have 10 kB. Each dot may open a table of a kilobyte, and a key with many costs the square of them in time.
 _LIMIT_CHARACTERS, _LIMIT_DOTS, _LIMIT_DOTS_IN_A_ROW = 1 << 19, 20_000, 2_000
+_INTEGERS = 1 << 63  # by the specification of TOML, below 0 and above
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -35,7 +37,18 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError(f"{text.count('.')} dots, more than {_LIMIT_DOTS}")
     if any(line.count(".") > _LIMIT_DOTS_IN_A_ROW for line in text.splitlines()):
         raise ValueError(f"a line with more than {_LIMIT_DOTS_IN_A_ROW} dots")
-    return tomllib.loads(text)
+    tree = tomllib.loads(text)
+    _refuse_long(tree)
+    return tree
+
+
+def _refuse_long(value: Any) -> None:
+    """Raise ValueError for a whole number beyond the 64 bits of TOML: Python reads it, and computes with no float."""
+    if isinstance(value, (dict, list)):
+        for inner in value.values() if isinstance(value, dict) else value:
+            _refuse_long(inner)
+    elif isinstance(value, int) and not -_INTEGERS <= value < _INTEGERS:
+        raise ValueError(f"a whole number of {value.bit_length()} bits; TOML has 64")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -49,6 +62,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     kind = _NOT_TOML.get(path.suffix.lower())
     if kind is not None:
         raise UsageError(f"{path}: is {kind} by its name, and a configuration is a TOML file; {begin}")
+    refuse_irregular(path)
     try:
         if path.stat().st_size > 4 * _LIMIT_CHARACTERS:
             raise ValueError(f"{path.stat().st_size} bytes, more than {4 * _LIMIT_CHARACTERS}")

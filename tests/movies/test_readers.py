@@ -1,6 +1,8 @@
 """Movies of other people's encoders: grey levels, times and depth come out as they went in, or the movie is refused."""
 
+import json
 import struct
+import sys
 import zlib
 
 import av
@@ -8,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import zstandard
 
 from flowrec.errors import MovieError
 from flowrec.movies import ReadOptions, open_movie
@@ -311,3 +314,21 @@ def test_what_can_not_be_kept_exactly_is_refused(tmp_path):
         read(tmp_path / "deep.tif", bits=12)
     facts, _, remarks = read(tmp_path / "deep.tif")
     assert facts.bits == 16 and "16 are assumed" in remarks[0]
+
+
+def test_a_zarr_whose_chunks_hold_nothing_or_unpack_without_measure_is_refused(tmp_path):
+    none = makers.ome_zarr(tmp_path / "none.zarr", pictures(), 0.05) / "0" / "zarr.json"
+    head = json.loads(none.read_text())
+    head["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
+    none.write_text(json.dumps(head))
+    with pytest.raises(MovieError, match=r"chunks of shape \(0, "):
+        read(tmp_path / "none.zarr")
+    if sys.platform != "linux":
+        return  # the system limits no memory
+    bomb = makers.ome_zarr(tmp_path / "bomb.zarr", pictures(), 0.05)
+    nothing, packer = bytes(1 << 24), zstandard.ZstdCompressor().compressobj(size=1 << 33)
+    packed = b"".join([packer.compress(nothing) for _ in range(1 << 9)] + [packer.flush()])
+    for chunk in (each for each in (bomb / "0" / "c").rglob("*") if each.is_file()):
+        chunk.write_bytes(packed)
+    with pytest.raises(MovieError, match=r"bomb\.zarr: needs more than 3\.2 GB of memory"):
+        read(bomb)

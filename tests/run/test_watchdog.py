@@ -156,10 +156,12 @@ def test_a_driver_that_also_fails_when_it_is_left_does_not_hide_that_the_coils_m
 
     driver.in_zero = refuse
     watchdog = Watchdog(driver, clock=driver.clock)
-    with pytest.raises(RigError, match=r"the coils may still carry a field: .*no answer.*by hand"), ExitStack() as run:
-        run.enter_context(watchdog.running())
-        run.callback(driver.zero)  # as drivers do when they are closed
-        run.callback(watchdog.field_off)
+    run = ExitStack()
+    run.enter_context(watchdog.running())
+    run.callback(driver.zero)  # as drivers do when they are closed
+    run.callback(watchdog.field_off)
+    with pytest.raises(RigError, match=r"the coils may still carry a field: .*no answer.*by hand"):
+        run.close()
     driver.in_zero = lambda: None
     until(lambda: watchdog.off)
 

@@ -1,5 +1,7 @@
 """Tables as people save them: separators, byte orders, Excel; and what is no number is named with its line."""
 
+import re
+import zipfile
 from datetime import UTC, datetime
 
 import openpyxl
@@ -108,3 +110,30 @@ def test_a_file_that_is_no_table_is_refused(data, tmp_path):
     (tmp_path / "log.csv").write_bytes(data)
     with pytest.raises(UsageError, match=r"log\.csv"):
         read_table(tmp_path / "log.csv").numbers("time_s")
+
+
+OVERLONG = {
+    "cell.csv": "t,x\n0,1\n1," + "3" * 200_000 + "\n",
+    "quote.csv": 't,x\n0,1\n1,"2\n' + "2,3\n" * 50_000,
+}
+
+
+@pytest.mark.parametrize("name", OVERLONG)
+def test_a_cell_without_end_is_refused_with_its_line(name, tmp_path):
+    (tmp_path / name).write_text(OVERLONG[name])
+    with pytest.raises(UsageError, match=rf"{name}: line 3: field larger than field limit.*quotation mark"):
+        read_table(tmp_path / name)
+
+
+def test_a_sheet_that_names_a_row_beyond_the_last_is_refused(tmp_path):
+    """Its reader makes an empty row for each that is left out."""
+    excel(tmp_path / "book.xlsx")
+    with (
+        zipfile.ZipFile(tmp_path / "book.xlsx") as book,
+        zipfile.ZipFile(tmp_path / "far.xlsx", "w", zipfile.ZIP_DEFLATED) as far,
+    ):
+        for part in book.namelist():
+            text = re.sub(rb"<dimension[^>]*>", b"", book.read(part)) if "sheet1" in part else book.read(part)
+            far.writestr(part, re.sub(rb'r="([A-Z]*)4"', rb'r="\g<1>2000000000"', text) if "sheet1" in part else text)
+    with pytest.raises(UsageError, match=r"far\.xlsx: names a row beyond 1048576"):
+        read_table(tmp_path / "far.xlsx")
