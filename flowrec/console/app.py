@@ -7,10 +7,10 @@ import html
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -23,7 +23,7 @@ from flowrec.console.access import Access
 from flowrec.console.board import MOST_PAGES, Board, Shown
 from flowrec.console.console import GOAL, SPEED
 from flowrec.console.rerun_viewer import RerunViewer
-from flowrec.run.operator_commands import COMMANDS, LONGEST_NOTE
+from flowrec.run.operator_commands import COMMANDS, LONGEST_NOTE, NOTE
 
 _PERIOD_S = 0.1  # from one state to the next of a page
 _FROZEN_S = 30.0  # a page that takes nothing for so long is let go
@@ -62,14 +62,18 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
         if not board.enter():
             await socket.close(1013, f"{MOST_PAGES} pages are open already: close one")
             return
-        sending = asyncio.create_task(_send(board, socket))
+        tasks = {asyncio.create_task(_send(board, socket))}
         try:
             while True:
-                await socket.send_text(json.dumps(commands.take(await socket.receive_text())))
+                # The answer waits for the run, the next command for nothing.
+                answering = asyncio.create_task(_answer(socket, commands.take(await socket.receive_text())))
+                tasks.add(answering)
+                answering.add_done_callback(tasks.discard)
         except WebSocketDisconnect:
             pass
         finally:
-            sending.cancel()
+            for task in tasks:
+                task.cancel()
             board.leave()
 
     routes = [
@@ -102,6 +106,28 @@ async def _send(board: Board, socket: WebSocket) -> None:
             await asyncio.sleep(_PERIOD_S)
 
 
+async def _answer(socket: WebSocket, given: _Given) -> None:
+    """Tell a page what became of its command, once that is known."""
+    refusal = await given.refusal if given.refusal is not None else given.not_given
+    with suppress(WebSocketDisconnect, RuntimeError):  # the page was closed
+        await socket.send_text(json.dumps({"answers": given.number, "refusal": refusal}))
+
+
+class _Given(NamedTuple):
+    """A command of a page.
+
+    Attributes
+    ----------
+    number : by which the page knows it.
+    refusal : of the run, to be waited for; None: the command was not given.
+    not_given : why.
+    """
+
+    number: Any
+    refusal: Awaitable[str] | None
+    not_given: str = ""
+
+
 class _Commands:
     """What pages ask for, checked and handed on at once: nothing that is sent to a page is before it in a queue."""
 
@@ -109,21 +135,20 @@ class _Commands:
         self._board, self._answer = board, answer
         self._given_s: list[float] = []
 
-    def take(self, text: str) -> dict[str, Any]:
-        """Hand a message of a page to the run; what to answer the page."""
+    def take(self, text: str) -> _Given:
+        """Hand a message of a page to the run."""
         number: Any = None
         try:
             asked = json.loads(text)
             number = asked.get("number")
             words = self._words(asked)
-            self._answer(words)
+            ticket = self._board.ticket()
+            self._answer({**words, "ticket": ticket})
         except OSError:
-            refusal = "the run has ended"
+            return _Given(number, None, "the run has ended")
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            refusal = f"not understood: {error}"
-        else:
-            refusal = ""
-        return {"answers": number, "refusal": refusal}
+            return _Given(number, None, f"not understood: {error}")
+        return _Given(number, self._board.refusal(ticket))
 
     def _words(self, asked: dict[str, Any]) -> dict[str, Any]:
         name = asked["command"]
@@ -139,7 +164,10 @@ class _Commands:
         if name == SPEED:
             limit = asked["limit_um_s"]
             return {"command": name, "limit_um_s": None if limit is None else _finite(limit)[0]}
-        return {"command": COMMANDS[name].name, "text": str(asked.get("text", ""))[:LONGEST_NOTE]}
+        text = str(asked.get("text", ""))[:LONGEST_NOTE]
+        if name == NOTE and not text.strip():
+            raise ValueError("a note without a text")
+        return {"command": COMMANDS[name].name, "text": text}
 
 
 def _finite(*given: Any) -> tuple[float, ...]:

@@ -7,11 +7,12 @@ grow. One thread takes over what the run sends; the pages wait in the loop of th
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 from collections import deque
 from typing import Any, NamedTuple
 
-from flowrec.console.messages import Ended
+from flowrec.console.messages import Ended, Verdict
 from flowrec.console.page_state import Drawing, PageState
 from flowrec.view.feed import Batch
 from flowrec.view.scene import Scene
@@ -71,6 +72,8 @@ class Board:
         self._ended: Ended | None = None
         self._changed = asyncio.Event()
         self._waking = False
+        self._tickets = itertools.count(1)
+        self._verdicts: dict[int, asyncio.Future[str]] = {}
 
     # ---- by the thread that hears the run
 
@@ -96,6 +99,11 @@ class Board:
         self._at = self._at._replace(number=self._at.number + 1)
         self._wake()
 
+    def settle(self, verdict: Verdict) -> None:
+        """Take over what the run made of a command."""
+        if self.loop is not None:
+            self.loop.call_soon_threadsafe(self._settled, verdict)
+
     def _wake(self) -> None:
         if self.loop is not None and not self._waking:
             self._waking = True
@@ -109,6 +117,21 @@ class Board:
         self._changed = asyncio.Event()
         if self._ended is not None:
             self.over.set()
+
+    def _settled(self, verdict: Verdict) -> None:
+        waiting = self._verdicts.pop(verdict.ticket, None)
+        if waiting is not None and not waiting.done():  # done: its page is gone
+            waiting.set_result(verdict.refusal)
+
+    def ticket(self) -> int:
+        """A number for a command that is handed to the run, which will say what it made of it."""
+        ticket = next(self._tickets)
+        self._verdicts[ticket] = asyncio.get_running_loop().create_future()
+        return ticket
+
+    async def refusal(self, ticket: int) -> str:
+        """Wait for the run: why it does not do a command, '' where it does."""
+        return await self._verdicts[ticket]
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
         """The place on the chip that the image shows there."""

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any, Self
 
-from flowrec.console.messages import STAYS, Begin, Ended
+from flowrec.console.messages import STAYS, Begin, Ended, Verdict
 from flowrec.errors import FlowrecError, UsageError
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import COMMANDS
@@ -138,7 +138,7 @@ class Console:
                     self._message = f"console: {self.url}"
                     self._accepts.set()
                 else:
-                    self._do(words)
+                    feed.tell(Verdict(words["ticket"], self._do(words)))
         if feed.closing:
             return
         feed.process.wait()
@@ -147,9 +147,11 @@ class Console:
             self._tell(self._message)
         self._accepts.set()
 
-    def _do(self, words: dict[str, Any]) -> None:
-        """Give a command to the run."""
-        name = words["command"]
+    def _do(self, words: dict[str, Any]) -> str:
+        """Give a command to the run; why it does not take it, '' where it does."""
+        name, taken = words["command"], True
+        if name in (GOAL, SPEED) and self._control.reason:
+            return f"the run ends: {self._control.reason}"
         try:
             if name == GOAL:
                 self._control.set_goal(float(words["x_um"]), float(words["y_um"]))
@@ -157,6 +159,8 @@ class Console:
                 limit = words["limit_um_s"]
                 self._control.limit_speed(None if limit is None else float(limit))
             else:
-                COMMANDS[name].give(self._control, words["text"], "console")
+                taken = COMMANDS[name].give(self._control, words["text"], "console")
         except FlowrecError as error:  # a place or speed that no run could have
             self._tell(f"console: {error}")
+            return str(error)
+        return "" if taken else "too many commands wait for their tick; give it again"

@@ -25,6 +25,19 @@ class Begin(NamedTuple):
     rerun_port: int | None
 
 
+class Verdict(NamedTuple):
+    """What the run made of a command.
+
+    Attributes
+    ----------
+    ticket : number of the command, as the server counts them.
+    refusal : why the run does not do it; '' where it has taken it.
+    """
+
+    ticket: int
+    refusal: str
+
+
 class Ended(NamedTuple):
     """The last: how the run ended, and where its file is."""
 

@@ -20,7 +20,7 @@ import uvicorn
 
 from flowrec.console.app import application
 from flowrec.console.board import Board
-from flowrec.console.messages import STAYS, Begin, Ended
+from flowrec.console.messages import STAYS, Begin, Ended, Verdict
 from flowrec.view.viewer import LOOPBACK
 
 PORT = 8460  # where it is free: the operator's tunnel and bookmark stay from run to run
@@ -93,6 +93,8 @@ def _read(source: Any, board: Board) -> None:
         if isinstance(news, Ended):
             ended = news
             print(STAYS, flush=True)
+        elif isinstance(news, Verdict):
+            board.settle(news)
         else:
             board.take(news)
     board.end(ended)

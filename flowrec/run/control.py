@@ -110,9 +110,9 @@ class RunControl:
         text, limit_um_s = ("no limit", None) if speed_um_s is None else (f"{speed_um_s:g} um/s", float(speed_um_s))
         self._steering[Action.SPEED].append(OperatorEvent(0, Action.SPEED, text, speed_limit_um_s=limit_um_s))
 
-    def mark(self) -> None:
-        """Ask for the next numbered mark; keys and console share the numbers."""
-        self.request(Action.MARK, str(next(self._marks)))
+    def mark(self) -> bool:
+        """Ask for the next numbered mark; keys and console share the numbers. False as of `request`."""
+        return self.request(Action.MARK, str(next(self._marks)))
 
     def toggle_hold(self) -> None:
         """Hold the robot, or let it go on if it is held."""

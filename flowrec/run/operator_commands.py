@@ -9,6 +9,7 @@ from flowrec.enums import Action
 from flowrec.run.control import LONGEST_TEXT, RunControl
 
 LONGEST_NOTE = LONGEST_TEXT
+NOTE = "note"  # the command with a text
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,39 +22,42 @@ class OperatorCommand:
     key : of the terminal and of the console's page.
     words : what the key does, in the terminal's line of keys and on the console's button.
     meaning : what it does to the robot and the run.
-    give : takes the control, a text (only a note has one) and how the command was given: a key, or `console`.
+    give : takes the control, a text (only a note has one) and how the command was given: a key, or `console`. False,
+        and nothing is done, while too many events wait.
     """
 
     name: str
     key: str
     words: str
     meaning: str
-    give: Callable[[RunControl, str, str], None]
+    give: Callable[[RunControl, str, str], bool]
 
 
-def _stop(control: RunControl, _text: str, by: str) -> None:
+def _stop(control: RunControl, _text: str, by: str) -> bool:
     control.stop(f"stopped by the operator ({by})")
+    return True
 
 
-def _mark(control: RunControl, _text: str, _by: str) -> None:
-    control.mark()
+def _mark(control: RunControl, _text: str, _by: str) -> bool:
+    return control.mark()
 
 
-def _note(control: RunControl, text: str, _by: str) -> None:
-    if text.strip():
-        control.request(Action.NOTE, text.strip()[:LONGEST_NOTE])
+def _note(control: RunControl, text: str, _by: str) -> bool:
+    return not text.strip() or control.request(Action.NOTE, text.strip()[:LONGEST_NOTE])
 
 
-def _hold(control: RunControl, _text: str, _by: str) -> None:
+def _hold(control: RunControl, _text: str, _by: str) -> bool:
     control.toggle_hold()
+    return True
 
 
-def _end(control: RunControl, _text: str, by: str) -> None:
-    control.request(Action.END, f"ended by the operator ({by})")
+def _end(control: RunControl, _text: str, by: str) -> bool:
+    return control.request(Action.END, f"ended by the operator ({by})")
 
 
-def _zero(control: RunControl, _text: str, by: str) -> None:
+def _zero(control: RunControl, _text: str, by: str) -> bool:
     control.stop(f"operator: zero field ({by})", zero=True)
+    return True
 
 
 COMMANDS = {
@@ -61,7 +65,7 @@ COMMANDS = {
     for row in (
         OperatorCommand("stop", "q", "stop", "The field ramps down, then the run ends.", _stop),
         OperatorCommand("mark", "m", "mark", "A numbered mark at this moment of the recording.", _mark),
-        OperatorCommand("note", "n", "note", "A text at this moment of the recording.", _note),
+        OperatorCommand(NOTE, "n", "note", "A text at this moment of the recording.", _note),
         OperatorCommand("hold", " ", "hold, go on", "The robot is held in its place, or goes on.", _hold),
         OperatorCommand("end", "e", "end observing", "The observation ends; its refinement begins.", _end),
         OperatorCommand("zero", "!", "zero field at once", "The field is off on the next tick; the run ends.", _zero),

@@ -79,6 +79,7 @@ class Feed:
         self._period_s = 1.0 / max_hz
         self._queue: deque[Tick] = deque(maxlen=_QUEUE_TICKS)
         self._frame: Frame | None = None  # the latest, with its image
+        self._told: deque[object] = deque()  # besides ticks
         self.dropped = 0  # ticks that were not shown, because the process could not keep up or has ended
         self.ended = False
         self._closing, self._ticked = threading.Event(), threading.Event()
@@ -110,6 +111,11 @@ class Feed:
         if len(self._queue) == _QUEUE_TICKS:
             self.dropped += 1
         self._queue.append(tick)
+        self._ticked.set()
+
+    def tell(self, what: object) -> None:
+        """Send something besides ticks, before those that wait; returns at once. Any thread."""
+        self._told.append(what)
         self._ticked.set()
 
     @property
@@ -170,6 +176,8 @@ class Feed:
                     self._ticked.wait(self._period_s)
                     time.sleep(_AFTER_TICK_S)
                 closing = self._closing.is_set()
+                while self._told:
+                    _send(pipe, self._told.popleft())
                 if closing or self._queue:
                     batch, sent = self._batch(sent)
                     _send(pipe, batch)

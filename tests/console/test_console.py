@@ -22,6 +22,7 @@ from flowrec.console import console as console_module
 from flowrec.console.board import MOST_PAGES
 from flowrec.console.messages import Ended
 from flowrec.console.page_state import PageState
+from flowrec.enums import Action
 from flowrec.errors import UsageError
 from flowrec.messages import FlowField, OperatorEvent
 from flowrec.run.control import RunControl
@@ -214,6 +215,35 @@ def test_a_goal_and_a_limit_reach_the_run_as_numbers(scene: Scene) -> None:
         goal, limit = events_of(served.control)
     np.testing.assert_allclose(goal.goal_um, scene.calibration.to_um((100.0, 60.0)))
     assert limit.speed_limit_um_s == 120.0
+
+
+REFUSED = {
+    "a negative speed": ({"command": "speed", "limit_um_s": -5}, "speed limit -5 um/s"),
+    "a speed of no robot": ({"command": "speed", "limit_um_s": 1e300}, "speed limit 1e+300 um/s"),
+    "a goal off every chip": ({"command": "goal", "x_px": 1e308, "y_px": 0}, "goal "),
+    "a note without text": ({"command": "note", "text": "  "}, "a note without a text"),
+}
+
+
+def test_the_page_is_told_accepted_only_by_the_run_and_otherwise_why_not(scene: Scene) -> None:
+    with (served := Served(scene)).console, served.page() as page:
+
+        def refusal(**asked: Any) -> str:
+            page.send(json.dumps(asked))
+            while "answers" not in (words := json.loads(page.recv())):
+                pass
+            return str(words["refusal"])
+
+        for what, (asked, why) in REFUSED.items():
+            assert why in refusal(**asked), what
+        assert not any(map(len, served.control._steering.values()))
+        assert refusal(command="speed", limit_um_s=5) == ""
+        assert len(served.control._steering[Action.SPEED]) == 1  # the run has it by the time that the page is told
+        while served.control.request("mark"):  # keys and scripts ask, too
+            pass
+        assert "too many" in refusal(command="mark")
+        assert refusal(command="stop") == ""
+        assert "the run ends: stopped by the operator" in refusal(command="goal", x_px=10.0, y_px=20.0)
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 90.0, 33.0])

@@ -4,7 +4,7 @@
 
 const facts = JSON.parse(document.body.dataset.facts);
 const part = (id) => document.getElementById(id);
-const PATIENCE_MS = 1500; // for the server to answer a command
+const PATIENCE_MS = 1500; // for the run to answer a command
 const STALE_MS = 2500; // without a tick of the run
 const TRAIL = 40; // states
 const MOST_EVENTS = 100;
@@ -27,7 +27,7 @@ function command(name, values = {}) {
   asked += 1;
   const number = asked;
   socket.send(JSON.stringify({ command: name, number, ...values }));
-  const late = () => alarm("The console does not answer. Use the keys in the terminal (! takes the field away).");
+  const late = () => alarm("The run does not answer. Use the keys in the terminal (! takes the field away).");
   waiting.set(number, setTimeout(late, PATIENCE_MS));
 }
 
@@ -35,6 +35,7 @@ function answered(number, refusal) {
   clearTimeout(waiting.get(number));
   waiting.delete(number);
   alarm(refusal ? `Refused: ${refusal}` : "");
+  if (refusal) place(part("asked"), null);
 }
 
 function alarm(text) {
