@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flowrec.bench.verbs import AsJson, Sets
+from flowrec.errors import UsageError
 
 if TYPE_CHECKING:
     from flowrec.config import Config
@@ -27,9 +28,16 @@ def doctor(
     from flowrec.commands import doctor as verb
     from flowrec.config import load_config
 
-    chosen = load_config(config, [*(sets or []), *([f"rig={rig}"] if rig is not None else [])], {"rig": "--rig"})
+    settings = [*(sets or []), *([f"rig={rig}"] if rig is not None else [])]
+    wrong = ""
+    try:
+        chosen = load_config(config, settings, {"rig": "--rig"})
+    except UsageError as error:
+        from flowrec.commands.doctor_settings import of_devices
+
+        chosen, wrong = of_devices(config, settings, error), str(error)
     found = []
-    for finding in verb.diagnose(chosen, config, folder):
+    for finding in verb.diagnose(chosen, config, folder, wrong):
         found.append(finding)
         if not as_json:
             typer.echo(verb.line_of(finding))

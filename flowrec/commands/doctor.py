@@ -18,6 +18,7 @@ import numpy as np
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
 from flowrec.commands.calibrate_image import registration_state, walls_state
+from flowrec.commands.doctor_settings import stand_in
 from flowrec.commands.record import refuse_adrift
 from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.control import Coils
@@ -68,19 +69,29 @@ class Finding:
     text: str
 
 
-def diagnose(asked: Config, config_file: Path | None = None, folder: Path | None = None) -> Iterator[Finding]:
+def diagnose(
+    asked: Config, config_file: Path | None = None, folder: Path | None = None, wrong: str = ""
+) -> Iterator[Finding]:
     """Look at everything that a run of a configuration needs, and yield what is found, as it is found.
 
     Parameters
     ----------
     config_file : from which the configuration was read, for the age of its calibrations.
     folder : where sessions are written; None: the present one.
+    wrong : why the configuration was refused, and `asked` is only what is right of it; "" if it was not.
     """
-    settled: list[tuple[ResolvedConfig, Chip]] = []
-    yield from _look("settings", lambda: _settings(asked, settled))
+    settled: list[tuple[ResolvedConfig, Chip | None]] = []
+    if wrong:
+        yield Finding("settings", FAILURE, wrong)
+    else:
+        yield from _look("settings", lambda: _settings(asked, settled))
+    if not settled and asked.rig == LAB:
+        yield from _look("devices", lambda: _without_settings(asked, settled))
     if settled:
         config, chip = settled[0]
-        yield from _look("mission", lambda: _mission(config, chip))
+        if chip is not None:
+            known = chip
+            yield from _look("mission", lambda: _mission(config, known))
         if asked.rig == LAB:
             yield from _look("camera", lambda: _camera(config, chip))
             yield from _look("coils", lambda: _coils(config))
@@ -113,7 +124,13 @@ def _look(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding
         yield Finding(what, FAILURE, f"{error.strerror or error}; see to it, then try again")
 
 
-def _settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip]]) -> Iterator[Finding]:
+def _without_settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) -> Iterator[Finding]:
+    settled.append((stand_in(asked), None))
+    text = "what is wrong or missing in the settings is made up to look at them; mission and walls are left out"
+    yield Finding("devices", WARNING, text)
+
+
+def _settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) -> Iterator[Finding]:
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
     settled.append((config, chip))
@@ -144,7 +161,7 @@ def _mission(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
     )
 
 
-def _camera(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
+def _camera(config: ResolvedConfig, chip: Chip | None) -> Iterator[Finding]:
     from flowrec.rigs.lab.cameras.probe import probe
 
     camera = config.camera
@@ -184,7 +201,7 @@ def _camera(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
         yield Finding("image", WARNING, text)
     else:
         yield Finding("image", OK, f"brightest pixel {seen.brightest} of {full}")
-    if seen.image is not None and seen.image.shape == (camera.height_px, camera.width_px):
+    if chip is not None and seen.image is not None and seen.image.shape == (camera.height_px, camera.width_px):
         yield from _walls(config, chip, seen.image)
 
 

@@ -132,6 +132,28 @@ def test_a_registration_is_judged_by_its_age_and_its_residual(
     assert levels(load_config(None, sets), tmp_path)["registration"] == level
 
 
+def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "_TRIAL_BYTES", 1 << 22)
+    devices = ["lab.camera=opencv", "lab.device=nowhere.avi", "lab.port=/dev/nothing"]
+    for wrong, text in {
+        "robot.radius_um=-5.0": "robot.radius_um = -5",
+        "camera.bits=9": "camera.bits = 9",
+        "chip.path=nowhere.png": "nowhere.png: no such file",
+        "mission.goal=[1e6, 0.0]": "goal",
+        "lab.devise=7": "unknown key lab.devise",
+    }.items():
+        sets = [*MEASURED, *devices, wrong]
+        words = ["doctor", "--json", "--folder", str(tmp_path), *(word for each in sets for word in ("--set", each))]
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 1, done.output
+        failures = {one["what"]: one["text"] for one in json.loads(done.stdout)["findings"] if one["level"] == FAILURE}
+        assert text in failures["settings"], wrong
+        assert "nowhere.avi" in failures["camera"], wrong
+        assert "/dev/nothing" in failures["coils"], wrong
+
+
 def test_settings_that_are_not_measured_are_a_failure_that_names_them() -> None:
     done = CliRunner().invoke(app, ["doctor", "--rig", "lab"])
     assert done.exit_code == 1
