@@ -24,6 +24,7 @@ from flowrec.config_tree import (
     Origin,
     apply_sets,
     key_of,
+    place_paths,
     refuse_unknown,
     take_registration,
     type_error,
@@ -247,6 +248,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     tree = read_toml(path)
     if tree.keys() & set(CHIP_KEYS) and not tree.keys() & hints(Config).keys():
         raise UsageError(f"{path}: describes a chip; a run on it is flowrec record --set chip.path={path}")
+    place_paths(tree, path)
     return tree
 
 

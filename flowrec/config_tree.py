@@ -6,6 +6,7 @@ config.py makes the typed configuration of such a tree of settings.
 from __future__ import annotations
 
 import difflib
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, is_dataclass
@@ -18,6 +19,16 @@ from flowrec.ranges import Fault, hints, range_of
 from flowrec.system.toml_file import parse_toml, read_toml
 
 REGISTRATION = "camera.registration"
+# Settings that name files; in a TOML their paths begin at its folder.
+FILES = (
+    "chip.path",
+    "camera.registration",
+    "movie.path",
+    "movie.times",
+    "movie.coils",
+    "start.field",
+    "lab.device_config",
+)
 IMAGE_SIZE = ("width_px", "height_px")
 _SHOWN = 40  # characters of a value
 
@@ -84,6 +95,32 @@ def take_registration(tree: dict[str, Any], sets: Iterable[str]) -> None:
                 "a picture with the size and region of the run, and register it"
             )
     tree["camera"] = camera | stated
+
+
+def place_paths(tree: dict[str, Any], file: Path) -> None:
+    """Let the relative paths in the tree of a file begin at the folder of the file, wherever the command is run.
+
+    Raises
+    ------
+    UsageError : there is no such file in that folder, but one in the working directory: which is meant is not guessed.
+    """
+    for key in FILES:
+        section, _, name = key.partition(".")
+        table = tree.get(section)
+        path = table.get(name) if isinstance(table, dict) else None
+        if not isinstance(path, str) or not path or ":/" in path or Path(path).is_absolute():  # ":/": a URL
+            continue
+        placed = file.parent / path
+        plain = Path(os.path.normpath(placed))
+        if plain.exists() and plain.resolve() == placed.resolve():  # without `..`, unless a link makes a difference
+            placed = plain
+        if not placed.exists() and Path(path).exists():
+            here = Path(os.path.relpath(path, file.parent)).as_posix()
+            raise UsageError(
+                f"{file}: {key} = {path!r} is not in the folder of this file, where its paths begin, but in the "
+                f"working directory; write {name} = {here!r}"
+            )
+        table[name] = str(placed)  # type: ignore[index]
 
 
 def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:

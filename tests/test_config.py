@@ -227,3 +227,45 @@ def test_a_start_called_outlet_is_where_the_robot_can_be_held_while_the_field_co
     # No place would do: it is refused as before.
     with pytest.raises(UnreachableError, match="too near the outlet"):
         start_of("chip.name=straight", "chip.inlet_speed_um_s=3000", "coils.ramp_s=5")
+
+
+def test_the_paths_of_a_file_begin_at_its_folder_from_wherever_it_is_read(tmp_path, monkeypatch):
+    (tmp_path / "chips").mkdir()
+    lab, elsewhere = tmp_path / "lab", tmp_path / "elsewhere"
+    lab.mkdir()
+    elsewhere.mkdir()
+    for name in ("chips/a.png", "lab/log.csv", "elsewhere/typed.png"):
+        (tmp_path / name).write_text("")
+    (lab / "lab.toml").write_text(
+        '[chip]\npath = "../chips/a.png"\n[movie]\ncoils = "log.csv"\npath = "none.avi"\n'
+        '[start]\nfield = "s3://bucket/a.mcap"\n'
+    )
+    for folder, file in ((tmp_path, "lab/lab.toml"), (elsewhere, "../lab/lab.toml"), (lab, "lab.toml")):
+        monkeypatch.chdir(folder)
+        config = load_config(Path(file))
+        assert Path(config.chip.path).resolve() == tmp_path / "chips" / "a.png"
+        assert Path(config.movie.coils).resolve() == lab / "log.csv"
+        assert Path(config.movie.path).resolve() == lab / "none.avi"  # whoever opens it says that it is not there
+        assert config.start.field == "s3://bucket/a.mcap"
+    monkeypatch.chdir(tmp_path)
+    assert load_config(Path("lab/lab.toml")).chip.path == str(Path("chips/a.png"))
+    monkeypatch.chdir(elsewhere)
+    assert load_config(Path("../lab/lab.toml"), ["chip.path=typed.png"]).chip.path == "typed.png"  # as other arguments
+
+
+def test_a_path_that_is_there_only_from_the_working_directory_is_not_guessed(tmp_path, monkeypatch):
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "a.png").write_text("")
+    (tmp_path / "lab" / "lab.toml").write_text('[chip]\npath = "a.png"\n')
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        UsageError, match=r"lab\.toml: chip\.path = 'a\.png' is not in the folder.*write path = '\.\./a"
+    ):
+        load_config(Path("lab/lab.toml"))
+
+
+def test_the_example_configurations_find_their_chips_from_any_folder(tmp_path, monkeypatch):
+    files = [file.absolute() for file in Path("sessions").rglob("*.toml") if file.parent.name != "chips"]
+    monkeypatch.chdir(tmp_path)
+    for file in files:
+        load_chip(load_config(file).chip)
