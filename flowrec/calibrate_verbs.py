@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from flowrec.bench.verbs import AsJson, Overwrite, Sets
+from flowrec.bench.verbs import AsJson, Overwrite, Sets, WholeDescriptions
 
 TomlOut = Annotated[
     Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
 ]
 
 
-class _Calibrations(TyperGroup):
+class _Calibrations(WholeDescriptions):
     """The group; a table where the name of a command is expected goes to `coils`, as before there was a group."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

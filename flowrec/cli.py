@@ -23,7 +23,7 @@ from typer.core import TyperGroup
 
 import flowrec
 from flowrec.archive_verbs import catalog, find, push, sweep
-from flowrec.bench.verbs import HELP_WIDTH, AsJson, Overwrite, Sets, bench
+from flowrec.bench.verbs import HELP_WIDTH, AsJson, Overwrite, Sets, WholeDescriptions, bench
 from flowrec.calibrate_verbs import calibrate
 from flowrec.doctor_verb import doctor, look_at_lab
 from flowrec.errors import FlowrecError, printable
@@ -63,6 +63,7 @@ class _Verbs(TyperGroup):
 app = typer.Typer(
     cls=_Verbs,
     name="flowrec",
+    cls=WholeDescriptions,
     help="Record, replay and view missions of magnetic micro-robots in flow.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
@@ -344,6 +345,9 @@ def main() -> None:
     try:
         sys.exit(app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec", standalone_mode=False) or 0)
     except usage_error as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # typer has moved the class from version to version
+            typer.echo(error.ctx.get_help())
+            sys.exit(0)
         message = printable(error.format_message()).rstrip(".")
         if message:  # empty if the help was printed
             verb = error.ctx.command_path if error.ctx is not None else "flowrec"

@@ -155,3 +155,21 @@ def test_a_verb_imports_no_library_that_it_does_not_need(words: tuple[str, ...],
     imported = {line.rsplit("|", 1)[1].strip() for line in said.splitlines() if line.startswith("import time:")}
     assert "flowrec.cli" in imported
     assert not imported & unwanted
+
+
+@pytest.mark.parametrize("words", [(), ("calibrate",), ("bench",)])
+def test_a_command_alone_prints_its_help_in_lines(words: tuple[str, ...]) -> None:
+    done = flowrec(*words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(f"Usage: {' '.join(('flowrec', *words))} [OPTIONS]")
+    assert "\\n" not in done.stdout
+
+
+@pytest.mark.parametrize("words", [(), ("calibrate",), ("bench",)])
+def test_the_help_cuts_no_description_on_a_narrow_terminal(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    text = flowrec(*words, "--help").stdout
+    assert "..." not in text.partition("Commands:")[2]
+    assert max(map(len, text.splitlines())) <= 80

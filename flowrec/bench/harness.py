@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_origin
 
 import typer
+from typer.core import TyperGroup
 
 from flowrec.errors import FlowrecError, UsageError
 from flowrec.system.endings import stopped_in_one_line
@@ -45,8 +46,23 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Smaller cases only.")]
 
 HELP_WIDTH = 110  # characters, on a terminal as wide as that
+_LONGEST_DESCRIPTION = 1000  # characters: longer than any
 _Z = 1.959963984540054  # of a two-sided interval of 95 %
 _BOOTSTRAP_DRAWS = 10_000
+
+
+class WholeDescriptions(TyperGroup):
+    """Commands whose list in the help has the whole first sentence of each, in as many lines as it takes."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [
+            (name, command.get_short_help_str(_LONGEST_DESCRIPTION))
+            for name, command in named
+            if command is not None and not command.hidden
+        ]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
 
 
 def run(

@@ -6,10 +6,10 @@ import importlib
 
 import typer
 
-from flowrec.bench.harness import HELP_WIDTH, AsJson, Overwrite, Sets, run
+from flowrec.bench.harness import HELP_WIDTH, AsJson, Overwrite, Sets, WholeDescriptions, run
 from flowrec.errors import UsageError
 
-__all__ = ["HELP_WIDTH", "AsJson", "Overwrite", "Sets", "bench"]
+__all__ = ["HELP_WIDTH", "AsJson", "Overwrite", "Sets", "WholeDescriptions", "bench"]
 
 BENCHES = {
     "flow": "Refinement: error of the flow before and after each method (Table I and Fig. 4 of the paper).",
@@ -27,7 +27,9 @@ MOVED = {
     "train": "flowrec.refine.training",
 }
 
-bench = typer.Typer(help="Measure flowrec: validate an installation, reproduce the paper.", no_args_is_help=True)
+bench = typer.Typer(
+    cls=WholeDescriptions, help="Measure flowrec: validate an installation, reproduce the paper.", no_args_is_help=True
+)
 _ALL_WORDS = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
 
 
