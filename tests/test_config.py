@@ -12,18 +12,20 @@ from functools import reduce
 from operator import attrgetter
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tomli_w
 
 import flowrec
-from flowrec.chip import load_chip
+from flowrec.chip import ChipSettings, load_chip
 from flowrec.cli import main
 from flowrec.commands.record import prepare
 from flowrec.commands.run_summary import Recorded
 from flowrec.config import _BEFORE, Config, config_from_toml, load_config, to_toml, with_sets
-from flowrec.errors import FlowrecError, UnreachableError, UsageError
+from flowrec.errors import FlowrecError, SessionError, UnreachableError, UsageError
 from flowrec.resolve import resolve
 from flowrec.rig_settings import RIGS
+from flowrec.run.disk_monitor import refuse_below
 from flowrec.store.reader import SessionReader
 
 
@@ -269,3 +271,35 @@ def test_the_example_configurations_find_their_chips_from_any_folder(tmp_path, m
     monkeypatch.chdir(tmp_path)
     for file in files:
         load_chip(load_config(file).chip)
+
+
+def made_to_fit(width_px, um_per_px, inlet_speed_um_s):
+    """The robot of the simulated rig that fits a straight channel, and the fastest flow in it, um/s."""
+    mask = np.zeros((29, 61), np.bool_)
+    mask[14 - width_px // 2 : 15 + width_px // 2] = True
+    chip = load_chip(ChipSettings(um_per_px=um_per_px, inlet_speed_um_s=inlet_speed_um_s), mask)
+    config = resolve(load_config(None, ["mission.phases=survey"]), chip)
+    return config.robot, float(np.linalg.norm(config.flow.solve(chip).velocity_um_s, axis=-1).max())
+
+
+def test_a_robot_that_is_made_to_fit_is_faster_than_the_fastest_flow_by_three_tenths():
+    robot, peak_um_s = made_to_fit(17, 13.0, 997.0)
+    assert peak_um_s > 1000.0
+    assert robot.max_speed_um_s == pytest.approx(1.3 * peak_um_s, rel=1e-3)
+    assert made_to_fit(17, 13.0, 7.0)[0].max_speed_um_s == 600.0  # the usual one
+
+
+def test_a_robot_in_a_narrow_channel_is_answered_before_it_has_crossed_a_fifth_of_it():
+    robot, _ = made_to_fit(5, 7.0, 11.0)
+    assert robot.delay_s * robot.max_speed_um_s == pytest.approx(0.2 * 5 * 7.0, rel=0.2)
+    assert made_to_fit(17, 13.0, 7.0)[0].delay_s == 0.04  # the usual one
+
+
+def test_the_defaults_keep_the_promises_of_the_documentation(tmp_path):
+    recording = flowrec.Config().recording
+    text = Path("notebooks/08_lab.ipynb").read_text(encoding="utf-8")
+    assert float(re.search(r"images a kill costs ([\d.]+) s", text)[1]) == recording.flush_s
+    assert float(re.search(r"A power cut costs ([\d.]+) s", text)[1]) == recording.sync_s
+    refuse_below(recording.disk_floor_gb, tmp_path, lambda _: 2_000_000_000)
+    with pytest.raises(SessionError, match="GB left on this disk"):
+        refuse_below(recording.disk_floor_gb, tmp_path, lambda _: 500_000_000)

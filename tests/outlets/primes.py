@@ -120,7 +120,8 @@ def ticks() -> Iterator[Tick]:
     nowhere = np.zeros(0)
     assumed, true = field(FIRST_NS, "fvm", ASSUMED_UM_S), field(FIRST_NS, "truth", TRUE_UM_S)
     refined = field(FIRST_NS + STEP_NS, "assimilate", REFINED_UM_S, std=True)
-    route = Route(FIRST_NS, 1, "astar", True, "", WAY_UM, np.array([0.0, 4.3, 8.9]), goal_um=GOAL_UM)
+    to_go = np.where(mask(), 0.25 * np.mgrid[:ROWS, :COLUMNS][1], np.inf)  # s, up to 15
+    route = Route(FIRST_NS, 1, "time_field", True, "", WAY_UM, np.array([0.0, 4.3, 8.9]), to_go, goal_um=GOAL_UM)
     mission = Mission(FIRST_NS, "navigate", FIRST_NS, 1, "", 0, START_UM, GOAL_UM, False, "", "")
     event = Event(FIRST_NS, "info", "begun")
     for number in range(COUNT):
