@@ -12,7 +12,7 @@ from flowrec.config import ResolvedConfig
 from flowrec.coverage import Coverage
 from flowrec.enums import WorkOrder
 from flowrec.errors import printable
-from flowrec.messages import Mission
+from flowrec.messages import FlowField, Mission
 from flowrec.pipeline import Pipeline
 from flowrec.replay_figures import CommandDifference
 from flowrec.run.loop import RunReport
@@ -82,11 +82,16 @@ class WorkerCheck:
             computed = replace(work(self._pipeline, order), stamp_ns=tick.stamp_ns) if order is not None else None
             topic = BY_FIELD[name]
             comparison = self.results.comparison
+            # The words about a result may have been mended since: they are told, and only what was computed is judged.
+            words = ""
+            if isinstance(computed, FlowField) and isinstance(adopted, FlowField) and computed.note != adopted.note:
+                words = f"; its note reads otherwise now: {computed.note}"
+                computed = replace(computed, note=adopted.note)
             found = comparison.add_pair(topic, adopted, computed, tick.stamp_ns)
             how = "identical"
             if found is not None:
                 how = f"{comparison.different_word if found.beyond else 'within tolerance'}: {found}"
-            self.results.lines.append(printable(f"{topic.path} {adopted.method}: {how}"))
+            self.results.lines.append(printable(f"{topic.path} {adopted.method}: {how}{words}"))
         mission = tick.mission
         if mission is not None and mission.wanted and mission.request > self._ordered:
             self._ordered = mission.request
