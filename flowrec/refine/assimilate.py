@@ -373,7 +373,9 @@ class Assimilate(PriorSettings):
             names += ["obstacle_x_um", "obstacle_y_um"]
             values = np.append(values, [x_um, y_um])
             stds = np.append(stds, 2 * [obstacle.half_width_px * chip.um_per_px])
-        note = report(chip, problem.operator, best, [*wrong, *also.words])
+        change = (velocity_um_s - problem.assumed.velocity_um_s)[chip.mask]
+        moved = float(np.linalg.norm(change)) / max(float(np.linalg.norm(std_um_s[chip.mask])), 1e-12)
+        note = report(chip, problem.operator, best, [*wrong, *also.words], moved)
         return replace(
             problem.assumed,
             method="assimilate",

@@ -14,13 +14,40 @@ from flowrec.refine.observation_operator import Floats
 
 SURE = 2.5  # standard deviations from zero above which a cause is named
 PROBABLE = 0.9  # probability of a depth, or of none, above which it is said
-# Least value of a cause that is worth a word, and the words for a negative and a positive one.
+# Factor for people, least value that is worth a word, and the words for a negative and a positive value. Clockwise is
+# from +x to +y, as the chip is drawn. The values have the signs of causes.py: um_per_px_share is the stated scale over
+# the true one, less 1; an offset is where the robot is, from where it was measured, so the chip lies the other way.
 WORDS = {
-    "um_per_rev_share": (0.02, "the robot moves {:.0f} +- {:.0f} % less per revolution than stated", "more"),
-    "hindrance_share": (0.03, "near walls the robot rolls by {:.0f} +- {:.0f} % faster than elsewhere", "slower"),
-    "um_per_px_share": (0.005, "the image scale is {:.1f} +- {:.1f} % smaller than stated", "larger"),
+    "um_per_rev_share": (
+        *(100.0, 0.02),
+        "the robot moves {} % less per revolution than stated",
+        "the robot moves {} % more per revolution than stated",
+    ),
+    "heading_deg": (
+        *(1.0, 2.0),
+        "the robot's own course lies {} degrees counterclockwise of its heading",
+        "the robot's own course lies {} degrees clockwise of its heading",
+    ),
+    "hindrance_share": (
+        *(100.0, 0.03),
+        "near walls the robot rolls by {} % faster than elsewhere",
+        "near walls the robot rolls by {} % slower than elsewhere",
+    ),
+    "um_per_px_share": (
+        *(100.0, 0.005),
+        "the image scale is {} % larger than stated",
+        "the image scale is {} % smaller than stated",
+    ),
+    "angle_deg": (
+        *(1.0, 0.3),
+        "the chip is turned by {} degrees counterclockwise from how the registration puts it",
+        "the chip is turned by {} degrees clockwise from how the registration puts it",
+    ),
 }
 UNSURE = 0.04  # of um per revolution: a larger standard deviation is worth a word
+MOVED_PX = 0.25  # least offset of the registration, or of walls, that is worth a word, in pixels of the mask
+WANDERS, PULSATES = 0.06, 0.03  # likewise of the flow in time, and of a line of the pump
+PERIODS = 1.5  # of a line in the time that was observed; with fewer, a place that was passed once looks like it
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +94,14 @@ def findings(found: Sequence[Fitted], weights: Floats) -> Findings:
         if share > PROBABLE:
             names.append("depth_um")
             values["depth_um"], stds["depth_um"] = depth, std
-            depth_words.append(f"chip depth {depth:.0f} +- {std:.0f} um")
+            depth_words.append(f"chip depth {with_error(depth, std)} um")
         elif share > 1.0 - PROBABLE:
             depth_words.append(
                 f"whether the chip is shallow they do not tell ({share:.0%}: {depth:.0f} +- {std:.0f} um)"
             )
-    words = (*_words(values, stds, found[0].observed.um_per_px), *depth_words)
+    time_s = found[0].observed.operator.time_s
+    observed_s = 0.0 if time_s is None else float(np.ptp(time_s))
+    words = (*_words(values, stds, found[0].observed.um_per_px, observed_s), *depth_words)
     return Findings(tuple(names), np.array([values[n] for n in names]), np.array([stds[n] for n in names]), words)
 
 
@@ -121,37 +150,66 @@ def _amplitude(mean: Floats, covariance: Floats) -> tuple[float, float]:
     return amplitude, float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
 
 
-def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float) -> list[str]:
+def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float, observed_s: float) -> list[str]:
     """Causes that are certain, and those that the observations could not tell apart."""
     words = []
-    for name, (least, less, more) in WORDS.items():
+    for name, (factor, least, less, more) in WORDS.items():
         value, std = values.get(name, 0.0), stds.get(name, 0.0)
         if abs(value) > max(SURE * std, least):
-            opposite = {"more": "less", "slower": "faster", "larger": "smaller"}[more]
-            words.append(
-                (less if value < 0.0 else less.replace(opposite, more)).format(100.0 * abs(value), 100.0 * std)
-            )
+            words.append((less if value < 0.0 else more).format(with_error(factor * abs(value), factor * std)))
     if stds.get("um_per_rev_share", 0.0) > UNSURE:
         words.append(
             f"um per revolution they tell to {100.0 * stds['um_per_rev_share']:.0f} % only: a survey with other "
             "headings tells more"
         )
-    offset = np.array([values["offset_x_um"], values["offset_y_um"]])
-    spread = np.array([stds["offset_x_um"], stds["offset_y_um"]])
-    size = float(np.hypot(*offset))
-    along = float(np.hypot(*(offset * spread))) / max(size, 1e-12)
-    if size > max(SURE * along, 0.25 * um_per_px):
-        words.append(f"the chip lies {size:.0f} +- {along:.0f} um from where the registration puts it")
+    words += _moved(values, stds, um_per_px)
     for name in values:
         if name.startswith("viscosity_"):
             words.append(f"{name.replace('_', ' ')} {values[name]:.3g} +- {stds[name]:.2g}")
-        if name.startswith(SHAKE):
-            words.append(f"the image shakes at {name.split('_')[1]} Hz")
-        if name.startswith("pump_") and values[name] > SURE * stds[name]:
-            hz = name.split("_")[1]
-            words.append(f"the pump pulsates by {100.0 * values[name]:.0f} +- {100.0 * stds[name]:.0f} % at {hz} Hz")
-    if values.get("wander_share", 0.0) > 0.06:
-        words.append(f"the flow wanders in time by {100.0 * values['wander_share']:.0f} %")
-    if values["walls_px"] > 0.5:
-        words.append(f"the walls seem {values['walls_px'] * um_per_px:.0f} um off in places")
+    words += _in_time(values, stds, observed_s)
+    # The size is that of random errors around zero mean; of walls that are off to one side it is the smaller part.
+    if values["walls_px"] > max(SURE * stds["walls_px"], MOVED_PX):
+        words.append(f"the walls seem off by {values['walls_px'] * um_per_px:.0f} um or more in places")
     return words
+
+
+def _in_time(values: Mapping[str, float], stds: Mapping[str, float], observed_s: float) -> list[str]:
+    """What changes in time: a stage that shakes, a pump, a flow that wanders."""
+    words, shaking_hz = [], [float(name.split("_")[1]) for name in values if name.startswith(SHAKE)]
+    words += [f"the image shakes at {hz:.2f} Hz" for hz in shaking_hz]
+    for name, share in values.items():
+        if not name.startswith("pump_") or share <= max(SURE * stds[name], PULSATES):
+            continue
+        hz = float(name.split("_")[1])
+        if any(abs(hz - other) * observed_s < 1.0 for other in shaking_hz):
+            continue  # what the frequency of the stage leaves of its motion
+        by = f"by {with_error(100.0 * share, 100.0 * stds[name])} % at {hz:.2f} Hz"
+        slow = hz * observed_s < PERIODS
+        words.append(f"the flow changes {by}, with the pump or by place" if slow else f"the pump pulsates {by}")
+    # A robot that passes each place once can not tell a slow change from one along the way.
+    wander, wander_std = (100.0 * of.get("wander_share", 0.0) for of in (values, stds))
+    if wander > 100.0 * WANDERS:
+        words.append(f"the flow wanders in time, or by place along the way, by {with_error(wander, wander_std)} %")
+    return words
+
+
+def _moved(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float) -> list[str]:
+    """That the chip lies elsewhere than the registration puts it, and on which side; nothing where that is not sure."""
+    offset = np.array([values["offset_x_um"], values["offset_y_um"]])  # of the robot on the chip
+    spread = np.array([stds["offset_x_um"], stds["offset_y_um"]])
+    size = float(np.hypot(*offset))
+    along = float(np.hypot(*(offset * spread))) / max(size, 1e-12)
+    if size <= max(SURE * along, MOVED_PX * um_per_px):
+        return []
+    x, y = -offset
+    sides = [
+        f"{abs(x):.0f} um to the {'left' if x < 0.0 else 'right'}",
+        f"{abs(y):.0f} um {'up' if y < 0.0 else 'down'}",
+    ]
+    return [f"the chip lies {with_error(size, along)} um from where the registration puts it ({', '.join(sides)})"]
+
+
+def with_error(value: float, std: float) -> str:
+    """A value and its standard deviation with as many digits as that has a meaning: '15.1 +- 0.2'."""
+    digits = 0 if std >= 0.95 else 1 if std >= 0.095 else 2
+    return f"{value:.{digits}f} +- {std:.{digits}f}"

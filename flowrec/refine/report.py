@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from flowrec.chip.chip import Chip
-from flowrec.refine.hypothesis import Fitted
+from flowrec.refine.hypothesis import NOISE, Fitted
 from flowrec.refine.observation_operator import Floats, ObservationOperator
 from flowrec.refine.prior import Prior
 
@@ -20,8 +20,12 @@ NOISIER = 1.3  # times the stated noise
 LEAST_GAIN = 1.0  # in ln evidence over the assumed flow
 
 
-def report(chip: Chip, operator: ObservationOperator, best: Fitted, causes: Sequence[str]) -> str:
-    """One line on the most probable hypothesis; `causes` are what it found besides the boundary values, in words."""
+def report(chip: Chip, operator: ObservationOperator, best: Fitted, causes: Sequence[str], moved: float) -> str:
+    """One line on the most probable hypothesis.
+
+    `causes` are what it found besides the boundary values, in words; `moved` is the distance of the map from the
+    assumed flow over the map's stated error.
+    """
     used = operator.count - int((best.robust.inlier < OUTLIER).sum())
     parts = [f"assimilated {used} observations" if used != 1 else "assimilated 1 observation"]
     if operator.count > used:
@@ -29,17 +33,18 @@ def report(chip: Chip, operator: ObservationOperator, best: Fitted, causes: Sequ
     if operator.ignored:
         parts.append(f"ignored {operator.ignored}")
     parts += causes
-    if best.robust.factor > NOISIER:
-        parts.append(f"they scatter {best.robust.factor:.1f} times more than their std says, error bars widened")
+    noisier = best.robust.factor * best.size(NOISE[0])
+    if noisier > NOISIER:
+        parts.append(f"they scatter {noisier:.1f} times more than their std says, error bars widened")
     mean, covariance = best.unknowns("boundary")
     far = [
-        f"{_name(chip, index)} ({abs(mean[index]):.0f} prior std off)"
+        f"{_name(chip, index)} ({abs(mean[index]):.0f} prior std {'higher' if mean[index] > 0.0 else 'lower'})"
         for index in range(len(chip.openings))
         if abs(mean[index]) > FAR
     ]
     if far:
         parts.append(f"far from what was assumed: {', '.join(far)}")
-    if best.gain() < LEAST_GAIN:
+    if moved < 1.0 and best.gain() < LEAST_GAIN:
         parts.append("they do not ask for another flow than the assumed one")
     return "; ".join([*parts, *_unobserved(chip, covariance, best.observed.model.prior)])
 
