@@ -7,7 +7,6 @@ of its survey is kept, and any method can refine it later without flying again.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
+from flowrec.bench.planted_causes import named, planted_causes
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
 from flowrec.commands.record import refuse_adrift
@@ -35,12 +35,6 @@ from flowrec.units import seconds
 # Messages of a work order that are kept; the assumed flow is solved again.
 _KEPT = ("mission", "estimate", "health", "observations")
 _IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compared
-
-# Clauses of a note that are no warning: what was used, what was not seen, what could not be told, the null model.
-_NO_WARNING = re.compile(
-    r"assimilated|\d+ more distrusted|ignored|they say nothing|of (in|out)let|whether|they do not ask|not refined"
-    r"|the assumed flow times|the observations scatter around it|residual|start|corrected|misfit|$"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,6 +221,7 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
     truth = SimulatedRig.of(pipeline, config).true_world().field.velocity_um_s * np.float32(flight.drift)
     order = _order_of(flight, pipeline)
     assert order.assumed is not None
+    planted = planted_causes(config, chip)
     flight.refined["assumed"] = scored(order.assumed, truth, chip.mask)
     for method in methods:
         refiner = replace(config.refine, method=method)
@@ -236,16 +231,19 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
             flight.refined[method] = {"failed": str(error)}
             continue
         assert isinstance(result, FlowField)
-        flight.refined[method] = scored(result, truth, chip.mask)
+        flight.refined[method] = scored(result, truth, chip.mask, planted)
 
 
-def scored(found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_]) -> dict[str, Any]:
+def scored(
+    found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_], planted: Sequence[str] = ()
+) -> dict[str, Any]:
     """Scores of a field over the components of the fluid pixels.
 
     error : relative RMSE of v. within_2_sigma : fraction of the components within two stated standard deviations of
     the truth; None if none are stated. crps : continuous ranked probability score of the Gaussian (Gneiting and Raftery
     2007, eq. 21), mean over the components, over the rms speed; without a standard deviation that is the mean
-    absolute error. warned: whether the note says that something is wrong.
+    absolute error. warned : whether the note names a planted cause, on the right side; invented : clauses that name
+    another one (planted_causes.py).
     """
     true = truth[mask].astype(np.float64)
     off = found.velocity_um_s[mask].astype(np.float64) - true
@@ -260,12 +258,8 @@ def scored(found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_]
         crps = std * (z * (2.0 * scipy.special.ndtr(z) - 1.0) + 2.0 * density - 1.0 / math.sqrt(math.pi))
     score["crps"] = float(crps.mean()) / rms
     score["expected"] = getattr(found, "error_share", None)
-    return score | {"warned": warned(found.note), "note": found.note}
-
-
-def warned(note: str) -> bool:
-    """Whether a note says more than what was used and what was not seen."""
-    return not all(_NO_WARNING.match(clause.strip()) for clause in note.split(";"))
+    right, invented = named(found.note, planted)
+    return score | {"warned": right > 0, "invented": invented, "note": found.note}
 
 
 def _as_json(message: Any) -> dict[str, Any]:

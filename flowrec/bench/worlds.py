@@ -180,7 +180,8 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
     """Means over flights with bootstrap 95 % intervals; errors and CRPS relative to the rms speed.
 
     worse : flights in which the refined error is larger than the assumed one; unsaid : those of them whose note does
-    not warn. expected : the error that the fields state (error_share). over_null : error over that of `gain`, paired.
+    not name a planted cause. invented : flights whose note names a cause that is not there, or its wrong side.
+    expected : the error that the fields state (error_share). over_null : error over that of `gain`, paired.
     within_2_sigma : share of the components, all flights pooled with the same weight.
     """
     rows = [one.refined for one in flights if method in one.refined and "failed" not in one.refined[method]]
@@ -201,6 +202,7 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
         "worse": len(worse),
         "unsaid": sum(not one["warned"] for one in worse),
         "warned": sum(one["warned"] for one in mine),
+        "invented": sum(one.get("invented", 0) > 0 for one in mine),
         "over_null": paired(np.array(pairs)) if pairs and method != NULL else None,
     }
 
@@ -220,11 +222,13 @@ def show(results: Results) -> None:
         line["world"], shown = ("" if line["world"] == shown else line["world"]), line["world"]
     print_rows(
         "Refined flow in worlds that are not the model's: relative RMSE in %, its mean over flights (bootstrap 95 %); "
-        "worse: than assumed, unsaid: and without a warning; 2 sigma: part of the components; CRPS in % of the speed",
+        "worse: than assumed, unsaid: and its cause not named; named, invented: flights "
+        "with a sentence on a planted cause, on another one; 2 sigma: part of the components; CRPS in % of the speed",
         lines,
         {
             **{"world": "{world}", "method": "{method}", "assumed": "{before}", "refined": "{after}"},
             **{"95 %": "{interval}", f"/ {NULL}": "{ratio}", "worse": "{worse}", "unsaid": "{unsaid}"},
+            **{"named": "{warned}", "invented": "{invented}"},
             **{"2 sigma": "{covered}", "CRPS": "{score}"},
         },
     )
@@ -249,6 +253,7 @@ def _line(world: str, method: str, found: Results) -> Results:
     low, high = found["error"]["interval_95"]
     return {
         **{"world": world, "method": method, "worse": found["worse"], "unsaid": found["unsaid"]},
+        **{"warned": found["warned"], "invented": found["invented"]},
         **{"before": percent(found["assumed"]["mean"]), "after": percent(found["error"]["mean"])},
         **{
             "interval": f"{percent(low)}-{percent(high)}" if found["count"] else "-",

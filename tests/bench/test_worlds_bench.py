@@ -9,7 +9,8 @@ import pytest
 
 from flowrec.bench import worlds
 from flowrec.bench.harness import mean_with_interval
-from flowrec.bench.world_flights import WORLDS, Case, Given, chip_sets, fly, prepared, refine, scored, warned
+from flowrec.bench.planted_causes import named, planted_causes
+from flowrec.bench.world_flights import WORLDS, Case, Given, chip_sets, fly, in_world, prepared, refine, scored
 from flowrec.config import load_config
 from flowrec.errors import UsageError
 from flowrec.pipeline import assemble
@@ -30,6 +31,8 @@ def flown():
 
 def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(flown, tmp_path, monkeypatch, capsys):
     assert (flown.outcome, flown.contacts) == ("reached", 0)
+    assert flown.refined["assimilate"]["warned"] == ("% less per revolution" in flown.refined["assimilate"]["note"])
+    assert not flown.refined["fvm"]["warned"]
     assert len(flown.order["observations"]["position_um"][1]) > 10
     file = tmp_path / "rows.jsonl"
     line = json.dumps(worlds.as_line(flown))
@@ -92,13 +95,54 @@ def test_scores_are_the_published_ones():
     assert bare["within_2_sigma"] is None
 
 
-def test_a_summary_counts_worse_maps_and_those_of_which_nothing_was_said(flown):
-    assert not warned(
-        "assimilated 8 observations; 1 more distrusted as outliers; they say nothing about outlet 1 (right)"
-    )
-    assert not warned("the assumed flow times 0.8 +- 0.1; the observations scatter around it by 9 % of the speed")
-    assert warned("assimilated 8 observations; neighbours miss alike: something here is not in the model")
+def causes(*faults):
+    config, chip = in_world(lambda _: faults, 99, 3, [*chip_sets("straight"), *TINY])
+    return planted_causes(config, chip)
 
+
+@pytest.mark.parametrize(
+    ("fault", "sentence", "other_side"),
+    [
+        ("um_per_rev_share=0.85", "the robot moves 15 +- 1 % less per revolution than stated", ("less", "more")),
+        ("um_per_rev_share=1.15", "the robot moves 15 +- 1 % more per revolution than stated", ("more", "less")),
+        ("slip=0.15", "the robot moves 15 +- 1 % less per revolution than stated", ("less", "more")),
+        ("hindrance=1.0", "near walls the robot rolls by 28 +- 2 % slower than elsewhere", ("slower", "faster")),
+        ("um_per_px=15.5", "the image scale is 3.0 +- 0.2 % smaller than stated", ("smaller", "larger")),
+        ("um_per_px=16.5", "the image scale is 3.0 +- 0.2 % larger than stated", ("larger", "smaller")),
+        ("angle_deg=2.0", "the chip is turned by 2.0 +- 0.1 degrees clockwise from", (" clock", " counterclock")),
+        ("angle_deg=-2.0", "the chip is turned by 2.0 +- 0.1 degrees counterclockwise from", ("counterclock", "clock")),
+        # The middle of the image truly shows what lies 20 um to the right on the chip: the chip lies to the left.
+        (
+            "centre_um=[2570.0, 630.0]",
+            "the chip lies 20 +- 1 um from where the registration puts it (20 um to the left, 0 um up)",
+            ("left", "right"),
+        ),
+        (
+            "centre_um=[2550.0, 610.0]",
+            "the chip lies 20 +- 1 um from where the registration puts it (0 um to the left, 20 um down)",
+            ("down", "up"),
+        ),
+        ("unstated_depth_widths=0.5", "chip depth 110 +- 9 um", None),
+        ("wall_error_px=1.0", "the walls seem off by 5 um or more in places", None),
+        ("blocked_share=0.5", "a channel is partly blocked at (100, 200) um", None),
+        ("pulsation_share=0.3", "the pump pulsates by 30 +- 1 % at 1.00 Hz", None),
+        ("drift_share=0.05", "the flow wanders in time, or by place along the way, by 7 +- 2 %", None),
+        ("shake_um=10.0", "the image shakes at 3.00 Hz", None),
+    ],
+    ids=lambda value: value.partition(",")[0] if isinstance(value, str) and "=" in value else "",
+)
+def test_a_warning_counts_where_it_names_the_planted_cause_on_its_side(fault, sentence, other_side):
+    def note(clause):
+        return f"assimilated 8 observations; 1 more distrusted as outliers; {clause}; they scatter 2.0 times more"
+
+    assert named(note(sentence), causes(fault)) == (1, 0)
+    assert named(note(sentence), causes()) == (0, 1)  # nothing is planted
+    if other_side:
+        assert named(note(sentence.replace(*other_side)), causes(fault)) == (0, 1)
+    assert named("assimilated 8 observations; they say nothing about outlet 1 (right)", causes(fault)) == (0, 0)
+
+
+def test_a_summary_counts_worse_maps_and_those_of_which_nothing_was_said(flown):
     def made(assumed, refined, note):
         found = {"assumed": {"error": assumed}, "gain": {**SCORE, "error": 0.1}}
         return replace(flown, refined={**found, "assimilate": {**SCORE, "error": refined, "warned": note}})

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -54,8 +55,9 @@ def test_a_branch_that_is_half_blocked_is_found_and_the_map_is_right_beside_it(c
     before, after = (relative_rmse(field, truth, chip.mask).v for field in (plain, corrected))
     assert after < 0.8 * before
     found = dict(zip(corrected.parameter_names.split("; "), corrected.parameters, strict=True))
-    assert (found["obstacle_x_um"], found["obstacle_y_um"]) == pytest.approx(AT_UM, abs=300.0)
-    assert "a channel is partly blocked" in corrected.note
+    assert (found["obstacle_x_um"], found["obstacle_y_um"]) == pytest.approx(AT_UM, abs=90.0)  # x and y are 200 apart
+    said = re.search(r"a channel is partly blocked at \((\d+), (\d+)\) um", corrected.note)
+    assert [float(one) for one in said.groups()] == pytest.approx(AT_UM, abs=90.0)
     true = truth.velocity_um_s[chip.mask]
     within = np.abs(corrected.velocity_um_s[chip.mask] - true) < 2.0 * corrected.std_um_s[chip.mask]
     assert within.mean() > 0.9

@@ -62,6 +62,14 @@ class _CameraClock:
         return self._jitter_s * float(self._rng.standard_exponential())
 
 
+def true_view(config: ResolvedConfig, chip: Chip) -> Calibration:
+    """The camera's true view of the chip, which [camera] states as it is assumed."""
+    keys, camera = ("um_per_px", "angle_deg", "mirror", "centre_um"), config.camera
+    true = {key: value for key in keys if (value := getattr(config.simulated, key)) is not None}
+    stated = registration_of(replace(camera, **true), chip)
+    return misregistered(stated, config.simulated, (camera.width_px, camera.height_px))
+
+
 class SimulatedRig:
     """Camera, coils and the world between them; see rigs.rig.Rig.
 
@@ -90,14 +98,10 @@ class SimulatedRig:
         true_field: FlowField | None = None,
     ) -> SimulatedRig:
         """The rig of a resolved configuration."""
-        keys = ("um_per_px", "angle_deg", "mirror", "centre_um")
-        camera = config.camera
-        true = {key: value for key in keys if (value := getattr(config.simulated, key)) is not None}
-        stated = registration_of(replace(camera, **true), pipeline.chip)
         return cls(
             pipeline.chip,
             config.robot,
-            misregistered(stated, config.simulated, (camera.width_px, camera.height_px)),
+            true_view(config, pipeline.chip),
             config.camera,
             config.simulated,
             config.mission.start,
