@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+from scipy.stats import multivariate_normal, norm
 
 from flowrec.refine.evidence import Effect, Evidence, _points
 
@@ -70,3 +72,26 @@ def test_the_points_of_the_sizes_have_the_moments_of_a_normal_distribution():
         points = _points(dimensions)
         np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-12)
         np.testing.assert_allclose(points.T @ points / len(points), np.eye(dimensions), atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_sizes_are_the_most_probable_ones(seed):
+    # Two effects whose hyperpriors are off, and pull: an independent density has its maximum where the sizes are.
+    rng = np.random.default_rng(seed)
+    columns = rng.standard_normal((2, 5, 40))
+    y = 0.8 * rng.standard_normal(5) @ columns[0] + 0.02 * rng.standard_normal(5) @ columns[1]
+    y = y + 0.1 * rng.standard_normal(40)
+    effects = [Effect("large", 0.3, 0.4, columns[0]), Effect("small", 0.3, 0.7, columns[1])]
+
+    def ln_density(ln_sizes):
+        covariance = 0.01 * np.eye(40)
+        ln_prior = 0.0
+        for ln_size, effect in zip(ln_sizes, effects, strict=True):
+            covariance = covariance + np.exp(2.0 * ln_size) * effect.columns.T @ effect.columns
+            ln_prior += norm.logpdf(ln_size, np.log(effect.median), effect.ln_std)
+        return multivariate_normal.logpdf(y, np.zeros(40), covariance) + ln_prior
+
+    mode = Evidence(y, 0.01 * np.eye(40), effects).sizes().mode
+    best = minimize(lambda ln_sizes: -ln_density(ln_sizes), mode, method="Nelder-Mead").x
+    assert mode == pytest.approx(best, abs=0.05)
+    assert np.all(np.abs(mode - np.log([0.3, 0.3])) > 0.3), "the hyperpriors are off"
