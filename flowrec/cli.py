@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from typer.core import TyperGroup
 
 import flowrec
 from flowrec.archive_verbs import catalog, find, push, sweep
@@ -48,7 +47,7 @@ from flowrec.system.endings import StoppedError, stopped_in_one_line
 from flowrec.units import amounts
 
 
-class _Verbs(TyperGroup):
+class _Verbs(WholeDescriptions):
     """The verbs; a signal that ends one of them is an error in one line, which Typer would swallow."""
 
     def make_context(self, *args: Any, **named: Any) -> Any:
@@ -63,7 +62,6 @@ class _Verbs(TyperGroup):
 app = typer.Typer(
     cls=_Verbs,
     name="flowrec",
-    cls=WholeDescriptions,
     help="Record, replay and view missions of magnetic micro-robots in flow.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},

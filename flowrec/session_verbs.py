@@ -356,10 +356,17 @@ def recover(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a complete session from one that was killed or cut off; exit status 3 if something was lost."""
+    """Make a complete session from one that was killed or cut off; exit status 3 if something was lost.
+
+    Temporary files that killed processes have left beside it are removed.
+    """
     from flowrec.store.recovery import recover_run
+    from flowrec.store.session_path import on_this_machine
+    from flowrec.system.leftovers import remove_leftovers
     from flowrec.terminal import say
 
+    for left in remove_leftovers(on_this_machine(session, "nothing is recovered from").absolute().parent):
+        say(f"{left}: removed, a killed process has left it")
     saved = recover_run(session, out)
     if as_json:
         typer.echo(json.dumps([asdict(done) | {"path": str(done.path)} for done in saved]))

@@ -20,6 +20,7 @@ from flowrec.store.run_files import files_of
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
 from flowrec.store.writer import SessionWriter
+from flowrec.system.leftovers import remove_leftovers_once
 from flowrec.system.outputs import Output
 
 _QUEUE_S = 2.0
@@ -74,6 +75,7 @@ def session_writer(
         bits=config.camera.bits,
         keep_failed=keep_failed,
     )
+    remove_leftovers_once(output.path.absolute().parent)
     inputs = (*output.inputs, *(files_behind(parent) if parent is not None else ()))
     return SessionWriter(output.path, header, options, inputs=inputs)
 

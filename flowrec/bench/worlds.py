@@ -15,7 +15,7 @@ from concurrent.futures import as_completed
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -25,6 +25,7 @@ from flowrec.bench.world_flights import WORLDS, Case, Flight, as_line, fly, refi
 from flowrec.errors import UsageError
 from flowrec.provenance import provenance
 from flowrec.refine.refiner import REFINERS
+from flowrec.system.durable import append_line, replace_content
 from flowrec.system.processes import pool
 from flowrec.terminal import progress, say
 
@@ -72,13 +73,13 @@ def measure(
     work = partial(flown, methods=wanted, again=again)
     with ExitStack() as stack:
         done = stack.enter_context(progress("flying", len(left), "missions"))
-        file = stack.enter_context(_appended(rows)) if rows is not None else None
+        if rows is not None:
+            _cut_torn_end(rows)
         for count, flight in enumerate(_each(work, [(case, flights.get(case.key())) for case in left], jobs), 1):
             flight.code = flight.code or code
             flights[flight.key()] = flight
-            if file is not None:
-                file.write(json.dumps(as_line(flight)) + "\n")
-                file.flush()
+            if rows is not None:
+                append_line(rows, json.dumps(as_line(flight)).encode())
             done(count)
     return results_of([flights[case.key()] for case in cases], names, wanted)
 
@@ -104,13 +105,10 @@ def kept(path: Path) -> Iterator[Flight]:
             raise UsageError(f"{path}, line {number}: is no flight of bench worlds; name another file") from error
 
 
-def _appended(path: Path) -> TextIO:
-    """The file, open at its end; a line that was cut short there is cut off."""
-    if path.exists():
-        data = path.read_bytes()
-        with path.open("r+b") as file:
-            file.truncate(data.rfind(b"\n") + 1)
-    return path.open("a", encoding="utf-8")
+def _cut_torn_end(path: Path) -> None:
+    """Cut off a last line that has no end."""
+    if path.exists() and not (data := path.read_bytes()).endswith(b"\n"):
+        replace_content(path, data[: data.rfind(b"\n") + 1])
 
 
 def _is_left(flight: Flight | None, methods: Iterable[str], *, again: bool) -> bool:

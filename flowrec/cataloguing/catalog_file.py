@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,9 @@ from typing import Any, Self
 from flowrec.cataloguing.format import EVENTS, KEY, NAME, PARQUET, SIGNATURE, SWEEP, About
 from flowrec.commands.listed import ALWAYS, LISTS, kind_of
 from flowrec.errors import FlowrecError, UsageError
+from flowrec.system.durable import replacing
 from flowrec.system.locks import open_new
-from flowrec.system.outputs import Output, OutputError, put_in_place
+from flowrec.system.outputs import Output, OutputError
 from flowrec.system.regular_file import refuse_irregular
 from flowrec.units import unit_of
 
@@ -123,18 +123,13 @@ def write(path: Path, sessions: pa.Table, replays: pa.ListArray, verdicts: Seque
     table = sessions.append_column(VERDICT, pa.array(verdicts, pa.string())).append_column(SWEEP, replays)
     fields = [field.with_metadata({"unit": unit_of(field.name)}) for field in table.schema]
     table = table.cast(pa.schema(fields, {KEY: about.to_json()}))
-    part = path.with_name(f".flowrec-{secrets.token_hex(6)}{PARQUET[0]}")
     try:
-        pq.write_table(table, part, compression="zstd", compression_level=_LEVEL)
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        put_in_place(part, path, overwrite=True)
+        with replacing(path) as part:
+            pq.write_table(table, part, compression="zstd", compression_level=_LEVEL)
     except OSError as error:
         raise FlowrecError(
             f"{path}: can not be written ({error.strerror or error}); choose another place with --out"
         ) from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _type(name: str) -> pa.DataType:

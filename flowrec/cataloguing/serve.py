@@ -15,6 +15,7 @@ from flowrec.errors import FlowrecError, SessionError, UsageError
 from flowrec.exports.rrd import RrdExport
 from flowrec.session import Session, input_blamed
 from flowrec.system.outputs import RRD, Output
+from flowrec.view.rrd_file import is_made_from
 
 FOLDER = ".flowrec-rrd"
 SERVED_LIMIT = 50  # sessions; each takes seconds to convert, and twice its size
@@ -57,12 +58,11 @@ def recordings_of(catalog: Path, where: str, say: Callable[[str], None]) -> list
 
 def _made(session: Session, folder: Path, say: Callable[[str], None]) -> Path:
     """The .rrd of a session: an earlier one of the same session, or a new one."""
-    exporter = RrdExport()
     path = folder / f"{session.path.stem}-{session.key[:8]}{RRD[0]}"
-    if not exporter.is_export_of(path, session):
+    if not is_made_from(path, session.key):
         say(f"{session.path.name}: making {path}")
         with input_blamed(session, None, "exported"), Output(path, RRD, overwrite=True).new_file() as part:
-            exporter.write(session, part, lambda _: None)
+            RrdExport().write(session, part, lambda _: None)
     session.close()
     return path
 

@@ -20,7 +20,7 @@ from flowrec.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, Opening
 from flowrec.chip.io import chip_files
 from flowrec.chip.openings import check_chip, find_openings, guess_inlets, name_inlets, opening_names, set_inlet_speed
 from flowrec.chip.segmentation import Segmentation, Shown, chip_mask, segment
-from flowrec.commands.pictures import Picture, read_picture
+from flowrec.commands.pictures import Picture, png_of, read_picture
 from flowrec.errors import ChipError, UsageError
 from flowrec.system.outputs import PICTURE, TOML, Output
 from flowrec.terminal import say, table
@@ -126,7 +126,7 @@ def calibrate_chip(
             parts = [files.enter_context(each.new_file()) for each in (settings, png, drawing)]
             parts[0].write_text(chip_toml(done, out.stem), encoding="utf-8")
             parts[1].write_bytes(chip_files(_chip(done, out.stem))[0])
-            cv2.imwrite(str(parts[2]), drawn(done))
+            parts[2].write_bytes(png_of(drawn(done)))
     return done
 
 

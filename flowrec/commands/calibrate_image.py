@@ -9,14 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
 from flowrec.chip.picture_registration import moved_px, overlay, register
 from flowrec.chip.registration import Calibration
 from flowrec.chip.wall_fit import WallFit
-from flowrec.commands.pictures import Picture, read_picture
+from flowrec.commands.pictures import Picture, png_of, read_picture
 from flowrec.config import Config
 from flowrec.declarations import Image
 from flowrec.errors import ChipError, UsageError
@@ -85,7 +83,7 @@ def calibrate_image(
     if outputs is not None and chosen is not None:
         settings, drawing = outputs
         with drawing.new_file() as part:
-            cv2.imwrite(str(part), overlay(picture.image, chip, chosen.calibration))
+            part.write_bytes(png_of(overlay(picture.image, chip, chosen.calibration)))
         with settings.new_file() as part:
             part.write_text(fragment(done, chosen), encoding="utf-8")
     return done

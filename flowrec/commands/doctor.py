@@ -29,6 +29,8 @@ from flowrec.resolve import resolve
 from flowrec.rig_settings import AMPLIFIERS, LAB
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
 from flowrec.session_writer import frames_of, image_bytes_s
+from flowrec.system.durable import write_all
+from flowrec.system.leftovers import temporary_name
 from flowrec.view.viewer import executable, has_display
 
 OK, WARNING, FAILURE = "ok", "warning", "failure"
@@ -286,13 +288,13 @@ def _disk(config: ResolvedConfig, folder: Path) -> Iterator[Finding]:
 
 def _write_speed(folder: Path) -> float:
     """Bytes per second that reach the disk of a folder."""
-    trial = folder / f".flowrec-doctor-{os.getpid()}"
+    trial = folder / temporary_name()
     block = np.random.default_rng(0).integers(0, 256, 1 << 22, dtype=np.uint8).tobytes()
     begin_s = time.perf_counter()
     try:
         with trial.open("xb", buffering=0) as file:
             for _ in range(_TRIAL_BYTES // len(block)):
-                file.write(block)
+                write_all(file.fileno(), block)
             os.fsync(file.fileno())
         return _TRIAL_BYTES / (time.perf_counter() - begin_s)
     finally:

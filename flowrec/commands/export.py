@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import cast
 
 from flowrec.coverage import Coverage
 from flowrec.errors import UsageError
-from flowrec.exports.formats import EXPORTS, Exporter, FileExporter
+from flowrec.exports.formats import EXPORTS, Exporter
 from flowrec.session import Session, files_behind, input_blamed
 from flowrec.store.session_path import named_beside
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
-from flowrec.terminal import progress, say
+from flowrec.system.written import note_written, written_sha256
+from flowrec.terminal import progress, say, warn
 
 
 def export(
@@ -31,8 +30,8 @@ def export(
     Parameters
     ----------
     out : the file or folder; by default beside the session, named like it. A format whose name has a suffix is also
-        written into an existing folder, under the session's name. By default an earlier export of the same session is
-        replaced, of a format that is a folder under any name. Anything else that exists is refused.
+        written into an existing folder, under the session's name. An earlier export of the same session is replaced if
+        nothing in it was changed since, by its hash; a file only under the default name. Anything else is refused.
     overwrite : any existing file, and any folder that an export made, may be replaced, but nothing that is read.
     file_format : name of a row of EXPORTS. In rrd a replay is shown beside its parent, if that is in the same folder.
     beside : of rrd: another session of the same chip and camera, shown on the same timeline and scale.
@@ -62,9 +61,16 @@ def exported(
         if out is None:
             out = named_beside(session.path, f"{session.path.stem}_and_{second.path.stem}{exporter.suffixes[0]}")
     target = _target(session, exporter, file_format, None if out is None else Path(out))
-    output = _output(session, exporter, file_format, target, overwrite, named=named)
-    if second is not None and isinstance(output, Output):
-        output = replace(output, inputs=(*output.inputs, *files_behind(second.path)))
+    facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
+    inputs = tuple(files_behind(session.path))
+    if second is not None:
+        facts["beside_key"] = second.key
+        inputs += tuple(files_behind(second.path))
+    if exporter.folder:
+        output: Output | OutputFolder = OutputFolder(target, facts, exporter.suffixes, inputs, overwrite)
+    else:
+        before = "" if named else written_sha256(target, facts)
+        output = Output(target, exporter.suffixes, inputs, overwrite, before)
     output.check()
     began_s, length_s = time.perf_counter(), max(session.duration_s, 1e-3)
     with (
@@ -73,6 +79,8 @@ def exported(
         _opened(output) as part,
     ):
         exporter.write(session, part, done)
+    if isinstance(output, Output):
+        _note(target, facts)
     covered = Coverage(min(done.done, length_s), length_s, "s")
     took_s = time.perf_counter() - began_s
     say(f"{target} written in {took_s:.1f} s, {covered.amount} of the session; {exporter.advice} {target}")
@@ -97,15 +105,11 @@ def _target(session: Session, exporter: Exporter, file_format: str, out: Path | 
     return out / name if within else out
 
 
-def _output(
-    session: Session, exporter: Exporter, file_format: str, target: Path, overwrite: bool, *, named: bool
-) -> Output | OutputFolder:
-    inputs = tuple(files_behind(session.path))
-    if exporter.folder:
-        facts = {"format": file_format, "session": session.path.name, "session_key": session.key}
-        return OutputFolder(target, facts, exporter.suffixes, inputs, overwrite)
-    overwrite = overwrite or (not named and cast(FileExporter, exporter).is_export_of(target, session))
-    return Output(target, exporter.suffixes, inputs, overwrite)
+def _note(target: Path, facts: Mapping[str, str]) -> None:
+    try:
+        note_written(target, facts)
+    except OSError as error:  # the export itself is whole
+        warn(f"{target}: its hash can not be kept ({error.strerror or error}): only --overwrite will replace it")
 
 
 @contextlib.contextmanager

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.coverage import Coverage
 from flowrec.declarations import Image
@@ -56,6 +58,14 @@ def read_picture(path: Path, channel: str | None = None) -> Picture:
             covered = Coverage(len(movie.median_indices()), frames, "images")
     source = path.name if covered.total == 1 else f"{path.name}, median of {covered.amount}"
     return Picture(image, bits, source, sha256_of(path), covered)
+
+
+def png_of(image: Image | NDArray[np.uint8]) -> bytes:
+    """An image as a PNG file, grey or BGR; ValueError if it can not be one."""
+    done, png = cv2.imencode(".png", image)
+    if not done:
+        raise ValueError(f"no PNG can have the shape {image.shape}")
+    return png.tobytes()
 
 
 def _of_session(path: Path) -> tuple[Image, int, Coverage]:

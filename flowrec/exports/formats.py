@@ -64,10 +64,3 @@ class Exporter(Protocol):
         SessionError : the session has nothing that this format holds, in one line. An OSError without a file name, or
             with one inside `part`, becomes the error "can not be written".
         """
-
-
-class FileExporter(Exporter, Protocol):
-    """What a row implements whose output is a file; a folder has a marker (system/output_folder.py)."""
-
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        """Whether a file is an earlier export of this session, which may be replaced without being asked for."""

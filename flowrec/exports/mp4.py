@@ -22,9 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.errors import MovieError
 from flowrec.exports.camera_images import GreyScale, first_frame, notes_of, refuse_windows, title_of, with_images
-from flowrec.movies.notes import MovieNotes, notes_in
+from flowrec.movies.notes import MovieNotes
 from flowrec.session import Session
 from flowrec.units import NS_PER_S, seconds
 from flowrec.view.overlay import Overlay
@@ -49,9 +48,6 @@ class Mp4Export:
     suffixes = (".mp4",)
     folder = False
     advice = "open it with any player:"
-
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        return is_made_from(path, session.key, drawn=True)
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         first = first_frame(session)
@@ -78,9 +74,6 @@ class PlainMp4Export:
     suffixes = (".mp4",)
     folder = False
     advice = "any player opens it; to make a session of it: flowrec import"
-
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        return is_made_from(path, session.key, drawn=False)
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         refuse_windows(session)
@@ -177,16 +170,6 @@ class Mp4Writer:
         self._encoder.shutdown(cancel_futures=True)
         with suppress(av.FFmpegError, OSError):  # the failure itself is what is reported
             self._container.close()
-
-
-def is_made_from(path: Path, session_key: str, *, drawn: bool) -> bool:
-    """Whether a file is an export of a session by this room, of the kind that is asked for."""
-    try:
-        with av.open(str(path)) as container:
-            notes = notes_in(container.metadata.get("description", ""), path)
-    except (av.FFmpegError, OSError, MovieError):
-        return False
-    return notes is not None and notes.session_key == session_key and notes.drawn == drawn
 
 
 def _metadata(notes: MovieNotes, session: Session) -> dict[str, str]:

@@ -45,13 +45,6 @@ class NwbExport:
     folder = False
     advice = "open it with pynwb or NWB Widgets:"
 
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        try:
-            with NWBHDF5IO(str(path), "r") as file:
-                return bool(file.read().identifier == session.key)
-        except (OSError, ValueError, KeyError, TypeError):
-            return False
-
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         began = started(session)
         if not began:

@@ -18,7 +18,7 @@ from flowrec.session import Session
 from flowrec.store.run_files import files_of
 from flowrec.system.outputs import RRD, Output
 from flowrec.view.entities import PAIR, REPLAY
-from flowrec.view.rrd_file import is_made_from, write_rrd
+from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene
 from flowrec.view.summary_text import (
     FIGURES,
@@ -60,9 +60,6 @@ class RrdExport:
         if not same:
             raise SessionError(f"{second.path}: has another chip or camera than {first.path}; view them one by one")
         return cls(second)
-
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        return is_made_from(path, session.key)
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         config, path = session.config, session.path

@@ -14,10 +14,10 @@ from typing import Any
 import tifffile
 
 from flowrec.declarations import Image
-from flowrec.errors import MovieError, SessionError
+from flowrec.errors import SessionError
 from flowrec.exports.camera_images import GreyScale, first_frame, image_stamps, notes_of, title_of, with_images
-from flowrec.movies.notes import MovieNotes, notes_in
-from flowrec.movies.ome import NAMESPACE, annotation_in
+from flowrec.movies.notes import MovieNotes
+from flowrec.movies.ome import NAMESPACE
 from flowrec.session import Session
 from flowrec.units import seconds
 
@@ -31,14 +31,6 @@ class TiffExport:
     suffixes = (".ome.tif", ".tif", ".tiff", ".btf")
     folder = False
     advice = "open it with Fiji (Bio-Formats), napari or tifffile:"
-
-    def is_export_of(self, path: Path, session: Session) -> bool:
-        try:
-            with tifffile.TiffFile(path) as file:
-                notes = notes_in(annotation_in(file.ome_metadata or ""), path)
-        except (tifffile.TiffFileError, OSError, MovieError, ValueError):
-            return False
-        return notes is not None and notes.session_key == session.key
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         first = first_frame(session)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -18,6 +17,7 @@ from flowrec.errors import SessionError, UsageError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.session_path import UrlPath, on_this_machine
 from flowrec.store.traffic import MissingError
+from flowrec.system.durable import append_line
 from flowrec.system.regular_file import refuse_irregular
 
 SUFFIX = ".notes.jsonl"
@@ -76,13 +76,7 @@ def append_note(session: Path, key: str, text: str, tags: Sequence[str], author:
     path = on_this_machine(notes_file(session), "no note is added to")
     refuse_irregular(path, SessionError)
     try:
-        with path.open("ab+", buffering=0) as file:
-            if file.seek(0, os.SEEK_END):
-                file.seek(-1, os.SEEK_END)
-                # A line that a power cut has left without its end is not continued.
-                line = (b"" if file.read(1) == b"\n" else b"\n") + line
-            file.write(line + b"\n")  # at once, behind what another process may have added
-            os.fsync(file.fileno())
+        append_line(path, line)
     except OSError as error:
         raise SessionError(f"{path}: the note can not be written ({error.strerror}); check folder and disk") from error
     return note

@@ -36,8 +36,9 @@ from flowrec.store.session_metadata import (
 )
 from flowrec.store.session_path import on_this_machine
 from flowrec.store.writer import SessionWriter
+from flowrec.system.durable import put_in_place
 from flowrec.system.locks import held
-from flowrec.system.outputs import MCAP, Output, OutputError, put_in_place
+from flowrec.system.outputs import MCAP, Output, OutputError
 from flowrec.system.regular_file import refuse_irregular
 from flowrec.topics import BY_PATH, Tick
 from flowrec.units import seconds
@@ -141,7 +142,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
             number = part_number(file)
             if number < 2 or number <= len(parts(path)):
                 raise
-            file.rename(file.with_name(file.name.removesuffix(PARTIAL_SUFFIX) + _REMAINS_SUFFIX))
+            _rename(file, file.with_name(file.name.removesuffix(PARTIAL_SUFFIX) + _REMAINS_SUFFIX))
     finished = parts(path)
     if finished:
         with SessionReader(finished[-1]) as last:

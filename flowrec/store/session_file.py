@@ -26,7 +26,8 @@ from flowrec.store.roi import Region
 from flowrec.store.run_files import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
 from flowrec.store.write_queue import Entry
-from flowrec.system.outputs import MCAP, Output, put_in_place, sync_directory, taken
+from flowrec.system.durable import put_in_place, sync_directory
+from flowrec.system.outputs import MCAP, Output, taken
 from flowrec.version import __version__
 
 

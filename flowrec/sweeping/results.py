@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import secrets
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,8 +16,9 @@ from typing import Any, Self
 from flowrec.errors import FlowrecError, SessionError, UsageError
 from flowrec.store.session_path import UrlPath
 from flowrec.sweeping.replay_process import Row
+from flowrec.system.durable import replace_content, replacing, sync_directory
 from flowrec.system.locks import try_lock
-from flowrec.system.outputs import Output, OutputError, put_in_place, sync_directory
+from flowrec.system.outputs import Output, OutputError
 from flowrec.units import unit_of
 
 try:
@@ -30,7 +29,7 @@ except ModuleNotFoundError as error:
 
 PARQUET = (".parquet",)
 _OURS = b"flowrec_sweep"  # key of the file's metadata: which columns are settings and figures, as JSON
-_FOLDER, _TASK, _PART = ".tasks", ".json", ".part"
+_FOLDER, _TASK = ".tasks", ".json"
 _LEVEL = 1  # of zstd
 _SIDES = ("recorded_", "replayed_")  # the two columns of a figure
 # Columns and what they mean; those with settings and figures come before `refinement`.
@@ -101,13 +100,8 @@ class Results:
     def put(self, row: Row) -> None:
         """Keep the row of a task; FlowrecError if it can not be written."""
         file = self._folder / (row["key"] + _TASK)
-        part = file.with_suffix(_PART)
         try:
-            with part.open("w", encoding="utf-8") as opened:
-                json.dump(row, opened)
-                opened.flush()
-                os.fsync(opened.fileno())
-            part.replace(file)
+            replace_content(file, json.dumps(row).encode())
         except OSError as error:
             raise FlowrecError(
                 f"{file}: can not be written ({error.strerror or error}); what was done before is kept, and the same "
@@ -125,6 +119,7 @@ class Results:
         """The folder is there, and no other process uses it."""
         try:
             self._folder.mkdir(exist_ok=True)
+            sync_directory(self._folder.absolute().parent)  # the rows in it would be lost with its name
         except OSError as error:
             reason = error.strerror or error
             raise OutputError(f"{self._folder}: can not be made ({reason}); choose another place") from error
@@ -153,29 +148,21 @@ class Results:
 
     def _gather(self) -> None:
         """Move all rows into the Parquet file."""
-        for part in self._folder.glob(f"*{_PART}"):
-            part.unlink()
         found = list(self._files())
         if not found:
             return
         before = read_rows(self.path) if self.path.exists() else []
         rows = {row["key"]: row for row in [*before, *(row for _, row in found)]}
-        part = self.path.with_name(f".flowrec-{secrets.token_hex(6)}{PARQUET[0]}")
         try:
-            pq.write_table(_table(list(rows.values())), part, compression="zstd", compression_level=_LEVEL)
-            with part.open("rb") as file:
-                os.fsync(file.fileno())
-            put_in_place(part, self.path, overwrite=True)
+            with replacing(self.path) as part:
+                pq.write_table(_table(list(rows.values())), part, compression="zstd", compression_level=_LEVEL)
         except OSError as error:
             raise FlowrecError(
                 f"{self.path}: can not be written ({error.strerror or error}); the results stay in {self._folder}, and "
                 "the same command goes on"
             ) from error
-        finally:
-            part.unlink(missing_ok=True)
         for path, _ in found:
             path.unlink()
-        sync_directory(self.path.parent)
 
 
 def read_rows(path: Path) -> list[Row]:

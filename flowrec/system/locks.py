@@ -51,7 +51,7 @@ def open_new(path: Path, *, overwrite: bool = False) -> FileIO:
             continue
         try:
             _take(file.fileno())
-            if _is_at(file, path):
+            if is_at(file.fileno(), path):
                 return file
         except BlockingIOError:
             file.close()  # another process was quicker to lock the new file, and has it now
@@ -78,7 +78,7 @@ def remove_idle(path: Path) -> None:
         return
     with file:
         _take(file.fileno())
-        if _is_at(file, path):
+        if is_at(file.fileno(), path):
             path.unlink()
 
 
@@ -130,6 +130,20 @@ def try_lock(descriptor: int, *, exclusive: bool) -> bool:
     return True
 
 
+def take_lock(descriptor: int) -> None:
+    """Take the exclusive lock of an open file, when those have let go that hold it for moments.
+
+    Raises
+    ------
+    BlockingIOError : another process has held it for two seconds.
+    """
+    end_s = time.monotonic() + _TIMEOUT_S
+    while not try_lock(descriptor, exclusive=True):
+        if time.monotonic() > end_s:
+            raise BlockingIOError(errno.EWOULDBLOCK, "another process has locked it")
+        time.sleep(_PAUSE_S)
+
+
 def _take(descriptor: int) -> None:
     """Take the exclusive lock, after processes that only ask."""
     end_s = time.monotonic() + _TIMEOUT_S
@@ -142,9 +156,9 @@ def _take(descriptor: int) -> None:
         time.sleep(_PAUSE_S)
 
 
-def _is_at(file: FileIO, path: Path) -> bool:
+def is_at(descriptor: int, path: Path) -> bool:
     """Whether a path still names an open file."""
     try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+        return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:
         return False

@@ -1,4 +1,7 @@
-"""Output folders: written beside their name and renamed as a whole; only an export of flowrec is ever replaced."""
+"""Output folders: written beside their name and renamed as a whole; only what flowrec wrote is replaced unasked.
+
+The marker, a JSON file in the folder, lists every file with its hash.
+"""
 
 from __future__ import annotations
 
@@ -12,25 +15,29 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import SessionError
-from flowrec.system.outputs import OutputError, sync_directory, taken
+from flowrec.system.durable import sync_directory, sync_file
+from flowrec.system.leftovers import MARKER, OLD, remove_leftovers_once, temporary_name
+from flowrec.system.outputs import OutputError, taken
+from flowrec.system.written import sha256_of
 
-MARKER = "flowrec_export.json"
+_WRITTEN = "sha256"  # of the files of a folder, by name
 
 
 @dataclass(frozen=True, slots=True)
 class OutputFolder:
     """An output folder of a verb, and what it may replace.
 
-    An existing folder is replaced if it is an earlier output with the same `facts`; with `overwrite` if it is an output
-    of flowrec at all. A folder with anything that flowrec did not write into it always stays as it is.
+    An existing folder is replaced if it is an earlier output with the same `facts` in which nothing was changed; with
+    `overwrite` if it is an output of flowrec at all. A folder with a file that flowrec did not write into it always
+    stays as it is.
 
     Attributes
     ----------
     path : of the folder.
-    facts : what it is made from; kept in its marker, a JSON file that also lists what flowrec wrote.
+    facts : what it is made from; kept in its marker.
     suffixes : that the name must end in, the usual one first; "" allows any name.
     inputs : files that the command reads; the folder must contain none of them.
-    overwrite : a folder with other facts may be replaced.
+    overwrite : a folder with other facts, or with files that were changed, may be replaced.
     """
 
     path: Path
@@ -72,13 +79,21 @@ class OutputFolder:
         """
         self.check()
         path = self.path.absolute()
-        name = f".flowrec-{os.urandom(6).hex()}"
-        part, old = path.with_name(name), path.with_name(name + "-old")
+        part = path.with_name(temporary_name())
+        old = part.with_name(part.name + OLD)
+        remove_leftovers_once(path.parent)
         try:
             part.mkdir()
             yield part
-            entries = sorted(entry.name for entry in part.iterdir())
-            marker = {"made_by": "flowrec export"} | dict(self.facts) | {"entries": entries}
+            written = {name: sha256_of(part / name) for name in _files_in(part)}
+            entries = sorted({name.partition("/")[0] for name in written})
+            marker = {
+                "made_by": "flowrec export",
+                **self.facts,
+                "name": path.name,
+                "entries": entries,
+                _WRITTEN: written,
+            }
             (part / MARKER).write_text(json.dumps(marker, indent=1), encoding="utf-8")
             _sync(part)
             if os.path.lexists(path):
@@ -106,13 +121,14 @@ class OutputFolder:
         if path.is_symlink() or not path.is_dir():
             raise OutputError(f"{path}: is a file, where a folder is to be made; choose another name")
         marker = marker_of(path)
-        found = {entry.name for entry in path.iterdir()}
-        if not found:
+        if not any(path.iterdir()):
             return
         if marker is None:
             raise OutputError(f"{path}: is a folder that flowrec export did not make, and stays; choose another name")
-        foreign = sorted(found - set(marker["entries"]) - {MARKER})
-        if foreign:
+        found, written = set(_files_in(path)), marker.get(_WRITTEN)
+        # A marker of an older flowrec lists what is in the folder itself, without hashes.
+        known = written or {name for name in found if name.partition("/")[0] in marker["entries"]}
+        if foreign := sorted(found - set(known)):
             raise OutputError(
                 f"{path}: holds {foreign[0]}, which flowrec export did not write; move it, or choose another name"
             )
@@ -120,8 +136,14 @@ class OutputFolder:
         for file in self.inputs:
             if file.resolve().is_relative_to(whole):
                 raise OutputError(f"{file}: is read by this command and stays; choose another name for the output")
-        if not self.overwrite and any(marker.get(key) != value for key, value in self.facts.items()):
+        if self.overwrite:
+            return
+        if any(marker.get(key) != value for key, value in self.facts.items()):
             raise taken(path, ", an export of another session or format")
+        if written is None:
+            raise taken(path, ", and does not say whether it was changed since")
+        if changed := [name for name in sorted(found) if sha256_of(path / name) != written[name]]:
+            raise taken(path, f", and {changed[0]} was changed since flowrec wrote it")
 
 
 def marker_of(folder: Path) -> dict[str, Any] | None:
@@ -130,15 +152,23 @@ def marker_of(folder: Path) -> dict[str, Any] | None:
         marker = json.loads((folder / MARKER).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    entries = marker.get("entries") if isinstance(marker, dict) else None
+    entries, written = (marker.get("entries"), marker.get(_WRITTEN, {})) if isinstance(marker, dict) else (None, None)
     named = isinstance(entries, list) and all(isinstance(entry, str) for entry in entries)
-    return marker if named else None
+    return marker if named and isinstance(written, dict) else None
+
+
+def _files_in(folder: Path) -> list[str]:
+    """The files of an output folder and of all folders in it, as `a/b`, and links to folders; without its marker."""
+    found = []
+    for root, folders, names in os.walk(folder):
+        links = [name for name in folders if Path(root, name).is_symlink()]
+        found += [Path(root, name).relative_to(folder).as_posix() for name in (*names, *links)]
+    return sorted(set(found) - {MARKER})
 
 
 def _sync(folder: Path) -> None:
     """Flush all files of a folder to the disk."""
     for root, _, names in os.walk(folder):
         for name in names:
-            with Path(root, name).open("rb") as file:
-                os.fsync(file.fileno())
+            sync_file(Path(root, name))
         sync_directory(Path(root))

@@ -6,15 +6,16 @@ A file gets its name when it is complete and on the disk. Sessions are written b
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
-import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from flowrec.errors import SessionError
+from flowrec.system.durable import replacing
+from flowrec.system.leftovers import PREFIX
 from flowrec.system.locks import is_growing
+from flowrec.system.written import sha256_of
 
 MCAP = (".mcap",)
 RRD = (".rrd",)
@@ -24,8 +25,6 @@ FIGURE = (".png", ".pdf", ".svg")
 JSON = (".json",)
 TOML = (".toml",)
 WEIGHTS = (".safetensors",)
-
-_WITHOUT_LINKS = (errno.EPERM, errno.EMLINK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL)
 
 
 class OutputError(SessionError):
@@ -44,12 +43,14 @@ class Output:
     suffixes : those of its format, the usual one first.
     inputs : files that the command reads; the output must be none of them, even with `overwrite`.
     overwrite : an existing file may be replaced.
+    replaces : SHA-256 of what flowrec wrote there before; a file that still holds it may be replaced, too.
     """
 
     path: Path
     suffixes: tuple[str, ...]
     inputs: tuple[Path, ...] = ()
     overwrite: bool = False
+    replaces: str = ""
 
     def check(self, also: Iterable[Path] = ()) -> None:
         """Check the output before any work is done for it.
@@ -83,8 +84,7 @@ class Output:
                     f"{file}: is being written by another process just now; let it end or stop it with Ctrl-C, or "
                     "choose another name"
                 )
-        if not self.overwrite and os.path.lexists(path):
-            raise taken(path)
+        self._check_existing()
         if not os.access(path.parent, os.W_OK | os.X_OK):
             raise OutputError(f"{path.parent}: can not be written to; choose another place for {path.name}")
 
@@ -101,65 +101,34 @@ class Output:
         """
         self.check()
         path = self.path
-        part = path.with_name(f".flowrec-{os.urandom(6).hex()}{path.suffix}")
         try:
-            part.touch(exist_ok=False)  # fails before any work is done if the folder can not be written to
-            yield part
-            with part.open("rb") as file:
-                os.fsync(file.fileno())
-            put_in_place(part, path, overwrite=self.overwrite)
+            with replacing(path, overwrite=self.overwrite or bool(self.replaces)) as part:
+                yield part
+                self._check_existing()  # again: somebody may have used the time
         except FileExistsError as error:
             raise taken(path) from error
         except OSError as error:
-            if error.filename not in (None, str(part), str(path)):
+            named = Path(str(error.filename)) if error.filename is not None else path
+            if named != path and not named.name.startswith(PREFIX):
                 raise
             raise SessionError(
                 f"{path}: can not be written ({error.strerror or error}); choose another place"
             ) from error
-        finally:
-            part.unlink(missing_ok=True)
+
+    def _check_existing(self) -> None:
+        """Refuse a file that is there and may not be replaced."""
+        path = self.path
+        if self.overwrite or not os.path.lexists(path):
+            return
+        if not self.replaces:
+            raise taken(path)
+        if path.is_symlink() or sha256_of(path) != self.replaces:
+            raise taken(path, ", and was changed since flowrec wrote it")
 
 
 def taken(path: Path, kept: str = "") -> OutputError:
     """The error for a name that another file has."""
     return OutputError(f"{path}: exists already{kept}; choose another name, or replace it with --overwrite")
-
-
-def put_in_place(part: Path, path: Path, *, overwrite: bool) -> None:
-    """Rename a finished file to its final name in one step, and flush the name to the disk.
-
-    Raises
-    ------
-    FileExistsError : another file has the name by now, and `overwrite` is not set.
-    OSError : the name can not be given.
-    """
-    if overwrite:
-        part.replace(path)
-    else:
-        try:
-            os.link(part, path)
-        except OSError as error:
-            if error.errno not in _WITHOUT_LINKS:
-                raise
-            path.touch(exist_ok=False)  # keeps others from the name
-            try:
-                part.replace(path)
-            except BaseException:
-                path.unlink()
-                raise
-        else:
-            part.unlink()
-    sync_directory(path.parent)
-
-
-def sync_directory(directory: Path) -> None:
-    """Flush the names in a directory to the disk; Windows has no such call."""
-    if sys.platform != "win32":
-        descriptor = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _same(output: Path, other: Path) -> bool:

@@ -35,12 +35,25 @@ def test_an_export_replaces_an_earlier_export_of_the_same_session_and_no_other_f
     assert made.parent == tmp_path
     assert made.stem.startswith(session.stem)
     assert flowrec.export(session, file_format=any_export) == made
-    assert set(tmp_path.iterdir()) == {session, made}
-    precious = made / "precious" if made.is_dir() else made
-    precious.write_bytes(b"precious")
-    with pytest.raises(OutputError, match=r"exists already|flowrec export did not write"):
+    assert set(tmp_path.iterdir()) - {tmp_path / ".flowrec_exports.json"} == {session, made}
+    changed = next(path for path in made.rglob("*") if path.is_file()) if made.is_dir() else made
+    with changed.open("ab") as file:
+        file.write(b"my annotation")  # as HDF5, too, adds data to a file
+    with pytest.raises(OutputError, match=r"exists already, and .*was changed since flowrec wrote it"):
         flowrec.export(session, file_format=any_export)
-    assert precious.read_bytes() == b"precious"
+    assert changed.read_bytes().endswith(b"my annotation")
+    assert flowrec.export(session, file_format=any_export, overwrite=True) == made
+    assert not changed.read_bytes().endswith(b"my annotation")
+    if made.is_dir():
+        (changed.parent / "precious").touch()
+        for overwrite in (False, True):
+            with pytest.raises(OutputError, match="flowrec export did not write"):
+                flowrec.export(session, file_format=any_export, overwrite=overwrite)
+    else:
+        made.unlink()
+        made.write_bytes(b"precious")
+        with pytest.raises(OutputError, match="exists already"):
+            flowrec.export(session, file_format=any_export)
 
 
 def test_the_help_of_export_lists_every_format_with_its_summary(any_export: str) -> None:

@@ -152,7 +152,7 @@ def test_with_overwrite_an_existing_output_is_replaced_whole(folder, flowrec):
         assert (folder / out).stat().st_size > 100
         assert (folder / "kept").read_bytes() == b"precious"  # the same file by another name
         (folder / "kept").unlink()
-    assert not [name for name in contents(folder) if name.startswith(".")]
+    assert not [name for name in contents(folder) if name.startswith(".flowrec-")]
 
 
 def test_the_rrd_beside_a_session_is_made_anew_only_where_it_was_made_from_that_session(folder, flowrec):

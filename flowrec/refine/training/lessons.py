@@ -20,6 +20,7 @@ from flowrec.flow import FlowSolver
 from flowrec.messages import FlowField, Observations
 from flowrec.refine.observation_operator import ObservationOperator, observation_operator
 from flowrec.refine.training.vessels import MASK_ERRORS, draw_mask, make_case, with_mask_error
+from flowrec.system.durable import replacing
 
 _MASK_ERROR_PROBABILITY = 0.15
 _OUTLIER_PROBABILITY = 0.25  # of one set of observations; up to a seventh of them are outliers then
@@ -69,24 +70,23 @@ def prepare(folder: Path, count: int, seed: int = 0) -> Iterator[Path]:
 
 def _make(path: Path, rng: np.random.Generator) -> None:
     """Write one vessel case and its assumed flow."""
-    part = path.with_suffix(".part")
-    while True:
-        case = make_case(draw_mask(rng), rng, truth_k=2)
-        if case is None:
-            continue
-        error = str(rng.choice(list(MASK_ERRORS)[1:])) if rng.random() < _MASK_ERROR_PROBABILITY else "right"
-        with part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **case)
-        try:
-            assumed = _SOLVER.solve(with_mask_error(read_vessel_case(part), error))
-        except FlowrecError:  # a wall that is one pixel off may close an opening
-            continue
-        case |= {"wrong": error, "assumed_v": assumed.velocity_um_s, "assumed_p": assumed.pressure_pa}
-        case["assumed_walls"] = assumed.wall_px
-        with part.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **case)
-        part.replace(path)
-        return
+    with replacing(path) as part:
+        while True:
+            case = make_case(draw_mask(rng), rng, truth_k=2)
+            if case is None:
+                continue
+            error = str(rng.choice(list(MASK_ERRORS)[1:])) if rng.random() < _MASK_ERROR_PROBABILITY else "right"
+            with part.open("wb") as file:
+                np.savez(file, allow_pickle=False, **case)
+            try:
+                assumed = _SOLVER.solve(with_mask_error(read_vessel_case(part), error))
+            except FlowrecError:  # a wall that is one pixel off may close an opening
+                continue
+            case |= {"wrong": error, "assumed_v": assumed.velocity_um_s, "assumed_p": assumed.pressure_pa}
+            case["assumed_walls"] = assumed.wall_px
+            with part.open("wb") as file:
+                np.savez_compressed(file, allow_pickle=False, **case)
+            return
 
 
 def read_lesson(path: Path) -> Lesson:
