@@ -6,6 +6,7 @@ where the bucket has the beginning of them.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -15,12 +16,17 @@ from typing import Any
 from flowrec.errors import SessionError, UsageError
 from flowrec.session import session_sha256
 from flowrec.store.bucket_upload import Bucket, Content, StoreError, content_of_file
+from flowrec.store.byte_source import open_bytes
 from flowrec.store.notes import notes_content, notes_file
 from flowrec.store.remote_file import forget
 from flowrec.store.run_files import Run
 from flowrec.store.session_path import UrlPath, on_this_machine, session_path
-from flowrec.store.traffic import TRAFFIC
+from flowrec.store.traffic import TRAFFIC, HiddenError, MissingError
 from flowrec.terminal import Progress, progress, say
+
+_RANGE_BYTES = 64 << 10  # that is read back at a time
+_RANGE_EVERY_BYTES = 256 << 20  # of an object, one range more is read back
+_BY_ALL = "by reading all of it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +37,8 @@ class PushedFile:
     ----------
     sent_bytes : what was sent by this call; 0 if it was there already, less than `size_bytes` if it was resumed.
     sha256 : of the file.
-    read_back : it was compared by reading it, because the ETag of this store does not say what an object holds.
+    compared : how, in words: by reading back what was sent, all of it or, where the ETag of the store is that of the
+        content, some ranges; '' where these credentials may not read it.
     """
 
     file: Path
@@ -39,14 +46,14 @@ class PushedFile:
     size_bytes: int
     sent_bytes: int
     sha256: str
-    read_back: bool
+    compared: str
 
     def __str__(self) -> str:
         if not self.sent_bytes and self.size_bytes:
             return f"{self.url}: is there already, the same"
         resumed = f", {self.sent_bytes / 1e6:.1f} MB of them now" if self.sent_bytes < self.size_bytes else ""
-        how = "by reading it back" if self.read_back else "by its ETag"
-        return f"{self.url}: {self.size_bytes / 1e6:.1f} MB sent{resumed}, compared {how}"
+        how = f"compared {self.compared}" if self.compared else "not compared: these credentials may not read it"
+        return f"{self.url}: {self.size_bytes / 1e6:.1f} MB sent{resumed}, {how}"
 
 
 @dataclass(slots=True)
@@ -64,12 +71,12 @@ class Pushed:
 
     @property
     def exit_status(self) -> int:
-        """0 all is there, 1 a session is not."""
-        return 1 if self.failed else 0
+        """0 all is there, 1 a session is not, 3 all was sent, and what could not be read back may not be there."""
+        return 1 if self.failed else 0 if all(each.compared for each in self.files) else 3
 
     def as_json(self) -> dict[str, Any]:
         """All facts by name."""
-        names = ("size_bytes", "sent_bytes", "sha256", "read_back")
+        names = ("size_bytes", "sent_bytes", "sha256", "compared")
         objects = [
             {"file": str(each.file), "url": str(each.url)} | {name: getattr(each, name) for name in names}
             for each in self.files
@@ -165,11 +172,9 @@ def _pushed(bucket: Bucket, session: Path, file: Path, done: Callable[[int], Non
             raise SessionError(f"{file}: is not pushed, {worst}")
         sent = bucket.upload(file.name, file, done)
         if sent is not None:
-            content = sent.content
-            read_back = sent.etag != content.etag
-            if read_back and not _is(bucket.url(file.name), content):
-                raise SessionError(f"{bucket.url(file.name)}: does not hold what was sent; delete it, and push again")
-            return PushedFile(file, bucket.url(file.name), content.size, sent.sent_bytes, content.sha256, read_back)
+            content, url = sent.content, bucket.url(file.name)
+            compared = _read_back(url, file, content, sent.etag)
+            return PushedFile(file, url, content.size, sent.sent_bytes, content.sha256, compared)
         stored = bucket.stored(file.name)  # it has come meanwhile
     return _same(bucket.url(file.name), file, stored, done)
 
@@ -179,10 +184,47 @@ def _same(url: UrlPath, file: Path, stored: tuple[int, str] | None, done: Callab
     size_bytes, etag = stored or (0, "")
     if size_bytes == file.stat().st_size:
         content = content_of_file(file, done)
-        read_back = etag != content.etag
-        if not read_back or _is(url, content):
-            return PushedFile(file, url, content.size, 0, content.sha256, read_back)
+        if etag == content.etag:
+            return PushedFile(file, url, content.size, 0, content.sha256, "by its ETag")
+        if _is(url, content):
+            return PushedFile(file, url, content.size, 0, content.sha256, _BY_ALL)
     raise SessionError(f"{url}: is there with another content than {file}, and stays; push to another folder")
+
+
+def _read_back(url: UrlPath, file: Path, content: Content, etag: str) -> str:
+    """How an object was compared with the file that was sent to it; '' where these credentials may not read.
+
+    The answer to what was sent is no evidence, a store may keep nothing. An ETag that is the MD5 of the content says
+    that all of it has arrived; then ranges of what is stored are read, its beginning and end among them.
+
+    Raises
+    ------
+    SessionError : it does not hold what was sent.
+    """
+    wrong = SessionError(f"{url}: does not hold what was sent; delete it, and push again")
+    forget(url)
+    try:
+        with contextlib.closing(open_bytes(url)) as stored, contextlib.closing(open_bytes(file)) as sent:
+            if stored.size != content.size:
+                raise wrong
+            if etag != content.etag:
+                if session_sha256([url]) != content.sha256:
+                    raise wrong
+                return _BY_ALL
+            ranges = _ranges(content.size)
+            if any(stored.read(*each) != sent.read(*each) for each in ranges):
+                raise wrong
+    except HiddenError:
+        return ""
+    except MissingError as error:
+        raise SessionError(f"{url}: is not there, although the store has taken it; is this a store of S3?") from error
+    return f"by its ETag and {len(ranges)} of its ranges"
+
+
+def _ranges(size: int) -> list[tuple[int, int]]:
+    """Ranges (offset, length) that are read back: begin, middle, end, and others so that 256 MB lie between two."""
+    length, steps = min(_RANGE_BYTES, size), 2 + size // _RANGE_EVERY_BYTES
+    return [(offset, length) for offset in sorted({number * (size - length) // steps for number in range(steps + 1)})]
 
 
 def _is(url: UrlPath, content: Content) -> bool:
@@ -198,7 +240,7 @@ def _pushed_notes(bucket: Bucket, file: Path) -> PushedFile:
     forget(url)
     there = b"" if stored is None else notes_content(url)
     if stored is not None and there.startswith(data):
-        return PushedFile(file, url, here.size, 0, here.sha256, read_back=True)
+        return PushedFile(file, url, here.size, 0, here.sha256, _BY_ALL)
     if not data.startswith(there) or bucket.put(file.name, data, "" if stored is None else stored[1]) is None:
         raise SessionError(f"{url}: has other notes than {file}, and stays; put them together by hand")
-    return PushedFile(file, url, here.size, len(data), here.sha256, read_back=False)
+    return PushedFile(file, url, here.size, len(data), here.sha256, _read_back(url, file, here, ""))

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.errors import SessionError, UsageError
-from flowrec.store.object_requests import in_a_line, of_status, reason
+from flowrec.store.object_requests import NOT_OFFERED, in_a_line, of_status, reason
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError, RefusedError, TransientError, answered, timeout_s
 
@@ -220,7 +220,7 @@ class Bucket:
                 raise ours from error
 
         try:
-            return answered(self.url(name), once, wanted, timeout_s() + nbytes / _SLOWEST_BYTES_S)
+            return answered(self.url(name), once, wanted, timeout_s() + nbytes / _SLOWEST_BYTES_S, "written")
         except SessionError as error:
             if isinstance(error, MissingError) and verb in _LOOKS:
                 return None
@@ -341,6 +341,8 @@ def _ours(error: Exception) -> Exception | None:
         if code in _AGAIN:
             return TransientError(f"the server answers {code}")
         found = of_status(status)
+        if status == NOT_OFFERED:
+            return RefusedError(f"can not be written: the store does not offer what push needs ({status} {code[:60]})")
         return found if type(found) is not RefusedError else RefusedError(f"the server answers {status} {code[:60]}")
     if isinstance(error, exceptions.NoCredentialsError | exceptions.PartialCredentialsError):
         return RefusedError("can not be written: there are no credentials in the environment")

@@ -18,18 +18,20 @@ from typing import Any, Protocol
 from urllib.parse import urljoin, urlsplit
 
 from flowrec.errors import SessionError, UsageError
-from flowrec.store.traffic import AbsentError, RefusedError, TransientError
+from flowrec.store.traffic import AbsentError, ForbiddenError, RefusedError, TransientError
 
 CONNECTIONS = 32  # requests at a time
 _REDIRECTS = 3
 _PIECE_BYTES = 1 << 16
 _ENDPOINTS = ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT", "AZURE_STORAGE_ENDPOINT", "GOOGLE_BASE_URL")
 _CONTENT_RANGE = re.compile(r"bytes (\d+)-(\d+)/(\d+)")
-_OK, _PARTIAL, _NO_RANGE = 200, 206, 416
+_OK, _PARTIAL, _NO_RANGE, NOT_OFFERED = 200, 206, 416, 501
 _LATER = (408, 425, 429)  # a time limit, too early, too many requests
 _REFUSED = "refuses access ({}); check the credentials in the environment"
 _NOT_INSTALLED = "{}: reading from a URL needs a package; pip install 'flowrec[remote]'"
 _MISSING = "is not there (404); check the name"
+_WHOLE_ONLY = "can not be read in ranges, the server sends whole files only; copy it to this machine"
+_NO_RANGE_TOLD = "can not be read: the server answers 206 without a range"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +49,14 @@ class Answer:
     first: int
     size: int
     version: str
+
+
+class OtherRangeError(TransientError):
+    """The server has sent another range than was asked for; `size` of the object is 0 where it is not known."""
+
+    def __init__(self, text: str, size: int = 0) -> None:
+        super().__init__(text)
+        self.size = size
 
 
 class ObjectRequests(Protocol):
@@ -141,6 +151,14 @@ class _Bucket:
             raise SessionError(f"{url}: is no URL of a bucket ({in_a_line(error)})") from error
 
     def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
+        if first is None and not self._without_suffix:
+            try:
+                return self._get(None, length)
+            except OtherRangeError:  # a store that takes "the last bytes" for something else
+                self._without_suffix = True
+        return self._get(first, length)
+
+    def _get(self, first: int | None, length: int) -> Answer:
         import obstore
 
         with _bucket_faults() as faults:
@@ -193,12 +211,16 @@ def _bucket_faults() -> Iterator[_Faults]:
     except (exceptions.NotFoundError, FileNotFoundError) as error:
         raise AbsentError(_MISSING) from error
     except (exceptions.PermissionDeniedError, exceptions.UnauthenticatedError, PermissionError) as error:
-        raise AbsentError(_REFUSED.format("403")) from error
+        raise ForbiddenError(_REFUSED.format("403")) from error
     except (exceptions.BaseError, OSError, ValueError) as error:
         text = in_a_line(error)
         if "416" in text and "ange" in text:
             faults.empty = True
             return
+        if "UnexpectedRange" in text:
+            raise OtherRangeError("the server sends other bytes than those that are asked for") from error
+        if "NotPartial" in text or "NoContentRange" in text:
+            raise RefusedError(_WHOLE_ONLY if "NotPartial" in text else _NO_RANGE_TOLD) from error
         if "169.254.169.254" in text or "redential" in text:
             raise RefusedError("can not be asked for: there are no credentials in the environment") from error
         status = re.search(r"\b(?:status|Status|code)\D{0,20}([45]\d\d)\b", text)
@@ -208,9 +230,11 @@ def _bucket_faults() -> Iterator[_Faults]:
 def of_status(status: int) -> Exception:
     """The error of an answer that is none."""
     if status in (401, 403):
-        return AbsentError(_REFUSED.format(status))
+        return ForbiddenError(_REFUSED.format(status))
     if status in (404, 410):
         return AbsentError(_MISSING)
+    if status == NOT_OFFERED:
+        return RefusedError(f"the server does not offer what is asked of it ({status})")
     if status >= 500 or status in _LATER:
         return TransientError(f"the server answers {status}")
     return RefusedError(f"can not be read: the server answers {status}")
@@ -230,11 +254,20 @@ class _Http:
         self._pool = urllib3.PoolManager(maxsize=CONNECTIONS, retries=False)
 
     def get(self, first: int | None, length: int, timeout_s: float) -> Answer:
+        end_s = time.monotonic() + timeout_s
+        if first is None:
+            try:
+                return self._get(None, length, end_s)
+            except OtherRangeError as error:  # a server that takes "the last bytes" for something else
+                first = max(0, error.size - length)
+        return self._get(first, length, end_s)
+
+    def _get(self, first: int | None, length: int, end_s: float) -> Answer:
         import urllib3
 
         wanted = f"bytes=-{length}" if first is None else f"bytes={first}-{first + length - 1}"
         headers = {"Range": wanted, "Accept-Encoding": "identity"}
-        end_s = time.monotonic() + timeout_s
+        timeout_s = max(0.1, end_s - time.monotonic())
         limits = urllib3.Timeout(connect=min(5.0, timeout_s), read=timeout_s)
         url = self._url
         try:
@@ -267,15 +300,16 @@ def _answer(response: Any, first: int | None, length: int, end_s: float) -> Answ
     if status >= 400:
         raise of_status(status)
     if status == _OK:
-        raise RefusedError("can not be read in ranges, the server sends whole files only; copy it to this machine")
+        raise RefusedError(_WHOLE_ONLY)
     found = _CONTENT_RANGE.fullmatch(response.headers.get("Content-Range", ""))
     if status != _PARTIAL or found is None:
-        raise RefusedError(f"can not be read: the server answers {status} without a range")
+        raise RefusedError(_NO_RANGE_TOLD if status == _PARTIAL else f"can not be read: the server answers {status}")
     begin, last, size = map(int, found.groups())
     expected = last - begin + 1
     asked = max(0, size - length) if first is None else first
     if begin != asked or expected != min(length, size - asked):
-        raise TransientError(f"the server sent the bytes {begin} to {last} where {length} from {asked} were asked for")
+        text = f"the server sent the bytes {begin} to {last} where {length} from {asked} were asked for"
+        raise OtherRangeError(text, size)
     data = bytearray()
     while piece := response.read1(_PIECE_BYTES):
         data += piece
@@ -322,4 +356,6 @@ def reason(text: str) -> str:
         return "the connection was cut"
     if "resolve" in lower or "dns" in lower:
         return "the host is not known"
-    return "no connection"
+    if "connect" in lower or "unreachable" in lower:
+        return "no connection"
+    return "the answer of the server can not be used"

@@ -32,8 +32,16 @@ class AbsentError(RefusedError):
     """There is no such object, or this user may not know of it."""
 
 
+class ForbiddenError(AbsentError):
+    """Access to the object is refused to this user."""
+
+
 class MissingError(SessionError):
     """No object of that name can be read: there is none, or access is refused."""
+
+
+class HiddenError(MissingError):
+    """Access to the object is refused."""
 
 
 @dataclass(slots=True)
@@ -84,6 +92,7 @@ def answered(
     ask: Callable[[float], _Answered],
     wanted: Callable[[], bool] = lambda: True,
     limit_s: float | None = None,
+    done: str = "read",
 ) -> _Answered:
     """An answer, after several tries and within the time limit.
 
@@ -93,6 +102,7 @@ def answered(
     ask : makes the request, which may take a time in s.
     wanted : whether it is still worth a try.
     limit_s : time limit of all tries together in s; None: that of a request.
+    done : what could not be done with it, for messages.
 
     Raises
     ------
@@ -104,6 +114,8 @@ def answered(
         TRAFFIC.add(requests=1, repeated=reason)
         try:
             return ask(max(0.1, end_s - time.monotonic()))
+        except ForbiddenError as error:
+            raise HiddenError(f"{path}: {error}") from error
         except AbsentError as error:
             raise MissingError(f"{path}: {error}") from error
         except RefusedError as error:
@@ -112,7 +124,7 @@ def answered(
             pause_s, reason = _PAUSE_S * 2.0**number, str(error)
             if number == _TRIES - 1 or time.monotonic() + pause_s > end_s or not wanted():
                 tries = f"{number + 1} tries" if number else "one try"
-                raise SessionError(f"{path}: can not be read ({error}, {tries})") from error
+                raise SessionError(f"{path}: can not be {done} ({error}, {tries})") from error
             time.sleep(pause_s)
     raise AssertionError("the last try raises or returns")
 

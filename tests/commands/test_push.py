@@ -24,6 +24,7 @@ from flowrec.session import Session, session_sha256
 from flowrec.store import bucket_upload, remote_file, traffic
 from flowrec.store.run_files import part_path
 from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import TRAFFIC
 from flowrec.store.writer import SessionWriter
 from tests.conftest import HANG_S, until
@@ -71,7 +72,7 @@ def test_a_session_that_was_pushed_is_the_file(server: S3Server, large: Path) ->
     (done,) = push([large], TARGET).files
     assert content(server, "large.mcap") == large.read_bytes()
     assert (done.sent_bytes, done.sha256) == (large.stat().st_size, hashlib.sha256(large.read_bytes()).hexdigest())
-    assert not done.read_back and session_sha256([done.url]) == done.sha256
+    assert done.compared.startswith("by its ETag and 3 of its ranges") and session_sha256([done.url]) == done.sha256
     assert flowrec.check(done.url).findings == flowrec.check(large).findings
     (small,) = push([SESSION], TARGET).files
     assert content(server, SESSION.name) == SESSION.read_bytes() and small.sent_bytes == SESSION.stat().st_size
@@ -86,7 +87,7 @@ def test_the_same_again_sends_nothing_and_other_content_is_never_replaced(server
     # Sent by another program, in other parts: no ETag of ours, and still the same content.
     server.client.upload_file(str(large), BUCKET, "runs/large.mcap")
     (other,) = push([large], TARGET).files
-    assert other.read_back and not other.sent_bytes
+    assert other.compared == "by reading all of it" and not other.sent_bytes
     for changed in (large.read_bytes()[:-1] + b"x", b"short"):
         server.client.put_object(Bucket=BUCKET, Key="runs/large.mcap", Body=changed)
         refused = push([large, SESSION], TARGET)
@@ -195,6 +196,63 @@ def test_an_end_whose_answer_was_lost_is_no_failure(server: S3Server, large: Pat
     server.fault = fault
     assert not push([large], TARGET).failed and len(ends) == 3
     assert content(server, "large.mcap") == large.read_bytes()
+
+
+def test_progress_ends_with_the_size_of_the_file(server: S3Server, large: Path) -> None:
+    done: list[int] = []
+    bucket_upload.Bucket(UrlPath(TARGET)).upload("large.mcap", large, done.append)
+    assert done == sorted(done) and len(done) == LARGE_PARTS and done[-1] == large.stat().st_size
+
+
+def test_an_upload_of_another_file_is_not_continued(server: S3Server, large: Path) -> None:
+    key = {"Bucket": BUCKET, "Key": "runs/large.mcap"}
+    foreign = server.client.create_multipart_upload(**key)["UploadId"]
+    server.client.upload_part(**key, UploadId=foreign, PartNumber=1, Body=bytes(PART_BYTES))
+    push([large], TARGET)
+    assert [each["PartNumber"] for each in server.client.list_parts(**key, UploadId=foreign)["Parts"]] == [1]
+
+
+class Pretending:
+    """A client of a store that answers as if it had taken an object, and has stored something else or nothing."""
+
+    def __init__(self, client: Any, stored: bytes | None) -> None:
+        self._client, self._stored = client, stored
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._client, name)
+
+    def put_object(self, **words: Any) -> Any:
+        if self._stored is not None:
+            self._client.put_object(Bucket=words["Bucket"], Key=words["Key"], Body=self._stored)
+        return {"ETag": hashlib.md5(words["Body"]).hexdigest()}
+
+
+@pytest.mark.parametrize("kept", ["nothing", "a beginning", "zeros"])
+def test_a_store_that_answers_well_and_keeps_something_else_is_found_out(
+    server: S3Server, monkeypatch: pytest.MonkeyPatch, kept: str
+) -> None:
+    data = SESSION.read_bytes()
+    stored = {"nothing": None, "a beginning": data[:-1], "zeros": bytes(len(data))}[kept]
+    made = bucket_upload._client
+    monkeypatch.setattr(bucket_upload, "_client", lambda folder: Pretending(made(folder), stored))
+    done = push([SESSION], TARGET)
+    said = "is not there, although the store has taken it" if stored is None else "does not hold what was sent"
+    assert said in done.failed[SESSION] and not done.files and done.exit_status == 1
+
+
+def test_who_may_write_and_not_read_is_told_that_nothing_was_compared(server: S3Server) -> None:
+    server.fault = lambda method, _: 403 if method in ("GET", "HEAD") else None
+    done = push([SESSION], TARGET)
+    assert done.exit_status == 3 and str(done.files[0]).endswith("not compared: these credentials may not read it")
+    server.fault = lambda *_: None
+    assert content(server, SESSION.name) == SESSION.read_bytes()
+
+
+def test_what_a_store_does_not_offer_is_asked_for_once_and_called_so(server: S3Server) -> None:
+    server.fault = lambda method, _: 501 if method == "PUT" else None
+    with pytest.raises(FlowrecError, match=r"can not be written: the store does not offer what push needs \(501"):
+        push([SESSION], TARGET)
+    assert [method for method, _ in server.requests].count("PUT") == 1
 
 
 def test_a_part_that_arrives_otherwise_is_never_called_pushed(

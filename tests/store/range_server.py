@@ -52,6 +52,12 @@ class RangeServer:
                         file.seek(first)
                         answer(self, first, last, size, file.read(last - first + 1))
 
+            def do_HEAD(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Length", str(outer.path.stat().st_size))
+                self.send_header("ETag", '"1"')
+                self.end_headers()
+
         class Server(ThreadingHTTPServer):
             request_queue_size = 64
             daemon_threads = True

@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ from flowrec.store.session_path import UrlPath, session_path
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError
 from tests.conftest import HANG_S
 from tests.store.range_server import RangeServer, answer, served, some, status
-from tests.store.s3_server import BUCKET, s3_server
+from tests.store.s3_server import BUCKET, KEYS, s3_server
 
 SESSION = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 
@@ -91,6 +92,7 @@ FAULTS = {
     "shorter": (lambda to, a, b, size: answer(to, a, b - 1, size, b"x" * (b - a)) is None, "were asked for"),
     "other": (lambda to, a, b, size: answer(to, 7, 7 + b - a, size, b"x" * (b - a + 1)) is None, "were asked for"),
     "whole": (status(200), "can not be read in ranges"),
+    "no offer": (status(501), r"does not offer what is asked of it \(501\)"),
     "circle": (status(302, "/again"), "redirected more than 3 times"),
     "file": (status(302, "file:///etc/passwd"), "redirected from http to file"),
 }
@@ -115,6 +117,26 @@ def test_a_fault_that_passes_is_counted_and_does_no_harm(server: RangeServer, se
     before = TRAFFIC.repeated
     assert flowrec.compare(flowrec.open(session), flowrec.open(server.url), ignore=["drawings"]).identical
     assert TRAFFIC.repeated - before == 2
+
+
+@pytest.mark.parametrize("scheme", ["http", "s3"])
+def test_a_server_that_takes_the_last_bytes_for_the_first_is_asked_for_them_by_number(
+    server: RangeServer, session: Path, monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    whole = session.read_bytes()
+
+    def first_ones(to: BaseHTTPRequestHandler, first: int, last: int, size: int) -> bool:
+        if not to.headers["Range"].startswith("bytes=-"):
+            return False
+        answer(to, 0, last - first, size, whole[: last - first + 1])
+        return True
+
+    server.fault = first_ones
+    for name, value in {**KEYS, "AWS_ENDPOINT_URL": server.url.rpartition("/runs/")[0]}.items():
+        monkeypatch.setenv(name, value)
+    url = server.url if scheme == "http" else f"s3://{BUCKET}/{session.name}"
+    before = TRAFFIC.repeated
+    assert flowrec.open(url).last.track.same_as(flowrec.open(session).last.track) and TRAFFIC.repeated == before
 
 
 def test_a_verb_says_which_requests_it_has_repeated(
