@@ -114,7 +114,8 @@ def test_what_was_put_in_the_place_of_an_output_while_it_was_made_stays(tmp_path
 
 
 def test_what_a_killed_process_has_left_is_removed_and_nothing_that_may_be_in_use(tmp_path: Path) -> None:
-    other_host = tmp_path / temporary_name(".json").replace(".flowrec-", ".flowrec-0000000")[: -len("0000000.json")]
+    _, _, *numbers = name_of_the_dead().split("-")
+    other_host = tmp_path / "-".join((".flowrec", "0" * 8, *numbers))
     foreign = [other_host, tmp_path / ".flowrec-notes", tmp_path / ".flowrec-rrd"]
     for path in foreign:
         path.touch()
