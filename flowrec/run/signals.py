@@ -32,7 +32,7 @@ from typing import Any
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
 from flowrec.system.endings import status_of, stopped_by
-from flowrec.system.processes import realtime_priority
+from flowrec.system.processes import Priority, realtime_priority
 from flowrec.system.stderr import said_within
 
 assert sys.platform != "win32"  # there is no SIGHUP, SIGTSTP or pthread_kill
@@ -108,7 +108,7 @@ class Signals:
     # ---- the thread
 
     def _listen(self, pipe: int) -> None:
-        with realtime_priority(2):  # as the watchdog
+        with realtime_priority(Priority.DEVICE):  # as the watchdog
             while True:
                 ready, _, _ = select.select([pipe], [], [], _POLL_S)
                 for number in os.read(pipe, 64) if ready else b"":

@@ -21,7 +21,7 @@ from typing import Protocol
 
 from flowrec.errors import RigError
 from flowrec.messages import Currents
-from flowrec.system.processes import realtime_priority
+from flowrec.system.processes import Priority, realtime_priority
 
 ZERO_PATIENCE_S = 2.0  # time for zero() to succeed, with all its repetitions; then the run fails
 _RETRY_S = 0.02
@@ -213,7 +213,7 @@ class Watchdog:
 
     def _watch(self) -> None:
         # At a higher priority than the loop, which may be what uses all of the processor.
-        with realtime_priority(2):
+        with realtime_priority(Priority.DEVICE):
             while not self._over or not self.off:
                 self._wake.wait(self.check())
                 self._wake.clear()

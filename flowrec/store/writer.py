@@ -30,10 +30,11 @@ from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, NewMessages, WriteQueue
 from flowrec.system.locks import remove_idle
+from flowrec.system.processes import Priority, prioritise_thread
 from flowrec.topics import TOPICS, Tick
 from flowrec.units import NS_PER_S, nanoseconds
 
-_NICE = 5  # where there are too few cores for all, the control loop goes first
+_NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
 _DROPS_EVERY_NS = NS_PER_S // 2
 _MESSAGE_BYTES = 500  # about the size of a message without its pixels
 _FIELDS = tuple(topic.field for topic in TOPICS)
@@ -130,6 +131,11 @@ class SessionWriter:
     def partial_path(self) -> Path:
         """The file that is written at present."""
         return self._output.partial_path
+
+    def prioritise(self) -> bool:
+        """Let the thread write in real time, behind a loop that has that priority too; whether it is allowed."""
+        native_id = self._thread.native_id
+        return native_id is not None and prioritise_thread(native_id, Priority.WRITER)
 
     def write(self, tick: Tick) -> None:
         """Record what is new in this tick.
@@ -290,7 +296,8 @@ class SessionWriter:
             new["drops"] = self._drops = Drops(stamp_ns, FRAME_PATH, *now)
 
     def _work(self) -> None:
-        if sys.platform == "linux":  # only there has each thread a priority of its own
+        # Not in a live run: preempted by any other program, it would keep the interpreter's lock from the loop.
+        if self._block and sys.platform == "linux":  # only there has each thread a priority of its own
             with contextlib.suppress(OSError):
                 os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         try:

@@ -7,14 +7,24 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from concurrent.futures import ProcessPoolExecutor
 
-# Above every ordinary thread, below those of the kernel and of sound and field-bus servers, which ask for more.
-_PRIORITY = 1
+
+class Priority(IntEnum):
+    """Real-time priorities of SCHED_FIFO: what must not wait for what.
+
+    Above every ordinary thread, below those of the kernel and of sound and field-bus servers, which ask for more.
+    """
+
+    WRITER = 1  # an ordinary one would stand still, with the interpreter's lock, wherever the computer is busy
+    LOOP = 2
+    DEVICE = 3  # what reads devices, takes signals, or watches the loop
+    GUARDIAN = 4
 
 
 def child_command(module: str, *words: str) -> list[str]:
@@ -75,7 +85,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def realtime_priority(priority: int = _PRIORITY) -> Iterator[bool]:
+def realtime_priority(priority: int = Priority.LOOP) -> Iterator[bool]:
     """Run this thread with real-time priority where that is allowed; yields whether it is.
 
     For loops that wait for a camera; one that never waits would occupy a core. Threads and processes that are started
@@ -103,5 +113,15 @@ def prioritise_process(priority: int) -> bool:
         with suppress(OSError):
             for thread in Path("/proc/self/task").iterdir():
                 os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
+            granted = True
+    return granted
+
+
+def prioritise_thread(native_id: int, priority: int) -> bool:
+    """Give a running thread of this process real-time priority; whether that is allowed. Its children have none."""
+    granted = False
+    if sys.platform == "linux":
+        with suppress(OSError):
+            os.sched_setscheduler(native_id, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
             granted = True
     return granted

@@ -6,6 +6,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import threading
 from collections import Counter
 from dataclasses import fields, replace
 from functools import partial
@@ -25,7 +26,9 @@ from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
+from flowrec.system.processes import Priority
 from flowrec.topics import Tick
+from tests.conftest import until
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
 TICKS = list(ticks_of(150))
@@ -322,3 +325,18 @@ def test_a_file_of_the_run_that_another_one_replaced_meanwhile_is_not_removed(tm
         newer.replace(stale)
         writer.write(TICKS[0])
     assert stale.read_bytes() == b"of another run" and (tmp_path / "x.mcap").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there has each thread a priority of its own")
+def test_the_thread_of_a_live_run_is_never_behind_other_programs_and_in_real_time_it_is_behind_the_loop(tmp_path):
+    """Behind them it would stand still with the interpreter's lock, and images and loop with it."""
+    with SessionWriter(tmp_path / "live.mcap", HEADER, WriterOptions(block=False)) as writer:
+        (thread,) = (one for one in threading.enumerate() if one.name == "session-writer")
+        writer.write(TICKS[0])
+        until(lambda: not writer.queue_bytes)
+        assert os.getpriority(os.PRIO_PROCESS, thread.native_id) == os.getpriority(os.PRIO_PROCESS, 0)
+        if writer.prioritise():
+            assert os.sched_getscheduler(thread.native_id) == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            assert 1 <= os.sched_getparam(thread.native_id).sched_priority < Priority.LOOP < Priority.DEVICE
+        writer.write(TICKS[1])
+    assert len(list(SessionReader(tmp_path / "live.mcap").ticks())) == 2

@@ -25,7 +25,7 @@ import session_pb2
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
-from flowrec.system.processes import prioritise_process
+from flowrec.system.processes import Priority, prioritise_process
 from tests.twins.firmware import SAMPLE
 
 DEVICE, OUTPUTS, RANGE_V, MAX_RATE_HZ = "cDAQ1Mod1", 4, 10.0, 100_000.0
@@ -269,6 +269,6 @@ def serve(file: Path, reset_zeroes: bool = True) -> tuple[grpc.Server, int, NiTw
 
 if __name__ == "__main__":
     running, bound, _twin = serve(Path(sys.argv[1]), reset_zeroes=len(sys.argv) < 3)
-    prioritise_process(4)  # a device does not wait for the computer's other work
+    prioritise_process(Priority.GUARDIAN + 1)  # a device does not wait for the computer's other work
     print(bound, flush=True)
     sys.stdin.read()

@@ -22,7 +22,7 @@ from flowrec.messages import FlowField, Truth
 from flowrec.pipeline import Pipeline
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.system.processes import realtime_priority
+from flowrec.system.processes import Priority, realtime_priority
 from flowrec.units import NS_PER_S, seconds
 from tests.twins.coils import Device
 from tests.twins.firmware import SAMPLE
@@ -119,7 +119,7 @@ def live_world(
     over, begun = threading.Event(), threading.Event()
 
     def run() -> None:
-        with realtime_priority(3):  # a world does not wait for the computer's other work
+        with realtime_priority(Priority.GUARDIAN):  # a world does not wait for the computer's other work
             world.began_ns = time.monotonic_ns()
             for inputs in world.inputs():
                 assert inputs.frame is not None and inputs.truth is not None

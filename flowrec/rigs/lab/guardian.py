@@ -32,7 +32,7 @@ from collections.abc import Callable, Sequence
 from typing import Self
 
 from flowrec.errors import RigError
-from flowrec.system.processes import child_command, child_environment, prioritise_process
+from flowrec.system.processes import Priority, child_command, child_environment, prioritise_process
 
 SILENCE_S = 0.1
 ONLY_HARDWARE = (
@@ -228,7 +228,8 @@ def main(arguments: Sequence[str]) -> int:
         return 1
     gc.freeze()
     gc.disable()
-    prioritise_process(3)  # above the recorder; without the right to it the guardian is an ordinary process
+    # Above the recorder. Without the right to it the guardian is an ordinary process.
+    prioritise_process(Priority.GUARDIAN)
     os.set_blocking(status, False)
     _say(status, "ready")
     cause = watch(beats, silence_s, lambda: _say(status, ".", end=""), lambda: _say(status, f"probed {_try(zero)}"))

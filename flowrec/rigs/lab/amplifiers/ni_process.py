@@ -29,7 +29,7 @@ from flowrec.rigs.lab.amplifiers.limits import Limits
 from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, reason
 from flowrec.rigs.lab.amplifiers.ni_orders import Played, Settings
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
-from flowrec.system.processes import prioritise_process
+from flowrec.system.processes import Priority, prioritise_process
 from flowrec.units import NS_PER_S, seconds
 
 BLOCK_S = 0.05
@@ -144,7 +144,7 @@ class Server:
         device = NiDevice(settings.channels, settings.server, settings.coils.amplifier, LATENCY_S)
         device.take()
         self._device = device  # from now on its outputs are taken to zero at the end, whoever uses them
-        prioritise_process(2)  # now that the driver has started its threads
+        prioritise_process(Priority.DEVICE)  # now that the driver has started its threads
         self._connection.send(("info", self._device.info))
 
     def _arm(self) -> None:

@@ -38,7 +38,7 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
     reply,
     telemetry,
 )
-from flowrec.system.processes import realtime_priority
+from flowrec.system.processes import Priority, realtime_priority
 from flowrec.units import NS_PER_S, seconds
 
 if TYPE_CHECKING:
@@ -264,7 +264,7 @@ class SerialAmplifier:
     # ---- the reader's thread
 
     def _read(self) -> None:
-        with realtime_priority(2):  # what it reads is stamped on arrival
+        with realtime_priority(Priority.DEVICE):  # what it reads is stamped on arrival
             self._read_lines()
 
     def _read_lines(self) -> None:

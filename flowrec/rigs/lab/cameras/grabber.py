@@ -23,7 +23,7 @@ from flowrec.diagnostics import CameraLosses
 from flowrec.errors import RigError
 from flowrec.rigs.lab.cameras.block_ids import BlockIds
 from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Image, Wanted
-from flowrec.system.processes import realtime_priority
+from flowrec.system.processes import Priority, realtime_priority
 from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _SLICE_S = 0.1  # longest wait in the driver, so that the thread ends promptly
@@ -201,7 +201,7 @@ class Grabber:
 
     def _work(self) -> None:
         # Above the loop, which may be what uses all of the processor.
-        with realtime_priority(2):
+        with realtime_priority(Priority.DEVICE):
             camera = self._make()
             try:
                 self._connected(camera.open())
