@@ -129,6 +129,9 @@ def record(
         str | None,
         typer.Option(metavar="TIME[,TIME]", help="Record only the time before and after marks and alarms: 30s,10s."),
     ] = None,
+    accept_losses: Annotated[
+        bool, typer.Option("--accept-losses", help="Record in real time also where images will be lost.")
+    ] = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -147,6 +150,7 @@ def record(
             ("--duration", duration, lambda time_s: {"duration_s": time_s}, "60"),
             ("--split", split, _split, "2GB,10min"),
             ("--snapshot", snapshot, _snapshot, "30s,10s"),
+            ("--accept-losses", accept_losses or None, lambda _: {"recording.accept_losses": "true"}, ""),
         ]
     )
     chosen = load_config(config, [*(sets or []), *settings], flags)

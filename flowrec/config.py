@@ -81,6 +81,10 @@ class Recording:
     snapshot_mb: Annotated[float, Range(1e-3, 1e6)] = 1000.0
     # free space below which a run is ended as by Ctrl-C; 0: never
     disk_floor_gb: Annotated[float, Range(0.0, 1e6)] = 1.0
+    # In real time, before the file begins: the mission's methods are compiled, and for so long the camera's images are
+    # processed and written for trial, s. A machine that does not hold them is refused. 0: the run begins at once.
+    admission_s: Annotated[float, Range(0.0, 60.0)] = 2.0
+    accept_losses: bool = False  # record also where the trial says that images will be lost
     recover_leftovers: bool = True  # recover what killed runs have left in the same folder
     operator: str = ""
     notes: str = ""
@@ -151,6 +155,7 @@ _BEFORE: dict[str, Any] = {
     "sampler.without_map": False,
     "refine.place_robot": False,
     "mission.wait_at_goal_s": 0.0,
+    "recording.admission_s": 0.0,
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}

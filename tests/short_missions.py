@@ -9,6 +9,7 @@ SMALL = [
     "simulated.world=kind",
     "survey.method=downstream",
     "refine.assimilate.doubt_depth=false",
+    "recording.admission_s=0",  # what the machine holds beside all other tests is of no interest
 ]
 
 # In real time, and still under way however long a busy machine takes for what a test does meanwhile.

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from flowrec.errors import FlowrecError
 from flowrec.store.recovery import recover
-from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX
+from flowrec.store.run_files import PARTIAL_SUFFIX, SUFFIX, TRIAL_PREFIX
 from flowrec.system.locks import is_growing, try_lock
 from flowrec.system.processes import child_command, child_environment
 from flowrec.terminal import say, warn
@@ -34,7 +34,7 @@ def leftovers(folder: Path) -> list[Path]:
     try:
         found = [path for path in folder.iterdir() if path.name.endswith(_UNFINISHED) and path.is_file()]
         # A recovery that was killed leaves its draft and its input. Only the input is worth recovering.
-        found = [path for path in found if not path.name.endswith(_DRAFT)]
+        found = [path for path in found if not path.name.endswith(_DRAFT) and not path.name.startswith(TRIAL_PREFIX)]
         unfinished = [path for path in found if not is_growing(path)]
         return sorted(unfinished, key=lambda path: path.stat().st_mtime_ns, reverse=True)
     except OSError:

@@ -20,6 +20,7 @@ from flowrec.chip.chip import Chip
 from flowrec.commands.calibrate_image import registration_state, walls_state
 from flowrec.commands.doctor_settings import stand_in
 from flowrec.commands.record import refuse_adrift
+from flowrec.commands.rehearsal import rehearse
 from flowrec.config import Config, ResolvedConfig, registration_of
 from flowrec.control import Coils
 from flowrec.declarations import Image
@@ -29,6 +30,7 @@ from flowrec.resolve import resolve
 from flowrec.rig_settings import AMPLIFIERS, LAB
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
 from flowrec.session_writer import frames_of, image_bytes_s
+from flowrec.system import numba_setup
 from flowrec.system.durable import write_all
 from flowrec.system.leftovers import temporary_name
 from flowrec.view.viewer import executable, has_display
@@ -94,6 +96,8 @@ def diagnose(
         if chip is not None:
             known = chip
             yield from _look("mission", lambda: _mission(config, known))
+            if config.recording.admission_s:
+                yield from _look("kernels", lambda: _kernels(config))
         if asked.rig == LAB:
             yield from _look("camera", lambda: _camera(config, chip))
             yield from _look("coils", lambda: _coils(config))
@@ -161,6 +165,20 @@ def _mission(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
     yield Finding(
         "mission", OK, f"{', '.join(mission.phases)}; a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s"
     )
+
+
+def _kernels(config: ResolvedConfig) -> Iterator[Finding]:
+    """Compile what a live run would compile before it begins."""
+    known = numba_setup.kernels_cached()
+    begin_s = time.perf_counter()
+    rehearse(config)
+    if not numba_setup.kernels_cached():
+        text = "can not be kept, no folder for a cache can be written: each run compiles them, half a minute before it"
+        yield Finding("kernels", WARNING, f"{text}; set XDG_CACHE_HOME to a folder of your own")
+        return
+    once = f"compiled in {time.perf_counter() - begin_s:.0f} s, once after an installation"
+    text = "compiled before" if known else once
+    yield Finding("kernels", OK, f"{text}; a short simulated mission with this configuration's methods went through")
 
 
 def _camera(config: ResolvedConfig, chip: Chip | None) -> Iterator[Finding]:

@@ -16,8 +16,10 @@ import numpy as np
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
 from flowrec.clocks import ClockMonitor
+from flowrec.commands.admission import admitted
 from flowrec.commands.auto_recovery import recover_leftovers
 from flowrec.commands.interactive import Unattended
+from flowrec.commands.rehearsal import rehearse_aloud
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded, figures_of, files_text
 from flowrec.commands.watching import View, Watching
 from flowrec.config import Config, ResolvedConfig, registration_of
@@ -264,6 +266,14 @@ def record(
         stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
         if isinstance(rig, Connecting):
             stack.enter_context(rig.connected())  # before there is a file
+        tried = realtime and resolved.recording.admission_s > 0.0
+        if tried:
+            rehearse_aloud(resolved, control)
+        worker: Worker
+        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, resolved.worker.adopt_after_s)
+        stack.callback(worker.close)
+        if tried:
+            source |= admitted(rig, worker, (resolved, chip, pipeline), fields, folder, run_control)
         writer = stack.enter_context(
             session_writer(
                 output,
@@ -278,9 +288,6 @@ def record(
         )
         opened.append(writer)
         sinks: list[Sink] = [writer, statistics]
-        worker: Worker
-        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, resolved.worker.adopt_after_s)
-        stack.callback(worker.close)
         if fields:
             worker = Preloaded(worker, fields)
         disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
@@ -296,6 +303,7 @@ def record(
         # A run that is not in real time never waits: with real-time priority it would occupy a core.
         priority = realtime_priority() if realtime else nullcontext(enter_result=False)
         with control.shown(writer, disk) as show, priority as first:
+            writes_first = first and writer.prioritise()
 
             def on_tick(tick: Tick) -> None:
                 show(tick)
@@ -329,6 +337,7 @@ def record(
         outcome = as_text(facts) | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"
+            outcome["writer_priority"] = "real time" if writes_first else "ordinary"
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
         writer.close(outcome, CLOSE_TIMEOUT_S if run_control.reason else None, why=bad)
         _report_remarks(writer)

@@ -5,7 +5,7 @@ The table of rigs is in rig_settings.py, because the configuration names one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Protocol, Self, runtime_checkable
@@ -61,6 +61,14 @@ class Connecting(Protocol):
         ------
         RigError, UsageError : on entering; one line says which device is missing, busy or not as configured.
         """
+
+
+@runtime_checkable
+class Tried(Protocol):
+    """A rig whose images can be had before a run, to measure whether the machine holds them."""
+
+    def tried(self) -> Generator[Inputs]:
+        """The inputs of a run that gives no command, as often as asked; once connected, before the rig is entered."""
 
 
 def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callable[[], None]) -> Iterator[Inputs]:

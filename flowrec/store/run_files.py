@@ -28,6 +28,7 @@ from flowrec.units import seconds
 
 SUFFIX = ".mcap"
 PARTIAL_SUFFIX = ".partial"
+TRIAL_PREFIX = ".flowrec-admission-"  # of a file that only measures what the machine holds
 _ASKED, _PROBED, _OPENED = 8, 1000, 64  # parts at a URL: asked for at a time, by number at most, opened at a time
 _NUMBERED = re.compile(r"(?P<stem>.+)\.(?P<kind>part|snap)(?P<number>\d{3,6})")
 

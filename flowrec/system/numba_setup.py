@@ -47,6 +47,12 @@ def compiled(function: Function) -> Function:
         _config.CACHE_DIR = before
 
 
+def kernels_cached() -> bool:
+    """Whether kernels of this installation have been compiled. Imported with the module: see `_IMPORTED`."""
+    folder = _cache_folder()
+    return bool(folder) and any(Path(folder).rglob("*.nbi"))
+
+
 def kernel_files(package: Path = _PACKAGE) -> list[Path]:
     """The files of flowrec with kernels."""
     return sorted(path for path in package.rglob("*.py") if _IMPORTED in path.read_text(encoding="utf-8"))

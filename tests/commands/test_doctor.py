@@ -30,6 +30,7 @@ MEASURED = (
     "robot.max_speed_um_s=900.0",
     "robot.step_out_hz=40.0",
     "robot.delay_s=0.05",
+    "recording.admission_s=0",
 )
 SEEN = camera.Probe(
     CameraInfo("Maker Model", "7", 640, 512, 8, 20.0, pixel_format="Mono8"),
@@ -100,7 +101,13 @@ def test_a_disk_is_judged_by_what_the_camera_delivers(
     speed: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(doctor, "_write_speed", lambda _folder: speed)
-    assert levels(load_config(None, ["camera.rate_hz=20.0"]), tmp_path)["disk"] == level
+    assert levels(load_config(None, ["camera.rate_hz=20.0", "recording.admission_s=0"]), tmp_path)["disk"] == level
+
+
+def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_write_speed", lambda _folder: 1e9)
+    told = {one.what: one.text for one in diagnose(load_config(), folder=tmp_path)}
+    assert "mission with this configuration's methods went through" in told["kernels"]
 
 
 def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(

@@ -29,6 +29,7 @@ COMMON = (
     "chip.inlet_speed_um_s=40.0",  # slow: a computer that tests beside it delays frames by 0.1 s and more
     "mission.phases=plan,navigate",
     "mission.goal=[1100.0, 2700.0]",
+    "recording.admission_s=0",
 )
 RATE = "camera.rate_hz=20.0"
 # A computer that compiles, tests and renders beside the recorder stops it for longer than a lab's may.

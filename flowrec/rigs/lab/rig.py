@@ -12,8 +12,9 @@ them.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
+from copy import copy
 from dataclasses import replace
 from functools import partial
 
@@ -176,6 +177,12 @@ class LabRig:
                 )
             before_ns = stamp_ns
             frame = self._next(grabber)
+
+    def tried(self) -> Generator[Inputs]:
+        """The camera's images, without the coils."""
+        camera_only = copy(self)
+        camera_only.drive = None
+        yield from camera_only.inputs()
 
     # ---- the camera
 

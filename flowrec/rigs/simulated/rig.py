@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -232,6 +233,11 @@ class SimulatedRig:
                 clock=fit,
             )
             index += 1
+
+    def tried(self) -> Generator[Inputs]:
+        """The same world and camera; what a run does later does not depend on it."""
+        self.true_world()  # once for both
+        yield from copy(self).inputs()
 
     def _true_field(self) -> FlowField:
         return self.true_world().field

@@ -156,6 +156,17 @@ def test_while_a_camera_is_absent_the_field_is_off_and_ticks_without_an_image_go
     assert "the field is off until" in off and "back after" in back
 
 
+def test_images_are_tried_before_a_run_without_a_word_to_the_coils_and_the_run_counts_from_its_own_first() -> None:
+    rig, coils = rig_of(config_of(), gone=(60.0, 61.0), duration_s=0.3)
+    with rig.connected():
+        tried = [inputs for inputs, _ in zip(rig.tried(), range(4), strict=False)]
+        assert [one.frame.index for one in tried if one.frame is not None] == [0, 1, 2, 3]
+        assert list(coils.calls) == ["enter"] and not coils.beats
+        with rig:
+            first = next(rig.inputs())
+    assert first.stamp_ns == 0 and first.frame is not None and first.frame.index == 0
+
+
 def test_the_guardian_hears_the_loop_while_it_waits_for_the_first_frame() -> None:
     """A guardian that has ended by then ends the run before there is a field."""
     rig, coils = rig_of(config_of(), gone=(60.0, 61.0), duration_s=0.2)
