@@ -19,8 +19,9 @@ from flowrec.chip import (
     median_width_um,
     nearest_fluid,
 )
+from flowrec.chip.chip import Opening
 from flowrec.chip.clearance import opening_point_um
-from flowrec.chip.openings import find_openings, guess_inlets
+from flowrec.chip.openings import distance_um, find_openings, guess_inlets
 from flowrec.errors import ChipError
 from flowrec.flow import FlowSolver
 
@@ -284,3 +285,18 @@ def test_named_places_lie_in_the_middle_of_the_channel_behind_their_opening(name
         check_point(chip, opening_point_um(chip, place, 250.0), place, 70.0)
     with pytest.raises(ChipError, match="place 'inlet:7' is not on chip"):
         opening_point_um(chip, "inlet:7", 250.0)
+
+
+def test_the_distance_to_an_opening_is_that_to_the_border_of_the_image():
+    mask = np.ones((6, 9), bool)
+    chip = Chip("border", mask, 20.0, (), 1.0, 1000.0)
+    for side, row, column in (("left", 2, 0), ("right", 2, 8), ("top", 0, 4), ("bottom", 5, 4)):
+        opening = Opening(side, 0, 3 if side in ("left", "right") else 7, "outlet", 0.0)
+        # The centre of a border pixel is half a pixel, 10 um, from the border.
+        assert distance_um(chip, opening, 20.0 * np.array([column, row])) == pytest.approx(10.0)
+    left, right = (Opening(side, 0, 5, "outlet", 0.0) for side in ("left", "right"))
+    across = [distance_um(chip, opening, (70.0, 40.0)) for opening in (left, right)]
+    assert sum(across) == pytest.approx(9 * 20.0)
+    # Beside an opening: to its nearest place.
+    corner = replace(left, last=1)
+    assert distance_um(chip, corner, (0.0, 100.0)) == pytest.approx(np.hypot(10.0, 80.0))

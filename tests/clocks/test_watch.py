@@ -64,6 +64,18 @@ def test_a_wall_clock_that_is_set_is_told_at_once_and_with_its_size():
     assert "wall clock set 2 times, by -3598.000 s in all" in outcome["clocks"]
 
 
+@pytest.mark.parametrize(("set_ms", "told"), [(50, 1), (-50, 1), (5, 0)])
+def test_a_wall_clock_that_is_set_by_50_ms_is_told_and_one_that_is_slewed_is_not(set_ms, told):
+    clocks = TwoClocks()
+    watch = ClockMonitor(clocks)
+    for n in range(40):
+        clocks.now_ns = n * S // 20
+        clocks.wall_off_ns += set_ms * 1_000_000 * (n == 20)
+        message = watch.update(n * S // 20, None)
+    assert message.wall_jumps == told
+    assert ("wall clock set" in watch.outcome().get("clocks", "")) == bool(told)
+
+
 def test_both_clocks_are_read_at_one_moment():
     before = time.monotonic_ns(), time.time_ns()
     monotonic_ns, wall_ns = read_clocks()

@@ -198,3 +198,17 @@ def test_the_plane_turns_the_shorter_way_and_by_a_quarter_turn_at_most(plane, he
         if abs(way.plane_end_rad - plane) > 1e-9:  # a turn of the size of rounding errors may wait or not
             assert turned.slew_s == pytest.approx(way.slew_s, abs=1e-9)
         assert turned.slew_rad_s * turned.slew_s == pytest.approx(way.slew_rad_s * way.slew_s, abs=1e-6)
+
+
+@pytest.mark.parametrize("phase", [0.3, 1.2, 2.5, 4.0, 5.9])
+@pytest.mark.parametrize("heading", [0.6, 2.6, -2.6])
+def test_a_field_that_turns_as_fast_as_it_can_be_followed_takes_its_new_plane_where_it_is_vertical(phase, heading):
+    # No rate is left for the plane, forwards (0.6 rad) or backwards: any other instant would be a jump of the field.
+    way = field_motion(FieldState(phase, 0.0, FULL_MT), FieldCommand(20.0, heading, FULL_MT, 20.0, COILS.ramp_mt_s))
+    assert way.direction == (1 if abs(heading) < 1.5 else -1)
+    up = math.cos(float(way.phase(way.slew_s)))
+    assert abs(up) == pytest.approx(1.0, abs=1e-9)
+    time = np.linspace(0.0, 0.06, 6001)
+    theta, plane = way.phase(time), way.plane(time)
+    field = np.stack([np.sin(theta) * np.cos(plane), np.sin(theta) * np.sin(plane), np.cos(theta)], axis=1)
+    assert np.linalg.norm(np.diff(field, axis=0), axis=1).max() < 1.01 * 2.0 * math.pi * 20.0 * 1e-5

@@ -5,7 +5,7 @@ import pytest
 
 from flowrec.chip import clearance_um
 from flowrec.control import Controller
-from flowrec.control.delay_compensation import corrected_flow
+from flowrec.control.delay_compensation import FlowModel, corrected_flow, predict_position
 from flowrec.messages import Demand, Estimate, Route
 from tests.control.plant import CENTRE_UM, ROBOT, field_of, fly, lemniscate, mission, straight, vortex
 
@@ -221,3 +221,27 @@ def test_a_route_that_is_adopted_on_the_way_continues_the_reference_where_it_is(
         )
         assert demand.progress_s == pytest.approx(1.0 if held else 2.0)
         assert np.hypot(*(demand.reference_um - way)) == pytest.approx(0.0 if held else 300.0, abs=1.0)
+
+
+@pytest.mark.parametrize("delay_frames", [0.4, 1.0, 1.7, 3.0, 3.5])
+def test_the_predicted_position_is_where_the_demands_that_are_on_their_way_take_the_robot(delay_frames):
+    dt_s, rng = 0.04, np.random.default_rng(0)
+    delay_s = delay_frames * dt_s
+    sent = rng.uniform(-300.0, 300.0, (int(np.ceil(delay_frames)) + 1, 2))  # the last of them a frame ago
+    flow = np.array([70.0, -20.0])
+    # Each demand acts from one delay after it was sent until the next one does; from now until a delay later.
+    time = (np.arange(40_000) + 0.5) * delay_s / 40_000
+    index = np.floor((time - delay_s) / dt_s).astype(int)  # -1: sent a frame ago
+    expected = delay_s * (flow + sent[np.maximum(index, -len(sent))].mean(axis=0))
+    found = predict_position(np.zeros(2), sent, dt_s, delay_s, FlowModel(None, flow))
+    np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+@pytest.mark.parametrize(("stated_um_s", "least", "most"), [(3.0, 0.1, 0.5), (90.0, 0.7, 1.0)])
+def test_an_observer_is_believed_by_what_the_map_states_of_itself(stated_um_s, least, most):
+    steady = field_of(lambda x, y: (0.0 * x, 300.0 + 0.0 * x))
+    mapped = replace(steady, std_um_s=np.full_like(steady.velocity_um_s, stated_um_s))
+    covariance = np.diag([1.0, 1.0, 40.0**2, 40.0**2])
+    seen = Estimate(0, CENTRE_UM, np.array([60.0, 300.0]), covariance, 2.0, CENTRE_UM, True)
+    correction = corrected_flow(mapped, seen, np.zeros((0, 2)), 0.3, 0.0).at(CENTRE_UM)[0]
+    assert least * 60.0 < correction < most * 60.0

@@ -244,6 +244,21 @@ def test_under_a_hold_nothing_goes_on_and_no_limit_of_time_runs() -> None:
     assert outcomes.index("timeout") == 7  # of 2 x 4 s and 5 s the first 6 had passed
 
 
+def test_the_time_of_every_hold_is_taken_off_the_limits_and_not_that_of_the_last_alone() -> None:
+    world = World(phases=("navigate",), patience=2.0)
+    world.tick(assumed=field(0))
+    world.tick()
+    world.tick(route=route(1))
+    for hold_s in (20, 3):
+        world.tick(operator="pause")
+        for _ in range(hold_s - 1):
+            world.tick()
+        world.tick(operator="resume")
+    assert world.mission is not None and world.mission.held_ns == 23 * 10**9
+    outcomes = [world.tick().outcome for _ in range(15)]
+    assert outcomes.index("timeout") == 11  # of 2 x 4 s and 5 s two had passed
+
+
 def test_a_held_robot_that_is_carried_off_is_swept_until_it_is_back() -> None:
     world = World(phases=("navigate",))
     world.tick(assumed=field(0))

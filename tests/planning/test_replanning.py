@@ -44,6 +44,14 @@ def test_a_route_that_gains_more_than_its_uncertainty_is_taken_and_begins_as_the
     assert at[0] == pytest.approx(at[1])
 
 
+def test_in_a_map_that_is_certain_a_route_that_is_a_few_per_cent_better_is_taken() -> None:
+    chip, field = loop(fast=-60.0)
+    present = present_route(-190.0)
+    new = better_route(Planner(), field, None, present, 0.3, EAST, chip, SWIMMER)
+    gained = 1.0 - new.arrival_s[-1] / present.arrival_s[-1]
+    assert 0.03 < gained < 0.1 and "another route gains" in new.reason
+
+
 def test_the_present_route_is_kept_where_the_gain_is_within_its_noise_or_none() -> None:
     present, sure = replanned(fast=0.0, believed_fast=-190.0, share=0.05)
     assert sure.waypoints_um[:, 1].max() < 300.0

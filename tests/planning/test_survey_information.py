@@ -91,6 +91,19 @@ def test_the_gain_that_is_expected_is_the_one_that_observations_bring():
     assert need.error(expected) < need.error(uncertainty.covariance)
 
 
+@pytest.mark.parametrize("noisier", [0.5, 3.0])
+def test_observations_that_scatter_more_than_they_state_tell_less_by_the_square_of_that(noisier):
+    chip, field = junction()
+    way, arrival_s = np.array([[445.0, 300.0], [445.0, 145.0], [1245.0, 145.0]]), np.array([0.0, 5.0, 30.0])
+
+    def told(uncertainty):
+        sampling = Sampling(spacing_um=20.0, interval_s=0.0, noise_um_s=2.0, rolling_share=0.02)
+        return Looks.none(uncertainty, sampling, chip, 30.0, 0.0).information(way, arrival_s)
+
+    stated = unknown(chip, field, (0.3, 0.3))
+    np.testing.assert_allclose(told(replace(stated, noise_factor=noisier)), told(stated) / noisier**2)
+
+
 def upper_part(chip, field):
     """The part of the squared speed that is in doubt."""
     square = (field.velocity_um_s[chip.mask].astype(float) ** 2).sum(axis=1)
