@@ -24,6 +24,7 @@ _NO_CAUSE = re.compile(
 )
 # From where on a cause is one: as the sentences have it (refine/findings.py), the depth by what a lab knows of it.
 _ROBOT, _SCALE, _ANGLE_DEG, _OFFSET_PX, _WALLS_PX, _PUMP, _DEPTH = 0.02, 0.005, 0.3, 0.25, 0.25, 0.03, 0.05
+_MOVED = "the chip lies .* from where the registration puts it"  # also by a wrong scale or angle: where the survey was
 _SIDE = 0.5  # of an offset: the part along an axis from where on its side has to be right
 
 
@@ -59,10 +60,12 @@ def _of_the_camera(config: ResolvedConfig, chip: Chip) -> Iterator[str]:
     share = true.um_per_px / stated.um_per_px - 1.0
     if abs(share) > _SCALE:
         yield f"the image scale is .* % {'larger' if share > 0.0 else 'smaller'} than stated"
+        yield _MOVED
     turned_deg = (true.angle_deg - stated.angle_deg + 180.0) % 360.0 - 180.0
     if abs(turned_deg) > _ANGLE_DEG and true.mirror == stated.mirror:
         clockwise = (turned_deg > 0.0) != stated.mirror
         yield f"the chip is turned by .* degrees {'' if clockwise else 'counter'}clockwise"
+        yield _MOVED
     middle_px = 0.5 * (np.array([camera.width_px, camera.height_px]) - 1.0)
     x, y = stated.to_um(middle_px) - true.to_um(middle_px)  # where the registration puts the chip: short by this
     size = float(np.hypot(x, y))
@@ -72,7 +75,7 @@ def _of_the_camera(config: ResolvedConfig, chip: Chip) -> Iterator[str]:
             for along, words in ((x, "to the left" if x < 0.0 else "to the right"), (y, "up" if y < 0.0 else "down"))
             if abs(along) > _SIDE * size
         ]
-        yield "the chip lies .* from where the registration puts it .*" + ".*".join(sides)
+        yield f"{_MOVED} .*" + ".*".join(sides)
     if config.simulated.value("shake_um") > 0.0:
         yield "the image shakes at"
 

@@ -139,6 +139,9 @@ def test_a_warning_counts_where_it_names_the_planted_cause_on_its_side(fault, se
     assert named(note(sentence), causes()) == (0, 1)  # nothing is planted
     if other_side:
         assert named(note(sentence.replace(*other_side)), causes(fault)) == (0, 1)
+    # A wrong scale also moves the chip, to a side that depends on where the survey was.
+    moved = "the chip lies 27 +- 10 um from where the registration puts it (25 um to the right, 11 um up)"
+    assert named(moved, causes(fault))[0] == int("um_per_px" in fault or "angle" in fault)
     assert named("assimilated 8 observations; they say nothing about outlet 1 (right)", causes(fault)) == (0, 0)
 
 
