@@ -49,7 +49,7 @@ from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import Floats, ObservationOperator
 from flowrec.refine.obstacles import PLACES, Obstacle, likely_obstacles, with_shape_error
 from flowrec.refine.prior import PriorSettings
-from flowrec.refine.report import report
+from flowrec.refine.report import over_error, report
 
 LEAST_GAIN = 4.0  # in ln evidence, before other walls than the chip's are taken
 LARGEST_PX = 30_000  # fluid pixels of a chip for which depths and walls are tried: each is a geometry of its own
@@ -373,8 +373,7 @@ class Assimilate(PriorSettings):
             names += ["obstacle_x_um", "obstacle_y_um"]
             values = np.append(values, [x_um, y_um])
             stds = np.append(stds, 2 * [obstacle.half_width_px * chip.um_per_px])
-        change = (velocity_um_s - problem.assumed.velocity_um_s)[chip.mask]
-        moved = float(np.linalg.norm(change)) / max(float(np.linalg.norm(std_um_s[chip.mask])), 1e-12)
+        moved = over_error((velocity_um_s - problem.assumed.velocity_um_s)[chip.mask], std_um_s[chip.mask])
         note = report(chip, problem.operator, best, [*wrong, *also.words], moved)
         return replace(
             problem.assumed,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.refine.hypothesis import NOISE, Fitted
@@ -47,6 +48,11 @@ def report(chip: Chip, operator: ObservationOperator, best: Fitted, causes: Sequ
     if moved < 1.0 and best.gain() < LEAST_GAIN:
         parts.append("they do not ask for another flow than the assumed one")
     return "; ".join([*parts, *_unobserved(chip, covariance, best.observed.model.prior)])
+
+
+def over_error(change: NDArray[np.floating], std: NDArray[np.floating]) -> float:
+    """The size of a change of a field over that of its standard deviation, of the same shape."""
+    return float(np.linalg.norm(change)) / max(float(np.linalg.norm(std)), 1e-12)
 
 
 def _unobserved(chip: Chip, posterior: Floats, prior: Prior) -> list[str]:

@@ -81,10 +81,10 @@ class Laboratory:
     noise_um_s: float = 2.0  # stated and, unless `noisier` than that, true
     noisier: float = 1.0
     across_um: float = 25.0  # how far from the middle of the channels the robot goes
-    step_s: float = 0.25
+    step_s: float = 0.35
     radius_um: float | None = RADIUS_UM  # None: not stated
 
-    def survey(self, true: FlowField, seed: int = 0, count: int = 80) -> Observations:
+    def survey(self, true: FlowField, seed: int = 0, count: int = 56) -> Observations:
         """Observations along the upper branch, with headings that vary."""
         rng = np.random.default_rng(seed)
         way = [np.linspace(a, b, int(np.abs(b - a).max() / 5), endpoint=False) for a, b in pairwise(_CORNERS_UM)]

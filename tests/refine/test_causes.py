@@ -47,16 +47,6 @@ def found(refined, name):
     return float(refined.parameters[index]), float(refined.parameter_std[index])
 
 
-@pytest.mark.parametrize("gain", [-0.14, 0.12])
-def test_um_per_revolution_is_found_where_the_headings_vary_and_the_note_says_so(twin, gain):
-    case = twin()
-    refined = SETTINGS.refine(case.assumed, flown(case, gain=gain), case.chip, case.solver)
-    value, std = found(refined, "um_per_rev_share")
-    assert value == pytest.approx(gain, abs=0.04) and std < 0.04
-    assert f"% {'less' if gain < 0 else 'more'} per revolution than stated" in refined.note
-    assert case.error(refined) < 0.04
-
-
 def test_where_the_headings_never_vary_the_note_says_that_it_is_unknown_and_the_error_bars_contain_it(twin):
     case = twin(truth=(120.0, 0.0, 0.0))
     scores = []
@@ -80,13 +70,6 @@ def test_a_planted_line_of_the_pump_is_found_at_its_frequency_and_the_flow_is_th
     assert found(refined, line)[0] == pytest.approx(0.25, abs=0.05)
     assert case.error(refined) < 0.06
     assert "the pump pulsates by" in refined.note
-
-
-def test_a_steady_flow_has_no_line_and_no_cause_beyond_doubt(twin):
-    case = twin()
-    refined = SETTINGS.refine(case.assumed, flown(case), case.chip, case.solver)
-    assert "pump_" not in refined.parameter_names
-    assert not any(word in refined.note for word in ("pulsates", "per revolution than", "registration", "wanders"))
 
 
 def test_an_offset_of_the_registration_is_found_in_its_direction(twin):
