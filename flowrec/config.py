@@ -42,7 +42,7 @@ from flowrec.rig_settings import RIGS, SIMULATED, Camera, CameraSettings, Lab, M
 from flowrec.robot import Robot, RobotSettings
 from flowrec.simulated_settings import FIRST_WORLD, WORLDS, Simulated
 from flowrec.system.toml_file import parse_toml, read_toml
-from flowrec.vision import Tracker
+from flowrec.vision import Stabiliser, Tracker
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +112,7 @@ class Config:
     movie: Movie = field(default_factory=Movie)
     lab: Lab = field(default_factory=Lab)
     start: Start = field(default_factory=Start)
+    stabilise: Stabiliser = field(default_factory=Stabiliser)
     tracker: Tracker = field(default_factory=Tracker)
     observer: Observer = field(default_factory=Observer)
     health: HealthMonitor = field(default_factory=HealthMonitor)
@@ -291,6 +292,11 @@ def check_config(config: Config, origin: Origin | None = None, known: frozenset[
         raise UsageError(
             f"{origin('recording')}: recording.snapshot_before_s keeps single moments and recording.split_mb, split_s "
             "all of a run; set one of them to 0"
+        )
+    if config.stabilise.on and recording.region == "robot":
+        raise UsageError(
+            f"{origin('stabilise.on', 'recording.region')}: stabilise.on reads the walls in every image, which "
+            "recording.region = 'robot' does not keep; set recording.region = 'whole', or stabilise.on = false"
         )
     if config.mission.observes and len(config.mission.phases) > 1:
         raise UsageError(

@@ -251,6 +251,28 @@ class Appearance(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Background(Message):
+    """What the solid of the chip looks like in the image to which later ones are registered."""
+
+    stamp_ns: int
+    # Column, row, grey level, and the change of the grey level per pixel along columns and rows. n = 0: the image shows
+    # no structure of the solid, so no shift can be measured.
+    pixels: Annotated[Matrix, Shape("n", 5)]
+    noise: float  # of a pixel, one standard deviation in grey levels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shift(Message):
+    """How far the image lies from where the registration of the chip holds, because the stage or the camera shakes."""
+
+    stamp_ns: int
+    shift_px: Vector2  # columns, rows: what the registration puts at p is seen at p + shift
+    found: bool  # False: the image is not like the background, and the shift is the one before
+    alike: float  # share of the background that agrees, 0 to 1
+    rests: bool = False  # the image rests: it did not move for a second, and small shifts are noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Estimate(Message):
     """The observer's estimate of the robot and of the flow that carries it."""
 

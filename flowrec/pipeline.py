@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +29,14 @@ from flowrec.interpolation import nearest_pixel
 from flowrec.messages import (
     Appearance,
     Applied,
+    Background,
     Estimate,
     FlowField,
     Frame,
     Observations,
     OperatorEvent,
     Route,
+    Shift,
     Track,
     Truth,
 )
@@ -41,7 +44,7 @@ from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
 from flowrec.topics import BY_FIELD, TOPICS, Tick
-from flowrec.vision import Tracker, unseen
+from flowrec.vision import Stabiliser, Tracker, carried, unseen
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +62,8 @@ class Inputs:
     true_field: FlowField | None = None  # likewise
     track: Track | None = None  # the recorded one, if `frame` was dropped
     appearance: Appearance | None = None  # likewise, if it changed then
+    background: Background | None = None  # likewise
+    shift: Shift | None = None  # likewise
     clock: Fit | None = None  # of the camera's clock, with which the stamp was made
     losses: CameraLosses | None = None  # of the camera so far, for the record only
 
@@ -66,7 +71,9 @@ class Inputs:
 # Fields of a Tick that arrive from outside, and those of them that stay known until the next message.
 ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.TRUTH))
 HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
-if {each.name for each in fields(Inputs)} != {"stamp_ns", "track", "appearance", "clock", "losses", *ARRIVING}:
+# The results of the stages that read the image: where it was not recorded, a replay takes these.
+FROM_IMAGE = ("track", "appearance", "background", "shift")
+if {each.name for each in fields(Inputs)} != {"stamp_ns", *FROM_IMAGE, "clock", "losses", *ARRIVING}:
     raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
 
 
@@ -80,6 +87,7 @@ class Pipeline:
     clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
     image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
     image_bits: int  # depth of their pixels
+    stabiliser: Stabiliser
     tracker: Tracker
     observer: Observer
     health: HealthMonitor
@@ -105,6 +113,7 @@ def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
         clearance_um=clearance_um(chip.mask, chip.um_per_px),
         image_shape=(config.camera.height_px, config.camera.width_px),
         image_bits=config.camera.bits,
+        stabiliser=config.stabilise,
         tracker=config.tracker,
         observer=config.observer,
         health=config.health,
@@ -152,19 +161,44 @@ def _strength(coils: Coils, last: Tick) -> float:
     return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
 
 
-def _seen(p: Pipeline, last: Tick, inputs: Inputs) -> tuple[Track, Appearance | None]:
+class Sight(NamedTuple):
+    """What an image shows: the robot, how it looks, and how far the image lies off."""
+
+    track: Track | None = None
+    appearance: Appearance | None = None
+    background: Background | None = None
+    shift: Shift | None = None
+
+
+def look(p: Pipeline, last: Sight, frame: Frame) -> Sight:
+    """What the next image shows."""
+    shift, background = p.stabiliser.register(
+        last.shift, last.background, last.track, frame, p.chip, p.calibration, p.robot
+    )
+    previous, off_px = last.track, (0.0, 0.0)
+    if shift is not None:
+        off_px = float(shift.shift_px[0]), float(shift.shift_px[1])
+        if previous is not None and last.shift is not None:
+            previous = carried(previous, shift.shift_px - last.shift.shift_px)
+    found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, off_px)
+    return Sight(*found, background, shift)
+
+
+def _seen(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
     """Position of the robot, when it was last seen, and how it looks. A repeated image counts as not seen."""
-    previous, known = last.track, last.appearance
+    previous, before = last.track, Sight(last.track, last.appearance, last.background, last.shift)
     if inputs.applied.repeats_image and previous is not None:
-        return unseen(previous, inputs.stamp_ns), known
+        return before._replace(track=unseen(previous, inputs.stamp_ns))
     if inputs.frame is None:
         assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
-        return inputs.track, inputs.appearance if inputs.appearance is not None else known
-    track, appearance = p.tracker.follow(previous, known, inputs.frame, p.chip, p.calibration, p.robot)
-    if inputs.applied.image_since_ns is None:
-        return track, appearance
+        new = {name: message for name in FROM_IMAGE if (message := getattr(inputs, name)) is not None}
+        return before._replace(**new)
+    sight = look(p, before, inputs.frame)
+    track = sight.track
+    if inputs.applied.image_since_ns is None or track is None:
+        return sight
     before_ns = previous.seen_ns if previous is not None else None
-    return replace(track, seen_ns=track.stamp_ns if track.seen else before_ns), appearance
+    return sight._replace(track=replace(track, seen_ns=track.stamp_ns if track.seen else before_ns))
 
 
 def _no_lap(_stage: str) -> None:
@@ -182,7 +216,9 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     p = pipeline
     tick = with_inputs(last, inputs)
     flow, route = tick.field, tick.route
-    track, appearance = _seen(p, last, inputs)
+    sight = _seen(p, last, inputs)
+    track, appearance = sight.track, sight.appearance
+    assert track is not None, "the tracker says of every image whether it shows the robot"
     lap("track")
     estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow, last.health)
     # The robot with the estimated um_per_rev, if the observer estimates it.
@@ -241,6 +277,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         tick,
         track=track,
         appearance=appearance,
+        background=sight.background,
+        shift=sight.shift,
         estimate=estimate,
         health=health,
         observations=observations,

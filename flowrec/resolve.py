@@ -22,12 +22,13 @@ from flowrec.interpolation import nearest_pixel
 from flowrec.planning.feasibility import swept_out, too_swift
 from flowrec.planning.free_space import CourseError, FastFlowMargin
 from flowrec.planning.survey import SURVEYS
-from flowrec.rig_settings import OF_SIMULATED_CAMERA, SIMULATED, Camera
+from flowrec.rig_settings import MOVIE, OF_SIMULATED_CAMERA, SIMULATED, Camera
 from flowrec.robot import USUAL_DELAY_S, Robot
 
 _FASTEST_CAMERA_HZ = 500.0  # about what the loop keeps up with: a tick takes 1.5 ms
 _MAY_BE_NONE = ("camera.centre_um", "camera.residual_um")  # None is a value
 _ONLY_FOR_DRIVING = ("robot.max_speed_um_s", "robot.step_out_hz", "robot.delay_s")
+_USUAL_UM_S = 600.0  # top speed of a robot of which none is stated
 _HOLD_START_S = 1.0  # the ramp of the coils and the first solution of the flow take less
 _PLACE_RADII = 5.0  # from a named opening into the chip
 _OUTLET_START_RADII = (_PLACE_RADII, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
@@ -39,9 +40,10 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
     """Choose the settings that are None to fit the chip, place the camera, and turn named places into points.
 
     A robot that is not described fits the chip: radius 50 um, or a fifth of the median channel width if that is
-    narrower, but at least three camera pixels; v_max 600 um/s, or 1.3 times the fastest assumed flow; a delay of 40 ms,
-    or the time through a fifth of a channel at v_max if that is shorter. On another rig these numbers have to be given,
-    but for those that only matter for driving the robot where it is only observed. Walls that may lie elsewhere by an
+    narrower, but at least three camera pixels; v_max 600 um/s, of a body in a movie its radius per image if that is
+    less, or 1.3 times the fastest assumed flow; a delay of 40 ms, or the time through a fifth of a channel at v_max if
+    that is shorter. On another rig these numbers have to be given, but for those that only matter for driving the robot
+    where it is only observed. Walls that may lie elsewhere by an
     amount that is not stated may do so by more than any margin. `derived` lists the numbers.
 
     Raises
@@ -76,14 +78,17 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
         _refuse_apart(chip, mission)
     tracker = replace(config.tracker, polarity=config.tracker.polarity or "auto")
     simulated = config.simulated.with_preset() if config.rig == SIMULATED else config.simulated
-    sections = {"tracker": tracker, "plan": plan, "survey": survey, "simulated": simulated}
+    shaky = config.rig != SIMULATED and config.recording.region == "whole"  # it reads the walls in every image
+    stabilise = replace(config.stabilise, on=shaky if config.stabilise.on is None else config.stabilise.on)
+    sections = {"stabilise": stabilise, "tracker": tracker, "plan": plan, "survey": survey, "simulated": simulated}
     return _narrowed(ResolvedConfig, config, robot=robot, camera=camera, mission=mission, **sections)
 
 
 def derived(asked: Config, resolved: ResolvedConfig) -> dict[str, float]:
     """The numbers that resolving a configuration has filled in or changed, by key; without those of a named world."""
     was, now = _flat(asdict(asked), ""), _flat(asdict(replace(resolved, simulated=asked.simulated)), "")
-    return {key: value for key, value in now.items() if isinstance(value, (int, float)) and value != was[key]}
+    numbers = {key: value for key, value in now.items() if isinstance(value, (int, float))}
+    return {key: value for key, value in numbers.items() if not isinstance(value, bool) and value != was[key]}
 
 
 def _flat(tree: Mapping[str, Any], prefix: str) -> dict[str, Any]:
@@ -149,7 +154,10 @@ def _fitted(config: Config, chip: Chip) -> tuple[Robot, Camera]:
         radius_um = round(min(max(min(50.0, 0.2 * channel_um), 3.0 * um_per_px), 0.25 * channel_um), 2)
     if speed_um_s is None:
         peak = float(np.linalg.norm(config.flow.solve(chip).velocity_um_s, axis=-1).max())
-        speed_um_s = max(600.0, round(1.3 * peak, 1))
+        usual = _USUAL_UM_S
+        if config.rig == MOVIE and rate_hz is not None:  # a small body that nobody drives goes its radius in an image
+            usual = min(usual, round(radius_um * rate_hz, 1))
+        speed_um_s = max(usual, round(1.3 * peak, 1))
     if delay_s is None:
         delay_s = round(min(USUAL_DELAY_S, 0.2 * channel_um / speed_um_s), 5)
     if step_out_hz is None:

@@ -17,6 +17,7 @@ from flowrec.enums import WorkOrder
 from flowrec.messages import (
     Appearance,
     Applied,
+    Background,
     Currents,
     Demand,
     Estimate,
@@ -28,6 +29,7 @@ from flowrec.messages import (
     Observations,
     OperatorEvent,
     Route,
+    Shift,
     Track,
     Truth,
 )
@@ -40,7 +42,7 @@ _SOLVE = SlowStage({WorkOrder.SOLVE: ("flow", "refine.assimilate")}, reads=(), s
 _REFINE = SlowStage(
     {WorkOrder.REFINE: ("sampler", "flow", "refine")},
     reads=("assumed", "refined", "observations"),
-    settings=("tracker", "observer", "sampler", "refine", "mission"),
+    settings=("stabilise", "tracker", "observer", "sampler", "refine", "mission"),
 )
 _PLAN = SlowStage(
     {
@@ -85,6 +87,8 @@ class Tick:
     ] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
+    background: Annotated[Background | None, Topic("/camera/background", Source.STAGE, 1e-6)] = None
+    shift: Annotated[Shift | None, Topic("/camera/shift", Source.STAGE, 1e-6)] = None
 
     @property
     def field(self) -> FlowField | None:

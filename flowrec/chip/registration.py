@@ -68,6 +68,11 @@ class Calibration:
         """(2, 3): chip coordinates in um of (column, row, 1)."""
         return np.column_stack((self.um_per_px * self.axes.T, self.origin_um))
 
+    def moved(self, shift_px: tuple[float, float]) -> Calibration:
+        """The transform for an image that lies `shift_px` (columns, rows) farther than this one is for."""
+        x_um, y_um = self.to_um((-shift_px[0], -shift_px[1])).tolist()
+        return Calibration(self.um_per_px, (x_um, y_um), self.angle_deg, self.mirror)
+
     def to_um(self, points_px: ArrayLike) -> NDArray[np.float64]:
         """Camera pixels (..., 2) as (column, row) to chip coordinates (..., 2) in um."""
         turned = self._turned(np.asarray(points_px, np.float64), back=True)

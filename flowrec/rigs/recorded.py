@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from flowrec.messages import Currents
-from flowrec.pipeline import ARRIVING, Inputs
+from flowrec.pipeline import ARRIVING, FROM_IMAGE, Inputs
 from flowrec.store.reader import SessionReader
 from flowrec.topics import Tick
 
@@ -55,9 +55,8 @@ class RecordedRig:
                     before = tick
                     continue  # a crash left the inputs without an image: nothing to replay
                 self.frames_missing += not tick.applied.without_image
-                new["track"] = tick.track
-                if tick.appearance is not before.appearance:
-                    new["appearance"] = tick.appearance
+                from_image = {name: getattr(tick, name) for name in FROM_IMAGE}
+                new |= {name: known for name, known in from_image.items() if known is not getattr(before, name)}
             yield Inputs(tick.stamp_ns, **({"frame": None} | new))
             before = tick
 

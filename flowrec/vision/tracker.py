@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.chip.chip import Chip
 from flowrec.chip.registration import Calibration
@@ -120,11 +121,17 @@ class Tracker:
         chip: Chip,
         calibration: Calibration,
         robot: Robot,
+        shift_px: tuple[float, float] = (0.0, 0.0),
     ) -> tuple[Track, Appearance | None]:
-        """The robot in this frame, and how it looks; the given appearance itself if nothing new is known of it."""
+        """The robot in this frame, and how it looks; the given appearance itself if nothing new is known of it.
+
+        `shift_px` (columns, rows): how far the image lies from where the calibration holds.
+        """
         if self.polarity is None:
             return self.track(previous, frame, chip, calibration, robot), None
         walls = walls_in_view(chip, calibration, (frame.image.shape[0], frame.image.shape[1]))
+        if any(shift_px):
+            walls, calibration = walls.moved(shift_px), calibration.moved(shift_px)
         scene = _Scene(frame, walls, calibration, robot)
         if appearance is None:
             return self._first_look(previous, scene)
@@ -359,6 +366,14 @@ def _not_seen(previous: Track | None, scene: _Scene, search: Search) -> Track:
         radius_px=search.expected_px,
         roi_px=np.array(search.box, np.float64),
     )
+
+
+def carried(previous: Track, by_px: NDArray[np.float64]) -> Track:
+    """A track as the next image shows it, which lies `by_px` (2,) farther: the neighbours are places in the image."""
+    if not previous.neighbours_px.size or not by_px.any():
+        return previous
+    moved = previous.neighbours_px.reshape(-1, 3) + np.array([by_px[0], by_px[1], 0.0])
+    return replace(previous, neighbours_px=moved.ravel())
 
 
 def unseen(previous: Track, stamp_ns: int) -> Track:

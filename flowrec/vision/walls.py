@@ -23,6 +23,18 @@ class Walls:
     distance_px: NDArray[np.float32]  # (h, w), negative in solid
     box: Box
 
+    def moved(self, shift_px: tuple[float, float]) -> Walls:
+        """The same walls in an image that lies `shift_px` (columns, rows) farther."""
+        (x, y), (height, width), (x0, y0, x1, y1) = shift_px, self.distance_px.shape, self.box
+        to_image = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+        distance = cv2.warpAffine(self.distance_px, to_image, (width, height), borderMode=cv2.BORDER_REPLICATE)
+        columns, rows = (
+            (min(max(each + round(by), 0), most) for each in ends)
+            for ends, by, most in (((x0, x1), x, width), ((y0, y1), y, height))
+        )
+        (left, right), (top, bottom) = columns, rows
+        return Walls(np.asarray(distance, np.float32), (left, top, right, bottom))
+
 
 @lru_cache(maxsize=4)
 def walls_in_view(chip: Chip, calibration: Calibration, shape: tuple[int, int]) -> Walls:
