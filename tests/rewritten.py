@@ -14,6 +14,8 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from flowrec.store.digest import channel_digest, digest_record, head_digest, message_digest
+from flowrec.store.viewer_topics import VIEWER_TOPICS
+from flowrec.topics import TOPICS
 
 Edit = Callable[[Channel, Message, Any], bool]  # edits the decoded message; True where it did
 EditHead = Callable[[Attachment | Metadata | Schema | Channel], None]
@@ -36,20 +38,23 @@ def rewrite(
     keep_digest: bool = True,
     redigest: bool = False,
     drop: str = "",
-    until_ns: int | None = None,
+    until: float | None = None,
     notes: dict[str, str] | None = None,
 ) -> int:
     """Copy a session message by message; returns how many messages were edited.
 
-    `drop` names a topic of which nothing is left, messages later than `until_ns` are left out, `notes` are added as a
-    metadata record of another program. `redigest`: the digest is made again, as whoever can write the file can.
+    `drop` names a topic of which nothing is left, `until` is the share of its time after which nothing is left, `notes`
+    are added as a metadata record of another program. `redigest`: the digest is made again, as whoever can write the
+    file can.
     """
     edited, head = 0, 0
     counts, sums = Counter[int](), Counter[int]()
     with source.open("rb") as read, target.open("wb") as write:
         reader = make_reader(read)
         header, summary = reader.get_header(), reader.get_summary()
-        assert summary is not None
+        assert summary is not None and summary.statistics is not None
+        first_ns, last_ns = summary.statistics.message_start_time, summary.statistics.message_end_time
+        until_ns = last_ns if until is None else first_ns + int(until * (last_ns - first_ns))
         writer = Writer(write, chunk_size=1 << 20, compression=CompressionType.ZSTD)
         writer.start(header.profile, header.library)
         for attachment in reader.iter_attachments():
@@ -75,7 +80,7 @@ def rewrite(
         if notes is not None:
             writer.add_metadata("lab.notes", notes)
         for _, channel, message in reader.iter_messages():
-            if channel.topic == drop or (until_ns is not None and message.log_time > until_ns):
+            if channel.topic == drop or message.log_time > until_ns:
                 continue
             data = message.data
             if edit is not None:
@@ -157,3 +162,73 @@ def _other(value: Any, field: Any) -> Any:
     if isinstance(value, int):
         return value + 1
     return value * 1.001 + 0.001 if value == value else 0.5
+
+
+def edit_of_value(topic: str) -> Edit:
+    """Changes one value of the first message of a topic."""
+    todo = [topic]
+
+    def edit(channel: Channel, _: Message, wire: Any) -> bool:
+        if channel.topic not in todo:
+            return False
+        todo.clear()
+        # Of an array the last bit of a byte may be within the tolerance, and another shape can not be read.
+        leaves = leaves_of(wire)
+        changes = [change for name, change in leaves if "." not in name] or [change for _, change in leaves]
+        changes[-1]()
+        return True
+
+    return edit
+
+
+def edit_of_number(attribute: str) -> Edit:
+    """Adds one to the time or the number of each image."""
+
+    def edit(channel: Channel, message: Message, _: Any) -> bool:
+        if channel.topic == "/camera/frame":
+            setattr(message, attribute, getattr(message, attribute) + 1)
+        return False
+
+    return edit
+
+
+def edit_of_declaration(what: str) -> EditHead:
+    """Another role, depth or schema of the images."""
+
+    def edit(record: Attachment | Metadata | Schema | Channel) -> None:
+        if isinstance(record, Channel) and record.topic == "/camera/frame" and what != "schema":
+            record.metadata.update({what: "8" if what == "bits" else "output"})
+        elif isinstance(record, Schema) and what == "schema":
+            record.data = record.data.replace(b"frame_id", b"frame_it")
+
+    return edit
+
+
+# Every way to edit a session that we know, by name: arguments of `rewrite`, and what `compare` says is different.
+EDITS: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
+    **{
+        f"a value of {path}": (lambda path=path: {"edit": edit_of_value(path)}, path)
+        for path in (*(topic.path for topic in TOPICS), *(view.path for view in VIEWER_TOPICS))
+    },
+    **{
+        f"{name} of the head": (lambda name=name: {"edit_head": edit_of_head(name, operator="somebody else")}, part)
+        for name, part in (
+            ("flowrec.provenance", "provenance"),
+            ("flowrec.parent", "parent"),
+            ("flowrec.outcome", "outcome"),
+            ("config.toml", "configuration"),
+            ("chip.toml", "chip"),
+            ("chip.png", "chip"),
+        )
+    },
+    **{
+        f"{what} of the images": (lambda what=what: {"edit_head": edit_of_declaration(what)}, "/camera/frame")
+        for what in ("bits", "role", "schema")
+    },
+    "time of the images": (lambda: {"edit": edit_of_number("log_time")}, "ticks"),
+    "number of the images": (lambda: {"edit": edit_of_number("sequence")}, "/camera/frame"),
+    "the appearance taken out": (lambda: {"drop": "/robot/appearance"}, "/robot/appearance"),
+    "the truth taken out": (lambda: {"drop": "/truth/robot"}, "/truth/robot"),
+    "the drawn path taken out": (lambda: {"drop": "/view/path"}, "/view/path"),
+    "the end cut off": (lambda: {"until": 0.9}, "ticks"),
+}

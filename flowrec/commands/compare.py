@@ -8,7 +8,7 @@ ran; that is told as every other difference is, with the option that leaves it o
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -19,6 +19,7 @@ from flowrec.commands.comparison import Comparison, Difference, Side
 from flowrec.commands.session_parts import (
     HEAD,
     PartOfHead,
+    RawTopic,
     at_text,
     compared_heads,
     declared_topics,
@@ -43,6 +44,9 @@ GROUPS = (*_ROLES, _DRAWINGS, "head")
 # What differs between any two runs, and between a recording and its replay: when, where and how quickly they ran.
 _BY_NATURE = ("provenance", "parent", "outcome", "start", "diagnostics")
 _NAMED = 6  # topics and parts of the head that the verdict names
+
+
+Raws = tuple[Mapping[str, RawTopic], Mapping[str, RawTopic]]  # of both sessions, by topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,9 +260,11 @@ def compare(
             found.covered = replace(found.covered, done=found.covered.total, topics=topics, head=HEAD)
             return found
         _compare_heads(found, sessions)
-        _compare_raw(found, sessions)
+        raw = raw_topics(sessions[0], choice), raw_topics(sessions[1], choice)
+        _compare_raw(found, raw)
         _compare_ticks(found, sessions, progress)
         _compare_declared(found, sessions)
+        _compare_unread(found, sessions, raw)
         _compare_digests(found, sessions)
     except KeyboardInterrupt as error:
         ended = Ended.of(error)
@@ -304,9 +310,9 @@ def _compare_heads(found: SessionComparison, sessions: tuple[Session, Session]) 
     found.covered = replace(found.covered, head=tuple(part.name for part in found.head))
 
 
-def _compare_raw(found: SessionComparison, sessions: tuple[Session, Session]) -> None:
+def _compare_raw(found: SessionComparison, raw: Raws) -> None:
     """Compare the topics that are no field of `Tick`."""
-    was, now = (raw_topics(session, found.choice) for session in sessions)
+    was, now = ({topic: each for topic, each in side.items() if topic not in BY_PATH} for side in raw)
     for topic in dict.fromkeys((*was, *now)):
         if topic not in was or topic not in now:
             found.apart[topic] = f"only in {found.names[topic not in was]}"
@@ -326,6 +332,18 @@ def _compare_declared(found: SessionComparison, sessions: tuple[Session, Session
         texts = [f"{key} {was[topic].get(key, '-')}, {now[topic].get(key, '-')}" for key in keys if key != "schema"]
         if keys:
             found.apart[topic] = f"declared otherwise: {'; '.join(texts) or 'another schema'}"
+
+
+def _compare_unread(found: SessionComparison, sessions: tuple[Session, Session], raw: Raws) -> None:
+    """Messages that are the same in all that flowrec reads, and not in the file: fields of foxglove's schemas."""
+    if sessions[0].header.start_unix_ns != sessions[1].header.start_unix_ns:
+        return  # the wall clock is in them
+    for topic, count in found.comparison.topics.items():
+        told = topic in found.apart or count.different or count.within_tolerance
+        if not told and topic in raw[0] and topic in raw[1]:
+            _, wrong, stamp_ns = raw[0][topic].same_as(raw[1][topic])
+            if wrong:
+                found.apart[topic] = f"{wrong} differ in what flowrec does not read{at_text(stamp_ns)}"
 
 
 def _compare_digests(found: SessionComparison, sessions: tuple[Session, Session]) -> None:

@@ -15,8 +15,8 @@ from typing import Any
 
 from flowrec.errors import printable
 from flowrec.session import Session, toml_table
+from flowrec.store.channels import FRAME_PATH
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata, is_header_file
-from flowrec.topics import BY_PATH
 from flowrec.units import seconds
 
 HEAD = (
@@ -161,7 +161,7 @@ class RawTopic:
 
 
 def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, RawTopic]:
-    """The topics of a session that are no field of `Tick`: drawings for viewers, and those of other programs.
+    """The topics of a session as they are in the file, but for images.
 
     The copies with which a part of a run begins are left out, as by a reader.
     """
@@ -171,7 +171,7 @@ def raw_topics(session: Session, chosen: Callable[[str], bool]) -> dict[str, Raw
             wanted = {
                 number: channel.topic
                 for number, channel in opened.channels.items()
-                if channel.topic not in BY_PATH and chosen(channel.topic)
+                if channel.topic != FRAME_PATH and chosen(channel.topic)
             }
             for chunk in opened.chunks:
                 if chunk.message_index_offsets and not wanted.keys() & chunk.message_index_offsets.keys():

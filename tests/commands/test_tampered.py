@@ -26,7 +26,7 @@ from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
 from flowrec.topics import TOPICS, Tick
-from tests.rewritten import leaves_of, parser_of, rewrite
+from tests.rewritten import EDITS, leaves_of, parser_of, rewrite
 from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
 
@@ -97,6 +97,25 @@ def test_every_value_of_a_message_is_under_the_digest(topic: str, small: Path, t
         assert rewrite(small, edited, edit) == 1
         assert any(f"damaged or edited at {topic}, in its messages" in text for text in digest_findings(edited)), name
         edited.unlink()
+
+
+@pytest.mark.parametrize("name", EDITS)
+def test_an_edit_is_a_difference_and_check_never_says_more_than_it_knows(
+    name: str, small: Path, tmp_path: Path
+) -> None:
+    arguments, different = EDITS[name]
+    left, out, again = (tmp_path / f"{kind}.mcap" for kind in ("left", "out", "again"))
+    rewrite(small, left, **arguments())
+    rewrite(small, out, **arguments(), keep_digest=False)
+    rewrite(small, again, **arguments(), redigest=True)
+    # Between whom wrote the digest nothing tells: of a file that agrees with itself no more is said.
+    assert [check(path).integrity.partition(" at ")[0] for path in (left, out)] == ["damaged or edited"] * 2
+    assert check(again).integrity == "consistent, unsigned"
+    for path in (left, out, again):
+        status, said = run("compare", small, path, "--json")
+        found = json.loads(said)
+        assert status == 3 and found["same"] is False
+        assert different in found["different"], said
 
 
 def test_one_pixel_of_a_large_image_is_under_the_digest(tmp_path: Path) -> None:
