@@ -58,6 +58,7 @@ class Signals:
     watchdog : of the coils; None for a replay, which has none: then only the signals that end a run are handled.
     give_up : closes what is open, within a second; returns what a person must know of the file.
     leave_terminal : restores the terminal.
+    clock : monotonic time in s.
     """
 
     def __init__(
@@ -66,7 +67,9 @@ class Signals:
         watchdog: Watchdog | None = None,
         give_up: Callable[[], str] = lambda: "",
         leave_terminal: Callable[[], None] = lambda: None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self._control = control
         self._watchdog = watchdog
         self._give_up = give_up
@@ -118,7 +121,7 @@ class Signals:
                 if self._control.must_interrupt:
                     signal.pthread_kill(self._main, signal.SIGALRM)
                 driven = self._watchdog is not None and self._watchdog.timeout_s is not None
-                late = self._deadline_s is not None and time.monotonic() > self._deadline_s
+                late = self._deadline_s is not None and self._clock() > self._deadline_s
                 if late or (driven and self._control.stuck):
                     self._end_process()
 
@@ -141,7 +144,7 @@ class Signals:
             self._watchdog.trip(reason)
         self._control.skip_ramp()
         if self._deadline_s is None:
-            self._deadline_s = time.monotonic() + _AT_ONCE_S
+            self._deadline_s = self._clock() + _AT_ONCE_S
 
     def _suspend(self) -> None:
         """Stop the process, but never with a field on."""

@@ -84,6 +84,7 @@ class WriterOptions:
     leave_out : topics that are not recorded, as names or patterns such as `/view/*`.
     bits : depth of the images; another one is refused.
     keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
+    clock : monotonic time in s, by which data is flushed and synced.
     """
 
     frames: str = "zstd"
@@ -97,6 +98,7 @@ class WriterOptions:
     leave_out: tuple[str, ...] = ()
     bits: int = 8
     keep_failed: bool = True
+    clock: Callable[[], float] = time.monotonic
 
     @property
     def left_out_topics(self) -> frozenset[str]:
@@ -276,7 +278,7 @@ class AsyncFileWriter(SessionFile):
         super().__init__(path, header, options)
         self.finished = False
         self._limit_bytes = limit_bytes
-        self._synced_s, self._synced_size = time.monotonic(), 0
+        self._synced_s, self._synced_size = options.clock(), 0
         self._waiting_bytes = 0
         self._written = threading.Condition()
         self._failure: BaseException | None = None
@@ -348,7 +350,7 @@ class AsyncFileWriter(SessionFile):
         self._sync()
 
     def _sync(self) -> None:
-        now, size = time.monotonic(), self.size
+        now, size = self._options.clock(), self.size
         if now >= self._synced_s + self._options.sync_interval_s and self._synced_size < size:
             self.sync()
             self._synced_s, self._synced_size = now, size

@@ -7,7 +7,6 @@ their own stamps. A part is finished in a side thread, because the writer's thre
 from __future__ import annotations
 
 import contextlib
-import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -63,7 +62,7 @@ class PartFile(SessionFile):
         self._raw_bytes = 1  # of what was added
         self._writing_keyframe: Future[None] | None = None
         self._held: list[SealedChunk] = []
-        self._flushed_s = self._synced_s = time.monotonic()
+        self._flushed_s = self._synced_s = self._options.clock()
         self._synced_size = 0
         self._since_ns: int | None = None  # stamp of the last flush, or of the first entry
         self._last_ns = 0
@@ -73,7 +72,7 @@ class PartFile(SessionFile):
             try:
                 self._synced_size = self.size
                 self.sync()
-                self._synced_s = time.monotonic()
+                self._synced_s = self._options.clock()
             except BaseException:
                 self.close()
                 raise
@@ -89,11 +88,11 @@ class PartFile(SessionFile):
         if self._writing_keyframe is not None:
             return _POLL_S
         if self._encoder.size:
-            return max(0.0, self._flushed_s + self._options.flush_interval_s - time.monotonic())
+            return max(0.0, self._flushed_s + self._options.flush_interval_s - self._options.clock())
         if self._synced_size < self.size:
             # While the last fsync is still running there is nothing to do about the next one.
             shortest = _POLL_S if self._sync_running else 0.0
-            return max(shortest, self._synced_s + self._options.sync_interval_s - time.monotonic())
+            return max(shortest, self._synced_s + self._options.sync_interval_s - self._options.clock())
         return None
 
     def is_larger_than(self, megabytes: float, awaited_bytes: int) -> bool:
@@ -137,7 +136,8 @@ class PartFile(SessionFile):
     def flush_if_due(self) -> None:
         """Write and sync the data whose interval has passed."""
         self._check_keyframe(wait=False)
-        options, now, stamps_s = self._options, time.monotonic(), seconds(self._last_ns - (self._since_ns or 0))
+        options, stamps_s = self._options, seconds(self._last_ns - (self._since_ns or 0))
+        now = options.clock()
         if now >= self._flushed_s + options.flush_interval_s or stamps_s >= options.flush_interval_s:
             self._flush()
         if now >= self._synced_s + options.sync_interval_s and self._synced_size < self.size and not self._sync_running:
@@ -168,7 +168,7 @@ class PartFile(SessionFile):
 
     def _flush(self) -> None:
         self._write_waiting()
-        self._flushed_s, self._since_ns = time.monotonic(), self._last_ns
+        self._flushed_s, self._since_ns = self._options.clock(), self._last_ns
 
     def _write_waiting(self) -> None:
         self._encoder.seal()

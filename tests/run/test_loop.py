@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flowrec.commands.record import record
+from flowrec.commands.record import prepare, record
 from flowrec.config import load_config
 from flowrec.estimation import Observer
 from flowrec.messages import Estimate
 from flowrec.pipeline import assemble
+from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.run.loop import run
+from flowrec.run.workers import LockstepWorker
 from flowrec.store.reader import SessionReader
+from flowrec.topics import Tick
 from flowrec.units import NS_PER_S
 from tests.short_missions import SMALL
 
 BREAKS_NS = NS_PER_S // 2
+_LONG_S = 5.0  # for the watchdog's thread to act, on a busy machine
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,3 +61,25 @@ def test_a_stage_that_fails_leaves_the_inputs_that_broke_it_as_the_last_tick_and
     for name in ("track", "estimate", "demand", "currents", "mission", "timing"):
         made, known = getattr(last, name), getattr(before, name)
         assert made is known is None or made.same_as(known), name
+
+
+def test_a_stage_that_fails_loses_the_field_before_anything_is_written_however_long_the_disk_takes() -> None:
+    prepared = prepare(load_config(None, SMALL), aloud=False)
+    gone, seen = threading.Event(), []
+
+    class Rig(SimulatedRig):
+        def zero(self) -> None:
+            super().zero()
+            gone.set()
+
+    class Hanging:
+        """A sink that, for the tick of the failure, hangs until the field is gone, or for seconds."""
+
+        def write(self, tick: Tick) -> None:
+            if tick.stamp_ns >= BREAKS_NS:
+                seen.append(gone.wait(_LONG_S))
+
+    pipeline = replace(prepared.pipeline, observer=Breaking(prepared.config.observer.method))
+    with pytest.raises(ValueError, match="the observer is broken"):
+        run(pipeline, Rig.of(pipeline, prepared.config, 1.0), LockstepWorker(pipeline, 0.1), [Hanging()])
+    assert seen == [True]

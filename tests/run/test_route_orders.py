@@ -62,3 +62,26 @@ def test_how_wrong_the_flow_may_be_is_computed_for_a_survey_that_asks_for_it_alo
         ordered(survey, SimpleNamespace(plan=lambda *_: NOWHERE))
     assert given == ["how wrong the flow may be", None]
     assert [SurveyPlanner(method).needs_uncertainty for method in ("information", "downstream")] == [True, False]
+
+
+def test_a_pause_takes_nothing_from_the_time_of_a_survey():
+    given = []
+    pipeline = SimpleNamespace(
+        survey=SimpleNamespace(needs_uncertainty=False, plan=lambda order: given.append(order.left_s) or NOWHERE),
+        mission=SimpleNamespace(survey_limit_s=100.0, lead_s=2.0),
+        **{"robot": robot(600.0), "sampler": Sampler(), "hindsight": None, "chip": None},
+    )
+    order = SimpleNamespace(
+        stamp_ns=75_000_000_000,
+        estimate=SimpleNamespace(covariance=np.eye(4)),
+        health=SimpleNamespace(limit_hz=None),
+        route=SimpleNamespace(arrival_s=np.array([0.0, 7.0])),
+        demand=SimpleNamespace(progress_s=4.0),
+        **{"field": 1, "observations": None},
+    )
+    for held_ns in (0, 60_000_000_000):
+        phase = {"phase": Phase.SURVEY, "since_ns": 5_000_000_000, "held_ns": held_ns}
+        where = {"start_um": np.zeros(2), "goal_um": np.ones(2), "speed_limit_um_s": None}
+        survey_route(pipeline, order, SimpleNamespace(**phase, **where))
+    # Of 100 s the survey has used 70, or 10 if it was held for 60; 3 s of the way under way are still to come.
+    assert given == [pytest.approx(27.0), pytest.approx(87.0)]

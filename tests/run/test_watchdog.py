@@ -8,13 +8,16 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from typing import cast
 
 import numpy as np
 import pytest
 
+from flowrec.enums import Action
 from flowrec.errors import RigError
 from flowrec.messages import Currents
 from flowrec.run.control import RAMP_PATIENCE_S, Interrupted, RunControl
+from flowrec.run.signals import Signals
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
 from tests.conftest import until
 
@@ -239,3 +242,52 @@ def test_a_late_zero_keeps_the_reason_of_the_guard() -> None:
     assert event is not None
     assert (event.action, event.text) == ("zero", "guard: no tick for 0.5 s")
     assert control.overdue
+
+
+def test_a_field_that_must_go_at_once_waits_behind_no_note_or_mark() -> None:
+    control = RunControl()
+    for number in range(3):
+        control.request(Action.NOTE, f"note {number}")
+    control.mark()
+    control.stop("guard: no tick", zero=True)
+    taken = [event.action for event in iter(lambda: control.next_event(0, held=False), None) if event is not None]
+    assert taken == [Action.ZERO, Action.NOTE, Action.NOTE, Action.NOTE, Action.MARK]
+
+
+def test_whoever_insists_has_the_process_ended_after_3_s_where_the_main_thread_does_not_end_the_run() -> None:
+    now_s, ended, looks = [100.0], threading.Event(), [0]
+
+    class Stubborn:
+        """A control whose run goes on whatever it is told."""
+
+        stuck = False
+
+        @property
+        def must_interrupt(self) -> bool:
+            looks[0] += 1
+            return False
+
+        def skip_ramp(self) -> None: ...
+
+    class Watched(Signals):
+        def _end_process(self) -> None:
+            ended.set()
+            self._over = True
+
+    driver = Driver()
+    watchdog = guarded(driver)
+    before = signal.signal(signal.SIGQUIT, lambda *_: None)
+    try:
+        with Watched(cast(RunControl, Stubborn()), watchdog, clock=lambda: now_s[0]).handled():
+            signal.raise_signal(signal.SIGQUIT)
+            until(lambda: watchdog.reason)
+            seen = looks[0]
+            until(lambda: looks[0] > seen)  # it has been taken
+            now_s[0] += 2.9
+            seen = looks[0]
+            until(lambda: looks[0] > seen + 2)
+            assert not ended.is_set()
+            now_s[0] += 0.2
+            until(ended.is_set)
+    finally:
+        signal.signal(signal.SIGQUIT, before)

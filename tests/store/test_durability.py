@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flowrec.config import load_config
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
 from flowrec.store.channels import SLOTS
@@ -23,7 +24,8 @@ from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.scan import scan
-from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_file import Split, WriterOptions
+from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, WriteQueue
 from flowrec.store.writer import SessionWriter
 from flowrec.topics import Tick
@@ -367,3 +369,36 @@ def test_the_operating_system_has_all_state_but_the_last_flush_s_of_stamps(tmp_p
             while writer.queue_bytes:
                 time.sleep(1e-4)
             assert (writer._output.flushed_ns or ticks[0].stamp_ns) >= tick.stamp_ns - NS_PER_S // 2
+
+
+def test_with_the_shipped_settings_a_power_cut_costs_a_second_on_the_slowest_disk_that_the_promise_allows(
+    tmp_path, monkeypatch
+):
+    """The clock is the test's: every fsync takes just less than half a second of it."""
+    recording = load_config().recording
+    now_s, done, sync = [100.0], threading.Semaphore(0), McapWriter.sync
+
+    def slow(file):
+        assert done.acquire(timeout=HANG_S)
+        sync(file)
+
+    options = WriterOptions(flush_s=recording.flush_s, sync_s=recording.sync_s, clock=lambda: now_s[0])
+    parts = Parts(tmp_path / "s.mcap", HEADER, options, Split(), "run")
+    monkeypatch.setattr(McapWriter, "sync", slow)
+    part = parts._router.current.segment
+    kept_ns, asked, lost_s, syncs = TICKS_BEGIN_NS, None, [], 0
+    for tick in ticks_of(400, shape=(8, 8)):  # 6.7 s
+        parts.add(Entry(tick.stamp_ns, {"track": tick.track, "truth": tick.truth}, 500, 1))
+        parts.flush_if_due()
+        if asked is None and part._sync_running:  # for what the operating system has now
+            asked = parts.flushed_ns, now_s[0] + 0.49
+        elif asked is not None and now_s[0] >= asked[1]:
+            done.release()
+            part._join_sync()
+            kept_ns, asked, syncs = asked[0], None, syncs + 1
+        lost_s.append(seconds(tick.stamp_ns - kept_ns))
+        now_s[0] += seconds(PERIOD_NS)
+    done.release()
+    parts.close()
+    assert syncs > 5
+    assert max(lost_s) <= 1.0 + 2.0 * seconds(PERIOD_NS)

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
+from flowrec.store.channels import FRAME_PATH
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
@@ -21,7 +22,7 @@ from flowrec.store.run_files import snapshot_path
 from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.units import NS_PER_S
-from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
+from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk
 from tests.store.test_split import messages_in, same
@@ -115,6 +116,16 @@ def test_a_mark_keeps_the_seconds_before_and_after_it_as_they_were(tmp_path, mon
         assert order == list(range(order[0], order[0] + len(order)))
 
 
+@pytest.mark.parametrize("in_time", [True, False])
+def test_a_snapshot_begins_with_the_image_before_its_first_tick_whenever_that_reached_the_ring(tmp_path, in_time):
+    """In time: with its tick. Otherwise behind all ticks, as where the disk is slow."""
+    (path,) = record(tmp_path / "x.mcap", with_events((400, ("mark", ""))), block=in_time).files
+    first, last, _ = span_of(path)
+    with path.open("rb") as stream:
+        images = [message.log_time - START_UNIX_NS for _, _, message in make_reader(stream).iter_messages([FRAME_PATH])]
+    assert images == [tick.stamp_ns for tick in QUIET[first - 1 : last + 1]]
+
+
 def test_events_that_meet_share_a_snapshot_and_later_ones_get_their_own(tmp_path):
     ticks = with_events((150, ("mark", "")), (200, ("note", "a bubble")), (450, ("mark", "again")))
     first, second = record(tmp_path / "x.mcap", ticks).files
@@ -139,8 +150,9 @@ def test_alarms_lost_images_and_bad_ends_are_events_and_what_a_person_is_told_is
             yield replace(tick, event=Event(at, level if number >= 300 else "info", "NIS"))
 
     assert record(tmp_path / "info.mcap", told("info")).files == []
-    (alarm,) = record(tmp_path / "alarm.mcap", told("warning")).files
-    assert span_of(alarm)[2]["flowrec.part"]["why"] == "NIS"
+    for level in ("warning", "error"):
+        (alarm,) = record(tmp_path / f"{level}.mcap", told(level)).files
+        assert span_of(alarm)[2]["flowrec.part"]["why"] == "NIS"
     lost = [replace(tick, frame=replace(tick.frame, index=n + (n > 300) + (n > 500))) for n, tick in enumerate(QUIET)]
     (lost,) = record(tmp_path / "lost.mcap", lost, Snapshot(4.0, 1.0)).files  # the second is no news after the first
     assert span_of(lost)[2]["flowrec.part"]["why"] == "images are lost"

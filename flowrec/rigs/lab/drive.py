@@ -46,6 +46,8 @@ class Drive:
     limits : of every command.
     silence_s : of the guardian.
     patience_s : longest time from one command to the next while a field is on. A loop that only waits stops to beat.
+    guardian : makes the guardian, not yet entered.
+    clock : monotonic time in s.
 
     Attributes
     ----------
@@ -61,7 +63,16 @@ class Drive:
 
     info: AmplifierInfo
 
-    def __init__(self, amplifier: Amplifier, limits: Limits, silence_s: float, patience_s: float) -> None:
+    def __init__(
+        self,
+        amplifier: Amplifier,
+        limits: Limits,
+        silence_s: float,
+        patience_s: float,
+        guardian: Callable[..., Guardian] = Guardian,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._make_guardian, self._clock = guardian, clock
         self._amplifier, self._limits = amplifier, limits
         self._silence_s, self._patience_s = silence_s, patience_s
         self._stack = ExitStack()
@@ -83,13 +94,14 @@ class Drive:
             stack.callback(self._amplifier.close)
             self._limits.check(self.info)
             self._check_beats()
-            self._guardian = stack.enter_context(Guardian(*self._amplifier.guard(), silence_s=self._silence_s))
+            made = self._make_guardian(*self._amplifier.guard(), silence_s=self._silence_s)
+            self._guardian = stack.enter_context(made)
             self._amplifier.arm()
             stack.callback(self._amplifier.zero)
             self._stack = stack.pop_all()
         self._taken_away = False
         self._command, self._accounted = _REST, None
-        self._commanded_s = time.monotonic()
+        self._commanded_s = self._clock()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -106,7 +118,7 @@ class Drive:
         """
         if self._taken_away:
             return
-        now_s = time.monotonic()
+        now_s = self._clock()
         self._send(self._limits.admit(currents, time.monotonic_ns()), now_s)
         self._commanded_s = now_s
 
@@ -122,7 +134,7 @@ class Drive:
         ------
         RigError : see `apply`.
         """
-        now_s = time.monotonic()
+        now_s = self._clock()
         if now_s - self._commanded_s <= self._patience_s or self._command.amplitude_mt == 0.0:
             self._send(self._command, now_s)
 
@@ -159,7 +171,7 @@ class Drive:
     def _send(self, command: FieldCommand, now_s: float | None = None) -> None:
         guardian = self._guardian
         assert guardian is not None, "commands are for the inside of the context"
-        now_s = time.monotonic() if now_s is None else now_s
+        now_s = self._clock() if now_s is None else now_s
         command = _REST if self._taken_away else command
         if command.amplitude_mt > 0.0:
             self._on_until_s = float("inf")

@@ -29,6 +29,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Self
 
 from flowrec.errors import RigError
@@ -54,9 +55,17 @@ class Guardian:
     ----------
     action : KIND and its arguments, see above; descriptors : what the child inherits for them.
     silence_s : longest time between beats while a field is on.
+    clock : monotonic time in s.
     """
 
-    def __init__(self, action: Sequence[str], descriptors: Sequence[int] = (), silence_s: float = SILENCE_S) -> None:
+    def __init__(
+        self,
+        action: Sequence[str],
+        descriptors: Sequence[int] = (),
+        silence_s: float = SILENCE_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._action = tuple(action)
         self._descriptors = tuple(descriptors)
         self.silence_s = silence_s
@@ -122,7 +131,7 @@ class Guardian:
             raise RigError(self.tripped or f"the guardian process has ended ({error}); the run ends") from error
         if self.tripped:
             raise RigError(self.tripped)
-        now_s = time.monotonic()
+        now_s = self._clock()
         self._unanswered_s = now_s if self._unanswered_s is None else self._unanswered_s
         if now_s - self._unanswered_s > _ANSWER_S:
             raise RigError(f"the guardian process has not answered for {_ANSWER_S:g} s; the run ends")
@@ -232,7 +241,12 @@ def main(arguments: Sequence[str]) -> int:
     prioritise_process(Priority.GUARDIAN)
     os.set_blocking(status, False)
     _say(status, "ready")
-    cause = watch(beats, silence_s, lambda: _say(status, ".", end=""), lambda: _say(status, f"probed {_try(zero)}"))
+    cause = watch(
+        partial(_heard, beats),
+        silence_s,
+        lambda: _say(status, ".", end=""),
+        lambda: _say(status, f"probed {_try(zero)}"),
+    )
     if not cause:
         return 0
     begin_s = time.monotonic()
@@ -241,21 +255,40 @@ def main(arguments: Sequence[str]) -> int:
     return 3
 
 
-def watch(beats: int, silence_s: float, answer: Callable[[], None], probe: Callable[[], None]) -> str:
-    """Read beats until there is a reason to act. Returns it; '' at an orderly end."""
-    energised, heard_s = False, time.monotonic()
+def _heard(beats: int, timeout_s: float | None) -> bytes | None:
+    """What the recorder says; b'' at the end of its pipe; None: nothing in that time."""
+    return os.read(beats, 4096) if select.select([beats], [], [], timeout_s)[0] else None
+
+
+def watch(
+    heard: Callable[[float | None], bytes | None],
+    silence_s: float,
+    answer: Callable[[], None],
+    probe: Callable[[], None],
+    clock: Callable[[], float] = time.monotonic,
+) -> str:
+    """Hear beats until there is a reason to act. Returns it; '' at an orderly end.
+
+    Parameters
+    ----------
+    heard : waits at most so many seconds (None: for ever) for what the recorder says, see `_heard`.
+    silence_s : longest time between beats while a field is on.
+    answer, probe : called after each beat, and when a probe is asked for.
+    clock : monotonic time in s.
+    """
+    energised, heard_s = False, clock()
     while True:
-        left_s = heard_s + silence_s - time.monotonic() if energised else None
-        if not select.select([beats], [], [], None if left_s is None else max(left_s, 0.0))[0]:
+        left_s = heard_s + silence_s - clock() if energised else None
+        said = heard(None if left_s is None else max(left_s, 0.0))
+        if said is None:
             return f"no beat of the loop for {1e3 * silence_s:.0f} ms"
-        said = os.read(beats, 4096)
         if not said:
             return "the recorder has ended"
         if _TRIP in said:
             return "asked to"
         if _QUIT in said:
             return ""
-        heard_s = time.monotonic()
+        heard_s = clock()
         if _PROBE in said:
             probe()
         energised = said.endswith(_ON)

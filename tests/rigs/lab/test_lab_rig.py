@@ -22,6 +22,7 @@ from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.rig import LabRig
 from flowrec.rigs.rig import checked_images
+from tests.conftest import until
 
 SHAPE = (48, 64)
 MEASURED = (
@@ -77,7 +78,7 @@ class Noted:
     def __init__(self) -> None:
         self.calls: deque[str] = deque()
         self.beats: list[float] = []
-        self.beats_before_rest = 0
+        self.beats_before_rest = self.looked_at = 0
 
     def __enter__(self) -> Noted:
         self.calls.append("enter")
@@ -103,6 +104,7 @@ class Noted:
         self.calls.append("zero")
 
     def applied(self, stamp_ns: int, before_ns: int | None) -> Applied:
+        self.looked_at += 1
         lasted_s = 0.0 if before_ns is None else (stamp_ns - before_ns) / 1e9
         return Applied(stamp_ns, 2.0, 0.0, 4.0, np.zeros(3), [2.0 * lasted_s, 0.0])
 
@@ -161,10 +163,24 @@ def test_images_are_tried_before_a_run_without_a_word_to_the_coils_and_the_run_c
     with rig.connected():
         tried = [inputs for inputs, _ in zip(rig.tried(), range(4), strict=False)]
         assert [one.frame.index for one in tried if one.frame is not None] == [0, 1, 2, 3]
-        assert list(coils.calls) == ["enter"] and not coils.beats
+        assert list(coils.calls) == ["enter"] and not coils.beats and not coils.looked_at
         with rig:
             first = next(rig.inputs())
     assert first.stamp_ns == 0 and first.frame is not None and first.frame.index == 0
+
+
+def test_images_that_were_dropped_before_the_run_are_no_losses_of_it() -> None:
+    """ids = frames + link + incomplete + driver + backlog, from the first frame of the run on."""
+    rig, _ = rig_of(config_of(), gone=(60.0, 61.0), duration_s=None)
+    with rig.connected(), rig:
+        grabber = rig._grabber
+        assert grabber is not None
+        until(lambda: grabber.backlog >= 3)
+        first = next(rig.inputs())
+    losses = first.losses
+    assert losses is not None and losses.ids == 1
+    counted = losses.frames + losses.link + losses.incomplete + losses.driver + losses.backlog
+    assert counted == losses.ids, "what the queue dropped while the run was prepared is not among them"
 
 
 def test_the_guardian_hears_the_loop_while_it_waits_for_the_first_frame() -> None:

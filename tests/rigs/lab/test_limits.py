@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 
 from flowrec.control.amplifier import Amplifier
 from flowrec.control.coils import Coils
+from flowrec.control.field_rotation import FieldCommand
 from flowrec.errors import RigError, UsageError
 from flowrec.messages import Currents
 from flowrec.rig_settings import OutputLimits
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.amplifiers.serial_protocol import field_line
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
 from flowrec.robot import Robot
 
@@ -154,3 +156,13 @@ def test_the_phase_is_continuous_from_block_to_block_whatever_the_commands() -> 
         samples.append(waveform.block(admitted, 125).currents_a[:-1])
     step = np.abs(np.diff(np.concatenate(samples), axis=0)).max()
     assert step * RATE_HZ <= limits.slew_a_s * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("amplitude_mt", "ut"), [(3.9999, 3999), (3.9991, 3999), (4.0, 4000), (0.0019, 1), (2.3, 2300)]
+)
+def test_a_board_that_counts_in_microtesla_gets_no_more_than_was_commanded(amplitude_mt: float, ut: int) -> None:
+    """Digits that are rounding errors of a whole number take nothing away."""
+    words = field_line(7, FieldCommand(5.0, 0.0, amplitude_mt, 20.0, 20.0)).split(b"*")[0].split()
+    assert words[:3] == [b"F", b"7", b"5000"]
+    assert int(words[4]) == ut <= 1e3 * amplitude_mt + 1e-6
