@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ from typing import Annotated
 import typer
 
 from flowrec.bench.verbs import AsJson, Sets
+from flowrec.errors import printable
 from flowrec.system.endings import Ended, StoppedError
 from flowrec.units import amounts
 
@@ -197,11 +199,16 @@ def find(
     paths: Annotated[
         bool, typer.Option("--paths", help="Only the paths, one a line, as for xargs -d '\\n' flowrec check.")
     ] = False,
+    null: Annotated[
+        bool, typer.Option("--null", "-0", help="With --paths: a zero byte after each, as for xargs -0.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Find sessions in a catalog by an SQL condition (DuckDB); reads the catalog and no other file."""
     if paths and as_json:
         raise typer.BadParameter("--paths and --json: name one")
+    if null and not paths:
+        raise typer.BadParameter("--null goes with --paths")
     from flowrec.cataloguing.bounds import process_bounds
     from flowrec.cataloguing.find import find as search
     from flowrec.cataloguing.sql import TIMEOUT_S, too_slow
@@ -211,8 +218,7 @@ def find(
     if as_json:
         typer.echo(json.dumps(found.as_json()))
     elif paths:
-        for path in found.paths():
-            typer.echo(path)
+        _print_paths(found.paths(), null=null)
     else:
         from flowrec.terminal import say, table, width
 
@@ -223,6 +229,17 @@ def find(
             say(line)
         if count > len(found.rows):
             say(f"{count - len(found.rows)} rows more: --limit {count}, --paths and --json have all of them")
+
+
+def _print_paths(paths: Sequence[str], *, null: bool) -> None:
+    """Print the bytes of paths; on a terminal what it shows, because a name could hold its commands."""
+    shown, end = sys.stdout.isatty(), b"\0" if null else b"\n"
+    for path in paths:
+        typer.echo(printable(path) if shown else os.fsencode(path) + end, nl=shown)
+    if not null and any("\n" in path for path in paths):
+        from flowrec.terminal import warn
+
+        warn("a path holds a line feed: --null separates them by zero bytes, for xargs -0")
 
 
 def _serve(catalog: Path, where: str, port: int | None) -> None:

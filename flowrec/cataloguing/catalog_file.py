@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from flowrec.cataloguing.format import EVENTS, KEY, NAME, PARQUET, SIGNATURE, SWEEP, About
+from flowrec.cataloguing.format import EVENTS, KEY, NAME, PARQUET, PLACE, SIGNATURE, SWEEP, About
 from flowrec.commands.listed import ALWAYS, LISTS, kind_of
 from flowrec.errors import FlowrecError, UsageError
 from flowrec.system.durable import replacing
@@ -32,7 +32,7 @@ _LOCK = ".lock"
 _LEVEL = 1  # of zstd
 _COLUMNS_LIMIT = 400  # a file can state any number of facts
 VERDICT = "verdict"
-_OURS = (*ALWAYS, "content", VERDICT, SIGNATURE)  # columns that are never left out
+_OURS = (*ALWAYS, "content", VERDICT, SIGNATURE, PLACE)  # columns that are never left out
 _KINDS = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 _EVENT = pa.list_(pa.struct([("time_s", pa.float64()), ("action", pa.string()), ("text", pa.string())]))
 
@@ -73,7 +73,7 @@ def read(path: Path, remark: str = "is made anew") -> tuple[Known, str]:
     if ours is None:
         raise OutputError(f"{path}: was not written by flowrec catalog, and stays; choose another name")
     about = About.of(ours.decode(errors="replace"))
-    if about is None or not {"path", SIGNATURE} <= set(table.column_names):
+    if about is None or not {"path", PLACE, SIGNATURE} <= set(table.column_names):
         return Known.nothing(), f"{path}: is a catalog of another version of flowrec, and {remark}"
     return Known(table.drop_columns([SWEEP, VERDICT]), about), ""
 
@@ -103,7 +103,7 @@ def held(path: Path) -> Iterator[None]:
 
 def table_of(rows: Sequence[dict[str, Any]]) -> pa.Table:
     """Rows of sessions as a table; the kind of a column follows from its name."""
-    names = dict.fromkeys((*ALWAYS, "content", SIGNATURE, EVENTS, *(name for row in rows for name in row)))
+    names = dict.fromkeys((*ALWAYS, "content", SIGNATURE, PLACE, EVENTS, *(name for row in rows for name in row)))
     columns = {name: pa.array([row.get(name) for row in rows], _type(name)) for name in names}
     return pa.table(columns)
 
@@ -115,7 +115,7 @@ def joined(before: pa.Table, kept: Sequence[bool], rows: Sequence[dict[str, Any]
     own = [name for name in both.column_names if name not in (*_OURS, EVENTS)]
     often = sorted(own, key=lambda name: (both[name].null_count, kind_of(name) is str))[:_COLUMNS_LIMIT]
     kept = [name for name in both.column_names if name in often or name in (*_OURS, EVENTS)]
-    return both.select(kept).sort_by("path")
+    return both.select(kept).sort_by(PLACE)
 
 
 def write(path: Path, sessions: pa.Table, replays: pa.ListArray, verdicts: Sequence[str | None], about: About) -> None:
@@ -133,6 +133,6 @@ def write(path: Path, sessions: pa.Table, replays: pa.ListArray, verdicts: Seque
 
 
 def _type(name: str) -> pa.DataType:
-    if name == EVENTS:
-        return _EVENT
+    if name in (EVENTS, PLACE):
+        return _EVENT if name == EVENTS else pa.binary()
     return pa.list_(pa.string()) if name in LISTS else _KINDS[kind_of(name)]

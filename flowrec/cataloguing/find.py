@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flowrec.cataloguing.format import RELATIONS, About, catalog_above, path_of
+from flowrec.cataloguing.format import PLACE, RELATIONS, About, catalog_above, path_of
 from flowrec.cataloguing.sql import AS_LIST, CatalogQuery
 from flowrec.commands.listed import LISTS, Listed, columns_for_people, joined
 from flowrec.errors import printable
@@ -36,14 +36,14 @@ class FoundSessions:
     mentioned: list[str]
 
     def paths(self) -> list[str]:
-        """The sessions, each once, as they are named from this folder."""
-        return list(dict.fromkeys(self._path(row) for row in self.rows))
+        """The sessions, each once, as they are named from this folder; `os.fsencode` makes the bytes of their names."""
+        return list(dict.fromkeys(self._named(row) for row in self.rows))
 
     def as_json(self) -> dict[str, Any]:
         """All known values of the rows, and what they are from."""
         rows = [
             # A list takes the place of its text.
-            {name.removesuffix(AS_LIST): value for name, value in row.items() if value is not None}
+            {name.removesuffix(AS_LIST): value for name, value in row.items() if value is not None and name != PLACE}
             | {"path": self._path(row)}
             for row in self.rows
         ]
@@ -56,10 +56,11 @@ class FoundSessions:
 
     def title(self) -> str:
         """What was found, in what, and how old that is."""
-        number = len({row["path"] for row in self.rows})
+        number = len({row[PLACE] for row in self.rows})
         left = f", {self.about.left} not read yet" if self.about.left else ""
         made = self.about.made[:16].replace("T", " ")
-        return f"{number} of {self.about.sessions} sessions, as of {made} UTC{left} ({self._relative(self.catalog)})"
+        catalog = printable(self._relative(self.catalog))
+        return f"{number} of {self.about.sessions} sessions, as of {made} UTC{left} ({catalog})"
 
     def cells(self, width: int) -> tuple[list[str], list[list[str]]]:
         """Names of the columns and the cells as `flowrec ls` has them, and what else the expression mentions."""
@@ -88,15 +89,18 @@ class FoundSessions:
             line[at:at] = [column[number] for column in values.values()]
         return names, lines
 
+    def _named(self, row: Mapping[str, Any]) -> str:
+        return self._relative(path_of(os.fsdecode(row[PLACE]), self.catalog.parent))
+
     def _path(self, row: Mapping[str, Any]) -> str:
-        return self._relative(path_of(row["path"], self.catalog.parent))
+        return printable(self._named(row))
 
     @staticmethod
     def _relative(path: Path) -> str:
         """A path as it is named from this folder, if it is below it."""
         here = Path().absolute()
         below = not isinstance(path, UrlPath) and path.is_relative_to(here)
-        return printable(os.path.relpath(path, here) if below else str(path))
+        return os.path.relpath(path, here) if below else str(path)
 
 
 def find(where: str = "", catalog: Path | None = None, sort: str = "", limit: int | None = None) -> FoundSessions:

@@ -14,11 +14,12 @@ from flowrec.store.session_path import UrlPath, session_path
 NAME = "flowrec-catalog.parquet"  # in the folder that is catalogued
 PARQUET = (".parquet",)
 KEY = "flowrec_catalog"  # of the file's metadata: About, as JSON
-FORMAT = 1  # of the columns and what they mean
+FORMAT = 2  # of the columns and what they mean
 # Lists of structures: an expression of `find` that names a member has a row for each.
 EVENTS, SWEEP = "events", "sweep"
 RELATIONS = {EVENTS: "no event states", SWEEP: "no replay states"}
 SIGNATURE = "signature"  # column of what tells whether a session has changed
+PLACE = "path_bytes"  # column by which a session is known: its name may be no text, and hold any byte
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -10,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.cataloguing import catalog_file  # first: it says which extra is missing
-from flowrec.cataloguing.format import NAME, SIGNATURE, About, path_of, written
+from flowrec.cataloguing.format import NAME, PLACE, SIGNATURE, About, path_of, written
 from flowrec.cataloguing.places import Contents, Found, contents_of
 from flowrec.cataloguing.session_rows import row_of
 from flowrec.cataloguing.sweeps import lists_of, sweep_rows
 from flowrec.commands.ls import read_each
-from flowrec.errors import SessionError, UsageError
+from flowrec.errors import SessionError, UsageError, printable
 from flowrec.store.session_path import UrlPath, session_path
 from flowrec.system.endings import Ended
 from flowrec.version import __version__
@@ -105,15 +106,16 @@ def refresh(
         contents = contents_of(given, path)
         _refuse_if_emptied(given, contents, known, base)
         named = {written(found.path, base): found for found in contents.sessions}
-        before = dict(zip(known.sessions["path"].to_pylist(), known.sessions[SIGNATURE].to_pylist(), strict=True))
+        places_before = map(os.fsdecode, known.sessions[PLACE].to_pylist())
+        before = dict(zip(places_before, known.sessions[SIGNATURE].to_pylist(), strict=True))
         due = {text: found for text, found in named.items() if before.get(text) != found.signature}
         rows, stop_status = _read(due, progress)
         left = len(due) - len(rows)
-        read = {row["path"] for row in rows}
+        read = {os.fsdecode(row[PLACE]) for row in rows}
         # A changed session that was not read before an interruption is left out: what is known of it is out of date.
         kept = [text in named and text not in due for text in before]
         sessions = catalog_file.joined(known.sessions, kept, rows)
-        replays = sweep_rows(contents.tables, lambda table: written(table, base), remarks.append)
+        replays = sweep_rows(contents.tables, lambda table: printable(written(table, base)), remarks.append)
         lists, verdicts = lists_of(sessions["content"].to_pylist(), replays)
         made = datetime.now(UTC).isoformat(timespec="seconds")
         stated = [written(place, base) for place in given]

@@ -6,11 +6,12 @@ removed when a later call serves others: the folder holds what was served last.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from flowrec.cataloguing.find import find
-from flowrec.cataloguing.format import path_of
+from flowrec.cataloguing.format import PLACE, path_of
 from flowrec.errors import FlowrecError, SessionError, UsageError
 from flowrec.exports.rrd import RrdExport
 from flowrec.session import Session, input_blamed
@@ -33,7 +34,7 @@ def recordings_of(catalog: Path, where: str, say: Callable[[str], None]) -> list
     UsageError : no session is found, or too many; as of `find`.
     SessionError : the folder can not be made.
     """
-    found = {row["path"]: row for row in find(where, catalog).rows if row["duration_s"] is not None}
+    found = {os.fsdecode(row[PLACE]): row for row in find(where, catalog).rows if row["duration_s"] is not None}
     if not 0 < len(found) <= SERVED_LIMIT:
         raise UsageError(
             f"--serve: {len(found)} whole sessions are found, and 1 to {SERVED_LIMIT} are served at a time; choose "

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
-from flowrec.cataloguing.format import EVENTS, SIGNATURE
+from flowrec.cataloguing.format import EVENTS, PLACE, SIGNATURE
 from flowrec.cataloguing.places import Found
 from flowrec.commands.listed import TEXT_LIMIT, columns_of
 from flowrec.commands.ls import describe
@@ -29,8 +30,10 @@ def row_of(found: Found, path: str) -> dict[str, Any]:
         listed, opened = describe(found.path, found.files, found.path.name)
     except OSError as error:  # it went away meanwhile
         reason = SessionError(f"{found.path}: can not be read ({error.strerror or error})")
-        return {"path": path, "name": found.path.name, "outcome": "unreadable", "note": str(reason), SIGNATURE: ""}
-    row = columns_of(listed, path) | {EVENTS: [], "content": None, SIGNATURE: found.signature}
+        row = {"path": printable(path), "name": printable(found.path.name), "outcome": "unreadable"}
+        return row | {"note": str(reason), SIGNATURE: "", PLACE: os.fsencode(path)}
+    row = columns_of(listed, printable(path)) | {EVENTS: [], "content": None, SIGNATURE: found.signature}
+    row[PLACE] = os.fsencode(path)
     if isinstance(opened, SessionError):
         # What may pass without a change of the file is asked for again the next time.
         passing = listed.outcome == "recording" or isinstance(opened.__cause__, _PASSING)

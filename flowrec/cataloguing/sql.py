@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from flowrec.cataloguing.format import KEY, RELATIONS, SIGNATURE, About
+from flowrec.cataloguing.format import KEY, PLACE, RELATIONS, SIGNATURE, About
 from flowrec.commands.listed import LISTS, unknown_name
 from flowrec.errors import UsageError
 
@@ -71,7 +71,7 @@ class CatalogQuery:
             self.about = self._about()
             described = self._connection.execute(f"DESCRIBE FROM {self._from}").fetchall()
             types = {name: kind for name, kind, *_ in described}
-            self.columns = [name for name in types if name not in (*RELATIONS, SIGNATURE)]
+            self.columns = [name for name in types if name not in (*RELATIONS, SIGNATURE, PLACE)]
             self.members = {name: self._members(name, types[name]) for name in RELATIONS}
             lists = [name for name in LISTS if name in types]
             texts = ", ".join(f"array_to_string({name}, ', ') AS {name}" for name in lists)
@@ -113,7 +113,7 @@ class CatalogQuery:
         dropped = ", ".join(name for name in RELATIONS if name not in unnested)
         star = f"* EXCLUDE ({dropped})" if dropped else "*"
         # The expression is the user's own, and what it can do is bounded. A comment in it ends with its line.
-        query = f"SELECT {star} FROM {source} WHERE (\n{where or 'true'}\n) ORDER BY {order} path"  # noqa: S608
+        query = f"SELECT {star} FROM {source} WHERE (\n{where or 'true'}\n) ORDER BY {order} {PLACE}"  # noqa: S608
         if limit is not None:
             query += f" LIMIT {limit}"
         names, found = self._answer(query, where)

@@ -194,6 +194,25 @@ def test_what_has_changed_is_read_again_and_what_is_gone_is_dropped(catalogued: 
     assert find("name = 'b.mcap'").rows == before
 
 
+def test_names_of_any_bytes_are_known_again_and_printed_so_that_they_can_be_opened(
+    lab: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "Anna's lab"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    odd = [b"line\nfeed.mcap", b"\x1b[31m.mcap", b"caf\xe9.mcap", b"quote'd.mcap", b"plain.mcap"]
+    for name in odd:
+        shutil.copy(lab / "a.mcap", os.fsdecode(name))
+    assert refresh.refresh([folder]).new == 5
+    again = refresh.refresh([folder])
+    assert (again.new, again.changed, again.gone) == (0, 0, 0)
+    printed = typed("find", "--paths", "--null").stdout_bytes.split(b"\0")
+    assert sorted(printed) == [b"", *sorted(odd)] and all(Path(os.fsdecode(name)).is_file() for name in odd)
+    lines = typed("find", "duration_s > 0", "--paths")
+    assert b"caf\xe9.mcap\n" in lines.stdout_bytes and "--null" in lines.stderr
+    assert "\x1b" not in typed("find").output and len(json.loads(typed("find", "--json").stdout)["sessions"]) == 5
+
+
 def test_a_run_that_is_being_recorded_is_asked_for_again(tmp_path: Path) -> None:
     with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
         for tick in ticks_of(3, shape=(8, 8)):

@@ -6,6 +6,8 @@ import json
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +15,9 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
+from flowrec.chip.registration import Calibration
 from flowrec.cli import app
-from flowrec.commands.calibrate_image import registration_state
+from flowrec.commands.calibrate_image import fragment, registration_state
 from flowrec.commands.record import record
 from flowrec.config import load_config, with_sets
 from flowrec.errors import UsageError
@@ -80,14 +83,27 @@ def test_the_state_of_a_registration_is_told():
     )
     now = datetime(2026, 1, 12, 8, tzinfo=UTC)
     assert registration_state(camera, now) == (True, "registered 2 days ago from a.png, residual 1.5 um")
+    assert registration_state(replace(camera, registered_on="2025-12-14"), now)[0]  # 29 days
     for worse in (
         {"registered_on": ""},
         {"registered_on": "soon"},
         {"residual_um": 15.0},
-        {"registered_on": "2025-01-10"},
+        {"registered_on": "2025-12-12"},  # 31 days
     ):
         good, text = registration_state(replace(camera, **worse), now)
-    assert not good and "flowrec calibrate image" in text
+        assert not good and "flowrec calibrate image" in text, worse
+
+
+def test_the_standard_errors_of_a_registration_are_in_the_units_that_stand_beside_them():
+    pose = Calibration(10.0, (500.0, 400.0), 0.0, mirror=False)
+    fit: Any = SimpleNamespace(
+        std=np.array([0.3, 0.7, 0.05, 0.0025]), found=0.9, seen=0.8, calibration=pose, residual_um=2
+    )
+    picture = SimpleNamespace(image=np.zeros((64, 80), np.uint8), source="a.png", sha256="0" * 64)
+    done: Any = SimpleNamespace(picture=picture, chip=SimpleNamespace(name="c"), registered_on="2026-01-10")
+    text = fragment(done, fit)
+    assert "# Standard errors: 0.7 um, 0.05 degrees, 0.25 %.\n" in text
+    assert "90 % of the walls in the picture agree, 80 % of the chip's walls" in text
 
 
 def test_several_poses_are_listed_and_nothing_is_written(tmp_path):

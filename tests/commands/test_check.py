@@ -5,12 +5,14 @@ import json
 import signal
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 from typer.testing import CliRunner
 
+import flowrec
 from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.diagnostics import CameraLosses
@@ -21,10 +23,13 @@ from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
 from flowrec.system.endings import Ended
+from flowrec.topics import Tick
 from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
 from tests.store.made_up import HEADER, ticks_of
+from tests.store.test_run_files import in_parts
 
 DRAFT = small_draft()
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 FRAMES, TRACK = SLOTS["/camera/frame"].channel, SLOTS["/robot/track"].channel
 APPLIED, TIMING = SLOTS["/coils/applied"].channel, SLOTS["/run/timing"].channel
 
@@ -142,6 +147,26 @@ def test_a_gap_is_a_time_of_more_than_one_and_a_half_periods(tmp_path):
     said = [text for about, text in found(verdict) if about == "gaps"]
     assert said == ["1 times more than 1.5 periods without a frame: 0.067 s at 0.07 s"]
     assert any("1 images of the camera never arrived" in text for _, text in found(verdict))
+
+
+def test_gaps_of_a_later_part_are_told_at_the_time_of_the_run(tmp_path):
+    ticks = [tick for number, tick in enumerate(ticks_of(60, shape=(8, 8))) if number not in (10, 50)]
+    in_parts(tmp_path / "run.mcap", [30], ticks)
+    verdict = check(tmp_path / "run.mcap")
+    assert [gap.at_s for gap in verdict.gaps] == pytest.approx([9 / 60, 49 / 60], rel=1e-6)
+
+
+@pytest.mark.parametrize(("rate_hz", "told"), [(28.0, True), (29.0, False), (31.0, False), (32.0, True)])
+def test_another_rate_than_the_stated_one_is_told_from_five_per_cent_on(tmp_path, rate_hz, told):
+    golden = flowrec.open(GOLDEN)
+    stated_hz = golden.config.camera.rate_hz
+    with SessionWriter(tmp_path / "s.mcap", golden.header, WriterOptions(block=True)) as writer:
+        for number, tick in enumerate(ticks_of(30, shape=(8, 8))):
+            now = round(10**9 * (1.0 + number / (rate_hz / 30.0 * stated_hz)))
+            frame = replace(tick.frame, stamp_ns=now)
+            track, applied = replace(tick.track, stamp_ns=now), replace(tick.applied, stamp_ns=now)
+            writer.write(Tick(now, frame=frame, track=track, applied=applied))
+    assert any(about == "rate" for about, _ in found(check(tmp_path / "s.mcap"))) == told
 
 
 def test_images_that_were_dropped_are_told_apart_from_those_that_are_missing(tmp_path):

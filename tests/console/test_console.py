@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import http.client
 import importlib
+import itertools
 import json
 import os
 import signal
@@ -19,12 +21,13 @@ import psutil
 import pytest
 
 from flowrec.console import console as console_module
-from flowrec.console.board import MOST_PAGES
+from flowrec.console.app import application
+from flowrec.console.board import MOST_PAGES, Board, Shown
 from flowrec.console.messages import Ended
 from flowrec.console.page_state import PageState
 from flowrec.enums import Action
 from flowrec.errors import UsageError
-from flowrec.messages import FlowField, OperatorEvent
+from flowrec.messages import Event, FlowField, OperatorEvent
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import COMMANDS
 from flowrec.topics import Tick
@@ -205,6 +208,48 @@ def test_what_a_page_asks_becomes_an_event_and_nonsense_is_refused(scene: Scene)
     assert events[0].text == "operator: zero field (console)"
     assert events[1].text == "1"
     assert all("console" in event.text for event in (events[0], events[4]))
+
+
+def test_pages_that_flood_the_run_are_refused_after_ten_commands_in_a_second(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock stands still; the page is an ASGI client in this process."""
+    monkeypatch.setattr(time, "monotonic", lambda: 5.0)
+    given, answers = list[dict[str, Any]](), list[str]()
+    headers = [("host", "localhost:1"), ("origin", "http://localhost:1"), ("cookie", "flowrec_console_1=secret")]
+    scope = {
+        "type": "websocket",
+        "path": "/live",
+        "query_string": b"",
+        "subprotocols": [],
+        "headers": [(name.encode(), value.encode()) for name, value in headers],
+    }
+    marks = ({"type": "websocket.receive", "text": json.dumps({"number": 1, "command": "mark"})} for _ in range(40))
+    messages = itertools.chain([{"type": "websocket.connect"}], marks, [{"type": "websocket.disconnect", "code": 1000}])
+
+    async def receive() -> Any:
+        return next(messages)
+
+    async def send(message: Any) -> None:
+        if "refusal" in (words := json.loads(message.get("text", "{}"))):
+            answers.append(words["refusal"])
+
+    asyncio.run(application(Board(scene, "a.mcap"), "secret", 1, None, given.append)(scope, receive, send))
+    assert len(given) == 10 and len(answers) == 40 and all("too many" in text for text in answers[10:])
+
+
+def test_an_event_is_sent_to_a_page_once(scene: Scene) -> None:
+    async def seen() -> list[list[str]]:
+        board, shown, told = Board(scene, "a.mcap"), Shown(), []
+        for text in ("first", None, "second", None):
+            changes = {} if text is None else {"event": Event(1, "info", text)}
+            board.take(Batch(1, [changes], {}))
+            news = await board.news(shown)
+            shown = news.shown
+            told.append([event["text"] for event in json.loads(news.words)["events"]])
+        return told
+
+    assert asyncio.run(seen()) == [["first"], [], ["second"], []]
 
 
 def test_a_goal_and_a_limit_reach_the_run_as_numbers(scene: Scene) -> None:
