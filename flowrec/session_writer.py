@@ -74,6 +74,7 @@ def session_writer(
         leave_out=config.recording.leave_out,
         bits=config.camera.bits,
         keep_failed=keep_failed,
+        start_by_clocks=parent is None,
     )
     remove_leftovers_once(output.path.absolute().parent)
     inputs = (*output.inputs, *(files_behind(parent) if parent is not None else ()))

@@ -30,8 +30,8 @@ def row_of(found: Found, path: str) -> dict[str, Any]:
         listed, opened = describe(found.path, found.files, found.path.name)
     except OSError as error:  # it went away meanwhile
         reason = SessionError(f"{found.path}: can not be read ({error.strerror or error})")
-        row = {"path": printable(path), "name": printable(found.path.name), "outcome": "unreadable"}
-        return row | {"note": str(reason), SIGNATURE: "", PLACE: os.fsencode(path)}
+        told = {"path": printable(path), "name": printable(found.path.name), "outcome": "unreadable"}
+        return told | {"note": str(reason), SIGNATURE: "", PLACE: os.fsencode(path)}
     row = columns_of(listed, printable(path)) | {EVENTS: [], "content": None, SIGNATURE: found.signature}
     row[PLACE] = os.fsencode(path)
     if isinstance(opened, SessionError):

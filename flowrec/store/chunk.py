@@ -162,13 +162,14 @@ class ChunkEncoder:
 
     Attributes
     ----------
+    start_unix_ns : may be set before anything is added.
     sequences : the next sequence number by topic, for topics whose messages do not give their own.
     """
 
     def __init__(self, encoding: FrameEncoding, views: ViewerTopics, sink: Sink, start_unix_ns: int) -> None:
         self.sink = sink
         self.sequences: Counter[str] = Counter()
-        self._start_unix_ns = start_unix_ns
+        self.start_unix_ns = start_unix_ns
         self._encoding = encoding
         self._views = views
         self._cutter = WindowCutter()
@@ -195,7 +196,7 @@ class ChunkEncoder:
                     message = self._cutter.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
             else:
                 codec = codec_of(type(message))
-            sequence, payload = encode_record(message, codec, self._start_unix_ns)
+            sequence, payload = encode_record(message, codec, self.start_unix_ns)
             self._append(BY_FIELD[field].path, entry.stamp_ns, message.stamp_ns, payload, sequence)
         for path, stamp_ns, payload in self._views.of(entry.messages):
             self._append(path, entry.stamp_ns, stamp_ns, payload, None)
@@ -221,5 +222,5 @@ class ChunkEncoder:
         if builder.size and builder.size + size > _MESSAGE_LIMIT_BYTES:
             self.sink([builder.seal()])
         # The stamp itself is in the payload; MCAP has no time before zero.
-        publish_unix_ns = max(0, publish_ns + self._start_unix_ns)
-        builder.add(slot.channel, sequence, log_ns + self._start_unix_ns, publish_unix_ns, payload)
+        publish_unix_ns = max(0, publish_ns + self.start_unix_ns)
+        builder.add(slot.channel, sequence, log_ns + self.start_unix_ns, publish_unix_ns, payload)

@@ -56,6 +56,10 @@ class McapWriter:
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+        self._file = open_new(path, overwrite=overwrite)
+        self._reset()
+
+    def _reset(self) -> None:
         self.size = 0
         self._crc = 0
         self._summary = Summary()
@@ -65,7 +69,12 @@ class McapWriter:
         self._digests: Counter[int] = Counter()
         self._head_digest = 0
         self._first_ns = self._last_ns = 0
-        self._file = open_new(path, overwrite=overwrite)
+
+    def clear(self) -> None:
+        """Remove all that was written, to begin again."""
+        os.ftruncate(self._file.fileno(), 0)
+        self._file.seek(0)
+        self._reset()
 
     def start(self, profile: str, library: str) -> None:
         """Write magic and header."""

@@ -152,6 +152,12 @@ class RingBuffer:
         self._router = SegmentRouter(self._segment({}, None))
         self._check_disk()
 
+    def begin_at(self, start_unix_ns: int) -> None:
+        """Take another Unix time of stamp 0, before anything was added."""
+        self._header = replace(self._header, start_unix_ns=start_unix_ns)
+        self._views.begin_at(start_unix_ns)
+        self._router.current.segment.encoder.start_unix_ns = start_unix_ns
+
     @property
     def partial_path(self) -> Path:
         """The file that is written at present, or the next one."""

@@ -85,6 +85,7 @@ class WriterOptions:
     bits : depth of the images; another one is refused.
     keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
     clock : monotonic time in s, by which data is flushed and synced.
+    start_by_clocks : stamp 0 is at the time of day that the first tick's /run/clocks says; the header's is a guess.
     """
 
     frames: str = "zstd"
@@ -99,6 +100,7 @@ class WriterOptions:
     bits: int = 8
     keep_failed: bool = True
     clock: Callable[[], float] = time.monotonic
+    start_by_clocks: bool = False
 
     @property
     def left_out_topics(self) -> frozenset[str]:
@@ -156,14 +158,23 @@ class SessionFile:
         except OSError as error:
             raise _not_writable(self.partial_path, error) from error
         try:
-            self._file.start(PROFILE, f"flowrec {__version__}")
-            for record in (*header_records(header), *declarations(options.encoding, options.region)):
-                self._file.add(record)
+            self._write_head(header)
         except BaseException as error:
             self._file.close()
             if isinstance(error, OSError):
                 raise _not_writable(self.partial_path, error) from error
             raise
+
+    def restart(self, header: SessionHeader) -> None:
+        """Write another header into a file that holds nothing but its header."""
+        with self._checked():
+            self._file.clear()
+            self._write_head(header)
+
+    def _write_head(self, header: SessionHeader) -> None:
+        self._file.start(PROFILE, f"flowrec {__version__}")
+        for record in (*header_records(header), *declarations(self._options.encoding, self._options.region)):
+            self._file.add(record)
 
     @property
     def size(self) -> int:

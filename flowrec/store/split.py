@@ -95,6 +95,13 @@ class PartFile(SessionFile):
             return max(shortest, self._synced_s + self._options.sync_interval_s - self._options.clock())
         return None
 
+    def begin_at(self, header: SessionHeader) -> None:
+        """Take another start of the session, before anything was added."""
+        self.restart(header)
+        self._encoder.start_unix_ns = header.start_unix_ns
+        self._first_bytes = self.size
+        self.sync()
+
     def is_larger_than(self, megabytes: float, awaited_bytes: int) -> bool:
         """Whether the part has reached a size; with a keyframe of more than half of that, twice the keyframe's size.
 
@@ -259,6 +266,13 @@ class Parts:
         # A part begins when the one before has been flushed.
         return current.keyframe_ns if current.segment.flushed_ns is None else current.segment.flushed_ns
 
+    def begin_at(self, start_unix_ns: int) -> None:
+        """Take another Unix time of stamp 0, before anything was added."""
+        self._header = replace(self._header, start_unix_ns=start_unix_ns)
+        self.views.begin_at(start_unix_ns)
+        part = self._router.current.segment
+        part.begin_at(self._header_of(part.number, None))
+
     def add(self, entry: Entry) -> None:
         """Write one entry, to the part that it belongs to."""
         self._collect_finished(wait=False)
@@ -328,12 +342,14 @@ class Parts:
         return bool(split.megabytes) and place.segment.is_larger_than(split.megabytes or 0.0, place.awaited_bytes)
 
     def _part(self, number: int, first: Entry | None = None) -> PartFile:
-        path, header = self._path, self._header
-        if self._split:
-            path = part_path(path, number)
-            keyframe_ns = first.stamp_ns if first is not None else None
-            header = replace(header, part=Part(self._run, number, keyframe_ns=keyframe_ns))
-        return PartFile(self, number, path, header, first)
+        path = part_path(self._path, number) if self._split else self._path
+        return PartFile(self, number, path, self._header_of(number, first), first)
+
+    def _header_of(self, number: int, first: Entry | None) -> SessionHeader:
+        if not self._split:
+            return self._header
+        keyframe_ns = first.stamp_ns if first is not None else None
+        return replace(self._header, part=Part(self._run, number, keyframe_ns=keyframe_ns))
 
     def _continued(self, part: PartFile) -> dict[str, str]:
         return {"outcome": Outcome.CONTINUED, "next": part_path(self._path, part.number + 1).name}

@@ -73,6 +73,10 @@ class ViewerTopics:
         """Speed at the bright end of the colour scale; None before the first flow field."""
         return self._scene.top_um_s
 
+    def begin_at(self, start_unix_ns: int) -> None:
+        """Take another Unix time of stamp 0."""
+        self._scene.start_unix_ns = start_unix_ns
+
     def copy(self) -> ViewerTopics:
         """One for the keyframe of another file, which describes the cameras anew; with the present colour scale."""
         return ViewerTopics(copy.copy(self._scene), self._left_out)

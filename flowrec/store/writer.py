@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 
 from flowrec.declarations import Message, array_fields
-from flowrec.diagnostics import Drops
+from flowrec.diagnostics import Clocks, Drops
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Track
@@ -87,6 +87,7 @@ class SessionWriter:
         options = options or WriterOptions()
         self._block = options.block
         self._keep_failed = options.keep_failed
+        self._start_by_clocks = options.start_by_clocks
         self._flush_ns = nanoseconds(options.flush_s)
         self._decimation = FrameDecimation()
         self._selector = WindowSelector(options.region) if options.region is not None else None
@@ -304,6 +305,9 @@ class SessionWriter:
             while not self._queue.drained:
                 entry = self._queue.take(self._output.timeout_s)
                 if entry is not None:
+                    if self._start_by_clocks:
+                        self._start_by_clocks = False
+                        self._begin_at_clocks(entry)
                     self._output.add(entry)
                 if entry is None and self._queue.flush_wanted:
                     self._output.flush()
@@ -317,6 +321,12 @@ class SessionWriter:
         except Exception as error:  # noqa: BLE001  `write` and `close` raise it in the control loop
             self._failure = error
             self._queue.abandon()
+
+    def _begin_at_clocks(self, first: Entry) -> None:
+        """Let the session begin when its first tick was, by the host's clock: to prepare the run has taken a while."""
+        clocks = first.messages.get("clocks")
+        if isinstance(clocks, Clocks):
+            self._output.begin_at(clocks.wall_ns - clocks.stamp_ns)
 
     def _finish(self, outcome: Mapping[str, str], dropped: int, why: str) -> None:
         """Complete the output after the end of the thread; `dropped` images were left in the queue."""

@@ -19,11 +19,13 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 
+from flowrec.diagnostics import Clocks
 from flowrec.errors import SessionError
 from flowrec.messages import Frame
+from flowrec.store.audit import digest_faults
 from flowrec.store.reader import SessionReader
 from flowrec.store.schema import foxglove_schema
-from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
 from flowrec.system.processes import Priority
@@ -219,11 +221,37 @@ def test_every_message_index_of_the_file_points_at_its_messages(path):
 def test_a_session_is_dated_by_the_day_on_which_it_was_recorded(session):
     found, statistics = seen_by_others(session)
     with SessionReader(session) as reader:
-        said, last_ns = reader.header.provenance, reader.last_ns
-    began_ns = int(said["wall_ns"])
+        said, last_ns, began_ns = reader.header.provenance, reader.last_ns, reader.header.start_unix_ns
+        clocks = next(iter(reader.messages("clocks")))
+    assert began_ns == clocks.wall_ns - clocks.stamp_ns >= int(said["wall_ns"])
     assert said["durability_state_s"] == said["durability_images_s"] == "0.5"  # it waited for its disk
     assert statistics.message_start_time >= began_ns and statistics.message_end_time == began_ns + last_ns
     assert all(time >= began_ns for messages in found.values() for time, _, _ in messages)
+
+
+@pytest.mark.parametrize("files", [Split(), Split(seconds=0.2), Snapshot(before_s=10.0)])
+def test_a_run_begins_at_the_time_of_its_first_tick_however_long_it_was_prepared(tmp_path, files):
+    ticks = list(ticks_of(40, shape=(8, 8)))
+    zeros = {field.name: 0 for field in fields(Clocks)}
+    began_ns = START_UNIX_NS + 28_500_000_000
+    clocks = Clocks(**zeros | {"stamp_ns": ticks[0].stamp_ns, "wall_ns": began_ns + ticks[0].stamp_ns})
+    ticks = [replace(tick, clocks=clocks) for tick in ticks]
+    with SessionWriter(
+        tmp_path / "s.mcap", HEADER, WriterOptions(block=True, files=files, start_by_clocks=True)
+    ) as out:
+        for tick in ticks:
+            out.write(tick)
+        out.close(why="end")
+    written = sorted(tmp_path.glob("*.mcap"))
+    assert len(written) == (1 if not isinstance(files, Split) or not files else 4)
+    for path in written:
+        reader = SessionReader(path)
+        assert reader.header.start_unix_ns == began_ns and not any(digest_faults(path).values())
+        with path.open("rb") as file:
+            for _, channel, message in make_reader(file).iter_messages():
+                assert 0 <= message.log_time - began_ns - 10**9 <= 40 * PERIOD_NS, channel.topic
+    read = [tick.track for path in written for tick in SessionReader(path).ticks()]
+    assert len({track.stamp_ns for track in read}) == 40
 
 
 def test_a_session_that_does_not_say_when_it_started_has_stamps_for_times(tmp_path):
