@@ -47,6 +47,7 @@ class BoundedProcess:
     ) -> None:
         self._where, self._cpu_s, self._memory_bytes, self._error = where, cpu_s, memory_bytes, error
         self._process: subprocess.Popen[bytes] | None = None
+        self._late = False  # ended by the clock, where the system limits no CPU time
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
 
     def call(self, function: Callable[..., Answer], *given: Any) -> Answer:
@@ -59,7 +60,7 @@ class BoundedProcess:
         process = self._process = self._process or self._started()
         assert process.stdin is not None
         assert process.stdout is not None
-        timer = threading.Timer(self._cpu_s, process.kill) if sys.platform == "win32" else None
+        timer = threading.Timer(self._cpu_s, self._end_late) if sys.platform == "win32" else None
         try:
             if timer is not None:
                 timer.start()
@@ -107,16 +108,21 @@ class BoundedProcess:
         except OSError as error:
             raise self._error(f"{self._where}: no process starts to read it ({error.strerror or error})") from error
 
+    def _end_late(self) -> None:
+        self._late = True
+        if self._process is not None:
+            self._process.kill()
+
     def _cause(self, process: subprocess.Popen[bytes]) -> str:
         """Why the child has ended without an answer."""
         status = process.wait(_JOIN_S)
-        if sys.platform == "win32" or -status == signal.SIGXCPU:
+        how = signal.Signals(-status).name if status < 0 else f"status {status}"
+        if self._late or how == "SIGXCPU":
             return self._words("time")
-        if -status == signal.SIGKILL:
+        if how == "SIGKILL":
             return self._words("memory")
         self._printed.seek(0)
         last = self._printed.read().decode(errors="replace").strip().rpartition("\n")[2]
-        how = signal.Signals(-status).name if status < 0 else f"status {status}"
         return f"its reader has ended ({how}{': ' + last[:300] if last else ''}); the file is damaged"
 
     def _words(self, failure: str) -> str:
@@ -129,14 +135,13 @@ class BoundedProcess:
 
 def _limit_time(cpu_s: float) -> None:
     """Limit the CPU time that is spent from now on."""
-    if sys.platform == "win32":
-        return
-    import resource
+    if sys.platform != "win32":
+        import resource
 
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    until_s = math.ceil(usage.ru_utime + usage.ru_stime + cpu_s)
-    resource.setrlimit(resource.RLIMIT_CPU, (until_s, resource.getrlimit(resource.RLIMIT_CPU)[1]))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        until_s = math.ceil(usage.ru_utime + usage.ru_stime + cpu_s)
+        resource.setrlimit(resource.RLIMIT_CPU, (until_s, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
 
 
 def _limit_memory(memory_bytes: int) -> None:
