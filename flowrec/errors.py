@@ -45,6 +45,10 @@ class FlowError(FlowrecError):
     """The flow solver has no answer."""
 
 
+class NotFiniteError(FlowrecError):
+    """A message would hold NaN or infinity where its declaration excludes them."""
+
+
 class RigError(FlowrecError):
     """Camera, amplifier or simulated rig refused to work."""
 

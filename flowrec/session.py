@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from flowrec.errors import FlowrecError, SessionError, UsageError
+from flowrec.errors import FlowrecError, NotFiniteError, SessionError, UsageError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.notes import Note, append_note, read_notes
 from flowrec.store.run_files import Run, files_of, run_files
@@ -318,9 +318,9 @@ def input_blamed(session: Session, config: ResolvedConfig | None, done: str) -> 
     """
     try:
         yield
-    except FlowrecError:
-        raise
     except Exception as error:
+        if isinstance(error, FlowrecError) and not isinstance(error, NotFiniteError):
+            raise
         from flowrec.ranges import faults
 
         used = session.config if config is None else config

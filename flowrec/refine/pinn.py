@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
-from flowrec.errors import FlowError
+from flowrec.errors import FlowError, NotFiniteError
 from flowrec.messages import FlowField
 from flowrec.ranges import Range, Seed, Threads, Weight
 from flowrec.refine.collocation import POISEUILLE, PinnCase
@@ -68,7 +68,9 @@ class Pinn:
         Raises
         ------
         FlowError
-            If the device is not available, the fit diverges, or the viscosity depends on the shear rate.
+            If the device is not available, or the viscosity depends on the shear rate.
+        NotFiniteError
+            If the fit diverges.
         """
         assumed, operator, chip = problem.assumed, problem.operator, problem.chip
         if chip.law is not None:
@@ -83,7 +85,7 @@ class Pinn:
         with torch_run(self.device, self.threads, self.seed, "refine.pinn.device"):
             iterations, values, residual = self._fit_network(case)
         if not np.isfinite(values).all():
-            raise FlowError("the PINN diverged: lower refine.pinn.learning_rate")
+            raise NotFiniteError("the PINN diverged: lower refine.pinn.learning_rate")
         velocity, pressure = np.zeros((*chip.mask.shape, 2), np.float32), np.zeros(chip.mask.shape, np.float32)
         velocity[chip.mask], pressure[chip.mask] = values[:, :2] * speed, values[:, 2] * case.unit_pressure
         return replace(

@@ -21,7 +21,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from flowrec.declarations import MessageField, message_fields
+from flowrec.declarations import MessageField, as_read, message_fields
 from flowrec.enums import Level
 from flowrec.errors import SessionError
 from flowrec.messages import Event, Frame, OperatorEvent
@@ -122,9 +122,10 @@ def decode(
     SessionError : the payload is no such message.
     """
     try:
-        message = codec.decode(payload, sequence)
-        if start_unix_ns and codec.has_unix_time:
-            message = replace(message, stamp_ns=message.stamp_ns - start_unix_ns)
+        with as_read():
+            message = codec.decode(payload, sequence)
+            if start_unix_ns and codec.has_unix_time:
+                message = replace(message, stamp_ns=message.stamp_ns - start_unix_ns)
     except (DecodeError, ValueError, TypeError, OverflowError) as error:
         raise SessionError(f"damaged {message_type.__name__}: {error}") from error
     return message

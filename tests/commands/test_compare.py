@@ -15,6 +15,7 @@ from flowrec.cli import app
 from flowrec.commands.compare import compare
 from flowrec.commands.comparison import Comparison
 from flowrec.config import load_config, to_toml
+from flowrec.declarations import as_read
 from flowrec.messages import Demand, FlowField
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import SessionHeader
@@ -35,7 +36,8 @@ def run(*words: object) -> tuple[int, str]:
 
 
 def demand(pairs: list[list[float]], error_um: float = 0.0) -> Tick:
-    said = Demand(0, np.zeros(2), np.zeros(2), 0.0, error_um, False, np.array(pairs).reshape(-1, 2))
+    with as_read():
+        said = Demand(0, np.zeros(2), np.zeros(2), 0.0, error_um, False, np.array(pairs).reshape(-1, 2))
     return Tick(stamp_ns=0, demand=said)
 
 

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from flowrec.declarations import as_read
 from flowrec.estimation import HealthMonitor, Kalman, Luenberger, Observer, Sampler
 from flowrec.messages import Applied, Estimate, FlowField, Track
 from tests.estimation.lap import RATE_HZ, ROBOT, across, lemniscate, vortex
@@ -86,7 +87,7 @@ def test_the_process_noise_is_that_of_van_loans_integral() -> None:
 def test_two_frames_without_the_robot_widen_the_belief_as_one_of_both_lengths() -> None:
     kalman = Kalman(position_noise_um=5.0, flow_noise_um2_s3=1700.0)
     _, estimates, _, _ = swim(Observer(kalman=kalman), 5.0, 2.0)
-    last, none, nowhere = estimates[-1], np.zeros(2), np.full(2, np.nan)
+    last, none, nowhere = estimates[-1], np.zeros(2), np.full(2, 1e9)
     once = kalman.estimate(last, track(61, nowhere, seen=False), applied(61, none), ROBOT)
     twice = kalman.estimate(last, track(60, nowhere, seen=False), applied(60, none), ROBOT)
     twice = kalman.estimate(twice, track(61, nowhere, seen=False), applied(61, none), ROBOT)
@@ -193,7 +194,8 @@ def test_a_clock_that_stands_still_and_a_position_that_is_no_number_do_no_harm(m
     still = replace(inputs[-1], turns=np.zeros(2))
     last = observer.estimate(estimates[-1], tracks[-1], still, ROBOT, vortex())
     assert math.dist(last.flow_um_s, estimates[-1].flow_um_s) < 20.0
-    nowhere = track(61, np.full(2, np.nan), seen=False)
+    with as_read():
+        nowhere = track(61, np.full(2, np.nan), seen=False)
     last = observer.estimate(last, nowhere, applied(61, np.zeros(2)), ROBOT, vortex())
     assert np.isfinite(last.flow_um_s).all() and np.isfinite(last.position_um).all()
     assert Sampler().collect(None, last, last, ROBOT) is None

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from flowrec.chip import clearance_um
+from flowrec.declarations import as_read
 from flowrec.errors import FlowError, UsageError
 from flowrec.interpolation import bilinear
 from flowrec.planning import Planner, travel_time
@@ -148,7 +149,8 @@ def test_a_broken_field_a_foreign_field_and_a_robot_without_speed_are_errors():
     field, chip = field_of(mask, 10.0), chip_of(mask)
     bad = np.array(field.velocity_um_s)
     bad[5, 5, 0] = np.nan
-    broken = type(field)(0, 0, "broken", PX, bad, field.pressure_pa, None, np.zeros(0), 1.0, 1000.0, "")
+    with as_read():
+        broken = type(field)(0, 0, "broken", PX, bad, field.pressure_pa, None, np.zeros(0), 1.0, 1000.0, "")
     with pytest.raises(FlowError, match="not finite"):
         Planner().plan(broken, START, GOAL, chip, robot())
     with pytest.raises(UsageError, match="solve the flow on this chip"):

@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from flowrec.chip.chip import Chip, Opening
+from flowrec.declarations import as_read
 from flowrec.errors import FlowError
 from flowrec.flow import FlowSolver, sample
 from flowrec.flow.linear_solver import clear_cache
@@ -130,9 +131,10 @@ def test_without_a_usable_observation_the_assumed_field_comes_back(twin):
     case = twin()
     nothing = Observations(0, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
     # In solid, off the chip, not a number.
-    useless = Observations(
-        0, [[5, 5], [-90, 3], [240, 240], [240, 240]], [[1, 1], [1, 1], [np.nan, 1], [1, 1]], [1, 1, 1, -1]
-    )
+    with as_read():
+        useless = Observations(
+            0, [[5, 5], [-90, 3], [240, 240], [240, 240]], [[1, 1], [1, 1], [np.nan, 1], [1, 1]], [1, 1, 1, -1]
+        )
     for observations in (nothing, useless):
         for method in ("assimilate", "pi_unet"):
             refined = Refiner(method).refine(case.assumed, observations, case.chip, case.solver)

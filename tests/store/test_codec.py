@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from flowrec.declarations import Matrix, Message, Vector, array_fields, defaulted_fields, message_fields
+from flowrec.declarations import Matrix, Message, Vector, array_fields, as_read, defaulted_fields, message_fields
 from flowrec.errors import SessionError
 from flowrec.messages import Event, FlowField, Frame, OperatorEvent, Track
 from flowrec.store import codec
@@ -65,7 +65,8 @@ def messages(draw, kind):
                     str: TEXTS,
                 }[form.kind]
             )
-    return kind(**values)
+    with as_read():
+        return kind(**values)
 
 
 @pytest.mark.parametrize("kind", TYPES, ids=lambda kind: kind.__name__)

@@ -17,7 +17,7 @@ from flowrec.cli import app
 from flowrec.commands.check import check
 from flowrec.commands.export import export
 from flowrec.config import config_from_toml
-from flowrec.declarations import Message, invalid_numbers, message_fields, shape_error
+from flowrec.declarations import Message, as_read, invalid_numbers, message_fields, shape_error
 from flowrec.errors import SessionError, UsageError, printable
 from flowrec.messages import Estimate, FlowField, Frame
 from flowrec.store.reader import SessionReader
@@ -100,7 +100,8 @@ def test_an_image_that_promises_more_than_it_has_is_refused(tmp_path):
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
 def test_a_pose_that_is_no_number_is_flagged(tmp_path, number):
     estimate = made_up(Estimate, 10**9, 0, np.random.default_rng(0))
-    payload = encode(replace(estimate, position_um=np.array([number, 1.0])))
+    with as_read():
+        payload = encode(replace(estimate, position_um=np.array([number, 1.0])))
     path = file_of(tmp_path, with_message(STATE, lambda sent: replace(sent, payload=payload)))
     verdict = check(path)
     assert verdict.word == "usable"
@@ -152,7 +153,8 @@ def spoiled(session, tmp_path, field, **changes):
     with SessionReader(session) as reader:
         header, ticks = reader.header, list(itertools.islice(reader.ticks(), 40))
     said = getattr(ticks[-5], field)
-    other = replace(said, **{name: np.full_like(getattr(said, name), value) for name, value in changes.items()})
+    with as_read():
+        other = replace(said, **{name: np.full_like(getattr(said, name), value) for name, value in changes.items()})
     path = tmp_path / "spoiled.mcap"
     with SessionWriter(path, header, WriterOptions(block=True)) as writer:
         for tick in ticks:

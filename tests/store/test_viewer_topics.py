@@ -8,6 +8,7 @@ import pytest
 from mcap.reader import make_reader
 
 from flowrec.chip.registration import Calibration, on_chip
+from flowrec.declarations import as_read
 from flowrec.flow import sample
 from flowrec.messages import Estimate, Mission, Observations, Route, Track
 from flowrec.session import Session
@@ -148,16 +149,17 @@ def test_the_robot_is_where_it_is_when_protobuf_reads_its_views():
 
 def test_numbers_beyond_all_measure_are_drawn_without_a_warning():
     way_um = np.array([[0.0, 1e300], [np.nan, -np.inf]])
-    route = Route(1, 0, "x", True, "", way_um, np.arange(2.0))
-    huge = np.full((4, 4, 2), 3e38, "<f4")
-    field = dataclasses.replace(
-        field_of(1, np.random.default_rng(0)),
-        velocity_um_s=huge,
-        um_per_px=np.nan,
-        registration=np.full((2, 3), np.inf),
-    )
-    here = Estimate(1, way_um[0], way_um[1], np.eye(4), 1.0, way_um[0], True)
-    made = Observations(1, way_um, way_um, np.array([1e300, np.nan]))
+    with as_read():
+        route = Route(1, 0, "x", True, "", way_um, np.arange(2.0))
+        huge = np.full((4, 4, 2), 3e38, "<f4")
+        field = dataclasses.replace(
+            field_of(1, np.random.default_rng(0)),
+            velocity_um_s=huge,
+            um_per_px=np.nan,
+            registration=np.full((2, 3), np.inf),
+        )
+        here = Estimate(1, way_um[0], way_um[1], np.eye(4), 1.0, way_um[0], True)
+        made = Observations(1, way_um, way_um, np.array([1e300, np.nan]))
     messages = {"route": route, "refined": field, "estimate": here, "observations": made}
     views = ViewerTopics(ViewerScene(ChipCamera(Calibration(2.0), (64, 48), 10.0), 0))
     assert len(list(views.of(messages))) >= 12

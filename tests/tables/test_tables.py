@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.declarations import message_fields
+from flowrec.declarations import as_read, message_fields
 from flowrec.errors import SessionError
 from flowrec.meanings import meanings
 from flowrec.messages import Estimate
@@ -76,7 +76,8 @@ def test_nan_and_infinity_stay_what_they_are_and_what_is_not_stated_is_empty(top
         if each.dtype is None or getattr(message, each.name) is not None
     }
     empty = {each.name: None for each in message_fields(type(message)) if each.optional}
-    messages = [message, dataclasses.replace(message, **worse), dataclasses.replace(message, **empty)]
+    with as_read():
+        messages = [message, dataclasses.replace(message, **worse), dataclasses.replace(message, **empty)]
     rows = rows_of(topic, messages)
     assert differences(topic, rows, messages) == []
     assert [row["wall_time"].value for row in rows] == [10**9 + 10**18] * 3
