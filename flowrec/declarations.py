@@ -88,7 +88,9 @@ class MessageField:
 
 
 _FIELDS: dict[type, tuple[MessageField, ...]] = {}
-_ARRAYS: dict[type, tuple[tuple[str, np.dtype[Any]], ...]] = {}  # for Message.__post_init__, which runs often
+# For Message.__post_init__, which runs often.
+_ARRAYS: dict[type, tuple[tuple[str, np.dtype[Any]], ...]] = {}
+_FINITE: dict[type, tuple[str, ...]] = {}
 
 
 def message_fields(message_type: type) -> tuple[MessageField, ...]:
@@ -209,10 +211,13 @@ class Message:
         return True
 
 
-@functools.cache
 def _finite_fields(message_type: type) -> tuple[str, ...]:
     """Names of the fields whose numbers may be NaN or infinite by their type only."""
-    return tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
+    found = _FINITE.get(message_type)
+    if found is None:
+        found = tuple(each.name for each in message_fields(message_type) if each.is_float and each.finite)
+        _FINITE[message_type] = found
+    return found
 
 
 def _is_finite(value: float | NDArray[np.floating]) -> bool:

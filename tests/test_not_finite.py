@@ -1,4 +1,4 @@
-"""NaN and infinity are refused where a message is made: in every field of every message of a run, but those that may."""
+"""NaN and infinity are refused where a message is made, in every field of every message of a run that excludes them."""
 
 from __future__ import annotations
 
