@@ -165,6 +165,15 @@ class FlowField(Message):
     viscosity_law: str = ""
     # The registration that the refinement found: a measured place x (2,) lies on the chip at R (x, 1). None: as stated.
     registration: Annotated[Matrix, Shape(2, 3)] | None = None
+    # Why this is the flow that was in use before, with the number of the order that it answers, and not the flow that
+    # was ordered. '': it is that one.
+    refused: str = ""
+    # Mean ln probability density, per observation and in 1/(um/s)^2, of observations that were held back: under the
+    # flow that was ordered, under the flow in use before it, and one standard error of their difference. None: not
+    # tested. See refine/held_back.py.
+    log_score: float | None = None
+    log_score_before: float | None = None
+    log_score_error: float | None = None
 
     def to_xarray(self) -> xarray.Dataset:
         """The field as an xarray Dataset with the dimensions y_um, x_um and component; see field_views.py."""
@@ -212,6 +221,8 @@ class Route(Message):
     survey_flow_um_s: Annotated[Matrix, Shape("o", 2)] | None = None
     # (2,) the goal that was asked for, which its last point may be near only; (0,): none, or not stated
     goal_um: Annotated[Vector, Shape("q")] = field(default_factory=lambda: np.zeros(0))
+    # Why this is the route that was in use before, or none, and not the result of the order. '': it is that result.
+    refused: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

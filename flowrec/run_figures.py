@@ -81,7 +81,7 @@ def figures_of(
         for name in FLOW_FIELDS:
             flow: FlowField | None = getattr(last, name)
             if flow is not None:
-                figures[f"{name}_method"] = flow.method
+                figures[f"{name}_method"] = f"{flow.method}, another refused" if flow.refused else flow.method
                 figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)
     if last.observations is not None:
         figures["observations"] = len(last.observations.position_um)

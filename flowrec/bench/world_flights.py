@@ -224,7 +224,7 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
     planted = planted_causes(config, chip)
     flight.refined["assumed"] = scored(order.assumed, truth, chip.mask)
     for method in methods:
-        refiner = replace(config.refine, method=method)
+        refiner = replace(config.refine, method=method, adopt="always")  # what the method gives, good or bad
         try:
             result = work(replace(pipeline, refiner=refiner), order)
         except FlowrecError as error:

@@ -327,6 +327,9 @@ def record(
             facts["tracking_error_um"] = statistics.tracking_error_um
         if control.note:
             facts["note_not_finished"] = control.note
+        refined = report.last.refined
+        if refined is not None and refined.refused and resolved.refine.observes_flow and refined.log_score is None:
+            facts["doubts"] = f"the flow was not refined: {refined.refused}"
         if isinstance(rig, MovieRig) and rig.noticed:
             facts["note_movie"] = "; ".join(rig.noticed)
         covered = None

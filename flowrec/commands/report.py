@@ -192,7 +192,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
         key_figures=_key_figures(data),
         figures=done,
         refined=data.refined is not None,
-        refinement=data.refined.note.split("; ") if data.refined is not None and data.refined.note else [],
+        refinement=_refinement(data),
         boundary=_boundary(data),
         events=_events(data),
         recording=Table("", [fact for fact in verdict.facts.items() if fact[0] not in ("written", "outcome")]),
@@ -271,6 +271,22 @@ def _boundary(data: ReportData) -> Table | None:
         what = "mean inward speed" if inlet else "pressure"
         rows.append((f"{opening.kind} on the {opening.side}, {what}", *texts))
     return Table("At the openings of the chip", rows, ("", *fields))
+
+
+def _refinement(data: ReportData) -> list[str]:
+    """What the refinement found, or why it was refused, and how both maps predict what was held back."""
+    refined = data.refined
+    if refined is None:
+        return []
+    found = refined.note.split("; ") if refined.note else []
+    if refined.refused:
+        found = [f"refused, the map in use stays: {refined.refused}"]
+    if refined.log_score is not None and refined.log_score_before is not None:
+        found.append(
+            f"log score of observations that were held back {refined.log_score:.2f}, by the map in use before "
+            f"{refined.log_score_before:.2f}"
+        )
+    return found
 
 
 def _events(data: ReportData) -> list[Table]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowrec.enums import Action, Alarm, Level, Outcome, Phase
-from flowrec.messages import Event, Health, Mission, OperatorEvent
+from flowrec.messages import Event, FlowField, Health, Mission, OperatorEvent
 from flowrec.topics import Tick
 from flowrec.units import seconds
 
@@ -46,8 +46,7 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
         peak = float(np.linalg.norm(tick.assumed.velocity_um_s, axis=-1).max())
         yield f"assumed flow adopted ({tick.assumed.method}), peak {peak:.0f} um/s", None
     if tick.refined is not None and tick.refined is not last.refined:
-        note = f": {tick.refined.note}" if tick.refined.note else ""
-        yield f"refined flow adopted ({tick.refined.method}){note}", None
+        yield _refined(tick.refined)
     route = tick.route
     if route is None or route is last.route:
         return
@@ -56,7 +55,7 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
         return
     mission, before = tick.mission, last.mission
     if mission is not None and before is not None and mission.phase == before.phase in (Phase.SURVEY, Phase.NAVIGATE):
-        yield f"{mission.phase}: {route.reason}", None  # ordered on the way
+        yield f"{mission.phase}: {route.reason}", Level.WARNING if route.refused else None  # ordered on the way
         return
     if (
         mission is not None
@@ -70,6 +69,21 @@ def _results(last: Tick, tick: Tick, needs_time_to_go: bool) -> Iterator[Line]:
     yield f"route adopted ({route.method}): {length / 1000:.2f} mm in {route.arrival_s[-1]:.1f} s", None
     if needs_time_to_go and route.method != "survey" and route.time_to_go_s is None:
         yield "no time to go is known from here: the route is followed as by control.method = vector", Level.WARNING
+
+
+def _refined(flow: FlowField) -> Line:
+    """A refined flow that is adopted, or refused for the one in use; and how both predict what was held back."""
+    scores = ""
+    if flow.log_score is not None and flow.log_score_before is not None:
+        scores = f" (log score {flow.log_score:.2f} against {flow.log_score_before:.2f})"
+    if flow.refused:
+        return f"refined flow refused, the map in use stays: {flow.refused}{scores}", Level.WARNING
+    note = f": {flow.note}" if flow.note else ""
+    if scores:
+        assert flow.log_score is not None and flow.log_score_before is not None and flow.log_score_error is not None
+        sure = flow.log_score - flow.log_score_before > 2.0 * flow.log_score_error
+        note += f"; predicts held-back observations {'better' if sure else 'no worse'} than the map before{scores}"
+    return f"refined flow adopted ({flow.method}){note}", None
 
 
 def _visibility(last: Tick, tick: Tick) -> Iterator[Line]:

@@ -30,6 +30,7 @@ from flowrec.refine.disturbances import held_back
 from flowrec.refine.field_variance import expected_error, field_variance, prior_variance
 from flowrec.refine.findings import PROBABLE, findings
 from flowrec.refine.flow_model import flow_model
+from flowrec.refine.held_back import scores_of
 from flowrec.refine.hypothesis import (
     Fitted,
     Robust,
@@ -375,7 +376,8 @@ class Assimilate(PriorSettings):
             stds = np.append(stds, 2 * [obstacle.half_width_px * chip.um_per_px])
         moved = over_error((velocity_um_s - problem.assumed.velocity_um_s)[chip.mask], std_um_s[chip.mask])
         note = report(chip, problem.operator, best, [*wrong, *also.words], moved)
-        return replace(
+        scores = scores_of(best, problem.before) if problem.hold_back else None
+        field = replace(
             problem.assumed,
             method="assimilate",
             um_per_px=chip.um_per_px,
@@ -393,3 +395,4 @@ class Assimilate(PriorSettings):
             viscosity_law=law_text(fitted.law),
             registration=np.tensordot(every.weights, [one.registration.matrix for one in every.found], axes=1),
         )
+        return field if scores is None else scores.on(field)

@@ -152,6 +152,10 @@ class Evidence:
             ]
         )
 
+    def covariance(self, ln_sizes: Floats) -> Floats:
+        """(m, m) of the observations at sizes of the effects."""
+        return self._covariance(self._matrices(), ln_sizes)
+
     def _matrices(self) -> Floats:
         """(effects, m, m) what each effect adds to the covariance at size 1."""
         return np.stack([effect.matrix for effect in self.effects])

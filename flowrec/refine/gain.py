@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowrec.messages import FlowField
+from flowrec.refine.held_back import Scores, blocks, made_after, predicted_in
 from flowrec.refine.method import Problem
 from flowrec.refine.observation_operator import Floats
 
@@ -33,8 +34,11 @@ class Gain:
         factor, factor_std = _factor(predicted, operator.flow_um_s, variance, spread)
         speed = np.linalg.norm(assumed.velocity_um_s, axis=-1, keepdims=True)
         std = np.hypot(factor_std * assumed.velocity_um_s, spread * speed)
+        scores = None
+        if problem.hold_back:
+            scores = _scores(problem, predicted, variance, spread)
         power = float((assumed.velocity_um_s.astype(np.float64) ** 2).sum())
-        return replace(
+        field = replace(
             assumed,
             method="gain",
             velocity_um_s=(factor * assumed.velocity_um_s).astype(np.float32),
@@ -48,6 +52,38 @@ class Gain:
             parameters=np.array([factor]),
             parameter_std=np.array([factor_std]),
         )
+        return field if scores is None else scores.on(field)
+
+
+def _scores(problem: Problem, predicted: Floats, variance: Floats, spread: float) -> Scores | None:
+    """Of the factor of the other observations, and of the flow before with a spread of its own around it."""
+    operator = problem.operator
+    which, there = np.arange(operator.count), predicted
+    if problem.before is not None:
+        which, there = which[made_after(operator, problem.before)], predicted_in(operator, problem.before)
+    held = blocks(which)
+    if not held:
+        return None
+    measured, square = operator.flow_um_s, (there**2).sum(axis=1)
+    before = _spread(there[which], measured[which], variance[which], 1.0)
+    new, old = [], []
+    for block in held:
+        rest = np.setdiff1d(np.arange(operator.count), block)
+        factor, factor_std = _factor(predicted[rest], measured[rest], variance[rest], spread)
+        noise = np.repeat(variance[block] + spread**2 * (predicted[block] ** 2).sum(axis=1), 2)
+        own = predicted[block].ravel()
+        new.append(_ln_density(measured[block].ravel() - factor * own, noise, factor_std * own) / len(block))
+        noise = np.repeat(variance[block] + before**2 * square[block], 2)
+        left = (measured[block] - there[block]).ravel()
+        old.append(_ln_density(left, noise, np.zeros_like(left)) / len(block))
+    return Scores(np.array(new), np.array(old))
+
+
+def _ln_density(left: Floats, variance: Floats, shared: Floats) -> float:
+    """Ln of a normal density at `left` (n,): independent variances (n,) and one error that all share, by `shared`."""
+    inner = 1.0 + float((shared**2 / variance).sum())
+    misfit = float((left**2 / variance).sum()) - float((shared * left / variance).sum()) ** 2 / inner
+    return -0.5 * (misfit + float(np.log(2.0 * np.pi * variance).sum()) + float(np.log(inner)))
 
 
 def _factor(predicted: Floats, measured: Floats, variance: Floats, spread: float) -> tuple[float, float]:
@@ -63,13 +99,16 @@ def _factor(predicted: Floats, measured: Floats, variance: Floats, spread: float
     return factor, float(np.sqrt(scatter)) / precision
 
 
-def _spread(predicted: Floats, measured: Floats, variance: Floats) -> float:
-    """The spread (of the speed, per component) at which chi squared is its number of degrees of freedom; 0 or more."""
+def _spread(predicted: Floats, measured: Floats, variance: Floats, known: float | None = None) -> float:
+    """The spread (of the speed, per component) at which chi squared is its number of degrees of freedom; 0 or more.
+
+    It is that around a factor that is `known`, or else around the one that fits best.
+    """
     square = (predicted**2).sum(axis=1)
-    freedom = 2.0 * len(square) - 1.0
+    freedom = 2.0 * len(square) - (1.0 if known is None else 0.0)
 
     def excess(spread: float) -> float:
-        factor, _ = _factor(predicted, measured, variance, spread)
+        factor = _factor(predicted, measured, variance, spread)[0] if known is None else known
         left = ((measured - factor * predicted) ** 2).sum(axis=1)
         return float((left / (variance + spread**2 * square)).sum()) - freedom
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowrec.flow.sensitivities import Remainder
 from flowrec.flow.uncertainty import Registration
@@ -69,10 +70,13 @@ class Fitted:
 
     def gain(self) -> float:
         """Ln evidence over that of the assumed flow, when robot, registration and pump may differ in both."""
+        return self.sizes.evidence - self.in_assumed_flow().sizes().evidence
+
+    def in_assumed_flow(self) -> Evidence:
+        """The observations in the assumed flow, where robot, registration and pump alone may differ."""
         base = self.observed.model.base
         full = _evidence(self.observed, self.robust, np.zeros_like(base), base, self.line_hz)
-        assumed = replace(full, effects=[effect for effect in full.effects if effect.name not in FIELD_EFFECTS])
-        return self.sizes.evidence - assumed.sizes().evidence
+        return replace(full, effects=[effect for effect in full.effects if effect.name not in FIELD_EFFECTS])
 
     def unknowns(self, *names: str) -> tuple[Floats, Floats]:
         """Mean (k,) and covariance (k, k) of the unknowns of effects; what there is not is left out."""
@@ -184,7 +188,7 @@ def shaking_stage(observed: Observed, robust: Robust) -> Disturbance | None:
         return None
     evidence = _evidence(observed, robust, np.zeros_like(base), base, None)
     sizes = evidence.sizes()
-    hz = likeliest_hz(evidence, sizes, _averages(robust, here), here.time_s, float(np.median(here.std_um_s)))
+    hz = likeliest_hz(evidence, sizes, averages(robust, here), here.time_s, float(np.median(here.std_um_s)))
     if hz is None:
         return None
     found = shaking(hz, here.time_s)
@@ -308,7 +312,7 @@ def _followed(observed: Observed, robust: Robust, state: State, steps: Steps) ->
         z = state.evidence.most_probable(state.sizes)
         remainder = model.expansion.approach(model.prior.offset(z[: len(model.known)]), state.remainder)
         nonlinear = model.expansion.pixels(remainder.flux)
-        shift = _averages(robust, observed.operator) @ observed.operator.predict(nonlinear - state.nonlinear).ravel()
+        shift = averages(robust, observed.operator) @ observed.operator.predict(nonlinear - state.nonlinear).ravel()
         evidence = replace(state.evidence, y=state.evidence.y - shift)
         state = replace(state, evidence=evidence, remainder=remainder, nonlinear=nonlinear)
         if remainder.step <= steps.tolerance:
@@ -330,7 +334,7 @@ def _flow(observed: Observed, z: Floats, in_use: Floats, nonlinear: Floats) -> F
 def _evidence(observed: Observed, robust: Robust, nonlinear: Floats, in_use: Floats, line_hz: float | None) -> Evidence:
     """The observations, averaged, and the effects on them."""
     here = observed.operator
-    average = _averages(robust, here)
+    average = averages(robust, here)
     misfit = observed.misfit(observed.model.base + nonlinear, in_use)
     noise = np.repeat(robust.factor**2 * robust.variance / robust.inlier, 2)
     effects = [
@@ -347,10 +351,15 @@ def _evidence(observed: Observed, robust: Robust, nonlinear: Floats, in_use: Flo
     return Evidence(average @ misfit.ravel(), least * np.eye(len(stated)), effects)
 
 
-def _averages(robust: Robust, operator: ObservationOperator) -> Floats:
+def groups(count: int) -> NDArray[np.intp]:
+    """(n,) number of the mean that each observation is a part of, in order."""
+    return np.arange(count) * min(MOST_OBSERVATIONS, count) // count
+
+
+def averages(robust: Robust, operator: ObservationOperator) -> Floats:
     """(m, 2 n) weighted means of neighbours along the way, x and y of each in turn; the identity for few."""
     count = operator.count
-    group = np.arange(count) * min(MOST_OBSERVATIONS, count) // count
+    group = groups(count)
     weight = robust.inlier / robust.variance
     matrix = np.zeros((group[-1] + 1, count))
     matrix[group, np.arange(count)] = weight
@@ -368,7 +377,7 @@ def _line_hz(observed: Observed, robust: Robust, evidence: Evidence, sizes: Size
         # A line must not be taken for a wander.
         wander = effect.name.startswith("wander")
         base += (effect.median**2 if wander else np.exp(2.0 * ln_size)) * effect.matrix
-    average = _averages(robust, observed.operator)
+    average = averages(robust, observed.operator)
     weighted = average * observed.operator.predict(observed.model.base).ravel()  # (m, 2 n): times a wave, its column
     phase = np.repeat(2.0 * np.pi * frequencies[:, None] * time_s, 2, axis=1)
     columns = np.stack([np.cos(phase), np.sin(phase)], axis=1) @ weighted.T  # (k, 2, m)

@@ -23,6 +23,9 @@ class Problem:
     # Computes the result of the assimilation, for methods that start from it, and the observations less what it finds
     # that robot, registration and pump do to them. True: with channels partly blocked.
     assimilated: Callable[[bool], tuple[FlowField, ObservationOperator]]
+    # Whether to state how the result predicts observations that were held back, see held_back.py.
+    hold_back: bool = False
+    before: FlowField | None = None  # the refined flow in use; None: it is the assumed one
 
 
 class Refinement(Protocol):
@@ -31,7 +34,8 @@ class Refinement(Protocol):
     def fit(self, problem: Problem) -> FlowField:
         """Better field (h, w) with the stamp and request of `problem.assumed`: zero in solid, with a note.
 
-        Its `std_um_s` is the standard deviation of each component, or None where the method gives none.
+        Its `std_um_s` is the standard deviation of each component, or None where the method gives none; its scores are
+        those of held_back.py, or None where the method would have to fit again to hold observations back.
 
         Raises
         ------

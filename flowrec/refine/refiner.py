@@ -7,7 +7,9 @@ one field of `Refiner` more, named in the row's options.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, Literal
+
+import numpy as np
 
 from flowrec.chip.chip import Chip
 from flowrec.errors import FlowError
@@ -16,6 +18,7 @@ from flowrec.flow.uncertainty import FlowUncertainty
 from flowrec.messages import FlowField, Observations
 from flowrec.methods import Method, Methods
 from flowrec.refine.assimilate import Assimilate
+from flowrec.refine.held_back import FEWEST, made_after, worse
 from flowrec.refine.method import Problem, Refinement
 from flowrec.refine.ni import Ni
 from flowrec.refine.observation_operator import ObservationOperator, observation_operator
@@ -59,6 +62,25 @@ REFINERS = Methods(
 )
 
 
+NO_FLOW = (
+    "there is no log of the coils, and the motion of a driven robot is not that of the flow; import with --coils LOG, "
+    "or with --set movie.drifts=true if nothing drove it"
+)
+
+
+def _untested(operator: ObservationOperator, before: FlowField | None) -> str:
+    """Why a flow could not be tested on observations that were held back."""
+    count = operator.count if before is None else int(np.count_nonzero(made_after(operator, before)))
+    why = f"{count} are too few" if count < FEWEST else "the method would have to fit again without them"
+    return f"not tested on observations that were held back: {why}"
+
+
+def kept(in_use: FlowField, why: str, refused: FlowField | None = None) -> FlowField:
+    """The flow in use with the reason why another is refused, and with the scores of that one where it has any."""
+    scores = [getattr(refused, name, None) for name in ("log_score", "log_score_before", "log_score_error")]
+    return replace(in_use, refused=why, log_score=scores[0], log_score_before=scores[1], log_score_error=scores[2])
+
+
 @dataclass(frozen=True, slots=True)
 class AssumedFlow:
     """The method `fvm`: no refinement."""
@@ -73,6 +95,11 @@ class Refiner:
     """Chooses the method. `ni` and `pinn` do not use the assumed field."""
 
     method: Annotated[str, REFINERS] = "assimilate"
+    # predicts: the flow in use stays where the refined one predicts observations that were held back worse, by more
+    # than two standard errors; always: the refined one is adopted without a test
+    adopt: Literal["predicts", "always"] = "predicts"
+    # False: nobody knows what part of the motion that was observed is the robot's own; nothing is refined
+    observes_flow: bool = True
     # Mission and controller place the robot on the chip by the registration that the refinement found.
     place_robot: bool = True
     assimilate: Assimilate = field(default_factory=Assimilate)
@@ -87,20 +114,32 @@ class Refiner:
         return str(getattr(self._selected(), "weights_sha256", ""))
 
     @one_blas_thread()
-    def refine(self, assumed: FlowField, observations: Observations, chip: Chip, solver: FlowSolver) -> FlowField:
+    def refine(
+        self,
+        assumed: FlowField,
+        observations: Observations,
+        chip: Chip,
+        solver: FlowSolver,
+        before: FlowField | None = None,
+    ) -> FlowField:
         """Better field on the same pixels; stamp and request are those of `assumed`.
 
         `chip` holds the assumed parameters. Without a usable observation `assumed` is returned with a note, and with
-        the standard deviation that follows from the prior of its parameters.
+        the standard deviation that follows from the prior of its parameters. Where its method can, it states how it
+        predicts observations that were held back, and how the flow in use does: `before`, a refined one, or `assumed`.
 
         Raises
         ------
+        NotFiniteError
+            If the fit diverges.
         FlowError
             If field and chip differ in size, or the flow of the fitted parameters can not be computed.
         UsageError
             If there is no such method, or a package that it needs is not installed.
         """
         method = self._selected()
+        if not self.observes_flow:
+            return kept(assumed if before is None else before, NO_FLOW)
         if assumed.velocity_um_s.shape[:2] != chip.mask.shape:
             raise FlowError(
                 f"the assumed field has {assumed.velocity_um_s.shape[:2]} pixels and the mask of chip '{chip.name}' "
@@ -111,13 +150,24 @@ class Refiner:
         def assimilated(obstacles: bool) -> tuple[FlowField, ObservationOperator]:
             return self.assimilate.fit_with_observations(problem, obstacles)
 
-        problem = Problem(assumed, operator, chip, solver, assimilated)
+        hold_back = self.adopt == "predicts"
+        if before is not None and before.refused and np.array_equal(before.velocity_um_s, assumed.velocity_um_s):
+            before = None
+        problem = Problem(assumed, operator, chip, solver, assimilated, hold_back, before)
         if operator.count == 0 and not isinstance(method, AssumedFlow):
             ignored = operator.ignored
             why = f"none of the observations is of use ({ignored})" if ignored else "no observations"
             return self.assimilate.unobserved(replace(assumed, note=f"not refined: {why}"), chip, solver)
         refined = method.fit(problem)
+        if hold_back and refined.log_score is None and not isinstance(method, AssumedFlow):
+            refined = replace(refined, note=f"{refined.note}; {_untested(operator, before)}")
         return refined if self.place_robot else replace(refined, registration=None)
+
+    def chosen(self, refined: FlowField, in_use: FlowField) -> FlowField:
+        """The refined flow, or with a reason the flow in use where that predicts held-back observations better."""
+        if self.adopt == "always" or not worse(refined):
+            return refined
+        return kept(in_use, f"by {refined.method} it predicts observations that were held back worse", refined)
 
     @one_blas_thread()
     def prior_error_share(self, chip: Chip, solver: FlowSolver) -> float | None:

@@ -10,11 +10,15 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
+
 from flowrec.declarations import Message
 from flowrec.enums import Phase, WorkOrder
-from flowrec.errors import FlowError
+from flowrec.errors import FlowError, NotFiniteError
 from flowrec.messages import FlowField, Mission, Route
 from flowrec.pipeline import Pipeline
+from flowrec.planning.route import no_route
+from flowrec.refine.refiner import kept
 from flowrec.run.route_orders import observations_of, route, survey_route
 from flowrec.system.blas_threads import one_blas_thread
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
@@ -32,32 +36,63 @@ def ordered(tick: Tick) -> tuple[Mission, str]:
 
 @one_blas_thread()
 def work(pipeline: Pipeline, order: Tick) -> Result:
-    """Do what `order.mission` wants with what was known in that tick; the result has the order's stamp and number."""
+    """Do what `order.mission` wants with what was known in that tick; the result has the order's stamp and number.
+
+    A result that is not finite, or that the numerics can not give, is refused: what is in use stays, and the result
+    says why (`refused`). Where nothing is in use yet the run ends with the error.
+
+    Raises
+    ------
+    FlowrecError : bad settings; nothing is in use that could stay.
+    """
     mission, _ = ordered(order)
-    result: Result
+    try:
+        result = _done(pipeline, order, mission)
+        return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
+    except (NotFiniteError, np.linalg.LinAlgError) as error:
+        if mission.wanted == WorkOrder.SOLVE:
+            raise
+        result = _in_use(pipeline, order, mission, str(error))
+    return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
+
+
+def _done(pipeline: Pipeline, order: Tick, mission: Mission) -> Result:
     if mission.wanted == WorkOrder.SOLVE:
         solved = pipeline.solver.solve(pipeline.chip)
-        share = pipeline.refiner.prior_error_share(pipeline.chip, pipeline.solver)
-        result = replace(solved, error_share=share)
-    elif mission.wanted == WorkOrder.REFINE:
-        result = _refined(pipeline, order, mission)
-    elif mission.wanted == WorkOrder.SURVEY_ROUTE:
-        result = survey_route(pipeline, order, mission)
-    else:
-        result = route(pipeline, order, mission)
-    return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
+        return replace(solved, error_share=pipeline.refiner.prior_error_share(pipeline.chip, pipeline.solver))
+    if mission.wanted == WorkOrder.REFINE:
+        return _refined(pipeline, order, mission)
+    if mission.wanted == WorkOrder.SURVEY_ROUTE:
+        return survey_route(pipeline, order, mission)
+    return route(pipeline, order, mission)
 
 
 def _refined(pipeline: Pipeline, order: Tick, mission: Mission) -> FlowField:
     """The refined flow; on the way to the goal the one before, where the new one can not be computed."""
-    assert order.assumed is not None
+    assert order.assumed is not None and order.field is not None
     observations = observations_of(pipeline, order)
+    refiner = pipeline.refiner
     try:
-        return pipeline.refiner.refine(order.assumed, observations, pipeline.chip, pipeline.solver)
+        found = refiner.refine(order.assumed, observations, pipeline.chip, pipeline.solver, order.refined)
     except FlowError as error:
         if mission.phase != Phase.NAVIGATE or order.refined is None:
             raise
-        return replace(order.refined, note=f"not refined again: {error}")
+        if refiner.adopt == "always":  # as sessions have it that were recorded before maps were tested
+            return replace(order.refined, note=f"not refined again: {error}")
+        return kept(order.refined, str(error))
+    return refiner.chosen(found, order.field)
+
+
+def _in_use(pipeline: Pipeline, order: Tick, mission: Mission, why: str) -> Result:
+    """What is in use at an order whose result is refused; no route where the robot is not on one."""
+    if mission.wanted == WorkOrder.REFINE:
+        assert order.field is not None
+        return kept(order.field, why)
+    if order.route is not None and mission.phase in (Phase.SURVEY, Phase.NAVIGATE):
+        # A survey ends with this stretch: the next one would be refused as well.
+        return replace(order.route, reason=f"route kept: {why}", more=False, refused=why)
+    method = "survey" if mission.wanted == WorkOrder.SURVEY_ROUTE else pipeline.planner.method
+    return replace(no_route(method, why), goal_um=mission.goal_um, refused=why)
 
 
 class Worker(Protocol):

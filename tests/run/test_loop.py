@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from flowrec.commands.record import prepare, record
 from flowrec.config import load_config
+from flowrec.errors import NotFiniteError
 from flowrec.estimation import Observer
 from flowrec.messages import Estimate
 from flowrec.pipeline import assemble
@@ -31,25 +33,51 @@ class Breaking(Observer):
     """Fails at a certain frame."""
 
     def estimate(self, previous, track, *known) -> Estimate:  # type: ignore[no-untyped-def]
+        found = Observer.estimate(self, previous, track, *known)
         if track.stamp_ns >= BREAKS_NS:
-            raise ValueError("the observer is broken")
-        return Observer.estimate(self, previous, track, *known)
+            self.fail(found)
+        return found
+
+    def fail(self, _found: Estimate) -> None:
+        """Raise what a defect does."""
+        raise ValueError("the observer is broken")
 
 
+@dataclass(frozen=True, slots=True)
+class Diverging(Breaking):
+    """Its flow is not finite from a certain frame on."""
+
+    def fail(self, found: Estimate) -> None:
+        """Make a message that is refused."""
+        replace(found, flow_um_s=np.array([np.inf, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("observer", "error", "said"),
+    [
+        (Breaking, ValueError, "the observer is broken"),
+        (Diverging, NotFiniteError, r"Estimate at 0.5\d* s refused: NaN or infinity in flow_um_s \(1 of 2 numbers\)"),
+    ],
+)
 def test_a_stage_that_fails_leaves_the_inputs_that_broke_it_as_the_last_tick_and_nothing_made_of_them(
-    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    session: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    observer: type[Breaking],
+    error: type[Exception],
+    said: str,
 ) -> None:
     def planted(config, chip):  # type: ignore[no-untyped-def]
         pipeline = assemble(config, chip)
-        return replace(pipeline, observer=Breaking(config.observer.method))
+        return replace(pipeline, observer=observer(config.observer.method))
 
     monkeypatch.setattr("flowrec.commands.record.assemble", planted)
     path = tmp_path / "broken.mcap"
-    with pytest.raises(ValueError, match="the observer is broken"):
+    with pytest.raises(error, match=said):
         record(load_config(None, SMALL), path)
     reader = SessionReader(path)
     assert reader.outcome["outcome"] == "failed"
-    assert "the observer is broken" in reader.outcome["reason"]
+    assert re.search(said, reader.outcome["reason"])
     *_, before, last = reader.ticks()
     # The same run, whole: what arrived on that tick.
     whole = next(tick for tick in SessionReader(session).ticks() if tick.stamp_ns >= BREAKS_NS)
