@@ -87,8 +87,8 @@ def resolve(config: Config, chip: Chip) -> ResolvedConfig:
 def derived(asked: Config, resolved: ResolvedConfig) -> dict[str, float]:
     """The numbers that resolving a configuration has filled in or changed, by key; without those of a named world."""
     was, now = _flat(asdict(asked), ""), _flat(asdict(replace(resolved, simulated=asked.simulated)), "")
-    numbers = {key: value for key, value in now.items() if isinstance(value, (int, float))}
-    return {key: value for key, value in numbers.items() if not isinstance(value, bool) and value != was[key]}
+    numbers = {key: value for key, value in now.items() if type(value) in (int, float)}
+    return {key: value for key, value in numbers.items() if value != was[key]}
 
 
 def _flat(tree: Mapping[str, Any], prefix: str) -> dict[str, Any]:

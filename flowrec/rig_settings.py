@@ -124,6 +124,7 @@ class Movie:
     times: str = ""  # CSV with a column time_s, a row for each image; '': as the movie tells
     rate_hz: Annotated[float, Range(1e-4, 1e6)] | None = None  # of the images, instead of their times
     coils: str = ""  # log of the coils, CSV or Excel; '': there is none
+    drifts: bool = False  # nothing drives the body, so that without a log its motion is that of the flow
     columns: Columns = field(default_factory=Columns)
     # Seconds of the log per second of the movie, and time of the log minus time of the movie at the first image.
     clock_rate: Annotated[float, Range(0.01, 100.0)] = 1.0

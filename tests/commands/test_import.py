@@ -148,12 +148,36 @@ def test_without_a_log_the_movie_is_still_a_session_that_says_what_it_does_not_k
     out = lab.folder / "watched.mcap"
     done = flowrec.import_movie(lab.folder / "film.avi", out, lab.config)
     assert done.exit_status == 0 and flowrec.replay(out, verify=True).same
-    assert "no log of the coils: how far the robot rolled by itself is not known" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no log of the coils: how far the robot rolled by itself is not known, so the flow is not refined" in said
+    assert "observes_flow" not in said
     assert flowrec.info(out)["coil_log_file"].startswith("none")
     session = flowrec.open(out)
     assert not any(tick.applied.turns.any() for tick in session.ticks(with_frames=False))
     moved = np.linalg.norm([each.flow_um_s for each in session.messages("estimate")], axis=1)
     assert np.median(moved) > 30.0  # what carried the robot, the coils' part included
+    said = [event.text for event in session.events if "refined flow" in event.text]
+    assert len(said) == 1
+    assert said[0].startswith("refined flow refused, the map in use stays: there is no log of the coils")
+    maps = session.fields
+    assert maps["refined"].refused and "movie.drifts=true" in maps["refined"].refused
+    np.testing.assert_array_equal(maps["refined"].velocity_um_s, maps["assumed"].velocity_um_s)
+    flowrec.replay(out, out=lab.folder / "again.mcap", refine="gain")  # by no other method either
+    assert flowrec.open(lab.folder / "again.mcap").fields["refined"].refused
+
+
+def test_a_body_that_only_drifts_shows_the_flow_without_a_log(
+    lab: Laboratory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drifting = replace(lab.config, movie=replace(lab.config.movie, drifts=True))
+    out = lab.folder / "drifting.mcap"
+    assert flowrec.import_movie(lab.folder / "short.avi", out, drifting).exit_status == 0
+    assert "not refined" not in capsys.readouterr().err
+    maps = flowrec.open(out).fields
+    assert not maps["refined"].refused and maps["refined"].method == "assimilate"
+    assert flowrec.info(out)["coil_log_file"] == "none: movie.drifts: the motion is that of the flow"
+    with pytest.raises(UsageError, match=r"movie.drifts = true says that nothing drove the body, and .*log.csv is a"):
+        flowrec.import_movie(lab.folder / "short.avi", out, drifting, coils=lab.log, overwrite=True)
 
 
 def test_a_robot_acts_on_the_log_its_delay_later(lab: Laboratory) -> None:

@@ -100,7 +100,8 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
     """Settings that a movie and its log determine, the provenance of both, and remarks for people.
 
     The movie sets size, depth and rate of the camera. Without other phases the robot is observed. Its top speed, which
-    only bounds what is plausible, is that of the fastest rotation in the log. A delay that is not given is 0.
+    only bounds what is plausible, is that of the fastest rotation in the log. A delay that is not given is 0. Without a
+    log the flow is not refined, unless the body drifts.
 
     Raises
     ------
@@ -125,6 +126,9 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
         mission = config.mission
         if mission.phases == PHASES:
             mission = replace(mission, phases=(Phase.OBSERVE,))
+        refine = config.refine
+        if log is None and not config.movie.drifts:
+            refine = replace(refine, observes_flow=False)
         remarks = list(source.remarks)
         if facts.um_per_px is not None and config.camera.um_per_px is not None:
             ratio = config.camera.um_per_px / facts.um_per_px
@@ -132,7 +136,11 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
                 used = config.camera.um_per_px
                 remarks.append(f"the file says {facts.um_per_px:.6g} um per pixel; camera.um_per_px = {used:g} is used")
         changed = replace(
-            config, camera=replace(config.camera, **camera), robot=replace(robot, **known), mission=mission
+            config,
+            camera=replace(config.camera, **camera),
+            robot=replace(robot, **known),
+            mission=mission,
+            refine=refine,
         )
         return changed, source.provenance(), remarks
 

@@ -144,7 +144,8 @@ class MovieSource:
                 stated[f"{key}_file"] = Path(file).name
                 stated[f"{key}_sha256"] = sha256_of(Path(file))
         if self.log is None:
-            stated["coil_log_file"] = "none: the motion of the robot itself counts as flow"
+            drifts = "movie.drifts: the motion is that of the flow"
+            stated["coil_log_file"] = f"none: {drifts if settings.drifts else 'the flow is not refined'}"
         if self.remarks:
             stated["source_remarks"] = "; ".join(self.remarks)
         return stated
@@ -173,10 +174,17 @@ class MovieSource:
     def _read_log(self, coils: Coils) -> FieldLog | None:
         settings = self._settings
         if not settings.coils:
-            self._log_remarks.append(
-                "there is no log of the coils: how far the robot rolled by itself is not known and counts as flow"
-            )
+            if not settings.drifts:
+                self._log_remarks.append(
+                    "there is no log of the coils: how far the robot rolled by itself is not known, so the flow is not "
+                    "refined; give --coils LOG, or --set movie.drifts=true if nothing drove it"
+                )
             return None
+        if settings.drifts:
+            raise UsageError(
+                f"movie.drifts = true says that nothing drove the body, and {settings.coils} is a log of its coils; "
+                "leave one of them out"
+            )
         name = Path(settings.coils)
         log = read_coil_log(name, settings.columns, coils, settings.heading_offset_deg, settings.heading_mirrored)
         log = log.shifted(-self.first_ns - nanoseconds(settings.clock_offset_s))
