@@ -1,11 +1,13 @@
 """A refined flow is tested on observations that were held back, in closed form, and adopted only where it predicts."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+import flowrec
 from flowrec.flow import sample
 from flowrec.messages import Observations
 from flowrec.refine import Ni, Refiner
@@ -85,8 +87,29 @@ def test_a_map_in_use_is_tested_on_what_was_made_after_it_alone(twin):
         in_use = replace(case.true, stamp_ns=int((0.5 * (count - new) - 0.25) * 1e9))
         found = refined_of(case, in_use, timed)
         assert (found.log_score is not None) is tested
+        doubled = replace(in_use, velocity_um_s=2.0 * case.true.velocity_um_s)
+        if tested:  # by its own flow, not by the assumed one
+            assert refined_of(case, doubled, timed).log_score_before < found.log_score_before - 1.0
         said = f"not tested on observations that were held back: {new} are too few"
         assert (said in found.note) is not tested
+
+
+def test_the_factor_that_predicts_a_block_is_that_of_the_others(twin):
+    case = twin(truth=(150.0, 0.0, 0.0), noise=0.2)
+    flow = sample(case.true, case.observations.position_um)  # no spread but the stated noise
+    made = replace(case.observations, flow_um_s=flow)
+    assumed, expected = sample(case.assumed, made.position_um), []
+    for block in blocks(np.arange(len(flow))):
+        others = refined_of(case, None, made.only(np.setdiff1d(np.arange(len(flow)), block)), method="gain")
+        own, (factor,), (std,) = assumed[block].ravel(), others.parameters, others.parameter_std
+        covariance = made.std_um_s[0] ** 2 * np.eye(len(own)) + std**2 * np.outer(own, own)
+        expected.append(multivariate_normal(factor * own, covariance).logpdf(flow[block].ravel()) / len(block))
+    assert refined_of(case, None, made, method="gain").log_score == pytest.approx(np.mean(expected), abs=1e-5)
+
+
+def test_a_session_from_before_the_test_replays_without_it():
+    golden = flowrec.open(Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap")
+    assert golden.config.refine.adopt == "always" and Refiner().adopt == "predicts"
 
 
 def test_a_correction_of_an_assimilated_flow_has_the_scores_of_its_start(twin):
