@@ -224,7 +224,8 @@ def find(
 
         title, count = found.title(), len(found.rows)
         found = replace(found, rows=found.rows[: limit or _SHOWN_ROWS])  # a table of thousands takes seconds
-        table(title, *found.cells(width()), text="notes")
+        doubtful = [number for number, row in enumerate(found.rows) if row.get("doubts")]
+        table(title, *found.cells(width()), text="notes", amber=doubtful)
         for line in found.remarks():
             say(line)
         if count > len(found.rows):

@@ -248,7 +248,7 @@ def replay(
         raise typer.Exit(done.exit_status)
     from flowrec.commands.replay_report import Outputs, refinement_remarks, replay_and_report
     from flowrec.summary import comparison_for_people
-    from flowrec.terminal import say, table
+    from flowrec.terminal import say, table, warn
 
     outputs = Outputs.of(session, out, overwrite, refly=refly, rrd=view == "rrd")
     done, rows = replay_and_report(session, change, outputs, from_s, frames, AtTerminal())
@@ -257,7 +257,8 @@ def replay(
         figures = {"wall_s": report.wall_s, "duration_s": report.duration_s, "ticks": report.ticks}
         named = [dict(zip(("quantity", "recorded", "replayed"), row, strict=True)) for row in rows]
         result = {"session": str(session), "out": str(outputs.session.path), "refinement": remarks, "rows": named}
-        typer.echo(json.dumps(result | figures | {"covered": done.covered.as_json()}))
+        doubts = {"doubts": "; ".join(done.doubts)} if done.doubts else {}
+        typer.echo(json.dumps(result | figures | {"covered": done.covered.as_json()} | doubts))
     else:
         table(f"Replay of {session.name}", ("", "recorded", "replayed"), comparison_for_people(rows))
         length = f"({report.duration_s:.1f} s) replayed in {report.wall_s:.1f} s"
@@ -265,8 +266,11 @@ def replay(
         say(f"{done.covered.text} {length}{of_these} -> {outputs.session.path}")
         for line in remarks:
             say(line)
+        for doubt in done.doubts:
+            warn(f"doubtful: {doubt}")
     if done.covered.stopped:
         raise typer.Exit(done.covered.status)
+    raise typer.Exit(3 if done.doubts else 0)
 
 
 app.command("import", epilog=examples("import"))(import_movie)

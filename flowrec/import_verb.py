@@ -33,6 +33,10 @@ def import_movie(
         bool,
         typer.Option("--align/--no-align", help="Fit the clock of the log to the motion of the robot."),
     ] = True,
+    robot: Annotated[
+        str,
+        typer.Option(metavar="WHICH", help="Which body is the robot: number of the picture, X,Ypx, or X,Y in um."),
+    ] = "",
     sets: Sets = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -60,6 +64,7 @@ def import_movie(
         control=AtTerminal(),
         inputs=[config] if config is not None else [],
         align=align,
+        robot=robot,
     )
     if as_json:
         files = [str(file) for file in recorded.files]

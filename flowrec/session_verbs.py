@@ -253,7 +253,8 @@ def info(
     from flowrec.commands.info import facts_for_people
     from flowrec.terminal import table
 
-    table(session.name, ("", "value"), facts_for_people(facts))
+    rows = facts_for_people(facts)
+    table(session.name, ("", "value"), rows, amber=[n for n, (name, _) in enumerate(rows) if name == "doubts"])
     table("Topics", ("topic", "messages"), [(name, str(count)) for name, count in topics.items()])
 
 
@@ -273,7 +274,7 @@ def list_directory(
     as_json: AsJson = False,
 ) -> None:
     """List sessions, unfinished and unreadable ones included."""
-    from flowrec.commands.listed import columns_for_people
+    from flowrec.commands.listed import columns_for_people, is_doubtful
     from flowrec.commands.ls import list_sessions
 
     rows = list_sessions(*(places or ()), where=where, sort=sort)
@@ -282,7 +283,8 @@ def list_directory(
         return
     from flowrec.terminal import say, table, width
 
-    table(", ".join(map(str, places or ())), *columns_for_people(rows, width()), text="notes")
+    doubtful = [number for number, row in enumerate(rows) if is_doubtful(row)]
+    table(", ".join(map(str, places or ())), *columns_for_people(rows, width()), text="notes", amber=doubtful)
     for row in rows:
         if row.duration_s is None:
             say(f"{row.name}: {row.note}")

@@ -19,6 +19,7 @@ _WHOLE = ("_bytes", "_ns")
 _LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
 _OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
 _HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
+DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
 # Names of keys that would be misread as words.
 _NAMES = {
     "wall_s": "computed in",
@@ -47,6 +48,16 @@ def of_text(text: Mapping[str, str]) -> Figures:
     counts = [figures.pop("dropped_frames", None), figures.get("frames_dropped")]
     numbers = [count for count in counts if isinstance(count, int)]
     return figures | ({"frames_dropped": max(numbers)} if numbers else {})
+
+
+def doubts_text(doubts: Iterable[str]) -> str:
+    """Doubts as a session states them in its outcome, each once; '' for none."""
+    return "; ".join(dict.fromkeys(doubts))
+
+
+def doubts_of(outcome: Mapping[str, object]) -> list[str]:
+    """The doubts that the outcome of a session states."""
+    return [each for each in str(outcome.get(DOUBTS) or "").split("; ") if each]
 
 
 def finite(value: float) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TextIO, cast
 
@@ -134,9 +134,17 @@ def time_left(estimate_s: float | None, stands_s: float) -> str:
 
 
 def table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], to: TextIO | None = None, text: str = ""
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    to: TextIO | None = None,
+    text: str = "",
+    amber: Container[int] = (),
 ) -> None:
-    """Print a table on stdout, or on `to`; where a column is named `text`, only it and the first one are folded."""
+    """Print a table on stdout, or on `to`; where a column is named `text`, only it and the first one are folded.
+
+    Rows with a number in `amber` are doubtful and have that colour.
+    """
     to = to or sys.stdout
     shown = Table(title=escape(printable(title)), title_justify="left", title_style="bold")
     for number, column in enumerate(columns):
@@ -147,8 +155,8 @@ def table(
             overflow="fold",
             no_wrap=bool(text) and text in columns and not words,
         )
-    for row in rows:
-        shown.add_row(*(escape(printable(cell)) for cell in row))
+    for number, row in enumerate(rows):
+        shown.add_row(*(escape(printable(cell)) for cell in row), style="yellow" if number in amber else None)
     Console(file=to, highlight=False, width=width(to)).print(shown)
 
 

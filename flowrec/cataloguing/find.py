@@ -64,7 +64,7 @@ class FoundSessions:
 
     def cells(self, width: int) -> tuple[list[str], list[list[str]]]:
         """Names of the columns and the cells as `flowrec ls` has them, and what else the expression mentions."""
-        own = ("notes", "replay_of", *_IN_FLOW_ERROR)
+        own = ("notes", "doubts", "replay_of", *_IN_FLOW_ERROR)
         listed = [
             Listed(
                 self._path(row),

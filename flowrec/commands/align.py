@@ -28,17 +28,20 @@ from flowrec.commands.calibrate_motion import (
     remarks,
     rows_of,
 )
+from flowrec.commands.misfit import Evidence, why_still, why_unexplained
 from flowrec.commands.record import prepare
 from flowrec.config import Config
 from flowrec.control.coil_log import is_of_session, read_coil_log
 from flowrec.control.field_log import FieldLog
 from flowrec.errors import UsageError
-from flowrec.estimation.motion_fit import MotionFit
-from flowrec.messages import Appearance, FlowField, Track
+from flowrec.estimation.motion_fit import UNEXPLAINED, MotionFit
+from flowrec.messages import FlowField, Track
+from flowrec.pipeline import Sight, look
 from flowrec.rigs.movie.exported import session_of_log
 from flowrec.rigs.movie.source import MovieSource
 from flowrec.terminal import say, table, warn
-from flowrec.units import seconds
+from flowrec.units import NS_PER_S, seconds
+from flowrec.vision.track_quality import TrackQuality
 
 _FAR = 0.3  # relative difference of um_per_rev from which it is doubtful whether the log is of this run
 _Z95 = 1.96
@@ -57,6 +60,7 @@ class MovieTracks:
     seen : (n,)
     log : what the coils did on the same clock, without the robot's delay; None: there is no log.
     assumed : the flow by the chip and its boundary values.
+    evidence : what the images show besides, for a log that does not explain the track.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -64,26 +68,42 @@ class MovieTracks:
     seen: NDArray[np.bool_]
     log: FieldLog | None
     assumed: FlowField
+    evidence: Evidence
 
 
 def tracks_of(asked: Config) -> MovieTracks:
     """Track the robot through the movie of a configuration; FlowrecError as `import_movie`."""
     config, chip, pipeline, *_ = prepare(asked, aloud=False)  # the import says it, of the settings that are used
-    track: Track | None = None
-    appearance: Appearance | None = None
-    tracks: list[Track] = []
+    sight, tracks, shifts = Sight(), list[Track](), list[NDArray[np.float64]]()
+    quality = TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot)
+    stabilised, measures = bool(config.stabilise.on), replace(config.stabilise, on=True)
+    shift, background = None, None  # measured, too, where they are not taken out of the track
     with MovieSource(config.movie, config.coils) as source:
         for frame in source.frames():
-            found = config.tracker.follow(track, appearance, frame, chip, pipeline.calibration, config.robot)
-            track, appearance = found
-            tracks.append(track)
-        return MovieTracks(
-            np.array([each.stamp_ns for each in tracks], np.int64),
-            np.array([each.position_um for each in tracks]).reshape(-1, 2),
-            np.array([each.seen for each in tracks], np.bool_),
-            source.log,
-            config.flow.solve(chip),
+            sight = look(pipeline, sight, frame)
+            assert sight.track is not None, "the tracker says of every image whether it shows the robot"
+            tracks.append(sight.track)
+            quality.take(sight.track, sight.appearance, sight.shift)
+            if stabilised:
+                shift, background = sight.shift, sight.background
+            else:
+                shift, background = measures.register(
+                    shift, background, sight.track, frame, chip, pipeline.calibration, config.robot
+                )
+            shifts += [shift.shift_px] if shift is not None else []
+        seen = np.array([each.seen for each in tracks], np.bool_)
+        stamps_ns = np.array([each.stamp_ns for each in tracks], np.int64)
+        positions_um = np.array([each.position_um for each in tracks]).reshape(-1, 2)
+        known = background is not None and len(background.pixels) > 0
+        evidence = Evidence(
+            stamps_ns[seen] / NS_PER_S,
+            positions_um[seen],
+            float(np.sqrt(np.array(shifts).var(axis=0).sum())) if known else None,
+            stabilised,
+            pipeline.calibration.um_per_px,
+            quality.doubts(),
         )
+        return MovieTracks(stamps_ns, positions_um, seen, source.log, config.flow.solve(chip), evidence)
 
 
 def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
@@ -100,7 +120,7 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
         return asked, {}
     if _on_one_clock(asked):
         return asked, {}
-    rough = _overlapping(asked)
+    rough = overlapping(asked)
     tracks = tracks_of(rough)
     assert tracks.log is not None, "there is a log"
     seen = tracks.seen
@@ -109,7 +129,13 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     except UsageError as error:
         raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {error}; {_WITHOUT}") from error
     if fit.refusal:
-        raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {fit.refusal}; or {_WITHOUT}")
+        refusal = fit.refusal
+        if UNEXPLAINED in refusal:
+            why = why_unexplained(tracks.evidence, tracks.log, tracks.assumed, rough.robot.um_per_rev)
+            refusal = refusal.replace(UNEXPLAINED, why)
+        else:
+            refusal = why_still(tracks.evidence, tracks.log, rough.robot.um_per_rev) or refusal
+        raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {refusal}; or {_WITHOUT}")
     movie = rough.movie
     # The rig applies a log of commands robot.delay_s late; the offset that is found has that latency in it.
     latency_s = 0.0 if is_of_session(Path(movie.coils)) else asked.robot.delay_s or 0.0
@@ -143,8 +169,13 @@ def _refuted(um_per_rev: float, fit: MotionFit) -> bool:
     return abs(fit.um_per_rev - um_per_rev) > _SIGNIFICANT * fit.um_per_rev_std
 
 
-def _overlapping(asked: Config) -> Config:
-    """The configuration with the log at the movie, wherever its clock begins: a log that is elsewhere is refused."""
+def overlapping(asked: Config) -> Config:
+    """The configuration with the log at the movie, wherever its clock begins: a log that is elsewhere is refused.
+
+    Without a log it is as it is.
+    """
+    if not asked.movie.coils:
+        return asked
     with MovieSource(replace(asked.movie, coils=""), asked.coils) as source:
         first_s = seconds(source.first_ns)
     movie = asked.movie

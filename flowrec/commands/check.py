@@ -11,10 +11,11 @@ from pathlib import Path
 from flowrec.chip import chip_from_files
 from flowrec.clocks.clock_monitor import CRYSTAL_PPM, camera_summary, irregular_frames, skew_ppm
 from flowrec.commands.check_tally import GAP_PERIODS, Tally
+from flowrec.commands.check_track import TrackTally
 from flowrec.commands.verdict import CONSISTENT, DAMAGED, NO_DIGEST, UNFINISHED, Finding, Gap, Verdict
 from flowrec.config import ResolvedConfig, config_from_toml
 from flowrec.coverage import Coverage
-from flowrec.declarations import Role
+from flowrec.declarations import Message, Role
 from flowrec.enums import Outcome
 from flowrec.errors import FlowrecError
 from flowrec.session import Session
@@ -23,7 +24,7 @@ from flowrec.store.byte_source import is_there, size_of
 from flowrec.store.channels import is_left_out
 from flowrec.store.run_files import continuity_fault, is_continued, part_number, part_path, run_files
 from flowrec.store.session_path import session_path
-from flowrec.summary import finite
+from flowrec.summary import doubts_of, finite
 from flowrec.system.endings import Ended
 from flowrec.system.locks import is_growing
 from flowrec.topics import BY_FIELD, TOPICS
@@ -104,7 +105,7 @@ class _FileCheck:
     """
 
     def __init__(self, path: Path, progress: Callable[[int], None] | None, before: int) -> None:
-        self.tally = Tally()
+        self.tally, self._track = Tally(), TrackTally()
         self.found = Audit(path, 0)
         self.read_bytes = 0
         self._progress, self._before = progress, before  # of the files before
@@ -113,6 +114,11 @@ class _FileCheck:
     def _begin(self, found: Audit) -> None:
         self.found = found
         self.tally.begin(found)
+        self._track.begin(found)
+
+    def _add(self, name: str, log_ns: int, message: Message) -> None:
+        self.tally.add(name, log_ns, message)
+        self._track.add(log_ns, message)
 
     def _at(self, read_bytes: int) -> None:
         self.read_bytes = read_bytes
@@ -137,9 +143,10 @@ class _FileCheck:
 
     def read(self) -> None:
         """Read the file and judge it."""
-        self.found = audit(self.found.path, self.tally.add, self._at, self._begin)
+        self.found = audit(self.found.path, self._add, self._at, self._begin)
         self._at(self.found.size_bytes)
         self.tally.close()
+        self._track.close()
         self.verdict.topics = self.topics
         self.verdict.covered = Coverage(self.read_bytes, self.found.size_bytes, "bytes")
         self._config = self._header()
@@ -195,6 +202,8 @@ class _FileCheck:
             verdict.odd("end", f"it was recovered from {source}; {note}")
         elif source is not None:
             verdict.fact("recovered", f"from {source}, without a loss")
+        for doubt in dict.fromkeys([*doubts_of(found.outcome), *self._track.doubts()]):
+            verdict.odd("doubts", f"doubtful: {doubt}")
 
     def _content(self) -> None:
         verdict, found = self.verdict, self.found

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.commands.align import aligned
+from flowrec.commands.align import aligned, overlapping
+from flowrec.commands.first_pass import first_pass
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.record import record
 from flowrec.commands.run_summary import Recorded
@@ -55,6 +56,7 @@ def import_movie(
     control: Unattended | None = None,
     inputs: Sequence[Path] = (),
     align: bool = True,
+    robot: str | int = "",
 ) -> Recorded:
     """Make a session of a movie, as fast as it can be read. A failure leaves no file.
 
@@ -73,16 +75,20 @@ def import_movie(
     inputs : files that were read besides these; the output may be none of them.
     align : fit offset and rate of the log's clock to the motion of the robot, see commands/align.py; False: they are
         those of the settings movie.clock_offset_s and clock_rate.
+    robot : which body is the robot, where several look alike: a number of the picture with which such a movie is
+        refused, a place in the first image as in "320,256px", or one on the chip in um as in "1250,840".
 
     Raises
     ------
     FlowrecError : in one line: what can not be read, what does not fit together, what is not told.
     """
     asked = asked_import(movie, config, coils=coils, times=times, fps=fps, partial=partial)
-    facts: Mapping[str, str] = {}
-    if align:
-        asked, facts = aligned(asked)
     path = None if out is None else Path(out)
+    looked_at = overlapping(asked) if align else asked
+    asked, facts = first_pass(asked, looked_at, str(robot), path.parent if path is not None else Path())
+    if align:
+        asked, found = aligned(asked)
+        facts = {**facts, **found}
     return record(
         asked, path, overwrite=overwrite, control=control, inputs=inputs, keep_failed=False, given_facts=facts
     )

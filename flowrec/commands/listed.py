@@ -14,7 +14,7 @@ from typing import Any
 
 from flowrec.enums import Outcome
 from flowrec.errors import printable
-from flowrec.summary import is_count, is_numeric, shown
+from flowrec.summary import DOUBTS, is_count, is_numeric, shown
 
 INT_LIMIT = 2**63  # of the integers of SQLite and Parquet
 TEXT_LIMIT = 20_000  # characters of a value; a longer text in a file is damage
@@ -99,7 +99,7 @@ def columns_for_people(rows: Sequence[Listed], width: int) -> tuple[list[str], l
     """Names of the columns and the cells, as many as fit into a width in characters; empty columns are left out."""
     cells = {
         "name": [row.name + (f" ({row.parts} parts)" if row.parts else "") for row in rows],
-        "outcome": [_outcome(row) for row in rows],
+        "outcome": [_outcome(row) + ", doubtful" * is_doubtful(row) for row in rows],
         "duration": ["" if row.duration_s is None else f"{row.duration_s:.1f} s" for row in rows],
         "size": [f"{row.size_bytes / 1e6:.1f} MB" for row in rows],
         "chip": [row.chip for row in rows],
@@ -113,6 +113,11 @@ def columns_for_people(rows: Sequence[Listed], width: int) -> tuple[list[str], l
         if sum(_width(column, values) for column, values in kept.items()) + 1 > width:
             kept.pop(name, None)
     return list(kept), [list(line) for line in zip(*kept.values(), strict=True)]
+
+
+def is_doubtful(row: Listed) -> bool:
+    """Whether the session states that its result is doubtful."""
+    return bool(row.facts.get(DOUBTS))
 
 
 def _width(name: str, column: Sequence[str]) -> int:

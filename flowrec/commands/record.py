@@ -47,11 +47,12 @@ from flowrec.session import Session, files_behind
 from flowrec.session_writer import session_writer
 from flowrec.store.run_files import run_files, run_path, runs_in
 from flowrec.store.writer import SessionWriter
-from flowrec.summary import as_text
+from flowrec.summary import DOUBTS, as_text, doubts_text
 from flowrec.system.outputs import MCAP, RRD, Output
 from flowrec.system.processes import realtime_priority
 from flowrec.terminal import say, warn
 from flowrec.topics import Tick
+from flowrec.vision.track_quality import TrackQuality
 
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
@@ -211,6 +212,7 @@ def record(
     keep_failed: bool = True,
     given_facts: Mapping[str, str] | None = None,
     console: bool = False,
+    given_doubts: Sequence[str] = (),
 ) -> Recorded:
     """Run the mission of `config` and write it to `out`, in any thread.
 
@@ -226,6 +228,7 @@ def record(
     keep_failed : False: a run that ends by an exception leaves no file, and one that it was to replace stays.
     given_facts : more for the provenance in the head of the file.
     console : serve a page on this machine that shows the run and steers it.
+    given_doubts : why the result is doubtful, besides what the track shows.
 
     Raises
     ------
@@ -287,7 +290,8 @@ def record(
             )
         )
         opened.append(writer)
-        sinks: list[Sink] = [writer, statistics]
+        quality = TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot)
+        sinks: list[Sink] = [writer, statistics, quality]
         if fields:
             worker = Preloaded(worker, fields)
         disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
@@ -327,9 +331,9 @@ def record(
             facts["tracking_error_um"] = statistics.tracking_error_um
         if control.note:
             facts["note_not_finished"] = control.note
-        refined = report.last.refined
+        refined, not_refined = report.last.refined, list[str]()
         if refined is not None and refined.refused and resolved.refine.observes_flow and refined.log_score is None:
-            facts["doubts"] = f"the flow was not refined: {refined.refused}"
+            not_refined = [f"the flow was not refined: {refined.refused}"]
         if isinstance(rig, MovieRig) and rig.noticed:
             facts["note_movie"] = "; ".join(rig.noticed)
         covered = None
@@ -337,6 +341,8 @@ def record(
             stopped = run_control.reason.removeprefix("stopped by ")
             covered = Coverage(rig.taken, rig.images, "images", stopped=stopped, status=run_control.stop_status)
             facts["covered"] = covered.amount
+        if doubts := doubts_text([*given_doubts, *not_refined, *quality.doubts()]):
+            facts[DOUBTS] = doubts
         outcome = as_text(facts) | clocks.outcome()
         if realtime:
             outcome["loop_priority"] = "real time" if first else "ordinary"

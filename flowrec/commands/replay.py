@@ -40,12 +40,13 @@ from flowrec.session_writer import session_writer
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_path import session_path
 from flowrec.store.writer import SessionWriter
-from flowrec.summary import as_text
+from flowrec.summary import DOUBTS, as_text, doubts_text
 from flowrec.system.outputs import MCAP, Output
 from flowrec.terminal import Progress, warn
 from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
 from flowrec.units import seconds
 from flowrec.version import NUMERICS_VERSION
+from flowrec.vision.track_quality import TrackQuality
 
 # Sections that a replay can not change.
 FIXED = ("chip", "camera", "rig", "simulated")
@@ -229,10 +230,11 @@ def replay(
     with ExitStack() as stack:
         stack.enter_context(input_blamed(session, config, "replayed"))
         sinks: list[Sink] = []
-        writer = None
+        writer, doubts = None, list[str]()
         if out is not None:
             writer = stack.enter_context(session_writer(output, config, session.chip, parent=path))
-            sinks.append(writer if frames else WithoutFrames(writer))
+            quality = TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot)
+            sinks += [writer if frames else WithoutFrames(writer), quality]
         length_s = max(seconds(end_ns - first_ns), 1e-3)
         progress = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
         with control.armed():
@@ -254,8 +256,10 @@ def replay(
             ended = Outcome.STOPPED if covered.stopped else Outcome.REPLAYED
             note = f"replay of {path.name}" + (f", {covered.text}" if covered.stopped else "")
             figures = figures_of(session.chip, replace(report, last=last), rig.recorded.true_field)
-            writer.close(as_text(figures | {"outcome": ended, "note": note, "covered": covered.amount}))
+            stated = {DOUBTS: doubts_text(doubts)} if (doubts := quality.doubts()) else {}
+            writer.close(as_text(figures | {"outcome": ended, "note": note, "covered": covered.amount} | stated))
     result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing, covered)
+    result.doubts = doubts
     if verify:
         result.worker = results
         if segment_ns is None:

@@ -134,6 +134,7 @@ class Replayed:
     covered : the ticks that were replayed and compared, of those that were asked for.
     worker : of --verify: the results of the worker.
     digest : of --verify: whether the files match their digests, and lines of text about it; None: they were not read.
+    doubts : why what was written is doubtful; none if it is not, or nothing was written.
     """
 
     session: Session
@@ -147,6 +148,7 @@ class Replayed:
     covered: Coverage
     worker: WorkerResults | None = None
     digest: tuple[bool, list[str]] | None = None
+    doubts: list[str] = field(default_factory=list)
 
     @property
     def same(self) -> bool | None:

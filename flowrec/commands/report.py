@@ -20,7 +20,7 @@ from flowrec.replay_figures import ReplayFiles, before_after
 from flowrec.run_figures import flow_error
 from flowrec.session import Session, files_behind, input_blamed, session_sha256, toml_table
 from flowrec.store.session_path import named_beside
-from flowrec.summary import Row, name_of, shown
+from flowrec.summary import DOUBTS, Row, doubts_of, name_of, shown
 from flowrec.system.output_folder import OutputFolder
 from flowrec.system.outputs import Output
 from flowrec.terminal import progress, say
@@ -34,7 +34,18 @@ if TYPE_CHECKING:
 HTML = (".html", ".htm")
 _PACKAGES = {"matplotlib": "matplotlib", "jinja2": "Jinja2"}  # of the extra `report`
 _HIDDEN = frozenset(  # of the outcome: shown elsewhere
-    {"outcome", "note", "reason", "wall_s", "wall_ns", "monotonic_ns", "clocks", "recovered_from", "frames_windows"}
+    {
+        "outcome",
+        "note",
+        "reason",
+        DOUBTS,
+        "wall_s",
+        "wall_ns",
+        "monotonic_ns",
+        "clocks",
+        "recovered_from",
+        "frames_windows",
+    }
 )
 _NEUTRAL = (Outcome.REPLAYED, Outcome.ENDED, Outcome.CONTINUED, Outcome.SNAPSHOT)  # of a file, not of a run
 _LINES = 600  # of settings or local changes on the page
@@ -187,6 +198,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
         good=any(outcome == each and each.completes_mission for each in Outcome) or outcome in _NEUTRAL,
         sentence=sentence(outcome),
         note=_sentence(str(facts["note"] or "")),
+        doubts=_doubts(data, verdict),
         about=_about(facts, session),
         notes=[note for note in (str(facts.get("notes") or ""), *facts["notes_added"]) if note],
         key_figures=_key_figures(data),
@@ -196,7 +208,7 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
         boundary=_boundary(data),
         events=_events(data),
         recording=Table("", [fact for fact in verdict.facts.items() if fact[0] not in ("written", "outcome")]),
-        findings=[judgement, *(finding.text for finding in verdict.findings)],
+        findings=[judgement, *(finding.text for finding in verdict.findings if finding.about != "doubts")],
         replays=[_replay_part(pair, done[f"replay_{number}"]) for number, pair in enumerate(pairs, 1)],
         provenance=[Table("", _provenance(facts, session))],
         folded=[
@@ -206,6 +218,12 @@ def _page(data: ReportData, verdict: Verdict, pairs: Sequence[ReplayFiles], kind
         ],
         glossary=GLOSSARY,
     )
+
+
+def _doubts(data: ReportData, verdict: Verdict) -> list[str]:
+    """Those that the session states, and those that its track shows."""
+    found = (finding.text.removeprefix("doubtful: ") for finding in verdict.findings if finding.about == "doubts")
+    return list(dict.fromkeys([*doubts_of(data.session.outcome), *found]))
 
 
 def _sentence(text: str) -> str:

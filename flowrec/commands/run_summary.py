@@ -13,8 +13,8 @@ from flowrec.enums import Outcome
 from flowrec.messages import FlowField
 from flowrec.run.loop import RunReport
 from flowrec.store.run_files import is_snapshot
-from flowrec.summary import Figures, rows_for_people
-from flowrec.terminal import say, table
+from flowrec.summary import DOUBTS, Figures, doubts_of, rows_for_people
+from flowrec.terminal import say, table, warn
 
 # The mission was completed, or was ended on purpose.
 GOOD_ENDS = frozenset(
@@ -56,12 +56,19 @@ class Recorded:
 
     @property
     def exit_status(self) -> int:
-        """0 reached its end, 1 did not, 3 was ended early by the disk monitor; 130 or 143 an import was stopped."""
+        """0 reached its end, 1 did not, 3 was ended early by the disk monitor, or is doubtful; 130 or 143 was stopped."""
         if self.lost:
             return 3
         if self.covered is not None and self.covered.stopped:
             return self.covered.status
-        return 0 if self.report.outcome in GOOD_ENDS else 1
+        if self.report.outcome not in GOOD_ENDS:
+            return 1
+        return 3 if self.doubts else 0
+
+    @property
+    def doubts(self) -> list[str]:
+        """Why the result is doubtful; none if it is not."""
+        return doubts_of(self.facts)
 
 
 def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
@@ -90,7 +97,8 @@ def files_text(path: Path, files: tuple[Path, ...]) -> str:
 def print_summary(recorded: Recorded) -> None:
     """Print the table at the end of a run, and what to do next."""
     files = ("file", files_text(recorded.path, recorded.files))
-    table("Session", ("", "value"), [*rows_for_people(recorded.facts), files])
+    facts = {key: value for key, value in recorded.facts.items() if key != DOUBTS}  # they are told below
+    table("Session", ("", "value"), [*rows_for_people(facts), files])
     sessions, report, covered = recorded.sessions, recorded.report, recorded.covered
     if recorded.lost:
         say(
@@ -98,7 +106,9 @@ def print_summary(recorded: Recorded) -> None:
         )
     elif covered is not None and covered.stopped:
         say(f"flowrec: {covered.text}; the session holds those, and no more is known of the movie")
-    elif recorded.exit_status and sessions:
+    elif report.outcome not in GOOD_ENDS and sessions:
         say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
+    for doubt in recorded.doubts:
+        warn(f"doubtful: {doubt}")
     if sessions:
         say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")

@@ -50,6 +50,7 @@ from flowrec.estimation.whitening import (
 # other runs, which explain 0 to 0.5 in most cases, 2 pass: on the same chip, where the commands are nearly the same and
 # the offset is right to 4 ms. Measured by python -m tests.perf.alignment.
 LEAST_EXPLAINED = 0.65
+UNEXPLAINED = "is it the log of another run, or does the track follow another particle"  # where no more is known
 LEAST_EXPLAINED_WITH_RATE = 0.75  # a rate that differs from 1 gives the log of another run one more way to fit
 LARGEST_P_VALUE = 0.01
 _LEAST_FRAMES = 30
@@ -344,7 +345,7 @@ def _refusal(fit: MotionFit, *, ambiguous: bool) -> str:
     if fit.explained < least:
         return (
             f"the log explains {100.0 * fit.explained:.0f} % of the robot's changes of motion, at least "
-            f"{100.0 * least:.0f} % are needed: is it the log of another run, or does the track follow another particle"
+            f"{100.0 * least:.0f} % are needed: {UNEXPLAINED}"
         )
     if fit.p_value > LARGEST_P_VALUE or not math.isfinite(fit.offset_std_s):
         return (

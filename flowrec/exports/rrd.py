@@ -16,6 +16,7 @@ from flowrec.pipeline import Pipeline, assemble
 from flowrec.replay_figures import ReplayFiles, before_after
 from flowrec.session import Session
 from flowrec.store.run_files import files_of
+from flowrec.summary import DOUBTS
 from flowrec.system.outputs import RRD, Output
 from flowrec.view.entities import PAIR, REPLAY
 from flowrec.view.rrd_file import write_rrd
@@ -23,6 +24,7 @@ from flowrec.view.scene import Scene
 from flowrec.view.summary_text import (
     FIGURES,
     document_of_run,
+    doubts_remark,
     note_of,
     registration_remark,
     rows_of_run,
@@ -64,6 +66,7 @@ class RrdExport:
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
         config, path = session.config, session.path
         scene = replace(scene_of(config, session.chip, assemble(config, session.chip), path), key=session.key)
+        scene = replace(scene, doubts=str(session.outcome.get(DOUBTS, "")))
         parent = _parent_of(session)
         prefixes = REPLAY
         if self._second is not None:
@@ -90,7 +93,8 @@ def _comparison(pair: ReplayFiles) -> rr.TextDocument:
 
 def _pair(first: Session, second: Session) -> rr.TextDocument:
     was, now = ({key: value for key, value, _ in rows_of_run(each.last, each.outcome)} for each in (first, second))
-    notes = [note_of(each.outcome, f"{name}: ") for name, each in zip(PAIR, (first, second), strict=True)]
+    named = list(zip(PAIR, (first, second), strict=True))
+    notes = [remark(each.outcome, f"{name}: ") for remark in (doubts_remark, note_of) for name, each in named]
     rows = [(key, was.get(key), now.get(key)) for key in ("goal", *FIGURES) if key in was or key in now]
     return summary_document([f"A: {first.path.stem}", f"B: {second.path.stem}"], rows, notes)
 
@@ -106,7 +110,15 @@ def scene_of(config: ResolvedConfig, chip: Chip, pipeline: Pipeline, path: Path)
         "controller": config.control.method,
     }
     windows = config.recording.region != "whole"
-    return Scene(chip, pipeline.calibration, pipeline.robot, path.stem, properties, windows=windows)
+    return Scene(
+        chip,
+        pipeline.calibration,
+        pipeline.robot,
+        path.stem,
+        properties,
+        windows=windows,
+        camera_shape=pipeline.image_shape,
+    )
 
 
 def _parent_of(session: Session) -> Path | None:

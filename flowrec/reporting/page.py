@@ -93,6 +93,7 @@ class Page:
     good: bool
     sentence: str
     note: str
+    doubts: Sequence[str]  # why it is doubtful
     about: str  # when, where, with what, in one line
     notes: Sequence[str]  # of people
     key_figures: Table

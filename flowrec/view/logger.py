@@ -80,7 +80,7 @@ class TickLogger:
         self._robot_px = scene.length_px(scene.robot.radius_um)
         angle = np.linspace(0.0, 2.0 * np.pi, 33)
         self._ring = np.stack([np.cos(angle), np.sin(angle)], 1)
-        self._states = StateLogger(self._entities, self.present)
+        self._states = StateLogger(self._entities, self.present, doubtful=bool(scene.doubts))
         self._moved = scene.measured_to_plane(None)  # of what was measured, by the registration of the refined field
         self._log_static()
         self._by_field: dict[str, Callable[[Any], None]] = {

@@ -41,6 +41,8 @@ class Scene:
     image_px: tuple[int, int] | None = None  # width and height of the camera's image; None: as the chip
     windows: bool = False  # whether most images are black except for a region around the robot
     key: str = ""
+    camera_shape: tuple[int, int] | None = None  # (height, width) in px of the images that were tracked
+    doubts: str = ""  # why the result is doubtful, as the session states it
 
     def to_plane(self, points_um: ArrayLike) -> NDArray[np.float64]:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""

@@ -34,9 +34,10 @@ _NONE = ""  # a state that is not drawn
 class StateLogger:
     """Logs changes of state only; a lane that never had a state is not logged and not in `present`."""
 
-    def __init__(self, entities: EntityLogger, present: set[str]) -> None:
+    def __init__(self, entities: EntityLogger, present: set[str], *, doubtful: bool = False) -> None:
         self._log = entities.log
         self._present = present
+        self._doubtful = doubtful  # the result: its outcome is amber
         self.phases: dict[str, int] = {}  # stamp at which each phase, and the outcome, first began
         self._now: dict[str, str] = {}
         self._colours: dict[str, dict[str, Rgb]] = {}  # of the states of each lane so far
@@ -46,7 +47,8 @@ class StateLogger:
         """The phase, and at the end the outcome."""
         if mission.finished and mission.outcome:
             done = mission.outcome in set(Outcome) and Outcome(mission.outcome).completes_mission
-            self._log_phase(mission, mission.outcome, colours.GREEN if done else colours.RED)
+            good = colours.YELLOW if self._doubtful else colours.GREEN
+            self._log_phase(mission, mission.outcome, good if done else colours.RED)
         else:
             self._log_phase(mission, mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY))
 

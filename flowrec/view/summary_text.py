@@ -11,10 +11,11 @@ from flowrec.chip.registration import on_chip
 from flowrec.errors import printable
 from flowrec.messages import FlowField
 from flowrec.run_figures import RunStatistics, figures_of
-from flowrec.summary import Row, Value, comparison_for_people
+from flowrec.summary import DOUBTS, Row, Value, comparison_for_people, doubts_text
 from flowrec.topics import FLOW_FIELDS, Tick
 from flowrec.units import seconds
 from flowrec.view.scene import Scene
+from flowrec.vision.track_quality import TrackQuality
 
 _MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\`*_{}[]()<>#+!|~"})
 _LETTERS = 200  # of one cell: names and notes come from the file
@@ -57,7 +58,17 @@ def rows_of_run(last: Tick, figures: Mapping[str, Value]) -> list[Row]:
 
 def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.TextDocument:
     """The panel of one run, finished or not."""
-    return summary_document([title], rows_of_run(last, figures), [note_of(figures), registration_remark(last.refined)])
+    return summary_document(
+        [title],
+        rows_of_run(last, figures),
+        [doubts_remark(figures), note_of(figures), registration_remark(last.refined)],
+    )
+
+
+def doubts_remark(figures: Mapping[str, Value], whose: str = "") -> str:
+    """Why the result is doubtful; '' if it is not."""
+    text = figures.get(DOUBTS)
+    return f"{whose}Doubtful: {text}" if text else ""
 
 
 def note_of(figures: Mapping[str, Value], whose: str = "") -> str:
@@ -72,6 +83,8 @@ class LiveSummary:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._statistics = RunStatistics()
+        shape = scene.camera_shape or scene.chip.mask.shape[:2]
+        self._quality = TrackQuality(scene.calibration, (shape[0], shape[1]), scene.robot)
         self._last = Tick()
         self._first_ns: int | None = None
 
@@ -79,6 +92,7 @@ class LiveSummary:
         """Take the next tick; whether the panel changes with it."""
         news = any(getattr(tick, name) is not getattr(self._last, name) for name in _NEWS)
         self._statistics.write(tick)
+        self._quality.write(tick)
         self._last = tick
         self._first_ns = tick.stamp_ns if self._first_ns is None else self._first_ns
         return news
@@ -90,6 +104,7 @@ class LiveSummary:
         mission, timing = last.mission, last.timing
         if mission is not None and mission.finished:
             figures |= {"outcome": mission.outcome, "note": mission.note}
+            figures[DOUBTS] = doubts_text(self._quality.doubts())
             figures["duration_s"] = seconds(last.stamp_ns - (self._first_ns or 0))
             figures["tracking_error_um"] = seen.tracking_error_um or None  # a policy has no reference
         elif mission is not None:

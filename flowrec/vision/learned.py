@@ -45,7 +45,7 @@ _LEAST_ENERGY_SHARE = 0.05  # and relative to the robot's
 _NEAR, _ALL = 12, 64  # candidates that are measured near the robot, and in a whole image
 _SIMILARITY_COST, _MOTION_COST, _MISSED_COST, _IMPOSSIBLE = 8.0, 1.5, 9.0, 1e3
 _NEIGHBOUR_MISSED_COST = 6.0
-_ENERGY_SPREAD = 0.7  # of ln(energy / expected energy)
+ENERGY_SPREAD = 0.7  # of ln(energy / expected energy)
 _ISOLATED_RADII = 2.2  # no neighbour is nearer
 _KNOWN_LOOK = 0.8  # correlation from which on a look is one of the views
 _EXPECTED_FRAMES = 3  # for which a velocity goes on
@@ -303,7 +303,7 @@ def alone(found: Candidates, energy: float, least_score: float) -> int | None:
     """The candidate of a whole image that is the robot; None if none is like it, or two are."""
     if not len(found.energy):
         return None
-    changed = np.log(found.energy / max(energy, 1e-6)) / _ENERGY_SPREAD
+    changed = np.log(found.energy / max(energy, 1e-6)) / ENERGY_SPREAD
     score = found.similarity * np.exp(-0.125 * changed**2)
     order = np.argsort(-score, kind="stable")
     best = int(order[0])
