@@ -29,9 +29,8 @@ _NOISE = 6.0  # standard deviations of the distance from the expected place that
 # The standard deviation over the lower quartile of distances in the plane: a track may jump on half of the images.
 _QUARTILE, _OF_QUARTILE = 0.25, 1.0 / 0.7585
 _FAST = 0.95  # quantile of the measured speeds that counts as the speed of the robot
-_FARTHEST_RADII = (
-    4.0  # that a reversal at this speed may take it between two images: in a track that jumps often it is that of jumps
-)
+# That a reversal at this speed may take it between two images: in a track that jumps often it is that of the jumps.
+_FARTHEST_RADII = 4.0
 _LEAST_STEPS = 5  # from which a speed is measured
 _GOES_ON_FRAMES = 3  # for which a velocity goes on, as in vision/learned.py
 _CUT_RADII = 0.5  # a centre nearer to the border than this is that of a part of the body
