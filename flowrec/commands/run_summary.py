@@ -56,7 +56,7 @@ class Recorded:
 
     @property
     def exit_status(self) -> int:
-        """0 reached its end, 1 did not, 3 was ended early by the disk monitor, or is doubtful; 130 or 143 was stopped."""
+        """0 reached its end, 1 did not, 3 was ended early by the disk monitor or is doubtful; 130, 143 was stopped."""
         if self.lost:
             return 3
         if self.covered is not None and self.covered.stopped:
