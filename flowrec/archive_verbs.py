@@ -89,8 +89,11 @@ def sweep(
             memory_bytes=memory_bytes,
         )
     except KeyboardInterrupt as error:
-        left = f"what is done is kept in {out}, and the same command goes on"
-        raise StoppedError(Ended.of(error), left) from None
+        stopped = StoppedError(Ended.of(error), f"what is done is kept in {out}, and the same command goes on")
+        if as_json:
+            typer.echo(json.dumps({"out": str(out), **stopped.as_json()}))
+        say(str(stopped))
+        raise typer.Exit(stopped.exit_status) from None
     if as_json:
         typer.echo(json.dumps(done.as_json()))
     else:

@@ -69,7 +69,7 @@ class Coverage:
         """
         if not self.stopped:
             return f"{self.amount}: {found}"
-        return f"{self.text}; {f'those are {found}' if self.done else 'nothing is known of them'}"
+        return f"{self.text}; {f'those are {found}' if self.done else 'nothing was looked at'}"
 
     def as_json(self) -> dict[str, Any]:
         """For JSON."""
