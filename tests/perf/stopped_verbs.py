@@ -121,6 +121,11 @@ def trial(words: list[str], folder: Path, number: int | None = None, at_cpu_s: f
     return Trial(process.returncode, cpu_s, sent, said, _left(folder, before), _processes_left(mark))
 
 
+def _sentence(said: str) -> str:
+    """The line that says that the verb was stopped; '' without one."""
+    return next((line for line in said.splitlines() if "stopped (" in line or "stopped after" in line), "")
+
+
 def _cpu_s(pid: int) -> float:
     total = 0.0
     with suppress(psutil.Error):
@@ -159,7 +164,7 @@ def faults(verb: Verb, ended: Trial, number: int, folder: Path) -> list[str]:
         found.append(f"status {ended.status}")
     if "Traceback" in ended.said:
         found.append("a traceback")
-    if "stopped" not in ended.said:
+    if not _sentence(ended.said):
         found.append("does not say that it was stopped")
     for name in ended.left:
         if name not in verb.kept:
@@ -182,7 +187,7 @@ def measure(
     verbs = {name: VERBS[name] for name in only} if only else VERBS
     rows: list[dict[str, Any]] = []
     count = len(verbs) * len(SIGNALS) * (len(SHARES) + len(IMPORTS))
-    with tempfile.TemporaryDirectory(prefix="flowrec-stopped-") as name, progress("stopping", count, "trials") as done:
+    with tempfile.TemporaryDirectory(prefix="flowrec-trials-") as name, progress("stopping", count, "trials") as done:
         sessions = _sessions(session, Path(name))
         for title, verb in verbs.items():
             for row in _rows(title, verb, sessions, Path(name)):
@@ -232,7 +237,7 @@ def _rows(title: str, verb: Verb, sessions: dict[str, str], folder: Path) -> Ite
                 "moment": moment,
                 "status": ended.status,
                 "before_its_end": stopped,
-                "said": next((line for line in reversed(lines) if "stopped" in line), (lines or [""])[-1]),
+                "said": _sentence(ended.said) or (lines or [""])[-1],
                 "left": ended.left,
                 "faults": faults(verb, ended, number, out) if stopped else [],
             }
