@@ -158,6 +158,7 @@ _BEFORE: dict[str, Any] = {
     "refine.adopt": "always",
     "mission.wait_at_goal_s": 0.0,
     "recording.admission_s": 0.0,
+    "mission.check_axes": False,
 }
 _AnyConfig = TypeVar("_AnyConfig", Config, ResolvedConfig)
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}

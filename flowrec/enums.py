@@ -40,6 +40,7 @@ class Outcome(StrEnum):
     TIME_OVER = "time over"  # the time that the run was given
     TIMEOUT = "timeout"  # the time limit of a phase
     UNREACHABLE = "unreachable"
+    REFUSED = "refused"  # the robot does not move as the axes of camera and coils say
     NOT_FOUND = "not found"  # the robot was never seen
     LOST = "lost"
     GAVE_UP = "gave up"
@@ -83,6 +84,15 @@ class Action(StrEnum):
     END = "end"  # of the observation: its refinement is due
     GOAL = "goal"  # another place to go to
     SPEED = "speed"  # a speed limit, or none any more
+
+
+class AxesVerdict(StrEnum):
+    """What the robot's motion says about the axes of camera and coils."""
+
+    AGREES = "agrees"
+    CONTRADICTS = "contradicts"
+    NO_MOTION = "no motion"  # the robot does not follow the field
+    UNDECIDED = "undecided"
 
 
 class Alarm(StrEnum):

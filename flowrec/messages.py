@@ -414,6 +414,38 @@ class Mission(Message):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class AxesCheck(Message):
+    """The check of the axes before the mission: what the robot's first small motions say, see control/axes_check.py.
+
+    A round is four legs: along x, back, along y, back. The sums of a round are those of a regression of its positions
+    on 1, t, t^2, t^3 (the flow) and the two components of the robot's own motion as commanded.
+    """
+
+    stamp_ns: int
+    leg: int  # since the check began, from 0; four are a round
+    leg_ns: int  # stamp at which it began
+    driven_s: float  # duration of the check so far
+    round_ns: int  # stamp at which the round began
+    from_um: Vector2  # position then
+    own_um: Vector2  # since then: um_per_rev times the revolutions along x and y
+    steady_um: Vector2  # the part of it that was demanded against the flow, not for the legs
+    speed_um_s: float  # of the legs of this round
+    reach_um: float  # own motion after which a leg turns round
+    count: int  # positions in the sums
+    normal: Annotated[Matrix, Shape(6, 6)]
+    moment: Annotated[Matrix, Shape(6, 2)]
+    square_um2: Vector2
+    # Of the most exact round so far: displacement seen (rows) per own motion as commanded (columns); the identity if
+    # all is as stated. (0, 0): no round is complete
+    gain: Annotated[Matrix, Shape("n", "n")] = field(default_factory=lambda: np.zeros((0, 0)))
+    gain_std: float = 0.0  # one standard deviation of each of its elements
+    # (2,) velocity that, by the last round, holds the robot against the flow; (0,): not known
+    against_um_s: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))
+    verdict: str = ""  # enums.AxesVerdict; '' while the check is under way
+    text: str = ""  # the verdict in a sentence, with what to do
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Demand(Message):
     """The motion that the controller demands of the robot."""
 

@@ -18,17 +18,19 @@ from flowrec.chip.registration import Calibration, on_chip
 from flowrec.clocks import Fit
 from flowrec.config import ResolvedConfig, calibration_of
 from flowrec.control import Coils, Controller
+from flowrec.control.axes_check import leg_velocity, steady_velocity, watch
 from flowrec.control.events import event_of
 from flowrec.control.mission import MissionStateMachine
 from flowrec.declarations import Role, Source
 from flowrec.diagnostics import CameraLosses
-from flowrec.enums import Action
+from flowrec.enums import Action, Phase
 from flowrec.estimation import HealthMonitor, Observer, Sampler
-from flowrec.flow import FlowSolver
+from flowrec.flow import FlowSolver, sample
 from flowrec.interpolation import nearest_pixel
 from flowrec.messages import (
     Appearance,
     Applied,
+    AxesCheck,
     Background,
     Estimate,
     FlowField,
@@ -44,7 +46,10 @@ from flowrec.planning import Planner, SurveyPlanner
 from flowrec.refine import Refiner
 from flowrec.robot import Robot
 from flowrec.topics import BY_FIELD, TOPICS, Tick
+from flowrec.units import seconds
 from flowrec.vision import Stabiliser, Tracker, carried, unseen
+
+_RELEASE_S = 0.2  # from the moment at which a held robot may be let go until it is taken to be free
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,6 +206,30 @@ def _seen(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
     return sight._replace(track=replace(track, seen_ns=track.stamp_ns if track.seen else before_ns))
 
 
+def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck | None, NDArray[np.float64] | None]:
+    """The check of the axes, and the velocity (2,) that it drives the robot with; None: the robot is controlled."""
+    mission = last.mission
+    checks = p.mission.check_axes and not p.mission.observes
+    if not checks or (mission is not None and mission.phase != Phase.START) or tick.applied is None:
+        return last.axes, None
+    if last.axes is not None and last.axes.verdict:
+        return last.axes, None
+    start_um = np.asarray(p.mission.start, np.float64)
+    map_um_s = np.zeros(2) if tick.assumed is None else sample(tick.assumed, start_um)
+    hold_s = p.mission.hold_start_s or 0.0
+    free_s = hold_s + p.coils.ramp_s + _RELEASE_S if hold_s else 0.0
+    since_s = 0.0 if mission is None else seconds(track.stamp_ns - mission.since_ns)
+    waits = mission is None or mission.held_since_ns is not None or mission.blind_since_ns is not None
+    axes = last.axes
+    if not waits and since_s >= free_s:
+        wall_um = _wall_um(p, start_um)
+        frame_s = p.planner.swift.frame_s or 0.0
+        axes = watch(axes, track, tick.applied, p.robot, map_um_s, wall_um, frame_s, p.calibration, p.coils)
+    if axes is not None and axes.verdict:
+        return axes, None
+    return axes, steady_velocity(axes, map_um_s) + (np.zeros(2) if waits else leg_velocity(axes))
+
+
 def _no_lap(_stage: str) -> None:
     """Ignore the end of a stage."""
 
@@ -239,6 +268,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
     before = None if last.estimate is None else p.observer.measured(last.mapless, last.estimate)
     observations = p.sampler.collect(last.observations, before, measured, p.robot)
     lap("observe")
+    axes, driven_um_s = _axes(p, last, tick, track)
     mission = p.mission.update(
         last.mission,
         track,
@@ -254,6 +284,8 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         appearance is not None and bool(appearance.note),
         observations,
         _goal_fault(p, inputs),
+        axes,
+        driven_um_s is not None,
     )
     robot = robot.slowed_to(mission.speed_limit_um_s)
     demand = p.controller.control(
@@ -267,6 +299,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         p.chip.um_per_px,
         _strength(p.coils, last),
         p.observer.uses_map(estimate),
+        driven_um_s,
     )
     asked = inputs.operator
     cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
@@ -286,6 +319,7 @@ def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], No
         mission=mission,
         demand=demand,
         currents=currents,
+        axes=axes,
     )
     event = event_of(last, tick, "time_to_go" in p.controller.needs)
     return replace(tick, event=event) if event is not None else tick

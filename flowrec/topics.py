@@ -17,6 +17,7 @@ from flowrec.enums import WorkOrder
 from flowrec.messages import (
     Appearance,
     Applied,
+    AxesCheck,
     Background,
     Currents,
     Demand,
@@ -85,6 +86,7 @@ class Tick:
     mapless: Annotated[
         Estimate | None, Topic("/robot/estimate_without_map", Source.STAGE, 1e-6, {"covariance": 1e-6})
     ] = None
+    axes: Annotated[AxesCheck | None, Topic("/run/axes", Source.STAGE, 1e-6, {"normal": 1e-3, "moment": 1e-3})] = None
     clocks: Annotated[Clocks | None, Topic("/run/clocks", Source.LOOP)] = None
     losses: Annotated[CameraLosses | None, Topic("/camera/losses", Source.LOOP)] = None
     background: Annotated[Background | None, Topic("/camera/background", Source.STAGE, 1e-6)] = None

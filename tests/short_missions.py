@@ -1,7 +1,7 @@
 """Settings of short missions: without what conftest loads, for processes that tests start."""
 
-# A short survey, and no doubt about the depth of the chip, which makes a refinement three times as long: most tests are
-# about something else. The recorded sessions in `sessions/` have both.
+# A short survey, no check of the axes before it, and no doubt about the depth of the chip, which makes a refinement
+# three times as long: most tests are about something else. The recorded sessions in `sessions/` have the latter.
 SMALL = [
     "camera.width_px=320",
     "camera.height_px=256",
@@ -10,6 +10,7 @@ SMALL = [
     "survey.method=downstream",
     "refine.assimilate.doubt_depth=false",
     "recording.admission_s=0",  # what the machine holds beside all other tests is of no interest
+    "mission.check_axes=false",
 ]
 
 # In real time, and still under way however long a busy machine takes for what a test does meanwhile.

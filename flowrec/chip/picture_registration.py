@@ -24,7 +24,7 @@ _CANDIDATES = 12
 _LEAST_SCORE = 0.55  # of a candidate, relative to the best one
 _FIRST, _HOPELESS = 3, 0.5  # if of so many candidates none finds this part of the walls, the others are not tried
 _REACH_WIDTHS, _REACH_PX = 0.6, 6.0  # from the walls: in median channel widths, but at least so many camera pixels
-_LEAST_FOUND = 0.7  # part of the walls
+LEAST_FOUND = 0.7  # part of the walls
 _EQUAL_FOUND, _EQUAL_EXPLAINED = 0.1, 0.85  # less found by this, and explained at least by this factor: equally good
 _SAME_PX = 2.0  # two poses that differ by less are one
 _MOST_SHIFT_PX, _MOST_ANGLE_DEG, _MOST_SCALE = 0.5, 0.1, 0.003  # standard errors above which a picture is refused
@@ -49,11 +49,9 @@ def register(
         raise ChipError(f"the picture has {grey.shape[1]} x {grey.shape[0]} pixels; take one of at least 32 x 32")
     if float(grey.max() - grey.min()) < 4.0:
         raise ChipError("the picture is blank; is the lamp on and the chip in view?")
-    rough_um = math.sqrt(um_per_px[0] * um_per_px[1])
     walls = WallMap(chip.mask, chip.um_per_px)
     poses = Search(grey, chip.mask, chip.um_per_px, walls.clearance_um).candidates(um_per_px, mirrors, _CANDIDATES)
-    reach_um = max(_REACH_WIDTHS * median_width_um(chip), _REACH_PX * rough_um)
-    fitter = Fitter(grey, walls, reach_um, rough_um)
+    fitter = fitter_of(grey, chip, math.sqrt(um_per_px[0] * um_per_px[1]), walls)
     fits: list[WallFit] = []
     for pose in poses:
         hopeless = len(fits) == _FIRST and max(fit.found for fit in fits) < _HOPELESS
@@ -67,11 +65,11 @@ def register(
         if all(_apart_px(fit.calibration, other.calibration, walls) > _SAME_PX for other in distinct):
             distinct.append(fit)
     distinct.sort(key=lambda fit: -fit.found * fit.explained)
-    if not distinct or distinct[0].found < _LEAST_FOUND:
+    if not distinct or distinct[0].found < LEAST_FOUND:
         found = 100.0 * distinct[0].found if distinct else 0.0
         raise ChipError(
             f"the picture does not show the chip {chip.name}: at best {found:.0f} % of its walls agree, "
-            f"{100 * _LEAST_FOUND:.0f} % are needed; is it this chip, in focus, and is um_per_px about right?"
+            f"{100 * LEAST_FOUND:.0f} % are needed; is it this chip, in focus, and is um_per_px about right?"
         )
     best = distinct[0]
     equal = [
@@ -89,11 +87,15 @@ def moved_px(picture: NDArray[np.uint8 | np.uint16], chip: Chip, assumed: Calibr
     None if the picture does not tell, because it does not show the walls nearby or not enough of them.
     """
     walls = WallMap(chip.mask, chip.um_per_px)
-    reach_um = max(_REACH_WIDTHS * median_width_um(chip), _REACH_PX * assumed.um_per_px)
-    fit = Fitter(np.asarray(picture, np.float32), walls, reach_um, assumed.um_per_px).fit(assumed)
-    if fit.found < _LEAST_FOUND or _loose(fit).any():
+    fit = fitter_of(np.asarray(picture, np.float32), chip, assumed.um_per_px, walls).fit(assumed)
+    if fit.found < LEAST_FOUND or _loose(fit).any():
         return None
     return _apart_px(fit.calibration, assumed, walls)
+
+
+def fitter_of(grey: NDArray[np.float32], chip: Chip, um_per_px: float, walls: WallMap) -> Fitter:
+    """Fits poses of a chip to a picture (h, w) of about this scale."""
+    return Fitter(grey, walls, max(_REACH_WIDTHS * median_width_um(chip), _REACH_PX * um_per_px), um_per_px)
 
 
 def _apart_px(one: Calibration, other: Calibration, walls: WallMap) -> float:

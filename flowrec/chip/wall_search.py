@@ -130,6 +130,10 @@ class Search:
                 distinct.append(pose)
         return distinct
 
+    def agreement(self, calibration: Calibration) -> float:
+        """How well the directions of the walls agree at one pose, which may be off by some 4 of 480 pixels."""
+        return self._agreement(self._maps[0], calibration)
+
     def _distance_px(self, one: Pose, other: Pose) -> float:
         """Root mean square distance of the walls of two poses, in coarse pixels."""
         off = one.calibration.to_px(self._points_um[::10]) - other.calibration.to_px(self._points_um[::10])

@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.chip.orientation import AS_STATED
+from flowrec.commands.axes import may_be_image, orientation_of_heading, orientation_of_log, turned_log
 from flowrec.commands.calibrate_motion import (
     ANYWHERE,
     figures_of,
@@ -29,7 +31,7 @@ from flowrec.commands.calibrate_motion import (
     rows_of,
 )
 from flowrec.commands.misfit import Evidence, why_still, why_unexplained
-from flowrec.commands.record import prepare
+from flowrec.commands.record import Prepared, prepare
 from flowrec.config import Config
 from flowrec.control.coil_log import is_of_session, read_coil_log
 from flowrec.control.field_log import FieldLog
@@ -61,6 +63,7 @@ class MovieTracks:
     log : what the coils did on the same clock, without the robot's delay; None: there is no log.
     assumed : the flow by the chip and its boundary values.
     evidence : what the images show besides, for a log that does not explain the track.
+    prepared : the settings of the run, its chip, and what its images say about the axes.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -69,11 +72,13 @@ class MovieTracks:
     log: FieldLog | None
     assumed: FlowField
     evidence: Evidence
+    prepared: Prepared
 
 
 def tracks_of(asked: Config) -> MovieTracks:
     """Track the robot through the movie of a configuration; FlowrecError as `import_movie`."""
-    config, chip, pipeline, *_ = prepare(asked, aloud=False)  # the import says it, of the settings that are used
+    prepared = prepare(asked, aloud=False)  # the import says it, of the settings that are used
+    config, chip, pipeline, *_ = prepared
     sight, tracks, shifts = Sight(), list[Track](), list[NDArray[np.float64]]()
     quality = TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot)
     stabilised, measures = bool(config.stabilise.on), replace(config.stabilise, on=True)
@@ -103,7 +108,31 @@ def tracks_of(asked: Config) -> MovieTracks:
             pipeline.calibration.um_per_px,
             quality.doubts(),
         )
-        return MovieTracks(stamps_ns, positions_um, seen, source.log, config.flow.solve(chip), evidence)
+        return MovieTracks(stamps_ns, positions_um, seen, source.log, config.flow.solve(chip), evidence, prepared)
+
+
+def refuse_turned(asked: Config) -> None:
+    """Raise ChipError where the robot of a movie moves in another orientation than its log says, on the log's clock."""
+    if not (asked.movie.coils and asked.mission.check_axes):
+        return
+    tracks = tracks_of(asked)
+    config, chip, image = tracks.prepared.config, tracks.prepared.chip, tracks.prepared.image
+    if tracks.log is None or image is None:
+        return
+    seen = tracks.seen
+    found = orientation_of_log(tracks.stamps_ns[seen], tracks.positions_um[seen], tracks.log, config)
+    if found != AS_STATED:
+        raise turned_log(found, image, config, chip)
+
+
+def _refuse_doubtful(fit: MotionFit, prepared: Prepared) -> None:
+    """Raise ChipError where a log fits in another orientation, and the image does not tell that it is the log's."""
+    found, image = orientation_of_heading(fit.heading_offset_rad, mirrored=fit.mirrored), prepared.image
+    if found == AS_STATED or image is None:
+        return
+    if may_be_image(found, image, prepared.config, prepared.chip):
+        raise turned_log(found, image, prepared.config, prepared.chip)
+    warn(f"the robot moves {found.name}, relative to the log, whose axes are adapted: {image.text}")
 
 
 def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
@@ -119,6 +148,7 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
     if not asked.movie.coils:
         return asked, {}
     if _on_one_clock(asked):
+        refuse_turned(asked)
         return asked, {}
     rough = overlapping(asked)
     tracks = tracks_of(rough)
@@ -136,6 +166,7 @@ def aligned(asked: Config) -> tuple[Config, Mapping[str, str]]:
         else:
             refusal = why_still(tracks.evidence, tracks.log, rough.robot.um_per_rev) or refusal
         raise UsageError(f"{asked.movie.coils}: the log can not be aligned: {refusal}; or {_WITHOUT}")
+    _refuse_doubtful(fit, tracks.prepared)
     movie = rough.movie
     # The rig applies a log of commands robot.delay_s late; the offset that is found has that latency in it.
     latency_s = 0.0 if is_of_session(Path(movie.coils)) else asked.robot.delay_s or 0.0

@@ -17,6 +17,7 @@ import numpy as np
 
 from flowrec.chip import load_chip
 from flowrec.chip.chip import Chip
+from flowrec.chip.picture_orientation import orientation_by_image
 from flowrec.commands.calibrate_image import registration_state, walls_state
 from flowrec.commands.doctor_settings import stand_in
 from flowrec.commands.record import refuse_adrift
@@ -226,8 +227,14 @@ def _camera(config: ResolvedConfig, chip: Chip | None) -> Iterator[Finding]:
 
 
 def _walls(config: ResolvedConfig, chip: Chip, image: Image) -> Iterator[Finding]:
-    """Whether the chip still lies in the image as it is registered; nothing if the image does not show enough of it."""
-    found = walls_state(image, chip, registration_of(config.camera, chip))
+    """The orientation of the chip in the image; and whether it still lies as registered, if the image shows enough."""
+    stated = registration_of(config.camera, chip)
+    seen = orientation_by_image(image, chip, stated)
+    later = "" if seen.decided or config.mission.observes else "; the motion tells at the beginning of a run"
+    yield Finding("axes", FAILURE if seen.contradiction else OK, seen.text if seen.contradiction else seen.text + later)
+    if seen.contradiction:
+        return
+    found = walls_state(image, chip, stated)
     if found is not None:
         good, text = found
         yield Finding("walls", OK if good else WARNING, text)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.commands.align import aligned, overlapping
+from flowrec.commands.align import aligned, overlapping, refuse_turned
 from flowrec.commands.first_pass import first_pass
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.record import record
@@ -89,6 +89,8 @@ def import_movie(
     if align:
         asked, found = aligned(asked)
         facts = {**facts, **found}
+    else:
+        refuse_turned(asked)
     return record(
         asked, path, overwrite=overwrite, control=control, inputs=inputs, keep_failed=False, given_facts=facts
     )

@@ -15,9 +15,11 @@ import numpy as np
 
 from flowrec.chip import load_chip, median_width_um
 from flowrec.chip.chip import Chip
+from flowrec.chip.picture_orientation import ImageVerdict
 from flowrec.clocks import ClockMonitor
 from flowrec.commands.admission import admitted
 from flowrec.commands.auto_recovery import recover_leftovers
+from flowrec.commands.axes import checked_image
 from flowrec.commands.interactive import Unattended
 from flowrec.commands.rehearsal import rehearse_aloud
 from flowrec.commands.run_summary import GOOD_ENDS, Recorded, figures_of, files_text
@@ -36,7 +38,7 @@ from flowrec.resolve import derived, resolve
 from flowrec.rig_settings import LAB, MOVIE, RIGS
 from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
 from flowrec.rigs.movie.source import opened
-from flowrec.rigs.rig import Connecting, Rig
+from flowrec.rigs.rig import Connecting, Picturing, Rig
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.loop import Sink, run
 from flowrec.run.watchdog import Watchdog
@@ -68,6 +70,7 @@ class Prepared(NamedTuple):
     ----------
     derived : settings that were derived because they were not given, by key.
     facts : about the source of a movie, for the head of the session.
+    image : what the images of a movie say about the axes; None: not looked at.
     """
 
     config: ResolvedConfig
@@ -75,6 +78,7 @@ class Prepared(NamedTuple):
     pipeline: Pipeline
     derived: dict[str, float]
     facts: Mapping[str, str]
+    image: ImageVerdict | None = None
 
 
 def prepare(asked: Config, aloud: bool = True) -> Prepared:
@@ -84,6 +88,7 @@ def prepare(asked: Config, aloud: bool = True) -> Prepared:
     ------
     UsageError : the method of the sampler needs a recording.
     UnreachableError : see `refuse_adrift`.
+    ChipError : the images of a movie show the chip in another orientation than stated, or at another scale.
     """
     if "recording" in SAMPLERS[asked.sampler.method].needs:
         able = " or ".join(f"'{row.name}'" for row in SAMPLERS.values() if "recording" not in row.needs)
@@ -101,9 +106,14 @@ def prepare(asked: Config, aloud: bool = True) -> Prepared:
             caution(remark)
     chip = load_chip(asked.chip)
     config = resolve(asked, chip)
-    if asked.rig == MOVIE and aloud and (moved := _walls_moved(config, chip)):
-        caution(moved)
-        facts["source_walls"] = moved
+    image = None
+    if asked.rig == MOVIE:
+        image, moved = _looked_at(config, chip)
+        if image is not None:
+            facts["source_axes"] = image.text
+        if moved:
+            caution(moved)
+            facts["source_walls"] = moved
     made = derived(given, config)
     if made:
         what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
@@ -129,20 +139,21 @@ def prepare(asked: Config, aloud: bool = True) -> Prepared:
             f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
             "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
         )
-    return Prepared(config, chip, assemble(config, chip), made, facts)
+    return Prepared(config, chip, assemble(config, chip), made, facts, image)
 
 
-def _walls_moved(config: ResolvedConfig, chip: Chip) -> str:
-    """What to say if the walls in a movie are not where its registration puts them; '' if it can not be told."""
+def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None, str]:
+    """What a movie says about the axes; and what to say if the walls are not where its registration puts them."""
     from flowrec.commands.calibrate_image import walls_state
 
     try:
         with opened(config.movie) as movie:
             image = movie.median_image()
     except MovieError:  # an image can not be read: the run tells that
-        return ""
+        return None, ""
+    verdict = checked_image(image, config, chip, config.movie.path)
     good, text = walls_state(image, chip, registration_of(config.camera, chip)) or (True, "")
-    return "" if good else text
+    return verdict, "" if good else text
 
 
 def _unsaid(_text: str) -> None:
@@ -239,7 +250,7 @@ def record(
     inputs = (*inputs, *_files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
-    resolved, chip, pipeline, made, found = prepare(config)
+    resolved, chip, pipeline, made, found, *_ = prepare(config)
     source = {**found, **(given_facts or {})}
     realtime = realtime or resolved.rig == LAB
     timeout_s = _guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
@@ -269,6 +280,9 @@ def record(
         stack.enter_context(control.armed(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
         if isinstance(rig, Connecting):
             stack.enter_context(rig.connected())  # before there is a file
+        if isinstance(rig, Picturing) and resolved.mission.check_axes:
+            verdict = checked_image(rig.picture(), resolved, chip, "camera")
+            source |= {"source_axes": verdict.text} if verdict is not None else {}
         tried = realtime and resolved.recording.admission_s > 0.0
         if tried:
             rehearse_aloud(resolved, control)

@@ -90,6 +90,7 @@ class Controller:
         um_per_px: float,
         strength: float = 1.0,
         estimate_uses_map: bool = False,
+        driven_um_s: Vector | None = None,
     ) -> Demand:
         """The demand after this frame, never above the robot's speed limit.
 
@@ -104,6 +105,7 @@ class Controller:
         um_per_px : size of those pixels.
         strength : 0 to 1, present fraction of the field's full amplitude; the step-out frequency is proportional to it.
         estimate_uses_map : the observer corrects the map (kalman_map), so it does not lag behind it.
+        driven_um_s : (2,) velocity to demand without any feedback, as the check of the axes does; None: control it.
 
         Raises
         ------
@@ -129,9 +131,12 @@ class Controller:
             dt_s=dt_s,
             um_per_px=um_per_px,
         )
-        reference = self._reference(now, law)
+        reference = self._reference(now, law) if driven_um_s is None else _where_it_is(now)
         demand, saturated = np.zeros(2), False
-        if not mission.finished and math.isfinite(reference.error_um):
+        if driven_um_s is not None:
+            if estimate.seen and not mission.finished:
+                demand, saturated = limit_length(driven_um_s, now.limit_um_s)
+        elif not mission.finished and math.isfinite(reference.error_um):
             demand, saturated = law.velocity(now, reference)
             if clearance_um is not None and self.guard_radii > 0.0:
                 keep_um, per_s = self.guard_radii * robot.radius_um, now.scaled_rate(self.guard_per_s)
@@ -179,6 +184,12 @@ def _law(settings: Controller) -> TrackingLaw:
     row = CONTROLLERS[settings.method]
     law: TrackingLaw = row.load()(**{name: getattr(settings, name) for name in row.options})
     return law
+
+
+def _where_it_is(now: Situation) -> Reference:
+    """The predicted position as the reference, from which the robot is held afterwards; NaN where it is not seen."""
+    here_um = now.predicted_um if now.estimate.seen else np.full(2, np.nan)
+    return Reference.at_rest(here_um, now.estimate, 0.0)
 
 
 def _hold_position(now: Situation) -> Vector:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.enums import Action, Alarm, Level, Outcome, Phase
+from flowrec.enums import Action, Alarm, AxesVerdict, Level, Outcome, Phase
 from flowrec.messages import Event, FlowField, Health, Mission, OperatorEvent
 from flowrec.topics import Tick
 from flowrec.units import seconds
@@ -32,6 +32,7 @@ def event_of(last: Tick, tick: Tick, needs_time_to_go: bool = False) -> Event | 
         *_look(last, tick),
         *_health(last.health, tick.health),
         *_operator(last, tick),
+        *_axes(last, tick),
         *_mission(last, tick),
     ]
     if not lines:
@@ -169,6 +170,17 @@ def _steering(event: OperatorEvent, mission: Mission) -> Line:
 
 def _place(point_um: NDArray[np.float64]) -> str:
     return f"{point_um[0]:.0f}, {point_um[1]:.0f} um"
+
+
+def _axes(last: Tick, tick: Tick) -> Iterator[Line]:
+    """The verdict of the check of the axes; the mission tells one that ends it."""
+    axes, before = tick.axes, last.axes
+    if axes is None or (before is not None and before.verdict == axes.verdict):
+        return
+    if axes.verdict == AxesVerdict.AGREES:
+        yield axes.text, None
+    elif axes.verdict == AxesVerdict.UNDECIDED:
+        yield axes.text, Level.WARNING
 
 
 def _mission(last: Tick, tick: Tick) -> Iterator[Line]:

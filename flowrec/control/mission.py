@@ -25,9 +25,10 @@ from flowrec.control.mission_goals import (
 from flowrec.control.mission_sight import IN_VIEW, lost, without_sight
 from flowrec.control.mission_steps import Frame, at_end, elapsed_s, finish, held, left_s, order, transition
 from flowrec.control.trajectory import position_at
-from flowrec.enums import Action, Outcome, Phase, WorkOrder
+from flowrec.enums import Action, AxesVerdict, Outcome, Phase, WorkOrder
 from flowrec.messages import (
     Applied,
+    AxesCheck,
     Demand,
     Estimate,
     FlowField,
@@ -66,6 +67,10 @@ class MissionStateMachine:
     phases: tuple[PhaseName, ...] = PHASES
     start: Place = "inlet"
     goal: Place = "outlet"
+    # Before anything is controlled, drive the robot a little along x and y, for at most 3 s, and refuse the run if it
+    # does not move as the axes of camera and coils say; see control/axes_check.py. Record, import and doctor then also
+    # compare the walls in the image with the stated orientation of the chip and the scale of the camera.
+    check_axes: bool = True
     # time from the first frame for which a pipette, a magnet or a pump that stands still holds the robot; the field is
     # on and the flow solved before it is let go. None: 1 s in the simulated rig at an outlet that `start` names, else 0
     hold_start_s: Annotated[float, Range(0.0, 3600.0)] | None = None
@@ -118,6 +123,8 @@ class MissionStateMachine:
         refused: bool = False,
         observations: Observations | None = None,
         goal_fault: str = "",
+        axes: AxesCheck | None = None,
+        checking: bool = False,
     ) -> Mission:
         """The mission after this frame; the previous object itself while nothing changes.
 
@@ -125,7 +132,8 @@ class MissionStateMachine:
         does not say whether the image is new, `hold_after_s` and `zero_after_s` have no effect.
 
         `not_found_note` is the tracker's advice for a robot that is not found; `refused`: it can not be found.
-        `goal_fault` says why the goal of `operator` can be none: it is in a wall, or outside the chip.
+        `goal_fault` says why the goal of `operator` can be none: it is in a wall, or outside the chip. `axes` is the
+        check of the axes; while `checking` is under way or due the mission stays at its start.
         """
         now = Frame(
             *(track, estimate, assumed, refined, route, operator, demand, robot, applied, not_found_note, refused),
@@ -154,6 +162,11 @@ class MissionStateMachine:
             return unseen
         if previous.held_since_ns is not None:
             return held(previous, now)
+        if checking:
+            return previous
+        refuted = axes is not None and axes.verdict in (AxesVerdict.CONTRADICTS, AxesVerdict.NO_MOTION)
+        if axes is not None and refuted and previous.phase == Phase.START:
+            return finish(previous, now, Outcome.REFUSED, axes.text)
         result = now.result(previous)
         waits = bool(previous.wanted) and result is None and previous.phase not in _ON_THE_WAY
         return previous if waits else self._advance(previous, now, result)

@@ -16,6 +16,7 @@ OUTCOMES: dict[str, str] = {
     Outcome.TIME_OVER: "The time that the run was given was over.",
     Outcome.TIMEOUT: "A phase of the mission took longer than it may.",
     Outcome.UNREACHABLE: "No route leads to the goal.",
+    Outcome.REFUSED: "The robot does not move as the axes of camera and coils say.",
     Outcome.NOT_FOUND: "The robot was never seen.",
     Outcome.LOST: "The robot was lost from view.",
     Outcome.GAVE_UP: "The mission gave up.",

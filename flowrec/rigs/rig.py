@@ -12,6 +12,7 @@ from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
+from flowrec.declarations import Image
 from flowrec.errors import RigError
 from flowrec.messages import Currents, Frame
 from flowrec.pipeline import Inputs
@@ -69,6 +70,19 @@ class Tried(Protocol):
 
     def tried(self) -> Generator[Inputs]:
         """The inputs of a run that gives no command, as often as asked; once connected, before the rig is entered."""
+
+
+@runtime_checkable
+class Picturing(Protocol):
+    """A rig that can show the chip before a run."""
+
+    def picture(self) -> Image:
+        """An image of the camera; of a rig with devices while they are connected.
+
+        Raises
+        ------
+        RigError : no image comes.
+        """
 
 
 def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callable[[], None]) -> Iterator[Inputs]:

@@ -7,6 +7,7 @@ import flowrec
 from flowrec.chip import ChipSettings, clearance_um, load_chip
 from flowrec.commands.record import record
 from flowrec.config import calibration_of, load_config
+from flowrec.errors import ChipError
 from flowrec.interpolation import bilinear
 from flowrec.resolve import resolve
 from flowrec.vision.walls import walls_in_view
@@ -58,3 +59,10 @@ def test_the_tracker_expects_the_walls_where_they_are(name):
             x0, y0, x1, y1 = walls.box
             assert expected < 1.0 or (x0 <= x < x1 and y0 <= y < y1)
     assert compared > 300
+
+
+def test_a_run_whose_camera_shows_the_chip_turned_leaves_no_file_and_names_the_setting(tmp_path):
+    config = load_config(None, [*SURVEY, "mission.check_axes=true", "simulated.angle_deg=180"])
+    with pytest.raises(ChipError, match=r"camera: the image shows the chip turned by 180 .*camera\.angle_deg = 180"):
+        record(config, tmp_path / "turned.mcap")
+    assert not list(tmp_path.iterdir())

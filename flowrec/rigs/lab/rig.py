@@ -22,6 +22,7 @@ import numpy as np
 
 from flowrec.clocks import Fit
 from flowrec.config import ResolvedConfig
+from flowrec.declarations import Image
 from flowrec.diagnostics import CameraLosses
 from flowrec.errors import RigError, UsageError
 from flowrec.messages import Applied, Currents, Frame
@@ -135,6 +136,11 @@ class LabRig:
         """Switch the field off at once, until the devices are connected again."""
         if self.drive is not None:
             self.drive.zero()
+
+    def picture(self) -> Image:
+        grabber = self._grabber
+        assert grabber is not None, "the devices are open"
+        return self._first(grabber).image
 
     def inputs(self) -> Iterator[Inputs]:
         """Frame after frame; while there is none, ticks without an image.

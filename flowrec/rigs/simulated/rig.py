@@ -23,6 +23,7 @@ from flowrec.clocks import DeviceClock
 from flowrec.config import ResolvedConfig, registration_of
 from flowrec.control.coils import Coils
 from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
+from flowrec.declarations import Image
 from flowrec.errors import RigError
 from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
 from flowrec.pipeline import Inputs, Pipeline
@@ -178,6 +179,23 @@ class SimulatedRig:
         """Switch the field off at once, until the rig is entered again."""
         self._cut = True
 
+    def _microscope(self) -> Microscope:
+        world, simulated = self.true_world(), self._simulated
+        return Microscope(
+            world.mask,
+            world.mask_um_per_px,
+            self._calibration,
+            self._camera,
+            simulated.seed,
+            simulated.value("optics"),
+            world.mask_origin_um,
+        )
+
+    def picture(self) -> Image:
+        """The chip alone."""
+        nothing = np.zeros(0)
+        return self._microscope().image(None, 0.0, np.zeros(2), np.zeros((0, 2)), nothing, nothing, None)
+
     def inputs(self) -> Iterator[Inputs]:
         """Frame after frame, at index / rate seconds; the first comes with the true flow field."""
         world = self.true_world()
@@ -187,10 +205,7 @@ class SimulatedRig:
             self._start_um, self._true_robot, self._simulated, field, walls, px, self.pump, world.hindrance
         )
         debris = Debris(self._chip, self._camera.debris, radius, field, walls, seed)
-        optics = self._simulated.value("optics")
-        microscope = Microscope(
-            world.mask, world.mask_um_per_px, self._calibration, self._camera, seed, optics, world.mask_origin_um
-        )
+        microscope = self._microscope()
         moving = slice(0, len(debris.points_um) - debris.still)
         for n in range(moving.stop, len(debris.points_um)):
             microscope.add_still(debris.points_um[n], float(debris.radii_um[n]), float(debris.darkness[n]))

@@ -1,0 +1,82 @@
+"""The axes of camera and coils against what image and motion show, before a run, in an import and by the doctor.
+
+The image is compared with the walls of the chip (chip/picture_orientation.py). Where that does not decide, the motion
+does: of a robot that is driven in the check at the beginning of a run (control/axes_check.py), of a movie here, over
+all of it, against the log of the coils.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.chip.chip import Chip
+from flowrec.chip.orientation import AS_STATED, Orientation, nearest
+from flowrec.chip.picture_orientation import ImageVerdict, orientation_by_image
+from flowrec.chip.registration import Calibration
+from flowrec.config import ResolvedConfig, registration_of
+from flowrec.control.field_log import FieldLog
+from flowrec.control.motion_axes import contradiction, orientation_by_motion, own_gain
+from flowrec.declarations import Image
+from flowrec.enums import AxesVerdict
+from flowrec.errors import ChipError
+from flowrec.rig_settings import Movie
+from flowrec.units import NS_PER_S, nanoseconds
+
+_OFF = "; mission.check_axes = false records without this check"
+_LAG_S, _LAG_FRAMES = (
+    0.25,
+    4.0,
+)  # of the differences that are compared: more than the delay, and at least so many frames
+
+
+def checked_image(image: Image, config: ResolvedConfig, chip: Chip, where: str) -> ImageVerdict | None:
+    """What an image (h, w) says about the stated registration; None where mission.check_axes is off.
+
+    Raises ChipError, in one line with the settings to paste, where it contradicts.
+    """
+    if not config.mission.check_axes:
+        return None
+    verdict = orientation_by_image(image, chip, registration_of(config.camera, chip))
+    if verdict.contradiction:
+        raise ChipError(f"{where}: {verdict.contradiction}{_OFF}")
+    return verdict
+
+
+def orientation_of_log(
+    stamps_ns: NDArray[np.int64], positions_um: NDArray[np.float64], log: FieldLog, config: ResolvedConfig
+) -> Orientation:
+    """The orientation in which a robot at (n, 2) moves, relative to the log; as stated if that is not told."""
+    stamps_s = stamps_ns / NS_PER_S
+    late_ns = nanoseconds(config.robot.delay_s)
+    own_um = config.robot.um_per_rev * log.turns_until((stamps_ns - late_ns).astype(np.float64))
+    frame_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 0.0
+    found = orientation_by_motion(*own_gain(stamps_s, positions_um, own_um, max(_LAG_S, _LAG_FRAMES * frame_s)))
+    return found.orientation if found.verdict == AxesVerdict.CONTRADICTS else AS_STATED
+
+
+def orientation_of_heading(offset_rad: float, *, mirrored: bool) -> Orientation:
+    """The orientation nearest to a heading offset, as `MotionFit` states it."""
+    return nearest(Calibration(1.0, angle_deg=math.degrees(offset_rad), mirror=mirrored).axes)
+
+
+def may_be_image(orientation: Orientation, image: ImageVerdict, config: ResolvedConfig, chip: Chip) -> bool:
+    """Whether it may be the image that is turned so, and not the log: whether the chip would look the same."""
+    return not image.alike or orientation.in_image(registration_of(config.camera, chip)) in image.alike
+
+
+def turned_log(orientation: Orientation, image: ImageVerdict, config: ResolvedConfig, chip: Chip) -> ChipError:
+    """The refusal of a log against which the robot moves in another orientation."""
+    stated = registration_of(config.camera, chip) if may_be_image(orientation, image, config, chip) else None
+    settings = _log_settings(orientation, config.movie)
+    return ChipError(f"{config.movie.coils}: {contradiction(orientation, 'the log', settings, stated)}{_OFF}")
+
+
+def _log_settings(orientation: Orientation, movie: Movie) -> str:
+    """The settings movie.heading_* with which the log is right."""
+    offset_deg = -movie.heading_offset_deg if orientation.mirrored else movie.heading_offset_deg
+    offset_deg = (offset_deg + orientation.turned_deg + 180.0) % 360.0 - 180.0
+    mirrored = str(movie.heading_mirrored != orientation.mirrored).lower()
+    return f"movie.heading_mirrored = {mirrored}, movie.heading_offset_deg = {offset_deg:g}"
