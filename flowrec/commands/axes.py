@@ -77,6 +77,6 @@ def turned_log(orientation: Orientation, image: ImageVerdict, config: ResolvedCo
 def _log_settings(orientation: Orientation, movie: Movie) -> str:
     """The settings movie.heading_* with which the log is right."""
     offset_deg = -movie.heading_offset_deg if orientation.mirrored else movie.heading_offset_deg
-    offset_deg = (offset_deg + orientation.turned_deg + 180.0) % 360.0 - 180.0
+    offset_deg = 180.0 - (180.0 - offset_deg - orientation.turned_deg) % 360.0
     mirrored = str(movie.heading_mirrored != orientation.mirrored).lower()
     return f"movie.heading_mirrored = {mirrored}, movie.heading_offset_deg = {offset_deg:g}"

@@ -20,11 +20,12 @@ from flowrec.enums import AxesVerdict
 
 # A robot that steps out at 0.7 of the field's frequency still moves a third of what is expected.
 _LEAST_MOTION = 0.2  # of the motion that is expected
-_STANDARD_ERRORS = 5.0  # by which the best orientation is ahead of the next one
+_STANDARD_ERRORS = 5.0  # by which the best orientation is ahead of others, or of the stated one where that is refuted
+_AMONG_OTHERS = 1.0  # by which one that refutes the stated one is ahead of the rest: it is named as the likeliest
 _LEAST_FRAMES = 30
 _JUMP = 10.0  # times the median of the second differences
-_PARTS, _LEAST_PARTS = 8, 4  # of a recording, and of those that determine a gain
-_WORST_CONDITION = 1e3  # of the commands of a part
+_PARTS = 8  # of a recording
+_WORST_CONDITION = 1e3  # of the commands
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,24 +36,30 @@ class MotionVerdict:
     orientation: Orientation = AS_STATED
 
 
-def orientation_by_motion(gain: NDArray[np.float64], std: float) -> MotionVerdict:
-    """The verdict of a gain (2, 2) whose elements have this standard deviation."""
-    like = likeness(gain)
-    second, best = np.sort(like)[-2:].tolist()
-    if not math.isfinite(std) or not np.isfinite(gain).all():
+def orientation_by_motion(gain: NDArray[np.float64], std: NDArray[np.float64] | float) -> MotionVerdict:
+    """The verdict of a gain (2, 2) whose elements have these standard deviations (2, 2), or all of them this one."""
+    errors = np.broadcast_to(np.asarray(std, np.float64), (2, 2))
+    if not np.isfinite(errors).all() or not np.isfinite(gain).all():
         return MotionVerdict(AxesVerdict.UNDECIDED)
-    if math.hypot(*gain.ravel().tolist()) / math.sqrt(2.0) + 2.0 * std < _LEAST_MOTION:
+    if math.hypot(*gain.ravel().tolist()) / math.sqrt(2.0) + 2.0 * float(errors.max()) < _LEAST_MOTION:
         return MotionVerdict(AxesVerdict.NO_MOTION)
-    if best < _LEAST_MOTION or best - second < _STANDARD_ERRORS * std:
-        return MotionVerdict(AxesVerdict.UNDECIDED)
+    like = likeness(gain)
     found = ORIENTATIONS[int(like.argmax())]
-    return MotionVerdict(AxesVerdict.AGREES if found == AS_STATED else AxesVerdict.CONTRADICTS, found)
+    agrees = found == AS_STATED
+    for each, its in zip(ORIENTATIONS, like.tolist(), strict=True):
+        apart = 0.5 * float(np.sqrt((((found.matrix - each.matrix) * errors) ** 2).sum()))
+        least = _STANDARD_ERRORS if agrees or each == AS_STATED else _AMONG_OTHERS
+        if each != found and like.max() - its < least * apart:
+            return MotionVerdict(AxesVerdict.UNDECIDED)
+    if like.max() < _LEAST_MOTION:
+        return MotionVerdict(AxesVerdict.UNDECIDED)
+    return MotionVerdict(AxesVerdict.AGREES if agrees else AxesVerdict.CONTRADICTS, found)
 
 
 def own_gain(
     stamps_s: NDArray[np.float64], positions_um: NDArray[np.float64], own_um: NDArray[np.float64], lag_s: float
-) -> tuple[NDArray[np.float64], float]:
-    """The gain of a whole recording, and its standard deviation from that of its parts.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The gain (2, 2) of a whole recording, and the standard deviations (2, 2) of its elements, by a jackknife.
 
     Second differences over `lag_s` are compared: the flow changes slowly against the commands.
 
@@ -62,7 +69,7 @@ def own_gain(
         commanded up to then.
     lag_s : more than the delay from command to motion.
     """
-    bad = np.full((2, 2), math.nan), math.inf
+    bad = np.full((2, 2), math.nan), np.full((2, 2), math.inf)
     if len(stamps_s) < _LEAST_FRAMES or stamps_s[-1] - stamps_s[0] < 4.0 * lag_s:
         return bad
     at = np.arange(stamps_s[0] + lag_s, stamps_s[-1] - lag_s, 0.5 * lag_s)
@@ -77,16 +84,14 @@ def own_gain(
     seen, own = bend(positions_um), bend(own_um)
     size = np.hypot(*seen.T)
     kept = size <= _JUMP * max(float(np.median(size)), 1e-9)  # jumps of the track
-    gains = []
-    for part in np.array_split(np.flatnonzero(kept), _PARTS):
-        normal = own[part].T @ own[part]
-        if len(part) < 3 or np.linalg.cond(normal) > _WORST_CONDITION:
-            continue
-        gains.append(np.linalg.solve(normal, own[part].T @ seen[part]).T)
-    if len(gains) < _LEAST_PARTS:
+    parts = [part for part in np.array_split(np.flatnonzero(kept), _PARTS) if len(part)]
+    normal = np.array([own[part].T @ own[part] for part in parts])
+    moment = np.array([own[part].T @ seen[part] for part in parts])
+    if len(parts) < _PARTS or np.linalg.cond(normal.sum(0)) > _WORST_CONDITION:
         return bad
-    each = np.array(gains)
-    return np.median(each, axis=0), float(each.std(0, ddof=1).max()) / math.sqrt(len(gains))
+    gain = np.linalg.solve(normal.sum(0), moment.sum(0)).T
+    without = np.linalg.solve(normal.sum(0) - normal, moment.sum(0) - moment)  # of each part: the jackknife
+    return gain, np.sqrt((len(parts) - 1) * without.var(0)).T
 
 
 def contradiction(orientation: Orientation, driver: str, settings: str, stated: Calibration | None) -> str:

@@ -119,6 +119,13 @@ def test_the_pasted_matrix_of_the_coils_makes_the_robot_move_as_commanded(orient
     np.testing.assert_allclose(true_field, expected, atol=1e-9)
 
 
+def test_a_robot_that_goes_mostly_along_one_axis_still_refutes_that_this_axis_is_as_stated():
+    std = np.array([[0.05, 0.4], [0.05, 0.4]])  # of the columns: hardly any command along y
+    assert orientation_by_motion(np.diag((1.0, 1.1)), std).verdict == "undecided"
+    found = orientation_by_motion(np.diag((-1.0, 1.1)), std)
+    assert found.verdict == "contradicts" and found.orientation.name == "mirrored left to right"
+
+
 def test_the_gain_of_a_recording_is_found_although_the_commands_compensate_a_flow():
     rng, time_s = np.random.default_rng(3), np.arange(0.0, 20.0, 1 / 30)
     flow_um_s = np.stack((120.0 + 40.0 * np.sin(0.3 * time_s), -60.0 * np.cos(0.2 * time_s)), -1)
@@ -127,6 +134,6 @@ def test_the_gain_of_a_recording_is_found_although_the_commands_compensate_a_flo
     turned = ORIENTATIONS[6].matrix
     seen_um = own_um @ turned.T + np.cumsum(flow_um_s / 30, axis=0) + rng.normal(0.0, 0.5, own_um.shape)
     gain, std = own_gain(time_s, seen_um, own_um, 0.25)
-    np.testing.assert_allclose(gain, turned, atol=max(4.0 * std, 0.1))
+    np.testing.assert_allclose(gain, turned, atol=max(4.0 * float(std.max()), 0.1))
     assert orientation_by_motion(gain, std).orientation == ORIENTATIONS[6]
     assert orientation_by_motion(*own_gain(time_s[:20], seen_um[:20], own_um[:20], 0.25)).verdict == "undecided"
