@@ -215,8 +215,10 @@ def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck 
     if last.axes is not None and last.axes.verdict:
         return last.axes, None
     start_um = np.asarray(p.mission.start, np.float64)
-    map_um_s = np.zeros(2) if tick.assumed is None else sample(tick.assumed, start_um)
     hold_s = p.mission.hold_start_s or 0.0
+    # A robot that is let go beside an outlet would be carried out. Elsewhere the flow carries it along its channel, and
+    # to act against the flow of the map would drive it into a wall if the axes of the coils were exchanged.
+    map_um_s = sample(tick.assumed, start_um) if hold_s and tick.assumed is not None else np.zeros(2)
     free_s = hold_s + p.coils.ramp_s + _RELEASE_S if hold_s else 0.0
     since_s = 0.0 if mission is None else seconds(track.stamp_ns - mission.since_ns)
     waits = mission is None or mission.held_since_ns is not None or mission.blind_since_ns is not None

@@ -1,9 +1,9 @@
 """The check of the axes: before anything is controlled, the robot is driven a little along x and y, and back.
 
 No feedback acts meanwhile: with a wrong axis it would drive the robot away from where it is to be held. The assumed
-flow at the start, where it is known, is compensated. The robot's own motion of a leg is at most a part of the distance
-to the walls, and returns, so that only the flow carries it on. The regression of one round usually decides; otherwise
-another, slower round follows, up to 3 s in all.
+flow is compensated only at a start where the robot had to be held; from the second round on, the flow that was seen.
+The robot's own motion of a leg is at most a part of the distance to the walls, and returns, so that only the flow
+carries it on. The regression of one round usually decides; otherwise another, slower round follows, up to 3 s in all.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def watch(
 
     Parameters
     ----------
-    map_um_s : (2,) the flow at the start by the map; 0 while none is known.
+    map_um_s : (2,) the flow at the start by the map, to be compensated; 0: none is.
     wall_um : from the place where the robot starts to the nearest wall.
     frame_s : time from one image to the next.
     stated, coils : as configured, for the settings that the verdict names.
