@@ -67,7 +67,7 @@ def import_movie(
     config : settings; it must give camera.um_per_px, robot.radius_um and chip.path, which no file tells but one that
         flowrec exported: such a movie, or else the folder of tables around `coils`, gives these and what else is known
         of robot, camera and coils. It is used where a setting has its default value.
-    coils : log of the coils (CSV or Excel), see control/coil_log.py. Without one the flow is refined only with movie.drifts.
+    coils : log of the coils (CSV or Excel), see control/coil_log.py. Without one only movie.drifts refines the flow.
     times : CSV with the time of each image in time_s, on the clock of the log.
     fps : images per second, instead.
     partial : a movie that breaks off is used up to there.
