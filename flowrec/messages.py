@@ -437,7 +437,7 @@ class AxesCheck(Message):
     square_um2: Vector2
     # Of the most exact round so far: displacement seen (rows) per own motion as commanded (columns); the identity if
     # all is as stated. (0, 0): no round is complete
-    gain: Annotated[Matrix, Shape("n", "n")] = field(default_factory=lambda: np.zeros((0, 0)))
+    gain: Annotated[Matrix, Shape("n", "n")]
     gain_std: float = 0.0  # one standard deviation of each of its elements
     # (2,) velocity that, by the last round, holds the robot against the flow; (0,): not known
     against_um_s: Annotated[Vector, Shape("m")] = field(default_factory=lambda: np.zeros(0))

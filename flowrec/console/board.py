@@ -10,6 +10,7 @@ import asyncio
 import itertools
 import json
 from collections import deque
+from collections.abc import Awaitable
 from typing import Any, NamedTuple
 
 from flowrec.console.messages import Ended, Verdict
@@ -129,9 +130,9 @@ class Board:
         self._verdicts[ticket] = asyncio.get_running_loop().create_future()
         return ticket
 
-    async def refusal(self, ticket: int) -> str:
+    def refusal(self, ticket: int) -> Awaitable[str]:
         """Wait for the run: why it does not do a command, '' where it does."""
-        return await self._verdicts[ticket]
+        return self._verdicts[ticket]
 
     def chip_um(self, x_px: float, y_px: float) -> tuple[float, float]:
         """The place on the chip that the image shows there."""

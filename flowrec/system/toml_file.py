@@ -21,7 +21,7 @@ _NOT_TOML = {
 
 # Ours have 10 kB. Each dot may open a table of a kilobyte, and a key with many costs the square of them in time.
 _LIMIT_CHARACTERS, _LIMIT_DOTS, _LIMIT_DOTS_IN_A_ROW = 1 << 19, 20_000, 2_000
-_INTEGERS = 1 << 63  # by the specification of TOML, below 0 and above
+_INTEGERS = 1 << 64  # one bit more than those of TOML, whose range a setting's own message tells
 
 
 def parse_toml(text: str) -> dict[str, Any]:

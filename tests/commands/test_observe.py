@@ -16,7 +16,6 @@ from flowrec.commands.record import record
 from flowrec.commands.replay import replay
 from flowrec.config import load_config
 from flowrec.errors import UsageError
-from flowrec.messages import Track
 from flowrec.resolve import resolve
 from flowrec.session import Session
 from flowrec.store.reader import SessionReader
@@ -57,9 +56,9 @@ def test_a_replay_of_an_observation_is_exact_and_its_file_is_whole(observed: Pat
 def test_a_robot_out_of_sight_ends_no_observation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = pipeline._seen
 
-    def blind(*known: Any) -> tuple[Track, Any]:
-        track, appearance = found(*known)
-        return replace(track, seen=False, seen_ns=None), appearance
+    def blind(*known: Any) -> pipeline.Sight:
+        sight = found(*known)
+        return sight._replace(track=replace(sight.track, seen=False, seen_ns=None))
 
     monkeypatch.setattr(pipeline, "_seen", blind)
     limits = ("mission.find_limit_s=0.5", "mission.lost_limit_frames=3")

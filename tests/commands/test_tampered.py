@@ -19,7 +19,7 @@ from flowrec.commands.check import check
 from flowrec.config import load_config
 from flowrec.declarations import Role
 from flowrec.diagnostics import CameraLosses, Clocks, Drops
-from flowrec.messages import Appearance, Health
+from flowrec.messages import Appearance, AxesCheck, Background, Health, Shift
 from flowrec.resolve import resolve
 from flowrec.session_writer import session_header
 from flowrec.store.session_file import Split, WriterOptions
@@ -50,8 +50,13 @@ def every_topic() -> list[Tick]:
     drops = Drops(now, "/camera/frame", 1, 0, 1)
     losses = CameraLosses(now, 12, 2, 1, 2, 3, 4, 5, 6)
     look = Appearance(now, "dark", 1.0, 0.5, 4.0, np.zeros(2), np.ones((1, 5, 5)))
-    more = {"health": health, "clocks": clocks, "drops": drops, "losses": losses, "appearance": look}
-    return [replace(tick, mapless=tick.estimate, **more) for tick in ticks]
+    axes = AxesCheck(
+        now, 1, 2, 0.5, 3, np.ones(2), np.ones(2), np.ones(2), 50.0, 20.0, 4, np.eye(6), np.ones((6, 2)), np.ones(2),
+        np.eye(2), 0.1, np.ones(2), "agrees", "as stated",
+    )  # fmt: skip
+    seen = {"background": Background(now, np.ones((3, 5)), 1.0), "shift": Shift(now, np.ones(2), True, 0.9)}
+    more = {"health": health, "clocks": clocks, "drops": drops, "losses": losses, "appearance": look, "axes": axes}
+    return [replace(tick, mapless=tick.estimate, **more, **seen) for tick in ticks]
 
 
 @pytest.fixture(scope="module")
@@ -223,8 +228,10 @@ def test_an_edit_that_no_replay_can_see_fails_verify_by_the_digest(session: Path
 
 def test_the_replay_itself_finds_an_edit_of_each_topic_that_it_computes(session: Path, tmp_path: Path) -> None:
     edited: set[str] = set()
-    # The map of this mission is not good enough for the observer, so nothing is computed without it.
-    computed = {topic.path for topic in TOPICS if topic.role is Role.OUTPUT} - {"/robot/estimate_without_map"}
+    # The map of this mission is not good enough for the observer, so nothing is computed without it. It neither checks
+    # the axes nor registers images.
+    absent = {"/robot/estimate_without_map", "/run/axes", "/camera/background", "/camera/shift"}
+    computed = {topic.path for topic in TOPICS if topic.role is Role.OUTPUT} - absent
 
     def edit(channel: Any, message: Any, wire: Any) -> bool:
         # Not the first, which is the state of the start as well; but the robot's appearance is found once.

@@ -23,7 +23,7 @@ import pytest
 from flowrec.console import console as console_module
 from flowrec.console.app import application
 from flowrec.console.board import MOST_PAGES, Board, Shown
-from flowrec.console.messages import Ended
+from flowrec.console.messages import Ended, Verdict
 from flowrec.console.page_state import PageState
 from flowrec.enums import Action
 from flowrec.errors import UsageError
@@ -228,13 +228,25 @@ def test_pages_that_flood_the_run_are_refused_after_ten_commands_in_a_second(
     messages = itertools.chain([{"type": "websocket.connect"}], marks, [{"type": "websocket.disconnect", "code": 1000}])
 
     async def receive() -> Any:
+        for _ in range(5):  # turns of the loop, in which what came before is answered
+            await asyncio.sleep(0)
         return next(messages)
 
     async def send(message: Any) -> None:
         if "refusal" in (words := json.loads(message.get("text", "{}"))):
             answers.append(words["refusal"])
 
-    asyncio.run(application(Board(scene, "a.mcap"), "secret", 1, None, given.append)(scope, receive, send))
+    board = Board(scene, "a.mcap")
+
+    def take(words: dict[str, Any]) -> None:
+        given.append(words)
+        board.settle(Verdict(words["ticket"], ""))
+
+    async def page() -> None:
+        board.loop = asyncio.get_running_loop()
+        await application(board, "secret", 1, None, take)(scope, receive, send)
+
+    asyncio.run(page())
     assert len(given) == 10 and len(answers) == 40 and all("too many" in text for text in answers[10:])
 
 

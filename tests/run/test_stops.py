@@ -70,7 +70,7 @@ def test_each_signal_ends_the_run_by_its_ramp_or_takes_the_field_away_at_once(na
     told: list[str] = []
     number, ends = getattr(signal, name), name in ("SIGINT", "SIGTERM", "SIGHUP")
     control = SimpleNamespace(
-        stop=lambda reason: told.append(f"ramp: {reason}"),
+        stop=lambda reason, **_: told.append(f"ramp: {reason}"),
         skip_ramp=lambda: told.append("no ramp"),
         must_interrupt=False,
         stuck=False,

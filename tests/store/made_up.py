@@ -64,7 +64,7 @@ def ticks_of(count: int, *, shape: tuple[int, int] = (48, 64), seed: int = 0, im
     tick = Tick()
     for number in range(count):
         now = 1_000_000_000 + number * PERIOD_NS
-        here = np.array([number * 0.5, 100.0 + np.sin(number / 9.0)])
+        here = np.array([300.0 + number * 0.5, 300.0 + np.sin(number / 9.0)])  # within the image
         nis = float("nan") if number % 7 == 0 else 1.0
         news = {
             "frame": Frame(now, number, pictures[number % images]),

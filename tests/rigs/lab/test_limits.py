@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from flowrec.control.amplifier import Amplifier
 from flowrec.control.coils import Coils
 from flowrec.control.field_rotation import FieldCommand
+from flowrec.declarations import as_read
 from flowrec.errors import RigError, UsageError
 from flowrec.messages import Currents
 from flowrec.rig_settings import OutputLimits
@@ -57,7 +58,8 @@ class JudgedHere(Limits):
 
 
 def command(frequency: float, heading: float, amplitude: float, limit: float) -> Currents:
-    return Currents(0, frequency, heading, amplitude, 0.0, np.zeros(3), False, limit_hz=limit)
+    with as_read():  # no stage can make one with NaN; the limits are the second line of defence
+        return Currents(0, frequency, heading, amplitude, 0.0, np.zeros(3), False, limit_hz=limit)
 
 
 @pytest.mark.parametrize(
