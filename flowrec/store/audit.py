@@ -131,7 +131,7 @@ def audit(
                 found.missing[name] += sum(gap.messages for gap in gaps)
         if found.finished:
             found.edits = reading.digest.faults(contents)
-            for fatal, text in _disagreements(contents, scanned):
+            for fatal, text in disagreements(contents, scanned):
                 (found.contradictions if fatal else found.disagreements).append(text)
     return found
 
@@ -204,7 +204,7 @@ def _contents_without_index(path: Path) -> SessionContents:
     return SessionContents(path, found.summary)
 
 
-def _disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool, str]]:
+def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool, str]]:
     """Where the index differs from what was read, and whether reading by it fails."""
     listed = {chunk.chunk_start_offset: chunk for chunk in contents.chunks}
     seen = {chunk.chunk_start_offset: chunk for chunk in found.summary.chunks}

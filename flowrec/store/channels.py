@@ -142,7 +142,7 @@ class SessionContents(SessionMetadata):
         for channel in self.channels.values():
             if channel.topic == FRAME_PATH:
                 self.frame_encoding = channel.metadata.get("encoding", "")
-                self.frame_bits = _bits_from(channel.metadata)
+                self.frame_bits = bits_from(channel.metadata)
                 self.region = region_from(channel.metadata)
             if channel.topic in BY_PATH:
                 self.fields[channel.id] = BY_PATH[channel.topic].field
@@ -186,7 +186,8 @@ class SessionContents(SessionMetadata):
         )
 
 
-def _bits_from(metadata: Mapping[str, str]) -> int:
+def bits_from(metadata: Mapping[str, str]) -> int:
+    """Depth of the images, from the metadata of their channel."""
     text = metadata.get(_BITS, "8")
     return int(text) if text in map(str, PIXEL_BITS) else PIXEL_BITS[-1]
 

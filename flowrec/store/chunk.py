@@ -10,9 +10,8 @@ import zlib
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
-from typing import NamedTuple
 
 import numpy as np
 import zstandard
@@ -25,7 +24,7 @@ from flowrec.store.channels import VIEW as VIEW_GROUP
 from flowrec.store.codec import Payload, codec_of, encode_record
 from flowrec.store.digest import message_digest
 from flowrec.store.frame_encodings import FrameEncoding
-from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGE_HEAD, RECORD_HEAD
+from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGE_HEAD, RECORD_HEAD, ChannelIndex, SealedChunk
 from flowrec.store.roi import WindowCutter
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
@@ -42,32 +41,7 @@ _REUSED_BYTES = 32 << 20  # larger memory is released after a chunk
 _LARGE_BYTES = 1 << 16  # numpy copies larger parts, because it releases the interpreter lock
 
 _size_of = attrgetter("size")
-Sink = Callable[[list["SealedChunk"]], None]
-
-
-class ChannelIndex(NamedTuple):
-    """The messages of one channel in a chunk: number, the sum of their digests and their MessageIndex record."""
-
-    channel: int
-    messages: int
-    digest: int
-    record: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class SealedChunk:
-    """The content of one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
-
-    `data` may be a view of the builder's memory: write or detach it before the builder is used again.
-    """
-
-    compression: str
-    data: bytes | memoryview
-    message_start_time: int
-    message_end_time: int
-    uncompressed_crc: int
-    uncompressed_size: int
-    indexes: list[ChannelIndex]
+Sink = Callable[[list[SealedChunk]], None]
 
 
 def detached(chunks: Iterable[SealedChunk]) -> list[SealedChunk]:
@@ -133,7 +107,7 @@ class ChunkBuilder:
             uncompressed_crc=zlib.crc32(content),
             uncompressed_size=self.size,
             indexes=[
-                ChannelIndex(channel, len(entries) // 2, self._digests[channel], _index_record(channel, entries))
+                ChannelIndex(channel, len(entries) // 2, self._digests[channel], index_record(channel, entries))
                 for channel, entries in self._index.items()
             ],
         )
@@ -143,8 +117,8 @@ class ChunkBuilder:
         return chunk
 
 
-def _index_record(channel: int, entries: array[int]) -> bytes:
-    """An MCAP MessageIndex; mcap's own takes 4 us for each message."""
+def index_record(channel: int, entries: array[int]) -> bytes:
+    """An MCAP MessageIndex of times and places by turns; mcap's own takes 4 us for each message."""
     data = np.array(entries, "<u8").tobytes()
     body = _INDEX_HEAD.pack(channel, len(data)) + data
     return RECORD_HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body
@@ -159,6 +133,7 @@ class ChunkEncoder:
     views : makes the viewer topics; shared by all files of a run, because it remembers the colour scale.
     sink : receives sealed chunks and must not keep views of them after it returns. May be replaced between calls.
     start_unix_ns : Unix time of stamp 0, which is added to all times that MCAP and foxglove's schemas hold.
+    copied_images : frames are not encoded, because their chunks are copied.
 
     Attributes
     ----------
@@ -166,12 +141,21 @@ class ChunkEncoder:
     sequences : the next sequence number by topic, for topics whose messages do not give their own.
     """
 
-    def __init__(self, encoding: FrameEncoding, views: ViewerTopics, sink: Sink, start_unix_ns: int) -> None:
+    def __init__(
+        self,
+        encoding: FrameEncoding,
+        views: ViewerTopics,
+        sink: Sink,
+        start_unix_ns: int,
+        *,
+        copied_images: bool = False,
+    ) -> None:
         self.sink = sink
         self.sequences: Counter[str] = Counter()
         self.start_unix_ns = start_unix_ns
         self._encoding = encoding
         self._views = views
+        self._copied_images = copied_images
         self._cutter = WindowCutter()
         self._builders = {
             group: ChunkBuilder(compressed=encoding.compressed_chunks or group != FRAMES) for group in GROUPS
@@ -191,6 +175,8 @@ class ChunkEncoder:
         """
         for field, message in entry.messages.items():
             if isinstance(message, Frame):
+                if self._copied_images:
+                    continue
                 codec = self._encoding.codec
                 if entry.window is not None:
                     message = self._cutter.cut(message, entry.window)  # noqa: PLW2901  the builder copies it

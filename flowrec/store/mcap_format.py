@@ -50,6 +50,31 @@ class Record(NamedTuple):
     payload: memoryview | Message  # a message where it has been decoded already
 
 
+class ChannelIndex(NamedTuple):
+    """The messages of one channel in a chunk: number, the sum of their digests and their MessageIndex record."""
+
+    channel: int
+    messages: int
+    digest: int
+    record: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class SealedChunk:
+    """The content of one chunk record, as `mcap.records.Chunk`, and the indexes that follow it.
+
+    `data` may be a view of the builder's memory: write or detach it before that is used again.
+    """
+
+    compression: str
+    data: bytes | memoryview
+    message_start_time: int
+    message_end_time: int
+    uncompressed_crc: int
+    uncompressed_size: int
+    indexes: list[ChannelIndex]
+
+
 @dataclass(slots=True)
 class Summary:
     """The summary section of a file.

@@ -16,7 +16,6 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -36,11 +35,8 @@ from mcap.records import (
 )
 
 from flowrec.store.digest import channel_digest, digest_record, head_digest
-from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, Summary
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary
 from flowrec.system.locks import open_new
-
-if TYPE_CHECKING:
-    from flowrec.store.chunk import SealedChunk
 
 _BUFFERS_PER_WRITE = 1024
 

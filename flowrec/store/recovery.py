@@ -11,8 +11,11 @@ from pathlib import Path
 
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
+from flowrec.store.audit import disagreements
 from flowrec.store.channels import SessionContents
+from flowrec.store.digest import FileDigest
 from flowrec.store.frame_encodings import ENCODINGS
+from flowrec.store.image_chunks import ImageChunk, ImageChunks, stored, with_images
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import (
@@ -91,7 +94,7 @@ class _Skipped:
         self.first = self.first or fault
 
 
-def recover(path: Path, out: Path | None = None) -> Recovered:
+def recover(path: Path, out: Path | None = None, *, copy_images: bool = True) -> Recovered:
     """Write everything intact of a session to a new file.
 
     A tick is complete when it has both inputs and outputs. The images of a killed run are often ahead of the rest: they
@@ -104,6 +107,8 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     ----------
     path : the unfinished, cut or damaged file.
     out : file to make; by default X.mcap for X.mcap.partial, else X_recovered.mcap.
+    copy_images : take over the images of an undamaged beginning in the chunks in which they are stored. False: encode
+        each image again, which takes several times as long and makes a file of the same messages.
 
     Raises
     ------
@@ -112,7 +117,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     refuse_irregular(path, SessionError)
     try:
         with held(path):
-            return _recover(path, out)
+            return _recover(path, out, copy_images)
     except BlockingIOError as error:
         raise SessionError(
             f"{path}: is being recorded just now, or recovered; stop that process with Ctrl-C, which completes the file"
@@ -154,7 +159,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
     return done
 
 
-def _recover(path: Path, out: Path | None) -> Recovered:
+def _recover(path: Path, out: Path | None, copy_images: bool) -> Recovered:
     partial = path.name.endswith(PARTIAL_SUFFIX)
     final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
     target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
@@ -173,7 +178,8 @@ def _recover(path: Path, out: Path | None) -> Recovered:
             _rename(path, target)
             return Recovered(target, intact.ticks, intact.duration_s)
         with contextlib.closing(McapReader(path)) as source:
-            found = scan(source)
+            images = ImageChunks(source, found := Scan())
+            scan(source, images.visit if copy_images else None, found=found)
         if partial and not found.summary.chunks:
             raise NothingSavedError(f"{path}: nothing can be saved: no message was on the disk; remove the file")
         skipped = _Skipped()
@@ -184,11 +190,12 @@ def _recover(path: Path, out: Path | None) -> Recovered:
         known = ENCODINGS.get(contents.frame_encoding)
         frames = known.name if known is not None and known.lossless else "zstd"
         end_ns = _last_whole_ns(path, reader, found)
+        copied = images.copyable(contents, ENCODINGS[frames].of(reader.frame_bits)) if copy_images else []
     _refuse_if_taken(target)
     draft = target.with_name(f"{target.stem}.recovering{target.suffix}")
     try:
-        ticks, lost = _rewrite(reader, found, end_ns, draft, frames, skipped)
-        done = _checked(draft)
+        ticks, lost = _rewrite(reader, found, end_ns, draft, frames, skipped, contents.source, copied)
+        done = _verified(draft)
         if done is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
         _refuse_if_taken(target)
@@ -218,6 +225,20 @@ def _checked(path: Path) -> Recovered | None:
                     contents.source.messages(chunk)
             repeated = reader.keyframe_ns is not None
             return Recovered(path, reader.counts.get("track", 0) - repeated, reader.duration_s, changed=False)
+    except SessionError:
+        return None
+
+
+def _verified(draft: Path) -> Recovered | None:
+    """A file that was just written; None unless every message is as it was meant, and the index agrees with them."""
+    try:
+        with SessionReader(draft, contents := SessionContents(draft)) as reader:
+            _ = reader.header
+            digest = FileDigest(contents.source.start_unix_ns)
+            scanned = scan(contents.source, digest.add)
+            if scanned.lost_bytes or digest.faults(contents) != [] or any(disagreements(contents, scanned)):
+                return None
+            return Recovered(draft, reader.counts.get("track", 0), reader.duration_s)
     except SessionError:
         return None
 
@@ -254,9 +275,19 @@ def _unknown_topics(found: Scan) -> list[str]:
 
 
 def _rewrite(
-    reader: SessionReader, found: Scan, end_ns: int, draft: Path, frames: str, skipped: _Skipped
+    reader: SessionReader,
+    found: Scan,
+    end_ns: int,
+    draft: Path,
+    frames: str,
+    skipped: _Skipped,
+    source: McapReader,
+    copied: list[ImageChunk],
 ) -> tuple[int, str]:
-    """Write all ticks, of which those after `end_ns` are incomplete; the number of complete ones and what was lost."""
+    """Write all ticks, of which those after `end_ns` are incomplete; the number of complete ones and what was lost.
+
+    Where there are chunks to be `copied`, they hold the images.
+    """
     before = Tick()
     complete = images_missing = images_ahead = dropped = 0
     # Only replays are written without images.
@@ -268,9 +299,13 @@ def _rewrite(
         queue_limit_bytes=_QUEUE_BYTES,
         region=reader.region,
         bits=reader.frame_bits,
+        copied_images=bool(copied),
+    )
+    ticks = (
+        with_images(reader.ticks(with_frames=False), copied) if copied else ((tick, None) for tick in reader.ticks())
     )
     with SessionWriter(draft, reader.header, options) as writer:
-        for tick in reader.ticks():
+        for tick, images in ticks:
             if tick.stamp_ns > end_ns:
                 images_ahead += tick.frame is not before.frame
             elif tick.stamp_ns == reader.keyframe_ns:
@@ -281,6 +316,8 @@ def _rewrite(
                 images_missing += lacks and not (tick.applied is not None and tick.applied.without_image)
                 dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
             writer.write(tick)
+            if images is not None:
+                writer.add_chunk(stored(source, images))
             before = tick
             while writer.queue_bytes > _QUEUE_BYTES:  # a large message must not wait while the next one is read
                 time.sleep(_POLL_S)

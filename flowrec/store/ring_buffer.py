@@ -17,7 +17,8 @@ from flowrec.diagnostics import Drops
 from flowrec.enums import Action, Level, Outcome
 from flowrec.messages import Event, OperatorEvent
 from flowrec.store.channels import FRAMES
-from flowrec.store.chunk import ChunkEncoder, SealedChunk, Sink, detached
+from flowrec.store.chunk import ChunkEncoder, Sink, detached
+from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.run_files import partial_path, snapshot_path
 from flowrec.store.segments import Counters, SegmentRouter, keyframe
 from flowrec.store.session_file import AsyncFileWriter, SessionFile, Snapshot, WriterOptions

@@ -151,19 +151,25 @@ class Scan:
             self.last_ns[channel] = max(log_ns, self.last_ns.get(channel, 0))
 
 
-def scan(source: McapReader, visit: Visit | None = None, progress: Callable[[int], None] | None = None) -> Scan:
+def scan(
+    source: McapReader,
+    visit: Visit | None = None,
+    progress: Callable[[int], None] | None = None,
+    found: Scan | None = None,
+) -> Scan:
     """Read all of a file and index its intact records; one chunk is in memory at a time.
 
     Parameters
     ----------
     visit : receives offset and messages of every intact chunk, in file order.
     progress : receives the byte up to which the file has been read.
+    found : an empty one, which is filled; where `visit` needs what was found before.
 
     Raises
     ------
     SessionError : the file can not be read.
     """
-    found = Scan()
+    found = Scan() if found is None else found
     at = len(MAGIC)
     # What looks like a chunk after damage may be none, and overlap the next one: the cost of trying is bounded.
     allowance_bytes = _TRIES * source.size + _WINDOW_BYTES

@@ -19,8 +19,9 @@ from mcap.records import Metadata
 
 from flowrec.errors import SessionError
 from flowrec.store.channels import declarations, left_out
-from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
+from flowrec.store.chunk import ChunkEncoder, detached
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
+from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.roi import Region
 from flowrec.store.run_files import PARTIAL_SUFFIX, partial_path, run_files
@@ -85,6 +86,7 @@ class WriterOptions:
     bits : depth of the images; another one is refused.
     keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
     clock : monotonic time in s, by which data is flushed and synced.
+    copied_images : the images are chunks of another file (SessionWriter.add_chunk); those in the ticks stand for them.
     start_by_clocks : stamp 0 is at the time of day that the first tick's /run/clocks says; the header's is a guess.
     """
 
@@ -101,6 +103,7 @@ class WriterOptions:
     keep_failed: bool = True
     clock: Callable[[], float] = time.monotonic
     start_by_clocks: bool = False
+    copied_images: bool = False
 
     @property
     def left_out_topics(self) -> frozenset[str]:

@@ -15,7 +15,8 @@ from pathlib import Path
 
 from flowrec.enums import Outcome
 from flowrec.errors import SessionError
-from flowrec.store.chunk import ChunkEncoder, SealedChunk, detached
+from flowrec.store.chunk import ChunkEncoder, detached
+from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.run_files import part_path
 from flowrec.store.segments import Counters, OpenSegment, SegmentRouter, keyframe
 from flowrec.store.session_file import FileError, SessionFile, Split, WriterOptions
@@ -56,7 +57,13 @@ class PartFile(SessionFile):
         self.number = number
         self.flushed_ns: int | None = None
         self._parts = parts
-        self._encoder = ChunkEncoder(self._options.encoding, parts.views, self.add_chunks, header.start_unix_ns)
+        self._encoder = ChunkEncoder(
+            self._options.encoding,
+            parts.views,
+            self.add_chunks,
+            header.start_unix_ns,
+            copied_images=self._options.copied_images,
+        )
         self._first_bytes = self.size  # of head and keyframe
         self._image_bytes = 0  # of the keyframe's image
         self._raw_bytes = 1  # of what was added
@@ -125,6 +132,9 @@ class PartFile(SessionFile):
         if self._since_ns is None:
             self._since_ns = entry.stamp_ns
         self._last_ns = max(self._last_ns, entry.stamp_ns)
+        if entry.chunk is not None:
+            self.add_chunks([entry.chunk])
+            return
         try:
             self._encoder.add(entry)
         except FileError:

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from typing import Any, NamedTuple
 
+from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.roi import Window
 from flowrec.units import NS_PER_S
 
@@ -32,6 +33,7 @@ class Entry(NamedTuple):
     late : this is that image.
     dropped, missing : images that the writer left out, and that the camera has not delivered, since the entry before.
     window : of the image, where not all of it is recorded.
+    chunk : is written as it is, instead of messages.
     """
 
     stamp_ns: int
@@ -43,6 +45,7 @@ class Entry(NamedTuple):
     dropped: int = 0
     missing: int = 0
     window: Window | None = None
+    chunk: SealedChunk | None = None
 
 
 class WriteQueue:

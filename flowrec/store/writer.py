@@ -22,6 +22,7 @@ from flowrec.enums import Outcome
 from flowrec.errors import SessionError
 from flowrec.messages import Frame, Track
 from flowrec.store.channels import FRAME_PATH
+from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.ring_buffer import RingBuffer
 from flowrec.store.roi import Window, WindowSelector
 from flowrec.store.run_files import run_files
@@ -192,6 +193,19 @@ class SessionWriter:
             missing=self.missing_frames - missing,
         )
         self._queue.put(entry, image)
+
+    def add_chunk(self, chunk: SealedChunk) -> None:
+        """Copy a chunk of images of another file, the option `copied_images`; they are those of ticks up to the last.
+
+        Raises
+        ------
+        SessionError : as `write`.
+        """
+        self._raise_failure()
+        entry = Entry(self._last_ns, {}, len(chunk.data), chunk=chunk)
+        self._queue.wait_for_room(entry.nbytes)
+        self._raise_failure()
+        self._queue.put(entry)
 
     def close(self, outcome: Mapping[str, str] | None = None, timeout_s: float | None = None, *, why: str = "") -> None:
         """Finish the file and give it its name; a second call does nothing.
