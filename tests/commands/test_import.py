@@ -143,7 +143,7 @@ def test_a_session_that_was_imported_replays_with_other_settings(lab: Laboratory
 
 
 def test_without_a_log_the_movie_is_still_a_session_that_says_what_it_does_not_know(
-    lab: Laboratory, capsys: pytest.CaptureFixture[str]
+    lab: Laboratory, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = lab.folder / "watched.mcap"
     done = flowrec.import_movie(lab.folder / "film.avi", out, lab.config)
@@ -162,8 +162,8 @@ def test_without_a_log_the_movie_is_still_a_session_that_says_what_it_does_not_k
     maps = session.fields
     assert maps["refined"].refused and "movie.drifts=true" in maps["refined"].refused
     np.testing.assert_array_equal(maps["refined"].velocity_um_s, maps["assumed"].velocity_um_s)
-    flowrec.replay(out, out=lab.folder / "again.mcap", refine="gain")  # by no other method either
-    assert flowrec.open(lab.folder / "again.mcap").fields["refined"].refused
+    flowrec.replay(out, out=tmp_path / "replayed.mcap", refine="gain")  # by no other method either
+    assert flowrec.open(tmp_path / "replayed.mcap").fields["refined"].refused
 
 
 def test_a_body_that_only_drifts_shows_the_flow_without_a_log(
