@@ -194,4 +194,5 @@ def _text(said: MotionVerdict, now: AxesCheck, stated: Calibration, coils: Coils
             "that is tracked, is it magnetic and free, and do the coils make their field?"
         )
     turned_deg = math.degrees(math.atan2(now.gain[1, 0] - now.gain[0, 1], now.gain[0, 0] + now.gain[1, 1]))
-    return f"the axes agree with the motion, turned by {turned_deg:+.0f} degrees and {100.0 * size:.0f} % as large"
+    own = f"{100.0 * size:.0f} % of the stated motion, {turned_deg:+.0f} degrees off its heading"
+    return f"the axes are right: the robot moves as camera and coils say ({own})"
