@@ -79,8 +79,10 @@ def _completed(path: Path) -> None:
 
 def _is_abandoned(name: str) -> bool:
     """Whether a name is that of a temporary file whose process, of this host, has ended."""
+    if sys.platform == "win32":  # where asking would end the process
+        return False
     found = _NAME.fullmatch(name)
-    if found is None or found["host"] != _host() or sys.platform == "win32":  # where asking would end the process
+    if found is None or found["host"] != _host():
         return False
     pid = int(found["pid"])
     try:
