@@ -79,19 +79,22 @@ def _completed(path: Path) -> None:
 
 def _is_abandoned(name: str) -> bool:
     """Whether a name is that of a temporary file whose process, of this host, has ended."""
-    if sys.platform == "win32":  # where asking would end the process
-        return False
     found = _NAME.fullmatch(name)
-    if found is None or found["host"] != _host():
-        return False
-    pid = int(found["pid"])
+    ended = False
+    if sys.platform != "win32" and found is not None and found["host"] == _host():  # there asking would end the process
+        ended = _has_ended(int(found["pid"]), int(found["start"]))
+    return ended
+
+
+def _has_ended(pid: int, start: int) -> bool:
+    """Whether a process is gone; another one that was given its number began at another time."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return True
     except OSError:  # of another user
         return False
-    return _start(pid) != int(found["start"])
+    return _start(pid) != start
 
 
 @functools.cache
