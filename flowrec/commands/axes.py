@@ -26,10 +26,8 @@ from flowrec.rig_settings import Movie
 from flowrec.units import NS_PER_S, nanoseconds
 
 _OFF = "; mission.check_axes = false records without this check"
-_LAG_S, _LAG_FRAMES = (
-    0.25,
-    4.0,
-)  # of the differences that are compared: more than the delay, and at least so many frames
+# Of the differences that are compared: more than the delay, and at least so many frames.
+_LAG_S, _LAG_FRAMES = 0.25, 4.0
 
 
 def checked_image(image: Image, config: ResolvedConfig, chip: Chip, where: str) -> ImageVerdict | None:

@@ -133,7 +133,8 @@ def test_a_zero_that_raises_is_repeated_until_it_works_and_a_person_is_told() ->
     assert "after 4 failures" in alarms[1]
 
 
-def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repeated() -> None:
+def refusing_driver() -> Driver:
+    """A driver whose zero() takes a tenth of a second and fails."""
     driver = Driver()
 
     def refuse() -> None:
@@ -141,6 +142,11 @@ def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repea
         raise OSError("no answer")
 
     driver.in_zero = refuse
+    return driver
+
+
+def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repeated() -> None:
+    driver = refusing_driver()
     watchdog = Watchdog(driver, clock=driver.clock)
     with watchdog.running(), pytest.raises(RigError, match=r"zero\(\) raised \d+ times: no answer.*by hand"):
         watchdog.field_off()
@@ -151,13 +157,7 @@ def test_a_zero_that_never_works_is_an_error_that_names_it_and_it_is_still_repea
 
 
 def test_a_driver_that_also_fails_when_it_is_left_does_not_hide_that_the_coils_may_carry_a_field() -> None:
-    driver = Driver()
-
-    def refuse() -> None:
-        driver.now_s += 0.1
-        raise OSError("no answer")
-
-    driver.in_zero = refuse
+    driver = refusing_driver()
     watchdog = Watchdog(driver, clock=driver.clock)
     run = ExitStack()
     run.enter_context(watchdog.running())
