@@ -7,6 +7,7 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -261,3 +262,11 @@ def _made_up(tmp_path):
         for tick in itertools.islice(ticks_of(20, shape=(8, 8)), 20):
             writer.write(tick)
     return tmp_path / "made_up.mcap"
+
+
+def test_a_track_at_the_border_is_doubted_also_where_the_session_states_no_doubt(tmp_path):
+    ticks = list(ticks_of(20, shape=(8, 8)))
+    at_border = [replace(tick, track=replace(tick.track, position_um=np.array([0.0, 100.0]))) for tick in ticks]
+    for name, recorded, doubted in (("a.mcap", at_border, True), ("b.mcap", ticks, False)):
+        (file,) = in_parts(tmp_path / name, [], recorded)
+        assert any("cut by the border" in finding.text for finding in check(file).findings) is doubted

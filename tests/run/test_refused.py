@@ -144,6 +144,7 @@ def test_a_replay_refuses_a_refinement_at_the_tick_at_which_the_run_did(
     monkeypatch.setattr("flowrec.commands.record.assemble", planted)
     recorded = record(load_config(None, [*SMALL, "mission.phases=refine"]), tmp_path / "a.mcap")
     assert recorded.report.outcome == "refine complete"
+    assert recorded.exit_status == 3 and any("the flow was not refined" in doubt for doubt in recorded.doubts)
     with SessionReader(recorded.path) as reader:
         (refused,) = reader.messages("refined")
         (assumed,) = reader.messages("assumed")
