@@ -11,10 +11,10 @@ def main() -> None:
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end_at_once)
-    from flowrec.system.endings import one_line_at_the_end
+    from flowrec.core import one_line_at_the_end
 
     with one_line_at_the_end():
-        from flowrec.cli import main as command_line
+        from flowrec.verbs import main as command_line
 
         command_line()
 

@@ -9,5 +9,5 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # The workers share the cores, and idle threads of BLAS and OpenMP spin: one thread, also in the processes that tests
-# start; set before anything imports NumPy. tests/refine/test_blas_threads.py gives itself two.
+# start; set before anything imports NumPy. tests/stages/refine/test_blas_threads.py gives itself two.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

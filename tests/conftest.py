@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import pickle
 import signal
@@ -18,13 +19,16 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.dispatcher import Dispatcher
 from threadpoolctl import threadpool_limits
 
-from flowrec.commands.record import record
-from flowrec.commands.run_summary import Recorded
-from flowrec.config import load_config
-from flowrec.system.numba_setup import _cache_folder
+from flowrec.core.system.numba_setup import _cache_folder
+from flowrec.stages.config import load_config
+from flowrec.verbs.record import record
+from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
 
 Made = TypeVar("Made")
+
+# Collecting the tests imports half a million objects that stay: to look for garbage among them took a fifth of it.
+gc.disable()
 
 # The workers share the cores, and idle threads of BLAS spin.
 threadpool_limits(limits=1, user_api="blas")
@@ -48,9 +52,17 @@ def pytest_xdist_auto_num_workers() -> int:
     return (os.cpu_count() or 1) + 1
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest tests first: at the end of a run a worker would wait for them."""
-    items.sort(key=lambda item: item.path.name not in ("test_contributing.py", "test_notebooks.py"))
+    """A slow test, which only .ci/run runs, states why it takes long."""
+    for item in items:
+        for mark in item.iter_markers("slow"):
+            assert mark.args and isinstance(mark.args[0], str), f"{item.nodeid}: pytest.mark.slow says why"
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
+from flowrec.core.topics import TOPICS
 from flowrec.store.digest import channel_digest, digest_record, head_digest, message_digest
 from flowrec.store.viewer_topics import VIEWER_TOPICS
-from flowrec.topics import TOPICS
 
 Edit = Callable[[Channel, Message, Any], bool]  # edits the decoded message; True where it did
 EditHead = Callable[[Attachment | Metadata | Schema | Channel], None]
@@ -23,10 +24,15 @@ EditHead = Callable[[Attachment | Metadata | Schema | Channel], None]
 
 def parser_of(schema: Schema) -> Any:
     """The protobuf class of a schema, by what the file says of it."""
+    return _class_of(schema.name, schema.data)
+
+
+@cache
+def _class_of(name: str, descriptors: bytes) -> Any:
     pool = descriptor_pool.DescriptorPool()
-    for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+    for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
         pool.Add(file)
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
 
 
 def rewrite(

@@ -14,11 +14,11 @@ import pytest
 from numba.core.caching import _CacheLocator
 
 import flowrec
-from flowrec.control.controller import CONTROLLERS
-from flowrec.estimation.observer import OBSERVERS
-from flowrec.planning.planner import PLANNERS
-from flowrec.refine.refiner import REFINERS
-from flowrec.system.numba_setup import _cache_folder, kernel_files
+from flowrec.core.system.numba_setup import _cache_folder, kernel_files
+from flowrec.stages.control.controller import CONTROLLERS
+from flowrec.stages.estimation.observer import OBSERVERS
+from flowrec.stages.planning.planner import PLANNERS
+from flowrec.stages.refine.refiner import REFINERS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(flowrec.__file__).parent  # where its kernels are compiled for
@@ -33,7 +33,7 @@ def blocks(text: str, kind: str) -> list[str]:
 
 ONE_AFTER_THE_OTHER = """
 import json, sys
-from flowrec.cli import main
+from flowrec.verbs.cli import main
 for sys.argv in json.loads(sys.argv[1]):
     try:
         main()
@@ -43,18 +43,45 @@ for sys.argv in json.loads(sys.argv[1]):
 """
 
 
-@pytest.mark.usefixtures("mission")  # has compiled most kernels, which the processes below would compile again
-def test_the_recipes_apply_to_a_copy_of_flowrec_and_their_commands_work(tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A copy of flowrec that recipes may change."""
     for folder in (PACKAGE, ROOT / "sessions"):
-        shutil.copytree(folder, copy / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
-    caches = tmp_path / "caches"
+        shutil.copytree(folder, tmp_path / "copy" / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path / "copy"
+
+
+def outside_of(copy: Path) -> dict[str, str]:
+    """The environment of commands in the copy."""
+    return os.environ | {"GIT_CEILING_DIRECTORIES": str(copy.parent), "PYTHONPATH": str(copy)}
+
+
+def apply(name: str, copy: Path) -> None:
+    (change,) = blocks(RECIPES[name], "diff")
+    run(["git", "apply", "--recount", "-"], f"{name}: the change does not apply", copy, outside_of(copy), change)
+
+
+def test_the_recipes_apply_to_a_copy_of_flowrec_which_can_be_imported(copy: Path) -> None:
+    for name in RECIPES:
+        apply(name, copy)
+    code = """
+from flowrec.stages.config import load_config
+from flowrec.core.topics import BY_FIELD
+load_config(None, ["plan.method=breadth_first", "sampler.least_flow_um_s=40"])
+assert "speed" in BY_FIELD
+"""
+    run([sys.executable, "-c", code], "all recipes", copy, outside_of(copy))
+
+
+@pytest.mark.slow("flies and verifies a mission with each recipe, in processes of its own: a minute")
+@pytest.mark.usefixtures("mission")  # has compiled most kernels, which the processes below would compile again
+def test_the_commands_of_the_recipes_work(copy: Path) -> None:
+    caches = copy.parent / "caches"
     share_kernels(copy, caches)
-    outside = os.environ | {"GIT_CEILING_DIRECTORIES": str(tmp_path), "PYTHONPATH": str(copy)}
-    outside = outside | {"XDG_CACHE_HOME": str(caches), "NUMBA_CACHE_DIR": ""}
+    outside = outside_of(copy) | {"XDG_CACHE_HOME": str(caches), "NUMBA_CACHE_DIR": ""}
     for name, text in RECIPES.items():
-        (change,), (commands,) = blocks(text, "diff"), blocks(text, "sh")
-        run(["git", "apply", "--recount", "-"], f"{name}: the change does not apply", copy, outside, change)
+        apply(name, copy)
+        (commands,) = blocks(text, "sh")
         words = [command.split() for command in commands.splitlines()]
         assert {program for program, *_ in words} == {"flowrec"}
         run([sys.executable, "-c", ONE_AFTER_THE_OTHER, json.dumps(words)], name, copy, outside)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.extras import why
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
@@ -24,20 +27,34 @@ def kinds(notebook: Any) -> list[list[str]]:
     ]
 
 
+def measured(notebook: Any) -> list[Any]:
+    """Cells that take minutes, of benches that have tests of their own: it is enough that they are stored."""
+    return [cell for cell in notebook.cells if "bench" in cell.metadata.get("tags", ())]
+
+
+def test_no_notebook_is_stored_with_an_error_and_each_bench_has_drawn() -> None:
+    for path in NOTEBOOKS:
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        outputs = [output for cell in cells if cell["cell_type"] == "code" for output in cell["outputs"]]
+        assert outputs and not any(output["output_type"] == "error" for output in outputs), path
+        benches = [cell for cell in cells if "bench" in cell["metadata"].get("tags", ())]
+        drawn = [any("image/png" in output.get("data", {}) for output in cell["outputs"]) for cell in benches]
+        assert all(drawn), path
+
+
+@pytest.mark.slow("runs nine notebooks, which record, solve and draw in kernels of their own: a minute")
 @pytest.mark.usefixtures("mission")  # has compiled most kernels, which each notebook would compile again
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_notebook_runs_from_top_to_bottom_and_shows_what_is_stored(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import nbformat  # seconds, with jsonschema: not in each worker
+    nbformat = pytest.importorskip("nbformat", reason=why("nbformat"))  # seconds, with jsonschema: not in each worker
     from nbclient import NotebookClient
 
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path))  # not every user may write to a home
     notebook = nbformat.read(path, as_version=4)
-    # Minutes of work, by benches that have tests of their own: it is enough that they are stored with what they drew.
-    measured = [cell for cell in notebook.cells if "bench" in cell.metadata.get("tags", ())]
-    assert all(any("image/png" in output.get("data", {}) for output in cell.outputs) for cell in measured)
-    notebook.cells = [cell for cell in notebook.cells if cell not in measured]
+    benches = measured(notebook)
+    notebook.cells = [cell for cell in notebook.cells if cell not in benches]
     stored = kinds(notebook)
     for long in LONG.get(path.stem, ()):
         (cell,) = [cell for cell in notebook.cells if long in cell.source]

@@ -14,7 +14,7 @@ WITHOUT_POSIX = """
 import contextlib, io, json, sys
 modules, commands = map(json.loads, sys.argv[1:])
 sys.modules |= dict.fromkeys(modules)
-from flowrec.cli import main
+from flowrec.verbs.cli import main
 for words in commands:
     if words[0] == "export":  # Rerun imports psutil, which needs `resource` on Linux and not on Windows
         del sys.modules["resource"]
@@ -28,6 +28,7 @@ for words in commands:
 """
 
 
+@pytest.mark.slow("every verb that reads, with the libraries of each, in a process of its own")
 def test_a_verb_that_reads_needs_no_posix_module(tmp_path: Path) -> None:
     exported = tmp_path / "golden.rrd"
     cases: list[tuple[list[object], str, int]] = [
@@ -51,7 +52,7 @@ def test_a_verb_that_reads_needs_no_posix_module(tmp_path: Path) -> None:
 
 
 def test_every_lock_is_granted_where_there_are_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from flowrec.system import locks
+    from flowrec.core.system import locks
 
     with locks.open_new(tmp_path / "a") as file:
         assert locks.is_growing(tmp_path / "a")

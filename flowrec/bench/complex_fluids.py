@@ -11,18 +11,24 @@ from numpy.typing import NDArray
 from scipy.integrate import cumulative_simpson
 from scipy.optimize import brentq
 
-from flowrec.chip.chip import Chip, Opening
-from flowrec.chip.fluid import CarreauYasuda, Law, PowerLaw, blood
-from flowrec.flow import FlowSolver
-from flowrec.flow.generalised import assembled
-from flowrec.flow.level_set import from_distance
-from flowrec.flow.linear_solver import clear_cache
-from flowrec.flow.newton_solver import Scales
-from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.physics import (
+    CarreauYasuda,
+    Chip,
+    FlowSolver,
+    Opening,
+    PowerLaw,
+    Scales,
+    ViscosityLaw,
+    blood,
+    clear_cache,
+    from_distance,
+    generalised_equations,
+)
 
 Floats = NDArray[np.float64]
 
-LAWS: dict[str, Law] = {
+LAWS: dict[str, ViscosityLaw] = {
     "power law 0.5": PowerLaw(0.5, plateau_1_s=1e-3),
     "power law 0.7": PowerLaw(0.7, plateau_1_s=1e-3),
     "power law 1.5": PowerLaw(1.5, plateau_1_s=1e-3),
@@ -33,7 +39,7 @@ _UM_PER_PX, _SPEED_UM_S, _MARGIN_PX = 10.0, 100.0, 2
 _ACROSS, _RATES = 4_001, 20_001  # of the quadrature
 
 
-def channel_profile(law: Law, half_m: float, mean_m_s: float, from_middle_m: Floats) -> tuple[Floats, float]:
+def channel_profile(law: ViscosityLaw, half_m: float, mean_m_s: float, from_middle_m: Floats) -> tuple[Floats, float]:
     """Speeds (m/s) of the developed flow in a plane channel, and its wall stress over the viscosity of the chip.
 
     The stress grows linearly from the middle, and the shear rate is the inverse of the flow curve.
@@ -91,7 +97,7 @@ def law_oblique_case(name: str, width_px: float, k: int, angles_deg: tuple[float
     }
 
 
-def _oblique(law: Law, width_px: float, angle_deg: float, k: int) -> float:
+def _oblique(law: ViscosityLaw, width_px: float, angle_deg: float, k: int) -> float:
     """Relative error of the velocity in the middle of the channel, percent."""
     angle, length = np.radians(angle_deg), 80
     rows = int(length * np.tan(angle)) + 24
@@ -110,7 +116,7 @@ def _oblique(law: Law, width_px: float, angle_deg: float, k: int) -> float:
     )
     chip = Chip("oblique", mask, _UM_PER_PX, openings, 1.0, 1000.0, law=law)
     walls = from_distance(lambda x, y: 0.5 * width_px - np.abs(across(x, y)), mask.shape, k)
-    equations = assembled(chip, law, k, walls)
+    equations = generalised_equations(chip, law, k, walls)
     flux = equations.steady(Scales.of(chip, k, False).drive, 0.0, 100, 1e-9)
     along = (x - middle_x) * np.cos(angle) + (y - middle_y) * np.sin(angle)
     core = np.abs(along)[mask] < 15.0
@@ -120,7 +126,7 @@ def _oblique(law: Law, width_px: float, angle_deg: float, k: int) -> float:
     return 100.0 * float(np.linalg.norm(equations.velocity(flux)[core] - exact) / np.linalg.norm(exact))
 
 
-def bend_drop(law: Law, inner_m: float, outer_m: float, flow_m2_s: float) -> float:
+def bend_drop(law: ViscosityLaw, inner_m: float, outer_m: float, flow_m2_s: float) -> float:
     """Fall of the pressure per radian over the chip's viscosity, of the flow along circles between two walls.
 
     The balance along a circle, d(r^2 tau) / dr = -K r, has tau = -K / 2 + C / r^2, and tau = f(gamma) gamma with
@@ -157,7 +163,7 @@ def law_bend_case(name: str, k: int) -> dict[str, Any]:
     ends = int(end[0]), int(end[-1])
     openings = (Opening("left", *ends, "inlet", _SPEED_UM_S), Opening("top", *ends, "outlet", 0.0))
     chip = Chip("bend", mask, _UM_PER_PX, openings, 1.0, 1000.0, law=law)
-    equations = assembled(chip, law, k, from_distance(distance, mask.shape, k))
+    equations = generalised_equations(chip, law, k, from_distance(distance, mask.shape, k))
     scales = Scales.of(chip, k, False)
     flux = equations.steady(scales.drive, 0.0, 100, 1e-9)
     load = equations.residual(flux, scales.drive, 0.0)
@@ -173,7 +179,7 @@ def law_bend_case(name: str, k: int) -> dict[str, Any]:
 def law_speed_case(pattern: str, chip: Chip, k: int, repeats: int) -> list[dict[str, Any]]:
     """CPU seconds of a solve without anything in the cache, for a Newtonian fluid and for laws; least of `repeats`."""
 
-    def seconds(law: Law | None) -> float:
+    def seconds(law: ViscosityLaw | None) -> float:
         taken = []
         for _ in range(repeats):
             clear_cache()

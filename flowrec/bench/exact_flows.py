@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.chip.chip import Chip, Opening, Walls
-from flowrec.flow import FlowSolver, sample
-from flowrec.flow.level_set import from_distance
-from flowrec.flow.newton_solver import assembled
-from flowrec.units import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S
+from flowrec.physics import Chip, FlowSolver, Opening, Walls, from_distance, newton_equations, sample
 
 _UM_PER_PX, _SPEED_UM_S, _MARGIN_PX = 10.0, 100.0, 2
 _SAMPLES = 65  # across a channel
@@ -79,7 +76,7 @@ def bend_case(k: int) -> dict[str, Any]:
     first, last = int(end[0]), int(end[-1])
     openings = (Opening("left", first, last, "inlet", _SPEED_UM_S), Opening("top", first, last, "outlet", 0.0))
     chip = Chip("bend", mask, _UM_PER_PX, openings, 1.0, 1000.0)
-    equations = assembled(chip, k, from_distance(distance, mask.shape, k))
+    equations = newton_equations(chip, k, from_distance(distance, mask.shape, k))
     h, mu = _UM_PER_PX * M_PER_UM / k, chip.viscosity_mpa_s * PA_S_PER_MPA_S
     drive = np.array([_SPEED_UM_S * M_PER_UM, 0.0])
     load = equations.residual(equations.linear(drive[:, None])[:, 0], drive, 0.0)

@@ -25,7 +25,7 @@ _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class FlowPanels:
     """One case. Velocities are (h, w, 2) in um/s, drawn in mm/s; y points down."""
 
     name: str
@@ -44,7 +44,7 @@ def median_case(rows: list[dict[str, Any]]) -> str:
     return str(ranked[(len(ranked) - 1) // 2][1])
 
 
-def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
+def draw(path: Path, picture: FlowPanels, rows: list[dict[str, Any]]) -> None:
     """Write the figure: the speed of the truth and of each method, their errors, and the relative RMSE of all cases.
 
     `rows` are those of `flowrec bench flow`, of all cases. All speeds have one colour scale, and all errors another.
@@ -57,7 +57,7 @@ def draw(path: Path, picture: Picture, rows: list[dict[str, Any]]) -> None:
     figure.savefig(path)
 
 
-def _case(figure: SubFigure, picture: Picture, errors: dict[str, float]) -> None:
+def _case(figure: SubFigure, picture: FlowPanels, errors: dict[str, float]) -> None:
     """Two rows of maps: speeds above, the observations and the errors below."""
     axes = figure.subplots(2, len(picture.fields) + 1, squeeze=False)
     speed_top = float(np.percentile(_length(picture.truth)[picture.mask], 99.5))
@@ -149,5 +149,5 @@ def _arrow_places(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def _length(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Of (..., 2) in um/s, in mm/s."""
+    """Magnitude in mm/s of vectors (..., 2) in um/s."""
     return np.asarray(MM_PER_UM * np.linalg.norm(vectors, axis=-1))

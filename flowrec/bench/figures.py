@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from flowrec.bench.lemniscate import Flight
-    from flowrec.bench.trips import Trip, World
-    from flowrec.messages import Route
+    from flowrec.bench.lemniscate import LemniscateRun
+    from flowrec.bench.trips import Trip, TripCase
+    from flowrec.core import Route
 
 SOLID = "#d4d4d4"
 INK = "#262626"
@@ -67,7 +67,7 @@ def colours(names: Iterable[str]) -> dict[str, str]:
     return {name: _PALETTE[number % len(_PALETTE)] for number, name in enumerate(dict.fromkeys(names))}
 
 
-def draw_plan(path: Path, examples: list[tuple[World, Trip, dict[str, Route]]], rows: list[dict[str, Any]]) -> None:
+def draw_plan(path: Path, examples: list[tuple[TripCase, Trip, dict[str, Route]]], rows: list[dict[str, Any]]) -> None:
     """Routes upstream in two channels; path length and travel time of all trips (rows of `flowrec bench plan`)."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     colour = colours(methods)
@@ -150,7 +150,7 @@ def draw_observer(
 
 
 def draw_track(
-    path: Path, curve_um: NDArray[np.float64], panels: dict[str, dict[str, Flight]], period_s: float
+    path: Path, curve_um: NDArray[np.float64], panels: dict[str, dict[str, LemniscateRun]], period_s: float
 ) -> None:
     """Paths and errors, a column per panel: its title, flights by law; `curve_um` (n, 2) is the reference."""
     figure = new_figure(9.5, 6.4)

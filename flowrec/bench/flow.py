@@ -17,26 +17,35 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from flowrec.bench.figure_flow import Picture, draw, median_case
-from flowrec.bench.harness import Cases, FigureFile, Names, Results, chosen, peak_mb, print_rows, vessel_cases
-from flowrec.chip.vessel_case import read_observations, read_true_velocity, read_vessel_case
-from flowrec.errors import FlowError, FlowrecError
-from flowrec.estimation import Trimmed
-from flowrec.flow import FlowSolver
-from flowrec.flow.linear_solver import clear_cache
-from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import Observations
-from flowrec.refine import PiUnet, Refiner
-from flowrec.refine.refiner import REFINERS
-from flowrec.refine.training.vessels import draw_mask, make_case, with_mask_error
-from flowrec.system.processes import pool
-from flowrec.terminal import progress, say
+from flowrec.bench.figure_flow import FlowPanels, draw, median_case
+from flowrec.bench.harness import Cases, FigureFile, Names, Results, choose_names, print_rows, vessel_cases
+from flowrec.bench.vessels import draw_mask, make_case, with_mask_error
+from flowrec.core import (
+    FlowError,
+    FlowrecError,
+    Observations,
+    peak_mb,
+    pool,
+    progress,
+    remove_leftovers,
+    replacing,
+    say,
+)
+from flowrec.physics import (
+    FlowSolver,
+    clear_cache,
+    read_observations,
+    read_true_velocity,
+    read_vessel_case,
+    relative_rmse,
+)
+from flowrec.stages import REFINERS, PiUnet, Refiner, Trimmed, with_row
 
 RANDOM_CASES = 10
 
 # The rows of REFINERS; fvm, no refinement, is the null model. As in the paper, pi_unet starts from the solver's field.
 # `:printed` has random weights and no other optimiser than the paper's.
-METHODS = {name: Refiner(name, pi_unet=PiUnet(start="fvm")) for name in REFINERS} | {
+METHODS = {name: with_row(Refiner(pi_unet=PiUnet(start="fvm")), REFINERS, name) for name in REFINERS.usable()} | {
     "pi_unet:printed": Refiner("pi_unet", pi_unet=PiUnet(start="fvm", weights="none", finish="none")),
     "pi_unet:assimilate": Refiner("pi_unet", pi_unet=PiUnet(start="assimilate")),
 }
@@ -45,7 +54,7 @@ _INCREMENTAL = ("fvm", "assimilate")  # an update reuses earlier results; the ot
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """What is observed, and what is wrong besides the assumed parameters."""
+    """Observations of a case, and its deviations from the assumptions besides the assumed parameters."""
 
     noise: str = "05"  # % of the root mean square speed along the route
     share: str = "10"  # part of the skeleton that is observed, %
@@ -91,7 +100,7 @@ def measure(
     FlowError
         If no case can be refined.
     """
-    names = chosen("bench flow: no method", methods, METHODS)
+    names = choose_names("bench flow: no method", methods, METHODS)
     scenario = Scenario(noise, share, k, outliers, mask, observations)
     rows: list[dict[str, Any]] = []
     left_out: dict[str, str] = {}
@@ -100,12 +109,13 @@ def measure(
             fields = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         if fields is not None:
             fields.mkdir(parents=True, exist_ok=True)
+            stack.callback(remove_leftovers, fields)  # of the process below, if it was stopped
         if cases is None:
             cases = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             make_up(cases, RANDOM_CASES)
         paths = vessel_cases(cases)
         if case is not None:
-            chosen("bench flow: no case", case, [path.stem for path in paths])
+            choose_names("bench flow: no case", case, [path.stem for path in paths])
         done = stack.enter_context(progress("refining", len(paths) * len(names), "refinements"))
         for first, method in zip(range(0, len(paths) * len(names), len(paths)), names, strict=True):
             with pool(1) as worker:
@@ -163,7 +173,8 @@ def refine_case(case: Path, method: str, scenario: Scenario, fields: Path | None
         refiner.refine(assumed, other, assumed_chip, solver)
         seconds_update = time.perf_counter() - began
     if fields is not None:
-        np.savez_compressed(_field_path(fields, case, method), velocity_um_s=field.velocity_um_s, mask=chip.mask)
+        with replacing(_field_path(fields, case, method)) as file:
+            np.savez_compressed(file, velocity_um_s=field.velocity_um_s, mask=chip.mask)
     true = read_true_velocity(case)
     error = relative_rmse(field, replace(field, velocity_um_s=true.astype(np.float32)), chip.mask)
     within = stated = None
@@ -223,15 +234,15 @@ def with_outliers(observations: Observations, fraction: float, seed: int) -> Obs
     return replace(observations, flow_um_s=flow)
 
 
-def _picture(case: Path, methods: Sequence[str], scenario: Scenario, fields: Path) -> Picture:
-    """What the figure shows of a case that is scored."""
+def _picture(case: Path, methods: Sequence[str], scenario: Scenario, fields: Path) -> FlowPanels:
+    """Panels of the figure for a case that is scored."""
     chip, observations = read_vessel_case(case), scenario.observe(case)
     found = {}
     for method in methods:
         with np.load(_field_path(fields, case, method)) as field:
             found[method] = field["velocity_um_s"]
     observed = observations.position_um, observations.flow_um_s
-    return Picture(case.stem, chip.mask, chip.um_per_px, read_true_velocity(case), found, *observed)
+    return FlowPanels(case.stem, chip.mask, chip.um_per_px, read_true_velocity(case), found, *observed)
 
 
 def _field_path(fields: Path, case: Path, method: str) -> Path:

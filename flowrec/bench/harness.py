@@ -1,4 +1,4 @@
-"""What the benches share: command-line options, output files, the choice of methods, statistics and memory.
+"""Shared parts of the benches: command-line options, output files, the choice of methods, and statistics.
 
 A bench is a module with `measure`, which returns its results as a dictionary for JSON, and `show`, which prints them.
 The parameters of `measure` that are annotated as options are the options of its command.
@@ -12,32 +12,23 @@ import json
 import math
 import os
 import platform
-import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_origin
+from typing import Annotated, Any, get_origin
 
+import numpy as np
 import typer
-from typer.core import TyperGroup
+from numpy.typing import NDArray
+from typer.core import TyperCommand
 
-from flowrec.errors import FlowrecError, UsageError
-from flowrec.system.endings import stopped_in_one_line
-from flowrec.system.outputs import FIGURE, JSON, Output
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from flowrec.core import FIGURE, JSON, FlowrecError, Output, StoppedError, UsageError, looked_at, say, table
+from flowrec.verbs import HELP_WIDTH, AsJson, Overwrite, Stoppable
 
 Results = dict[str, Any]
 
-Sets = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb."),
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 JsonFile = Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Also write the results as JSON.")]
 FigureFile = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the results (PNG, PDF or SVG).")]
 Cases = Annotated[Path | None, typer.Option(metavar="DIR", help="Vessel cases (*.npz); random ones by default.")]
@@ -45,24 +36,12 @@ Names = Annotated[str | None, typer.Option(metavar="A,B", help="Only these metho
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Smaller cases only.")]
 
-HELP_WIDTH = 110  # characters, on a terminal as wide as that
-_LONGEST_DESCRIPTION = 1000  # characters: longer than any
 _Z = 1.959963984540054  # of a two-sided interval of 95 %
 _BOOTSTRAP_DRAWS = 10_000
 
 
-class WholeDescriptions(TyperGroup):
-    """Commands whose list in the help has the whole first sentence of each, in as many lines as it takes."""
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
-        rows = [
-            (name, command.get_short_help_str(_LONGEST_DESCRIPTION))
-            for name, command in named
-            if command is not None and not command.hidden
-        ]
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
+class _Bench(Stoppable, TyperCommand):
+    pass
 
 
 def run(
@@ -82,10 +61,12 @@ def run(
         context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
         rich_markup_mode=None,
     )
-    app.command(help=summary or inspect.getdoc(sys.modules[measure.__module__]))(_command(measure, show))
+    app.command(cls=_Bench, help=summary or inspect.getdoc(sys.modules[measure.__module__]))(_command(measure, show))
     try:
         app(args=words, prog_name=program)
     except FlowrecError as error:
+        if isinstance(error, StoppedError) and "--json" in (sys.argv if words is None else words):
+            typer.echo(json.dumps(error.as_json()))
         sys.stderr.write(f"flowrec: {error}\n")
         sys.exit(error.exit_status)
 
@@ -95,16 +76,13 @@ def _command(measure: Callable[..., Results], show: Callable[[Any], None]) -> Ca
 
     def command(as_json: bool, out: Path | None, overwrite: bool, **options: Any) -> None:
         inputs = tuple(value for name, value in options.items() if isinstance(value, Path) and name != "figure")
-        from flowrec.terminal import looked_at, say  # late: every verb imports this file
-
         with ExitStack() as stack:
             file = out and stack.enter_context(Output(out, JSON, inputs, overwrite).new_file())
             if figure := options.get("figure"):
                 need_matplotlib()
                 options["figure"] = stack.enter_context(Output(figure, FIGURE, inputs, overwrite).new_file())
             looked_at()
-            with stopped_in_one_line():  # else it is Typer's, which says nothing
-                measured = measure(**options)
+            measured = measure(**options)
             covered = looked_at()
             results = {"machine": machine(), **measured, "covered": [each.as_json() for each in covered]}
             if as_json:
@@ -133,7 +111,6 @@ def _common(as_json: AsJson = False, out: JsonFile = None, overwrite: Overwrite 
 
 def print_rows(title: str, rows: Iterable[Results], columns: dict[str, str]) -> None:
     """Print a table: a format string of the row's keys by heading, as in {"RMSE": "{rmse_um:.1f}"}. None is "-"."""
-    from flowrec.terminal import table
 
     def cell(template: str, row: Results) -> str:
         try:
@@ -152,8 +129,6 @@ def need_matplotlib() -> None:
 
 def machine() -> dict[str, Any]:
     """The computer and the versions that a result depends on."""
-    from importlib.metadata import version  # late: every verb imports this file, and metadata takes 20 ms
-
     return {
         "cores": os.cpu_count(),
         "threads": os.environ.get("OMP_NUM_THREADS", "default"),
@@ -163,7 +138,7 @@ def machine() -> dict[str, Any]:
     }
 
 
-def chosen(what: str, names: str | None, known: Iterable[str]) -> tuple[str, ...]:
+def choose_names(what: str, names: str | None, known: Iterable[str]) -> tuple[str, ...]:
     """The names in "A,B", all known ones if there are none given.
 
     Raises
@@ -197,12 +172,11 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     return (0.0 if successes == 0 else middle - half), (1.0 if successes == count else middle + half)
 
 
-def paired(ratios: NDArray[np.float64]) -> Results:
+def paired_ratio(ratios: NDArray[np.float64]) -> Results:
     """Geometric mean of paired ratios (n,), its bootstrap 95 % interval, and tests of the hypothesis that it is 1.
 
     The sign test and Wilcoxon's signed-rank test are two-sided; ties (ratio 1) count for neither side.
     """
-    import numpy as np
     from scipy.stats import binomtest, wilcoxon
 
     if len(ratios) == 0:
@@ -224,21 +198,9 @@ def paired(ratios: NDArray[np.float64]) -> Results:
 
 def mean_with_interval(values: Sequence[float]) -> Results:
     """Mean of values and its bootstrap 95 % interval (percentiles of resampled means); NaN without a value."""
-    import numpy as np
-
     if len(values) == 0:
         return {"mean": math.nan, "interval_95": (math.nan, math.nan)}
     sample = np.asarray(values, np.float64)
     means = np.random.default_rng(0).choice(sample, (_BOOTSTRAP_DRAWS, len(sample))).mean(axis=1)
     low, high = np.percentile(means, (2.5, 97.5))
     return {"mean": float(sample.mean()), "interval_95": (float(low), float(high))}
-
-
-def peak_mb(key: str = "VmHWM") -> float:
-    """Largest memory of this process so far, in MB, or that now (`VmRSS`); NaN if not on Linux.
-
-    getrusage would count the memory of the parent process before the exec.
-    """
-    status = Path("/proc/self/status")
-    found = re.search(rf"{key}:\s+(\d+)", status.read_text(encoding="ascii")) if status.exists() else None
-    return float(found[1]) / 1024.0 if found else float("nan")

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control import Controller
-from flowrec.estimation import Observer
-from flowrec.messages import Applied, Demand, Estimate, FlowField, Mission, Route, Track
-from flowrec.robot import Robot
-from flowrec.units import NS_PER_S, seconds
+from flowrec.core import NS_PER_S, Applied, Demand, Estimate, FlowField, Mission, Route, Track, seconds
+from flowrec.physics import Robot
+from flowrec.stages import Controller, Observer
 
 SPIN_PER_S = 0.2  # of the vortex
 A_UM, B_UM = 1800.0, 1500.0
@@ -29,7 +27,7 @@ _UM_PER_PX = 50.0  # the vortex is linear, bilinear sampling of it exact
 
 
 @dataclass(frozen=True, slots=True)
-class World:
+class RunDisturbances:
     """Disturbances of a run."""
 
     delay_s: float = 0.0  # from command to motion
@@ -53,7 +51,7 @@ class World:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Flight:
+class LemniscateRun:
     """A run, frame by frame, in um about the centre."""
 
     time_s: NDArray[np.float64]  # (n,)
@@ -92,7 +90,9 @@ def vortex_map(error: float) -> FlowField:
     return FlowField(0, 0, "vortex", _UM_PER_PX, velocity, zero, None, np.zeros(0), 1.0, 1000.0, "")
 
 
-def fly(controller: Controller, observer: Observer, robot: Robot, world: World, seed: int, turns: int = 2) -> Flight:
+def fly(
+    controller: Controller, observer: Observer, robot: Robot, world: RunDisturbances, seed: int, turns: int = 2
+) -> LemniscateRun:
     """Two laps (80 s) of the Observer and Controller stages, from 600 um beside the start of the curve."""
     rng = np.random.default_rng([seed, 19])
     field, route = vortex_map(world.map_error), lemniscate(turns)
@@ -122,10 +122,10 @@ def fly(controller: Controller, observer: Observer, robot: Robot, world: World, 
                 acting = coming.pop(0)[1]
             until = min(coming[0][0], end) if coming else end
             turned += acting / robot.um_per_rev * (until - now)
-            z = _carried(z, _own(acting, robot), until - now)
+            z = _advance(z, _own(acting, robot), until - now)
             now = until
     made = np.array(rows)
-    return Flight(made[:, 0], made[:, 1:3], made[:, 3:5], made[:, 5], made[:, 7:9], made[:, 6])
+    return LemniscateRun(made[:, 0], made[:, 1:3], made[:, 3:5], made[:, 5], made[:, 7:9], made[:, 6])
 
 
 def _own(commanded: complex, robot: Robot) -> complex:
@@ -134,6 +134,6 @@ def _own(commanded: complex, robot: Robot) -> complex:
     return commanded / speed * robot.rolled_speed_um_s(speed / robot.um_per_rev) if speed > 0.0 else 0j
 
 
-def _carried(z: complex, own: complex, dt_s: float) -> complex:
+def _advance(z: complex, own: complex, dt_s: float) -> complex:
     turn = cmath.exp(1j * SPIN_PER_S * dt_s)
     return turn * z + own * (turn - 1.0) / (1j * SPIN_PER_S)

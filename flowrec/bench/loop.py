@@ -18,22 +18,14 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, print_rows
-from flowrec.commands.record import prepare
-from flowrec.commands.replay import Change, replay
-from flowrec.config import ResolvedConfig, load_config
-from flowrec.diagnostics import Timing
-from flowrec.exports.rrd import scene_of
-from flowrec.messages import Currents
-from flowrec.pipeline import Inputs, Pipeline
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.loop import Sink, run
-from flowrec.run.workers import LockstepWorker
-from flowrec.session_writer import session_header
-from flowrec.store.session_file import WriterOptions
-from flowrec.store.writer import SessionWriter
-from flowrec.terminal import progress, table
-from flowrec.topics import Tick
-from flowrec.view.live import LiveView
+from flowrec.core import Currents, Tick, Timing, progress, table
+from flowrec.exports import scene_of
+from flowrec.rigs import SimulatedRig
+from flowrec.run import LockstepWorker, Sink, run
+from flowrec.stages import Inputs, Pipeline, ResolvedConfig, load_config
+from flowrec.store import SessionWriter, WriterOptions, session_header
+from flowrec.verbs import Change, prepare, replay_session
+from flowrec.view import LiveView
 
 RATE_HZ = 60.0
 ROUNDS = 2
@@ -67,18 +59,16 @@ def prepare_inputs(config: ResolvedConfig, pipeline: Pipeline, ticks: int) -> li
     rig = SimulatedRig.of(pipeline, config, ticks / (config.camera.rate_hz or RATE_HZ))
     prepared: list[Inputs] = []
     before = Tick()
-    with progress("preparing frames", ticks, "frames") as done:
 
-        def collect(tick: Tick) -> None:
-            nonlocal before
-            assert tick.applied is not None
-            names = ("assumed", "refined", "route", "truth", "true_field")
-            new = {name: getattr(tick, name) for name in names if getattr(tick, name) is not getattr(before, name)}
-            prepared.append(Inputs(tick.stamp_ns, tick.frame, tick.applied, None, **new))
-            before = tick
-            done(len(prepared))
+    def collect(tick: Tick) -> None:
+        nonlocal before
+        assert tick.applied is not None
+        names = ("assumed", "refined", "route", "truth", "true_field")
+        new = {name: getattr(tick, name) for name in names if getattr(tick, name) is not getattr(before, name)}
+        prepared.append(Inputs(tick.stamp_ns, tick.frame, tick.applied, None, **new))
+        before = tick
 
-        run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [], on_tick=collect)
+    run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [], on_tick=collect)
     return prepared
 
 
@@ -104,11 +94,13 @@ def paced_run(
 def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] = 900) -> Results:
     """Time of a tick in ms by kind of run, their ratios, and the speed of a replay without refinement."""
     config, chip, pipeline, *_ = prepare(load_config(None, [f"camera.rate_hz={RATE_HZ}"]))
-    prepared = prepare_inputs(config, pipeline, ticks)
     timings: dict[str, list[Timing]] = {kind: [] for kind in KINDS}
-    with tempfile.TemporaryDirectory() as folder:
+    runs = ("preparation", *KINDS * ROUNDS, "replay")
+    with progress("timing", len(runs), "runs") as finished, tempfile.TemporaryDirectory() as folder:
+        prepared = prepare_inputs(config, pipeline, ticks)
+        finished(1)
         path = Path(folder) / "bench.mcap"
-        for kind in KINDS * ROUNDS:
+        for number, kind in enumerate(runs[1:-1], 2):
             with ExitStack() as stack:
                 sinks: list[Sink] = []
                 if "recording" in kind:
@@ -121,9 +113,11 @@ def measure(ticks: Annotated[int, typer.Option(help="Frames per measurement.")] 
                 timings[kind] += paced_run(prepared, config, pipeline, sinks)
                 if "recording" in kind:
                     writer.close({"outcome": "bench"})
+            finished(number)
         began = time.perf_counter()
-        done = replay(path, Change())
+        done = replay_session(path, Change())
         wall_s = time.perf_counter() - began
+        finished(len(runs))
     rows = {
         kind: {
             "median_ms": float(np.median([timing.total_ms for timing in found])),

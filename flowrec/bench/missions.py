@@ -22,29 +22,27 @@ import typer
 from numpy.typing import NDArray
 
 from flowrec.bench.figures import draw_missions
-from flowrec.bench.harness import FigureFile, Results, Sets, chosen, paired, print_rows, vessel_cases, wilson
+from flowrec.bench.harness import FigureFile, Results, choose_names, paired_ratio, print_rows, vessel_cases, wilson
 from flowrec.bench.world_flights import WORLDS as FAULTS
 from flowrec.bench.world_flights import Given, in_world
-from flowrec.chip import load_chip, median_width_um
-from flowrec.chip.chip import Chip
-from flowrec.config import load_config
-from flowrec.control.controller import CONTROLLERS
-from flowrec.errors import FlowrecError, RigError, UsageError
-from flowrec.messages import Currents, FlowField, Route
-from flowrec.pipeline import assemble
-from flowrec.planning import Planner
-from flowrec.rig_settings import OutputLimits
-from flowrec.rigs.lab.amplifiers.limits import Limits
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.rigs.simulated.world import true_robot
-from flowrec.robot import USUAL_DELAY_S, Robot
-from flowrec.run.loop import run
-from flowrec.run.workers import LockstepWorker
-from flowrec.simulated_settings import Simulated
-from flowrec.system.processes import pool
-from flowrec.terminal import progress, say
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.core import (
+    Currents,
+    FlowField,
+    FlowrecError,
+    RigError,
+    Route,
+    Tick,
+    UsageError,
+    pool,
+    progress,
+    say,
+    seconds,
+)
+from flowrec.physics import USUAL_DELAY_S, Chip, Robot, load_chip, median_width_um
+from flowrec.rigs import CommandLimits, SimulatedRig, true_robot
+from flowrec.run import LockstepWorker, run
+from flowrec.stages import CONTROLLERS, OutputLimits, Planner, Simulated, assemble, load_config
+from flowrec.verbs import SetTexts
 
 # The settings of a policy. `plain` is the null model: the shortest path, planned without the flow.
 POLICIES: dict[str, tuple[str, ...]] = {
@@ -56,7 +54,7 @@ POLICIES: dict[str, tuple[str, ...]] = {
 }
 POLICIES |= {
     name: ("plan.method=time_field", f"control.method={name}")
-    for name in CONTROLLERS
+    for name in CONTROLLERS.usable()
     if not any(f"control.method={name}" in sets for sets in POLICIES.values())
 }
 _DEFAULT_POLICIES = "policy,vector,paper,plain,ff_fb_no_flow"
@@ -86,8 +84,8 @@ _BEST = Planner(method="time_field", clearance_margin_um=0.0, speed_share=1.0)  
 
 
 @dataclass(frozen=True, slots=True)
-class World:
-    """What truly differs from the assumptions."""
+class TrueWorld:
+    """Deviations of the true world from the assumptions."""
 
     name: str = "kind"  # of WORLDS
     coils: str = "ample"  # of COILS
@@ -128,7 +126,7 @@ class MissionLog:
     limits : what the coils can do.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: CommandLimits) -> None:
         self.beyond = 0
         self._limits = limits
         self.began: tuple[int, NDArray[np.float64], Route] | None = None  # stamp, true position, route
@@ -155,7 +153,7 @@ class MissionLog:
         self._last = tick
 
     def _is_beyond(self, currents: Currents, frame_ns: int) -> bool:
-        """Whether a command, or an output sample of the frame that it lasts, is beyond a limit."""
+        """True if a command, or an output sample of the frame that it lasts, is beyond a limit."""
         coils = self._limits.coils
         state, command = coils.state_and_command(currents)
         admitted = self._limits.admit(currents, currents.stamp_ns)
@@ -174,7 +172,7 @@ def measure(
     worlds: Annotated[str, typer.Option(metavar="A,B", help=f"Of {', '.join(WORLDS)}.")] = _DEFAULT_WORLDS,
     coils: Annotated[str, typer.Option(metavar="NAME", help=f"One of {', '.join(COILS)}.")] = "real",
     first_seed: Annotated[int, typer.Option(min=1, help="Seed of the first world.")] = 1,
-    sets: Sets = None,
+    sets: SetTexts = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     figure: FigureFile = None,
     maps: Sequence[str] = ("surveyed", "assumed"),
@@ -188,13 +186,13 @@ def measure(
     UsageError
         If there is no such policy, world or kind of coils, or no case in `cases`.
     """
-    names = chosen("bench missions: no policy", policies, POLICIES)
-    known_worlds = chosen("bench missions: no world", worlds, WORLDS)
+    names = choose_names("bench missions: no policy", policies, POLICIES)
+    known_worlds = choose_names("bench missions: no world", worlds, WORLDS)
     if coils not in COILS:
         raise UsageError(f"bench missions: no coils {coils!r}; there are {', '.join(COILS)}")
     paths = [] if cases is None else vessel_cases(cases)
     missions = [
-        (seed, chip_of(seed, paths), way, known, policy, World(world, coils, tuple(sets or ())))
+        (seed, chip_of(seed, paths), way, known, policy, TrueWorld(world, coils, tuple(sets or ())))
         for seed in range(first_seed, first_seed + seeds)
         for world in known_worlds
         for way, known in TRIPS
@@ -228,7 +226,7 @@ def results_of(rows: Sequence[Row], worlds: Sequence[str], policies: Sequence[st
             for world, some in by_world.items()
         },
         "pairs": {
-            world: {f"{a} / {b}": compared(some, a, b) for a, b in combinations(policies, 2)}
+            world: {f"{a} / {b}": compare_times(some, a, b) for a, b in combinations(policies, 2)}
             for world, some in by_world.items()
         },
         "fault_count": sum(row.beyond for row in rows),
@@ -243,10 +241,10 @@ def chip_of(seed: int, paths: Sequence[Path]) -> tuple[str, ...]:
     if kind == 1:
         return ("chip.name=vessels", f"chip.seed={seed}")
     path = paths[turn % len(paths)]
-    return (f"chip.path={path}",) if kind == 2 else slowed(path)
+    return (f"chip.path={path}",) if kind == 2 else slower_case(path)
 
 
-def slowed(path: Path) -> tuple[str, ...]:
+def slower_case(path: Path) -> tuple[str, ...]:
     """A vessel case with a slower flow and robot, which 40 ms of latency and 30 frames a second can control.
 
     In that time the robot, 1.3 times as fast as the flow, swims a fifth of the median channel width. The flow in many
@@ -270,7 +268,7 @@ def fly(
     way: str,
     known: str,
     policy: str,
-    world: World,
+    world: TrueWorld,
     watch: Callable[[Tick], None] | None = None,
 ) -> Row:
     """One mission; `known` is the map, surveyed or assumed. `watch` gets every tick."""
@@ -286,7 +284,7 @@ def fly(
         truth = rig.true_world().field
     except FlowrecError as error:  # before anything is switched on
         return Row(world.name, seed, name, way, known, policy, "refused", str(error))
-    log = MissionLog(Limits(config.coils, config.robot, OutputLimits()))
+    log = MissionLog(CommandLimits(config.coils, config.robot, OutputLimits()))
     report = run(pipeline, rig, LockstepWorker(pipeline, config.worker.adopt_after_s), [log], on_tick=watch)
     mission, outcome = report.last.mission, report.outcome
     assert mission is not None
@@ -383,12 +381,12 @@ def _proportion(successes: int, count: int) -> dict[str, Any]:
     return {"share": successes / count, "wilson_95": wilson(successes, count)}
 
 
-def compared(rows: Sequence[Row], a: str, b: str) -> dict[str, Any]:
+def compare_times(rows: Sequence[Row], a: str, b: str) -> dict[str, Any]:
     """Times of `a` over those of `b` on the trips on which both arrived."""
     times = {(row.policy, (row.seed, row.way, row.map)): row.seconds for row in rows if row.seconds}
     trips = sorted({trip for _, trip in times})
     both = [trip for trip in trips if (a, trip) in times and (b, trip) in times]
-    return paired(np.array([times[a, trip] / times[b, trip] for trip in both]))
+    return paired_ratio(np.array([times[a, trip] / times[b, trip] for trip in both]))
 
 
 def show(results: Results) -> None:

@@ -17,15 +17,11 @@ from numpy.typing import NDArray
 from flowrec.bench.figures import draw_observer
 from flowrec.bench.harness import FigureFile, Results, Seed
 from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, RATE_HZ, SPIN_PER_S, place_um, vortex_map
-from flowrec.estimation import HealthMonitor, Kalman, Luenberger, Observer, smooth
-from flowrec.estimation.observer import OBSERVERS
-from flowrec.estimation.tuning import tune
-from flowrec.flow import sample
-from flowrec.messages import Applied, Estimate, FlowField, Health, Track
-from flowrec.robot import Robot
-from flowrec.session import Session
-from flowrec.terminal import progress, say, table
-from flowrec.units import seconds
+from flowrec.core import Applied, Estimate, FlowField, Health, Track, progress, say, seconds, table
+from flowrec.measure import tune
+from flowrec.physics import Robot, sample
+from flowrec.stages import OBSERVERS, HealthMonitor, Kalman, Luenberger, Observer, smooth, with_row
+from flowrec.store import Session
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=30.0, um_per_rev=25.0)
 LAPS = 2
@@ -38,7 +34,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class ObserverCase:
     """Conditions of one run."""
 
     name: str
@@ -49,17 +45,17 @@ class Case:
 
 
 CASES = (
-    Case("5 um", 5.0),
-    Case("10 um", 10.0),
-    Case("15 um", 15.0),
-    Case("10 um, pulsating", pulsation=0.5),
-    Case("10 um, gain +10 %", gain=1.1),
-    Case("10 um, gain +10 %, true map", gain=1.1, map_scale=1.0),
+    ObserverCase("5 um", 5.0),
+    ObserverCase("10 um", 10.0),
+    ObserverCase("15 um", 15.0),
+    ObserverCase("10 um, pulsating", pulsation=0.5),
+    ObserverCase("10 um, gain +10 %", gain=1.1),
+    ObserverCase("10 um, gain +10 %, true map", gain=1.1, map_scale=1.0),
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class ObserverRun:
     """Inputs of the observer and the truth, frame by frame."""
 
     tracks: list[Track]
@@ -68,7 +64,7 @@ class Run:
     flow_um_s: Floats  # (n, 2) true
 
 
-def drive(case: Case, seed: int = 0, laps: int = LAPS) -> Run:
+def drive(case: ObserverCase, seed: int = 0, laps: int = LAPS) -> ObserverRun:
     """The robot on the lemniscate. Its own displacement is the path less that by the flow (Simpson's rule)."""
     rng = np.random.default_rng(seed)
     count = round(laps * PERIOD_S * RATE_HZ)
@@ -87,10 +83,10 @@ def drive(case: Case, seed: int = 0, laps: int = LAPS) -> Run:
     stamps = [round(at * 1e9) for at in time]
     tracks = [Track(stamp, True, at, 0.9, 0, 5.0, np.zeros(4)) for stamp, at in zip(stamps, measured, strict=True)]
     applied = [Applied(stamp, 0.0, 0.0, 0.0, np.zeros(3), turn) for stamp, turn in zip(stamps, turns, strict=True)]
-    return Run(tracks, applied, time, true)
+    return ObserverRun(tracks, applied, time, true)
 
 
-def observe(observer: Observer, run: Run, field: FlowField | None = None) -> list[Estimate]:
+def observe(observer: Observer, run: ObserverRun, field: FlowField | None = None) -> list[Estimate]:
     """The estimate after every frame."""
     estimates: list[Estimate] = []
     for track, done in zip(run.tracks, run.applied, strict=True):
@@ -98,20 +94,20 @@ def observe(observer: Observer, run: Run, field: FlowField | None = None) -> lis
     return estimates
 
 
-def rmse(run: Run, flow_um_s: Floats) -> float:
+def rmse(run: ObserverRun, flow_um_s: Floats) -> float:
     """RMSE of the vector over the second half of the run, um/s."""
     half = len(run.time_s) // 2
     return float(np.sqrt(np.square(flow_um_s - run.flow_um_s)[half:].sum(axis=1).mean()))
 
 
-def estimates_of(case: Case, run: Run) -> tuple[dict[str, tuple[Floats, list[Estimate]]], float]:
+def estimates_of(case: ObserverCase, run: ObserverRun) -> tuple[dict[str, tuple[Floats, list[Estimate]]], float]:
     """Estimated flow (n, 2) in um/s by observer, with the estimates if it makes one per frame; the best gain, 1/s.
 
     Beside the rows of OBSERVERS: the Luenberger observer with its best gain, the smoother, the map alone, the Kalman
     filters that also estimate the displacement per revolution (if that is wrong), and a flow of zero.
     """
     field, kalman = vortex_map(case.map_scale - 1.0), Kalman(position_noise_um=case.noise_um)
-    observers = {name: Observer(name, kalman=kalman) for name in OBSERVERS}
+    observers = {name: with_row(Observer(kalman=kalman), OBSERVERS, name) for name in OBSERVERS.usable()}
     if case.gain != 1.0:
         adapting = replace(kalman, estimate_gain=True)
         observers |= {f"{name}, gain estimated": Observer(name, kalman=adapting) for name in ("kalman", "kalman_map")}
@@ -164,7 +160,8 @@ def measure(
     """
     rows: list[dict[str, Any]] = []
     drawn: tuple[Floats, Floats, dict[str, Floats]] | None = None
-    with progress("observing", len(CASES), "cases") as done:
+    recommended: Results | None = None
+    with progress("observing", len(CASES) + int(session is not None), "cases") as done:
         for number, case in enumerate(CASES):
             run = drive(case, seed)
             found, best_gain = estimates_of(case, run)
@@ -188,6 +185,9 @@ def measure(
             if case.name == DRAWN:
                 drawn = run.time_s, run.flow_um_s, {name: flow for name, (flow, _) in found.items()}
             done(number + 1)
+        if session is not None:
+            recommended = recommend(session)
+            done(len(CASES) + 1)
     if figure is not None:
         assert drawn is not None
         noises = {case.name: case.noise_um for case in CASES[:3]}
@@ -195,9 +195,7 @@ def measure(
         by_noise = {name: {um: of[case, name] for case, um in noises.items()} for name in drawn[2]}
         draw_observer(figure, *drawn, by_noise)
     results: Results = {"seed": seed, "map_share": MAP_SCALE, "rows": rows}
-    if session is not None:
-        results["session"] = recommend(session)
-    return results
+    return results if recommended is None else results | {"session": recommended}
 
 
 def recommend(path: Path) -> dict[str, Any]:

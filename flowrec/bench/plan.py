@@ -16,7 +16,7 @@ import numpy as np
 import typer
 
 from flowrec.bench.figures import draw_plan
-from flowrec.bench.harness import Cases, FigureFile, Names, Quick, Results, Seed, chosen
+from flowrec.bench.harness import Cases, FigureFile, Names, Quick, Results, Seed, choose_names
 from flowrec.bench.reserves import (
     least_clearance_um,
     policies_with_reserves,
@@ -25,11 +25,9 @@ from flowrec.bench.reserves import (
     summarised_policies,
     summarised_routes,
 )
-from flowrec.bench.trips import SPEED_UM_S, Points, World, best_time, draw_trip, worlds, worlds_of
-from flowrec.errors import UsageError
-from flowrec.messages import FlowField, Route
-from flowrec.planning import PLANNERS, Planner, travel_time
-from flowrec.terminal import progress, say, table
+from flowrec.bench.trips import SPEED_UM_S, Points, TripCase, best_time, draw_trip, worlds, worlds_of
+from flowrec.core import FlowField, Route, UsageError, progress, say, table
+from flowrec.stages import PLANNERS, Planner, travel_time, with_row
 
 RATIOS = (0.5, 0.9, 1.3)  # fastest flow over the robot's speed
 REGIMES = {f"{ratio} {direction}": (ratio, direction) for ratio in RATIOS for direction in ("down", "up")}
@@ -38,14 +36,14 @@ SIDE_PX = 256
 
 FULL = Planner(speed_share=1.0, robust_deviations=0.0)
 # The rows of PLANNERS, and two with 8 directions. The null model is astar_length, the shortest path without the flow.
-METHODS = {name: replace(FULL, method=name) for name in PLANNERS} | {
+METHODS = {name: with_row(FULL, PLANNERS, name) for name in PLANNERS.usable()} | {
     "astar_paper:8": replace(FULL, method="astar_paper", paper_radius_px=1.5),
     "astar_length:8": replace(FULL, method="astar_length", reach_px=1),
 }
 TREES = [name for name, row in PLANNERS.items() if "rrt" in row.options]
 
 
-def installed(methods: Iterable[str]) -> tuple[str, ...]:
+def installed_methods(methods: Iterable[str]) -> tuple[str, ...]:
     """The methods whose packages are installed; says which are left out."""
     missing = [name for name in methods if (extra := PLANNERS[METHODS[name].method].extra) and find_spec(extra) is None]
     if missing:
@@ -71,7 +69,7 @@ def measure(
     UsageError
         If there is no case with a trip, or no such method.
     """
-    names = installed(METHODS) if methods is None else chosen("bench plan: no method", methods, METHODS)
+    names = installed_methods(METHODS) if methods is None else choose_names("bench plan: no method", methods, METHODS)
     source = worlds(side_px, seed) if cases is None else worlds_of(cases)
     rows: list[dict[str, Any]] = []
     robust: list[dict[str, Any]] = []
@@ -114,7 +112,7 @@ def measure(
 
 
 def plan_trip(
-    planner: Planner, world: World, field: FlowField, ends: tuple[Points, Points]
+    planner: Planner, world: TripCase, field: FlowField, ends: tuple[Points, Points]
 ) -> tuple[dict[str, Any], Route]:
     """Time, length and least clearance of a route, None if there is none or nobody can follow it; its CPU time."""
     began = time.process_time()

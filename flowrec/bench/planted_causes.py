@@ -1,4 +1,4 @@
-"""Which causes a world has, by the words in which a refinement names each, with its side where it has one.
+"""Causes of a world, by the words in which a refinement names each, with the side where it has one.
 
 A warning is worth something where it names what is wrong. A clause about anything else, or on the wrong side, sends a
 person to the wrong place. What is only said of the observations (outliers, noise, what they can not tell) names none.
@@ -11,10 +11,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from flowrec.chip.chip import Chip
-from flowrec.config import ResolvedConfig, calibration_of
-from flowrec.rigs.simulated.rig import true_view
-from flowrec.rigs.simulated.world import true_depth_um, true_robot
+from flowrec.physics import Chip
+from flowrec.rigs import true_depth_um, true_robot, true_view
+from flowrec.stages import ResolvedConfig, calibration_of
 
 # Clauses that name no cause: what was used and seen, what could not be told, the null model, methods on themselves.
 _NO_CAUSE = re.compile(
@@ -28,7 +27,7 @@ _MOVED = "the chip lies .* from where the registration puts it"  # also by a wro
 _SIDE = 0.5  # of an offset: the part along an axis from where on its side has to be right
 
 
-def named(note: str, planted: Sequence[str]) -> tuple[int, int]:
+def count_causes(note: str, planted: Sequence[str]) -> tuple[int, int]:
     """Clauses of a note that name a planted cause, and clauses that name another one or the wrong side."""
     clauses = [clause.strip() for clause in note.split(";")]
     causes = [clause for clause in clauses if not _NO_CAUSE.match(clause)]

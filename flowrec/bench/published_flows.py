@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from flowrec.chip.chip import Chip, Opening, Walls
-from flowrec.flow.newton_solver import assembled, system
-from flowrec.units import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
+from flowrec.core import M_PER_UM, PA_S_PER_MPA_S, UM_PER_M
+from flowrec.physics import Chip, Opening, Walls, newton_equations, system
 
 Array = NDArray[np.float64]
 
@@ -92,7 +91,7 @@ def cavity_case(cells: int, reynolds: int) -> dict[str, Any]:
 def _solve(cells: int, reynolds: float) -> tuple[Array, Array]:
     """Velocities u (cells, cells + 1) and v (cells + 1, cells) of faces over that of the lid, which is the top row."""
     box = Chip("cavity", np.ones((cells, cells), bool), UM_PER_M / cells, (), 1.0, 1.0, walls="pixel")
-    equations = assembled(box, 1)
+    equations = newton_equations(box, 1)
     push = equations.momentum.sliding @ np.array([0.0, 0.0, 1.0, 0.0])
     moving = np.append(equations.steady(np.zeros(0), reynolds / cells, 100, 1e-9, push), 0.0)
     return moving[equations.grid.u.number], moving[equations.grid.v.number]

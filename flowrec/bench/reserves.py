@@ -14,13 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.bench.trips import SPEED_UM_S, Points, World
-from flowrec.chip import clearance_um
-from flowrec.interpolation import bilinear
-from flowrec.messages import FlowField, Route
-from flowrec.planning import Planner, travel_time
-from flowrec.system.numba_setup import compiled
-from flowrec.terminal import table
+from flowrec.bench.trips import SPEED_UM_S, Points, TripCase
+from flowrec.core import FlowField, Route, bilinear, compiled, table
+from flowrec.physics import clearance_um
+from flowrec.stages import Planner, travel_time
 
 FASTER = 1.1  # the true flow over the assumed one
 _TIME_LIMIT_S = 100.0  # of a driven policy
@@ -29,7 +26,7 @@ Raster = NDArray[np.float64]
 Lines = list[dict[str, Any]]
 
 
-def routes_with_reserves(world: World, regime: str, ratio: float, ends: tuple[Points, Points]) -> Lines:
+def routes_with_reserves(world: TripCase, regime: str, ratio: float, ends: tuple[Points, Points]) -> Lines:
     """One trip planned with several reserves: its time in the assumed flow, and if a faster flow still lets it through.
 
     The trip is timed at the robot's full speed. One deviation is a tenth of the flow's speed.
@@ -49,7 +46,7 @@ def routes_with_reserves(world: World, regime: str, ratio: float, ends: tuple[Po
 
 
 def policies_with_reserves(
-    world: World, regime: str, ratio: float, ends: tuple[Points, Points], least_s: float
+    world: TripCase, regime: str, ratio: float, ends: tuple[Points, Points], least_s: float
 ) -> Lines:
     """-grad T driven at full speed in the assumed flow and in a faster one, with T for several speeds and flows."""
     lines = []
@@ -68,7 +65,7 @@ def policies_with_reserves(
     return lines
 
 
-def least_clearance_um(world: World, path_um: Points) -> float:
+def least_clearance_um(world: TripCase, path_um: Points) -> float:
     """The least distance to a wall along a path (n, 2)."""
     gap = clearance_um(world.chip.mask, world.chip.um_per_px).astype(np.float64)
     return float(min(bilinear(gap, float(x), float(y)) for x, y in path_um / world.chip.um_per_px))
@@ -80,7 +77,7 @@ def summarised_routes(lines: Lines) -> Lines:
         (line["world"], line["regime"]): line["time_s"] for line in lines if line["setting"] == "share 1, 0 deviations"
     }
     summary = []
-    for (setting, regime), some in _grouped(lines, "setting", "regime").items():
+    for (setting, regime), some in _group_lines(lines, "setting", "regime").items():
         planned = [line for line in some if np.isfinite(line["time_s"])]
         costs = [line["time_s"] / without[line["world"], regime] - 1.0 for line in planned]
         kept = sum(line["kept"] for line in planned) / max(len(planned), 1)
@@ -93,7 +90,7 @@ def summarised_routes(lines: Lines) -> Lines:
 def summarised_policies(lines: Lines) -> Lines:
     """By setting, flow and regime: runs, arrivals, runs that touched a wall, mean % of the least time."""
     summary = []
-    for (setting, flow, regime), some in _grouped(lines, "setting", "flow", "regime").items():
+    for (setting, flow, regime), some in _group_lines(lines, "setting", "flow", "regime").items():
         arrived = [line for line in some if np.isfinite(line["time_s"])]
         percent = [100.0 * line["least_s"] / line["time_s"] for line in arrived if line["least_s"]]
         mean_percent, touched = float(np.mean(percent)) if percent else None, sum(line["touches"] for line in some)
@@ -102,7 +99,7 @@ def summarised_policies(lines: Lines) -> Lines:
     return summary
 
 
-def _grouped(lines: Lines, *keys: str) -> dict[tuple[Any, ...], Lines]:
+def _group_lines(lines: Lines, *keys: str) -> dict[tuple[Any, ...], Lines]:
     groups: dict[tuple[Any, ...], Lines] = {}
     for line in lines:
         groups.setdefault(tuple(line[key] for key in keys), []).append(line)

@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.messages import pixel_type
+from flowrec.core import Image, pixel_type
 
 _FINE = 4  # samples per pixel side
 
@@ -188,7 +187,7 @@ def _crossing(frames: int, apart_px: float) -> tuple[NDArray[np.float64], NDArra
 
 
 def judges(frames: int = 60) -> dict[str, Callable[[], RobotMovie]]:
-    """What makes each movie, by name."""
+    """Functions that make each movie, by its name."""
     walk = wander(frames, (50.0, 60.0), (1.2, 0.8), 0.6)
     slow = wander(frames, (80.0, 70.0), (0.5, 0.3), 0.3)
     far = wander(min(frames, 30), (150.0, 130.0), (4.0, 1.0), 3.0)

@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 
 from flowrec.bench.harness import print_rows
 from flowrec.bench.robot_movies import RobotMovie, judges
-from flowrec.chip.chip import Chip
-from flowrec.chip.registration import Calibration
-from flowrec.declarations import Image
-from flowrec.errors import UsageError
-from flowrec.messages import Appearance, Frame, Track
-from flowrec.robot import Robot
-from flowrec.vision import Tracker
+from flowrec.core import Appearance, Frame, Image, Track, UsageError
+from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages import Tracker
 
 _RATE_HZ = 25.0
 _MOST_RADII = 3.0  # that a robot moves between two frames: its greatest speed, which all methods are told
@@ -147,7 +143,7 @@ def row(name: str, method: str, movie: RobotMovie, found: Found) -> dict[str, An
     }
 
 
-def measured(movies: Path | None) -> Iterator[dict[str, Any]]:
+def tracking_rows(movies: Path | None) -> Iterator[dict[str, Any]]:
     """A row for each synthetic movie and method, and for each object of the recorded movies of a folder."""
     for name, make in judges().items():
         movie = make()

@@ -11,15 +11,21 @@ from numpy.typing import NDArray
 
 from flowrec.bench.complex_fluids import LAWS, law_bend_case, law_channel_case, law_oblique_case, law_speed_case
 from flowrec.bench.exact_flows import bend_case, oblique_case, straight_case
-from flowrec.bench.harness import Quick, Results, peak_mb, print_rows
+from flowrec.bench.harness import Quick, Results, print_rows
 from flowrec.bench.published_flows import cavity_case, cylinder_case
-from flowrec.chip.chip import Chip, Walls
-from flowrec.chip.io import without_pockets
-from flowrec.chip.openings import find_openings, guess_inlets
-from flowrec.chip.synthetic import bifurcation, straight, vessels
-from flowrec.flow import FlowSolver
-from flowrec.flow.newton_solver import system
-from flowrec.system.processes import pool
+from flowrec.core import peak_mb, pool, progress
+from flowrec.physics import (
+    Chip,
+    FlowSolver,
+    Walls,
+    bifurcation,
+    find_openings,
+    guess_inlets,
+    straight,
+    system,
+    vessels,
+    without_pockets,
+)
 
 Pattern = Literal["vessels", "posts"]
 _PITCH_PX, _RADIUS_PX = 32, 13  # of the posts
@@ -92,7 +98,11 @@ def measure(quick: Quick = False) -> Results:
         "law speed": (row for chip in chips for row in law_speed_case(chip.name, chip, 1, 1 if quick else 5)),
         "speed": (speed_case(*mask) for mask in masks),
     }
-    rows = [{"case": case, **row} for case, found in cases.items() for row in found]
+    rows: list[dict[str, Any]] = []
+    with progress("solving", len(cases), "kinds of cases") as done:
+        for number, (case, found) in enumerate(cases.items(), 1):
+            rows += ({"case": case, **row} for row in found)
+            done(number)
     return {"rows": rows, "summary": _summary(rows)}
 
 

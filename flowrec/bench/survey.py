@@ -18,19 +18,21 @@ import typer
 from numpy.typing import NDArray
 
 from flowrec.bench.flow import make_up
-from flowrec.bench.harness import Cases, Names, Results, chosen, print_rows, vessel_cases
-from flowrec.chip.vessel_case import NOISES, read_observations, read_true_velocity
-from flowrec.config import ResolvedConfig, load_config
-from flowrec.errors import FlowError
-from flowrec.flow import FlowSolver, sample
-from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import FlowField, Observations, Route
-from flowrec.planning.survey import SurveyPlanner
-from flowrec.planning.survey_design import Sampling, SurveyOrder, covariance_after, place_information
-from flowrec.refine import Refiner
-from flowrec.refine.training.vessels import thin
-from flowrec.resolve import resolve
-from flowrec.terminal import progress, say
+from flowrec.bench.harness import Cases, Names, Results, choose_names, print_rows, vessel_cases
+from flowrec.bench.vessels import thin
+from flowrec.core import FlowError, FlowField, Observations, Route, progress, say
+from flowrec.physics import NOISES, FlowSolver, read_observations, read_true_velocity, relative_rmse, sample
+from flowrec.stages import (
+    Refiner,
+    ResolvedConfig,
+    Sampling,
+    SurveyOrder,
+    SurveyPlanner,
+    covariance_after,
+    load_config,
+    place_information,
+    resolve,
+)
 
 RANDOM_CASES = 20
 _MOST_STRETCHES = 60
@@ -38,7 +40,7 @@ Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Task:
+class SurveyCase:
     """A case, and how it is observed."""
 
     name: str
@@ -68,25 +70,25 @@ class Seen:
     reason: str = ""
 
 
-def given(task: Task) -> Seen:
+def given_places(task: SurveyCase) -> Seen:
     """The places that the case holds: a path along the skeleton between two openings."""
     return Seen(task.given_um)
 
 
-def random(task: Task) -> Seen:
+def random(task: SurveyCase) -> Seen:
     """Random places of the skeleton."""
     places = np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px
     return Seen(places[task.rng.permutation(len(places))[: task.count]].astype(np.float64))
 
 
-def prior(task: Task) -> Seen:
+def prior(task: SurveyCase) -> Seen:
     """The places of the skeleton, one after the other, that lower the stated error of the map most."""
     places = (np.argwhere(thin(task.chip.mask))[:, ::-1] * task.chip.um_per_px).astype(np.float64)
     return Seen(_best(task, places))
 
 
-def _best(task: Task, places: Points) -> Points:
-    """Of places (n, 2) those, one after the other, that lower the stated error of the map most before any is seen."""
+def _best(task: SurveyCase, places: Points) -> Points:
+    """Greedy choice among places (n, 2): each next one lowers the predicted error of the map most."""
     uncertainty = task.config.refine.uncertainty(task.assumed, _none(), task.chip, task.config.flow)
     assert uncertainty is not None
     need, each = place_information(uncertainty, task.noise_um_s, task.chip, places)
@@ -99,7 +101,7 @@ def _best(task: Task, places: Points) -> Points:
     return places[taken]
 
 
-def survey(task: Task, planner: SurveyPlanner, choose: bool = False) -> Seen:
+def survey(task: SurveyCase, planner: SurveyPlanner, choose: bool = False) -> Seen:
     """Places along the way of a survey until it has had enough: evenly spread, or chosen, a pixel apart."""
     config = task.config
     start = np.array(config.mission.start)
@@ -117,7 +119,7 @@ def survey(task: Task, planner: SurveyPlanner, choose: bool = False) -> Seen:
         if not new.reachable:
             break
         route, start = new, new.waypoints_um[-1]
-        observed = _continued(observed, task.observe(_along(route, sampling.spacing_um)))
+        observed = _extend_observations(observed, task.observe(_along(route, sampling.spacing_um)))
         if not route.more:
             break
     if route is None:
@@ -129,7 +131,7 @@ def survey(task: Task, planner: SurveyPlanner, choose: bool = False) -> Seen:
     return Seen(places[: task.count], float(route.arrival_s[-1]), route.reason)
 
 
-def _continued(before: Observations, now: Observations) -> Observations:
+def _extend_observations(before: Observations, now: Observations) -> Observations:
     """The observations of a longer way: those of its first part have been made and stay as they are."""
     flow = np.concatenate([before.flow_um_s, now.flow_um_s[len(before.flow_um_s) :]])
     return replace(now, flow_um_s=flow)
@@ -147,8 +149,8 @@ def _none() -> Observations:
 
 
 _EXPLORE = SurveyPlanner(method="information", route_share=0.0)
-WAYS: dict[str, Callable[[Task], Seen]] = {
-    "given": given,
+WAYS: dict[str, Callable[[SurveyCase], Seen]] = {
+    "given": given_places,
     "downstream": lambda task: survey(task, SurveyPlanner(method="downstream", share=1.0)),
     "random": random,
     "information": lambda task: survey(task, _EXPLORE),
@@ -175,7 +177,7 @@ def measure(
     UsageError
         If there is no case or no such way.
     """
-    names = chosen("bench survey: no way", ways, WAYS)
+    names = choose_names("bench survey: no way", ways, WAYS)
     rows: list[dict[str, Any]] = []
     with ExitStack() as stack:
         if cases is None:
@@ -184,7 +186,7 @@ def measure(
         paths = vessel_cases(cases)
         done = stack.enter_context(progress("surveying", len(paths), "cases"))
         for number, path in enumerate(paths, 1):
-            rows += surveyed(path, names, noise, share, draws)
+            rows += survey_rows(path, names, noise, share, draws)
             done(number)
     return {
         **{"noise": noise, "share": share, "rows": rows},
@@ -192,7 +194,7 @@ def measure(
     }
 
 
-def surveyed(path: Path, names: Sequence[str], noise: str, share: str, draws: int) -> list[dict[str, Any]]:
+def survey_rows(path: Path, names: Sequence[str], noise: str, share: str, draws: int) -> list[dict[str, Any]]:
     """The rows of a case."""
     config = resolve_case(path)
     chip, solver = config[1], FlowSolver(2)
@@ -203,7 +205,7 @@ def surveyed(path: Path, names: Sequence[str], noise: str, share: str, draws: in
     sigma = max(float(seen.std_um_s[0]), 1e-3 * NOISES["05"] * float(np.abs(assumed.velocity_um_s).max()))
     rows = []
     for name in names:
-        task = Task(
+        task = SurveyCase(
             *(path.stem, config[0], chip, assumed, truth, len(seen.std_um_s), float(steps.mean()), sigma),
             *(seen.position_um, np.random.default_rng([1, *path.stem.encode()])),
         )
@@ -233,7 +235,7 @@ def crossing_s(config: ResolvedConfig, chip: Any, assumed: FlowField) -> float |
 
 def resolve_case(path: Path) -> tuple[ResolvedConfig, Any]:
     """The configuration of a mission on a case, and its chip."""
-    from flowrec.chip import load_chip
+    from flowrec.physics import load_chip
 
     asked = load_config(None, [f"chip.path={path}"])
     chip = load_chip(asked.chip)

@@ -18,25 +18,23 @@ from scipy.spatial import KDTree
 
 from flowrec.bench.figures import draw_track
 from flowrec.bench.harness import FigureFile, Results, print_rows
-from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, Flight, World, fly, lemniscate
-from flowrec.bench.robot_tracking import measured, show_rows
-from flowrec.control import Controller
-from flowrec.control.controller import CONTROLLERS
-from flowrec.estimation import Kalman, Observer
-from flowrec.estimation.observer import OBSERVERS
-from flowrec.terminal import progress, table
+from flowrec.bench.lemniscate import CENTRE_UM, PERIOD_S, LemniscateRun, RunDisturbances, fly, lemniscate
+from flowrec.bench.robot_tracking import show_rows, tracking_rows
+from flowrec.core import progress, table
+from flowrec.stages import CONTROLLERS, OBSERVERS, Controller, Kalman, Observer, with_row
 
 V_MAX_UM_S = 1000.0
 NO_LIMIT_UM_S = 1e6
 CONVERGED_UM = 50.0
-IDEAL = World()
-ALL = World(delay_s=0.04, noise_um=10.0, map_error=0.1)
+_LAST_FRAMES = 30  # the last second of a run
+IDEAL = RunDisturbances()
+ALL = RunDisturbances(delay_s=0.04, noise_um=10.0, map_error=0.1)
 WORLDS = {"ideal": IDEAL, "all": ALL}
 STEP_OUTS_UM_S = (600.0, 500.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class ControlLoop:
     """A controller with its observer."""
 
     method: str
@@ -46,24 +44,25 @@ class Law:
 
 # As in the paper, luenberger does not filter the measured position. The null model is the law without compensation.
 LAWS = {
-    "paper, with compensation": Law("ff_fb", "luenberger"),
-    "paper, without": Law("ff_fb_no_flow", "luenberger"),
-    "paper, with observer": Law("ff_fb_observer", "luenberger"),
-    "paper as printed": Law("ff_fb_literal", "luenberger"),
-    "paper as printed, no limit": Law("ff_fb_literal", "luenberger", NO_LIMIT_UM_S),
-    "paper's law, kalman_map": Law("ff_fb", "kalman_map"),
-    **{f"vector, {name}": Law("vector", name) for name in OBSERVERS},
+    "paper, with compensation": ControlLoop("ff_fb", "luenberger"),
+    "paper, without": ControlLoop("ff_fb_no_flow", "luenberger"),
+    "paper, with observer": ControlLoop("ff_fb_observer", "luenberger"),
+    "paper as printed": ControlLoop("ff_fb_literal", "luenberger"),
+    "paper as printed, no limit": ControlLoop("ff_fb_literal", "luenberger", NO_LIMIT_UM_S),
+    "paper's law, kalman_map": ControlLoop("ff_fb", "kalman_map"),
+    **{f"vector, {name}": ControlLoop("vector", name) for name in OBSERVERS.usable()},
 }
 # Other methods that follow a reference; the rest needs a time to go, which a lemniscate does not have.
 LAWS |= {
-    f"{name}, kalman_map": Law(name, "kalman_map")
-    for name, row in CONTROLLERS.items()
-    if not row.needs and name not in {law.method for law in LAWS.values()}
+    f"{name}, kalman_map": ControlLoop(name, "kalman_map")
+    for name in CONTROLLERS.usable()
+    if not CONTROLLERS[name].needs and name not in {law.method for law in LAWS.values()}
 }
 FIRST = ("paper, with compensation", "paper, without", "paper, with observer")
 OURS = ("paper, with compensation", "vector, kalman", "vector, kalman_map")
 
-# The reference of the paper does not wait. That of flowrec is no faster than the robot, and by default waits for it.
+# The paper's reference moves on wherever the robot is. That of flowrec is no faster than the robot, and by default it
+# waits for a robot that is behind.
 _FIXED = Controller(lag_free_radii=1e9, lag_full_radii=2e9, pace_share=1e9)
 PACES = {
     "as planned": _FIXED,
@@ -81,10 +80,10 @@ def measure(
 
     Besides, the tracker on robots of many looks, and on the recorded movies of a folder.
     """
-    flown: dict[tuple[str, str], list[Flight]] = {}
+    flown: dict[tuple[str, str], list[LemniscateRun]] = {}
     step_out: list[dict[str, Any]] = []
     bounded = ("paper, with compensation", "vector, kalman_map")
-    total = len(LAWS) * len(WORLDS) + len(bounded) * len(STEP_OUTS_UM_S) * len(PACES)
+    total = len(LAWS) * len(WORLDS) + len(bounded) * len(STEP_OUTS_UM_S) * len(PACES) + 1
     with progress("tracking", total, "runs") as done:
         for world_name, world in WORLDS.items():
             for name, law in LAWS.items():
@@ -97,6 +96,8 @@ def measure(
                     made = flights(LAWS[name], controller, world, seeds)
                     step_out.append(score(f"{name}; {pace}", f"step-out at {top_um_s:g} um/s", made))
                     done(len(flown) + len(step_out))
+        looks = list(tracking_rows(movies))
+        done(total)
     if figure is not None:
         panels = {
             "laws of the paper, ideal": {name: flown[name, "ideal"][0] for name in FIRST},
@@ -109,20 +110,20 @@ def measure(
         "worlds": {name: asdict(world) for name, world in WORLDS.items()},
         "rows": [score(name, world, made) for (name, world), made in flown.items()],
         "step_out": step_out,
-        "looks": list(measured(movies)),
+        "looks": looks,
     }
 
 
-def flights(law: Law, pace: Controller, world: World, seeds: int) -> list[Flight]:
+def flights(law: ControlLoop, pace: Controller, world: RunDisturbances, seeds: int) -> list[LemniscateRun]:
     """One run per seed; one run if there is no noise."""
     # The noise that a robot at rest would show.
     kalman = Kalman(position_noise_um=world.noise_um if world.noise_um > 0.0 else None)
-    observer = Observer(method=law.observer, kalman=kalman)
-    controller, robot = replace(pace, method=law.method), world.robot(law.v_max_um_s)
+    observer = with_row(Observer(kalman=kalman), OBSERVERS, law.observer)
+    controller, robot = with_row(pace, CONTROLLERS, law.method), world.robot(law.v_max_um_s)
     return [fly(controller, observer, robot, world, seed) for seed in range(seeds if world.noise_um > 0.0 else 1)]
 
 
-def score(name: str, world: str, flown: list[Flight]) -> dict[str, Any]:
+def score(name: str, world: str, flown: list[LemniscateRun]) -> dict[str, Any]:
     """Means over flights. Errors are distances to the reference in um.
 
     `steady_um` is the RMSE of the second lap and `off_curve_um` that of the distance to the curve; `converged_s` is the
@@ -145,12 +146,12 @@ def score(name: str, world: str, flown: list[Flight]) -> dict[str, Any]:
     }
 
 
-def _converged_s(flight: Flight) -> float | None:
+def _converged_s(flight: LemniscateRun) -> float | None:
     """From when on the error stays below 50 um; None if it does not for the last second."""
     out = np.flatnonzero(flight.error_um > CONVERGED_UM)
     if not len(out):
         return 0.0
-    return float(flight.time_s[out[-1] + 1]) if out[-1] + 1 < len(flight.time_s) - 30 else None
+    return float(flight.time_s[out[-1] + 1]) if out[-1] + 1 < len(flight.time_s) - _LAST_FRAMES else None
 
 
 def _rms(values: NDArray[np.float64]) -> float:

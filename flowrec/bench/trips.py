@@ -10,18 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.openings import find_openings
-from flowrec.chip.vessel_case import read_vessel_case
-from flowrec.errors import FlowrecError
-from flowrec.flow import FlowSolver
-from flowrec.messages import FlowField
-from flowrec.planning.eikonal import descend, time_field
-from flowrec.planning.free_space import open_space
-from flowrec.planning.path_refinement import SPACING_PX, refine_path
-from flowrec.planning.route import travel_time
-from flowrec.refine.training.vessels import draw_mask
-from flowrec.robot import Robot
+from flowrec.bench.vessels import draw_mask
+from flowrec.core import FlowField, FlowrecError
+from flowrec.physics import Chip, FlowSolver, Robot, find_openings, read_vessel_case
+from flowrec.stages import SPACING_PX, descend, open_space, refine_path, time_field, travel_time
 
 SPEED_UM_S = 1000.0  # the robot's; flows are scaled to it
 UM_PER_PX = 20.0
@@ -31,7 +23,7 @@ Points = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class World:
+class TripCase:
     """A chip, its flow scaled to a peak of 1 um/s, and a robot of SPEED_UM_S that fits through."""
 
     name: str
@@ -56,7 +48,7 @@ class Trip:
         return (self.upper_um, self.lower_um) if direction == "down" else (self.lower_um, self.upper_um)
 
 
-def worlds(side_px: int, seed: int = 0) -> Iterator[World]:
+def worlds(side_px: int, seed: int = 0) -> Iterator[TripCase]:
     """Random vessel networks without end, except those in which the flow can not be computed."""
     while True:
         rng = np.random.default_rng([seed, side_px, 0x7219])
@@ -77,7 +69,7 @@ def worlds(side_px: int, seed: int = 0) -> Iterator[World]:
             yield made
 
 
-def worlds_of(folder: Path) -> Iterator[World]:
+def worlds_of(folder: Path) -> Iterator[TripCase]:
     """The vessel cases of a folder with their assumed boundary values."""
     for path in sorted(folder.glob("*.npz")):
         made = world_of(replace(read_vessel_case(path), name=path.stem), k=2)
@@ -85,7 +77,7 @@ def worlds_of(folder: Path) -> Iterator[World]:
             yield made
 
 
-def world_of(chip: Chip, k: int) -> World | None:
+def world_of(chip: Chip, k: int) -> TripCase | None:
     """The world of a chip; None if its flow can not be computed."""
     try:
         field = FlowSolver(k).solve(chip)
@@ -94,10 +86,10 @@ def world_of(chip: Chip, k: int) -> World | None:
     peak = float(np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1]).max())
     flow = replace(field, velocity_um_s=field.velocity_um_s / np.float32(peak))
     robot = Robot(radius_um=chip.um_per_px, max_speed_um_s=SPEED_UM_S, step_out_hz=1e6, step_out_margin=1.0)
-    return World(chip.name, chip, flow, robot)
+    return TripCase(chip.name, chip, flow, robot)
 
 
-def draw_trip(world: World, rng: np.random.Generator) -> Trip | None:
+def draw_trip(world: TripCase, rng: np.random.Generator) -> Trip | None:
     """Two points with room for the robot, connected, 0.4 of the chip's size apart or more; None if there are none."""
     space = open_space(world.chip, world.flow, world.robot.radius_um, 0.5 * world.robot.radius_um)
     parts = label(space.free, _EIGHT)[0]
@@ -116,7 +108,7 @@ def draw_trip(world: World, rng: np.random.Generator) -> Trip | None:
 
 
 def best_time(
-    world: World, field: FlowField, start_um: Points, goal_um: Points, speed_um_s: float, finer: int = FINER
+    world: TripCase, field: FlowField, start_um: Points, goal_um: Points, speed_um_s: float, finer: int = FINER
 ) -> tuple[float, float]:
     """Travel time of the best path on a finer grid, and the time to go on that grid: both are close to the optimum.
 

@@ -15,22 +15,13 @@ import numpy as np
 import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.bench.planted_causes import named, planted_causes
-from flowrec.chip import load_chip
-from flowrec.chip.chip import Chip
-from flowrec.commands.record import refuse_adrift
-from flowrec.config import ResolvedConfig, calibration_of, load_config
-from flowrec.declarations import message_fields
-from flowrec.enums import Phase, WorkOrder
-from flowrec.errors import FlowrecError
-from flowrec.messages import FlowField
-from flowrec.pipeline import Pipeline, assemble
-from flowrec.resolve import resolve
-from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.run.loop import run
-from flowrec.run.workers import LockstepWorker, work
-from flowrec.topics import BY_FIELD, Tick
-from flowrec.units import seconds
+from flowrec.bench.planted_causes import count_causes, planted_causes
+from flowrec.core import BY_FIELD, FlowField, FlowrecError, Phase, Tick, WorkOrder, message_fields, seconds
+from flowrec.physics import Chip, load_chip
+from flowrec.rigs import SimulatedRig
+from flowrec.run import LockstepWorker, run, work
+from flowrec.stages import Pipeline, ResolvedConfig, assemble, calibration_of, load_config, resolve
+from flowrec.verbs import refuse_adrift
 
 # Messages of a work order that are kept; the assumed flow is solved again.
 _KEPT = ("mission", "estimate", "health", "observations")
@@ -39,7 +30,7 @@ _IN_FLIGHT = "assimilate"  # with which the robot navigates, whatever is compare
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What the faults of a world are made of: random numbers of the seed, and the configuration without the fault."""
+    """Inputs of a world's faults: random numbers of the seed, and the configuration without the fault."""
 
     rng: np.random.Generator
     config: ResolvedConfig
@@ -90,8 +81,8 @@ _FAULT_STREAM = 0xFA017
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """What is flown."""
+class FlightCase:
+    """Definition of a simulated mission."""
 
     world: str
     chip: str  # bifurcation, straight, vessels-SEED, or the path of a chip or of a vessel case
@@ -141,7 +132,7 @@ class Flight:
 
     def key(self) -> tuple[str, str, int, tuple[str, ...]]:
         """That of its case."""
-        return Case(self.world, self.chip, self.seed, self.sets).key()
+        return FlightCase(self.world, self.chip, self.seed, self.sets).key()
 
 
 def chip_sets(chip: str) -> tuple[str, ...]:
@@ -152,7 +143,7 @@ def chip_sets(chip: str) -> tuple[str, ...]:
     return (f"chip.name={name}", *((f"chip.seed={seed}",) if seed else ()))
 
 
-def prepared(case: Case) -> tuple[ResolvedConfig, Chip]:
+def prepare_case(case: FlightCase) -> tuple[ResolvedConfig, Chip]:
     """The configuration of a case on its chip.
 
     Raises FlowrecError where the mission can not be flown.
@@ -182,11 +173,11 @@ def in_world(
     return config, chip
 
 
-def fly(case: Case) -> Flight:
+def fly(case: FlightCase) -> Flight:
     """Fly a case; nothing is written."""
     flight = Flight(case.world, case.chip, case.seed, case.sets, "refused", "")
     try:
-        config, chip = prepared(case)
+        config, chip = prepare_case(case)
     except FlowrecError as error:
         flight.note = str(error)
         return flight
@@ -216,13 +207,13 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
     """Refine what a flight has observed by some methods and score them; also the assumed flow, as `assumed`."""
     if not flight.order:
         return
-    config, chip = prepared(Case(flight.world, flight.chip, flight.seed, flight.sets))
+    config, chip = prepare_case(FlightCase(flight.world, flight.chip, flight.seed, flight.sets))
     pipeline = assemble(config, chip)
     truth = SimulatedRig.of(pipeline, config).true_world().field.velocity_um_s * np.float32(flight.drift)
     order = _order_of(flight, pipeline)
     assert order.assumed is not None
     planted = planted_causes(config, chip)
-    flight.refined["assumed"] = scored(order.assumed, truth, chip.mask)
+    flight.refined["assumed"] = score_field(order.assumed, truth, chip.mask)
     for method in methods:
         refiner = replace(config.refine, method=method, adopt="always")  # what the method gives, good or bad
         try:
@@ -231,10 +222,10 @@ def refine(flight: Flight, methods: Sequence[str]) -> None:
             flight.refined[method] = {"failed": str(error)}
             continue
         assert isinstance(result, FlowField)
-        flight.refined[method] = scored(result, truth, chip.mask, planted)
+        flight.refined[method] = score_field(result, truth, chip.mask, planted)
 
 
-def scored(
+def score_field(
     found: FlowField, truth: NDArray[np.float32], mask: NDArray[np.bool_], planted: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Scores of a field over the components of the fluid pixels.
@@ -258,7 +249,7 @@ def scored(
         crps = std * (z * (2.0 * scipy.special.ndtr(z) - 1.0) + 2.0 * density - 1.0 / math.sqrt(math.pi))
     score["crps"] = float(crps.mean()) / rms
     score["expected"] = getattr(found, "error_share", None)
-    right, invented = named(found.note, planted)
+    right, invented = count_causes(found.note, planted)
     return score | {"warned": right > 0, "invented": invented, "note": found.note}
 
 

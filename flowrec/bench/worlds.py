@@ -20,14 +20,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, Sets, chosen, mean_with_interval, paired, print_rows
-from flowrec.bench.world_flights import WORLDS, Case, Flight, as_line, fly, refine
-from flowrec.errors import UsageError
-from flowrec.provenance import provenance
-from flowrec.refine.refiner import REFINERS
-from flowrec.system.durable import append_line, replace_content
-from flowrec.system.processes import pool
-from flowrec.terminal import progress, say
+from flowrec.bench.harness import Results, choose_names, mean_with_interval, paired_ratio, print_rows
+from flowrec.bench.world_flights import WORLDS, Flight, FlightCase, as_line, fly, refine
+from flowrec.core import UsageError, append_line, pool, progress, provenance, replace_content, say
+from flowrec.stages import REFINERS
+from flowrec.verbs import SetTexts
 
 CHIPS = "bifurcation,vessels-1,vessels-2,vessels-3"
 METHODS = [name for name in ("fvm", "gain", "assimilate", "pi_unet") if name in REFINERS]
@@ -45,7 +42,7 @@ def measure(
         Path | None, typer.Option(metavar="FILE", help="Keep the flights here, and use those that are here.")
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="Refine kept observations once more.")] = False,
-    sets: Sets = None,
+    sets: SetTexts = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
 ) -> Results:
     """Flights, and a summary by world and method.
@@ -55,22 +52,22 @@ def measure(
     UsageError
         If there is no such world or method, or `rows` is not a file of flights.
     """
-    names = chosen("bench worlds: no world", worlds, WORLDS)
-    wanted = chosen("bench worlds: no method", methods, REFINERS)
+    names = choose_names("bench worlds: no world", worlds, WORLDS)
+    wanted = choose_names("bench worlds: no method", methods, REFINERS)
     cases = [
-        Case(world, chip, seed, tuple(sets or ()))
+        FlightCase(world, chip, seed, tuple(sets or ()))
         for seed in range(first_seed, first_seed + seeds)
         for world in names
         for chip in chips.split(",")
     ]
-    flights = {} if rows is None else {flight.key(): flight for flight in kept(rows)}
+    flights = {} if rows is None else {flight.key(): flight for flight in read_flights(rows)}
     code = _code()
     if others := {flight.code or "another one" for flight in flights.values()} - {code}:
         say(f"{rows}: flown by {', '.join(sorted(others))}, this is {code}; another file has only flights of one")
     left = [case for case in cases if _is_left(flights.get(case.key()), wanted, again=again)]
     if rows is not None and len(left) < len(cases):
         say(f"{rows}: {len(cases) - len(left)} of {len(cases)} flights are there")
-    work = partial(flown, methods=wanted, again=again)
+    work = partial(fly_case, methods=wanted, again=again)
     with ExitStack() as stack:
         done = stack.enter_context(progress("flying", len(left), "missions"))
         if rows is not None:
@@ -91,7 +88,7 @@ def _code() -> str:
     return f"flowrec {facts['flowrec']} {facts.get('git_commit', '')[:10]}{changed}"
 
 
-def kept(path: Path) -> Iterator[Flight]:
+def read_flights(path: Path) -> Iterator[Flight]:
     """The flights of a file; a line that was cut short at its end is left out. Later lines replace earlier ones."""
     if not path.exists():
         return
@@ -117,7 +114,7 @@ def _is_left(flight: Flight | None, methods: Iterable[str], *, again: bool) -> b
     return bool(flight.order) and (again or not set(methods) <= flight.refined.keys())
 
 
-def flown(case: Case, flight: Flight | None, methods: Sequence[str], *, again: bool) -> Flight:
+def fly_case(case: FlightCase, flight: Flight | None, methods: Sequence[str], *, again: bool) -> Flight:
     """The flight of a case, flown if it is None, refined by the methods."""
     if flight is None:
         flight = fly(case)
@@ -126,7 +123,7 @@ def flown(case: Case, flight: Flight | None, methods: Sequence[str], *, again: b
 
 
 def _each(
-    work: Callable[[Case, Flight | None], Flight], tasks: Sequence[tuple[Case, Flight | None]], jobs: int
+    work: Callable[[FlightCase, Flight | None], Flight], tasks: Sequence[tuple[FlightCase, Flight | None]], jobs: int
 ) -> Iterator[Flight]:
     """The results as they are ready."""
     if jobs == 1:
@@ -201,7 +198,7 @@ def scores(flights: Sequence[Flight], method: str) -> Results:
         "unsaid": sum(not one["warned"] for one in worse),
         "warned": sum(one["warned"] for one in mine),
         "invented": sum(one.get("invented", 0) > 0 for one in mine),
-        "over_null": paired(np.array(pairs)) if pairs and method != NULL else None,
+        "over_null": paired_ratio(np.array(pairs)) if pairs and method != NULL else None,
     }
 
 

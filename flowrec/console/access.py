@@ -1,4 +1,4 @@
-"""Who may talk to the console: a browser that was given the token, from the console's own page.
+"""Access control of the console: a browser that was given the token, from the console's own page.
 
 The server is bound to 127.0.0.1, which keeps other machines out, but not the pages of others in a browser of this
 machine. A page elsewhere can send requests to 127.0.0.1, and can give its own name the address 127.0.0.1 (DNS
@@ -38,7 +38,7 @@ def cookie_name(port: int) -> str:
 
 
 def same(given: str, token: str) -> bool:
-    """Whether a token is the right one, in a time that does not tell how much of it is right."""
+    """True if a token is the right one, in a time that does not tell how much of it is right."""
     return bool(token) and hmac.compare_digest(given.encode(), token.encode())
 
 

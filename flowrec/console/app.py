@@ -20,10 +20,10 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from flowrec.console.access import Access
-from flowrec.console.board import MOST_PAGES, Board, Shown
+from flowrec.console.board import MOST_PAGES, Board, PageProgress
 from flowrec.console.console import GOAL, SPEED
 from flowrec.console.rerun_viewer import RerunViewer
-from flowrec.run.operator_commands import COMMANDS, LONGEST_NOTE, NOTE
+from flowrec.run import COMMANDS, LONGEST_NOTE, NOTE
 
 _PERIOD_S = 0.1  # from one state to the next of a page
 _FROZEN_S = 30.0  # a page that takes nothing for so long is let go
@@ -87,7 +87,7 @@ def application(board: Board, token: str, port: int, rerun_port: int | None, ans
 
 async def _send(board: Board, socket: WebSocket) -> None:
     """Send a page what is new, at most some times per second, until the run has ended."""
-    shown = Shown()
+    shown = PageProgress()
     with suppress(WebSocketDisconnect, RuntimeError):  # the page was closed
         while True:
             news = await board.news(shown)
@@ -129,7 +129,7 @@ class _Given(NamedTuple):
 
 
 class _Commands:
-    """What pages ask for, checked and handed on at once: nothing that is sent to a page is before it in a queue."""
+    """Commands from the pages, checked and handed on at once: they wait for nothing that is sent to a page."""
 
     def __init__(self, board: Board, answer: Answer) -> None:
         self._board, self._answer = board, answer

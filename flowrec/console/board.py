@@ -13,17 +13,16 @@ from collections import deque
 from collections.abc import Awaitable
 from typing import Any, NamedTuple
 
-from flowrec.console.messages import Ended, Verdict
+from flowrec.console.messages import CommandReply, RunEnded
 from flowrec.console.page_state import Drawing, PageState
-from flowrec.view.feed import Batch
-from flowrec.view.scene import Scene
+from flowrec.view import Batch, Scene
 
 MOST_PAGES = 8
 _MOST_EVENTS = 100
 
 
-class Shown(NamedTuple):
-    """How far a page is."""
+class PageProgress(NamedTuple):
+    """Counters of the latest content that a page has received."""
 
     number: int = 0
     drawing: int = 0
@@ -32,7 +31,7 @@ class Shown(NamedTuple):
 
 
 class News(NamedTuple):
-    """What a page has not shown yet.
+    """Content that a page has not received yet.
 
     Attributes
     ----------
@@ -42,7 +41,7 @@ class News(NamedTuple):
     last : the run has ended, and this says so.
     """
 
-    shown: Shown
+    shown: PageProgress
     words: str
     picture: bytes | None
     last: bool
@@ -65,12 +64,12 @@ class Board:
         self.name = name
         self._pages = 0
         self._page_state = PageState(scene)
-        self._at = Shown()
+        self._at = PageProgress()
         self._state: dict[str, Any] = {}
         self._drawing: Drawing = {}
         self._picture = b""
         self._events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_MOST_EVENTS)
-        self._ended: Ended | None = None
+        self._ended: RunEnded | None = None
         self._changed = asyncio.Event()
         self._waking = False
         self._tickets = itertools.count(1)
@@ -91,35 +90,35 @@ class Board:
         if picture is not None:
             self._picture, picture_number = picture, picture_number + 1
         self._state = self._page_state.state()
-        self._at = Shown(number + 1, drawing_number, picture_number, event_number)
+        self._at = PageProgress(number + 1, drawing_number, picture_number, event_number)
         self._wake()
 
-    def end(self, ended: Ended) -> None:
+    def end(self, ended: RunEnded) -> None:
         """Take over how the run ended."""
         self._ended = ended
         self._at = self._at._replace(number=self._at.number + 1)
         self._wake()
 
-    def settle(self, verdict: Verdict) -> None:
+    def settle(self, verdict: CommandReply) -> None:
         """Take over what the run made of a command."""
         if self.loop is not None:
-            self.loop.call_soon_threadsafe(self._settled, verdict)
+            self.loop.call_soon_threadsafe(self._settle, verdict)
 
     def _wake(self) -> None:
         if self.loop is not None and not self._waking:
             self._waking = True
-            self.loop.call_soon_threadsafe(self._woken)
+            self.loop.call_soon_threadsafe(self._wake_pages)
 
     # ---- in the loop of the server
 
-    def _woken(self) -> None:
+    def _wake_pages(self) -> None:
         self._waking = False
         self._changed.set()
         self._changed = asyncio.Event()
         if self._ended is not None:
             self.over.set()
 
-    def _settled(self, verdict: Verdict) -> None:
+    def _settle(self, verdict: CommandReply) -> None:
         waiting = self._verdicts.pop(verdict.ticket, None)
         if waiting is not None and not waiting.done():  # done: its page is gone
             waiting.set_result(verdict.refusal)
@@ -152,7 +151,7 @@ class Board:
         if not self._pages:
             self.left.set()
 
-    async def news(self, shown: Shown) -> News:
+    async def news(self, shown: PageProgress) -> News:
         """Wait until there is more than a page has shown."""
         while shown.number == self._at.number:
             await self._changed.wait()

@@ -15,14 +15,10 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any, Self
 
-from flowrec.console.messages import STAYS, Begin, Ended, Verdict
-from flowrec.errors import FlowrecError, UsageError
-from flowrec.run.control import RunControl
-from flowrec.run.operator_commands import COMMANDS
-from flowrec.topics import Tick
-from flowrec.view import viewer
-from flowrec.view.feed import Feed
-from flowrec.view.scene import Scene
+from flowrec.console.messages import STAYS, Begin, CommandReply, RunEnded
+from flowrec.core import FlowrecError, Tick, UsageError
+from flowrec.run import COMMANDS, RunControl
+from flowrec.view import Feed, Scene, viewer
 
 PACKAGES = ("starlette", "uvicorn", "websockets")  # of the extra `console`
 GOAL, SPEED = "goal", "speed"  # commands with numbers
@@ -86,12 +82,12 @@ class Console:
 
     @property
     def message(self) -> str:
-        """How to open the page, or why there is none."""
+        """Instructions to open the page, or the reason why there is none."""
         return self._message
 
     @property
     def tunnel(self) -> str:
-        """How to open it on another machine; '' if there is none."""
+        """Instructions to open the page on another machine; '' if there is no page."""
         there = f"{self.port}:{viewer.LOOPBACK}:{self.port} {platform.node()}"
         return f"on another machine: ssh -L {there}, then the same address" if self.port else ""
 
@@ -115,7 +111,7 @@ class Console:
         if self._feed is not None:
             self._feed.write(tick)
 
-    def close(self, ended: Ended | None = None, timeout_s: float = _CLOSE_S) -> None:
+    def close(self, ended: RunEnded | None = None, timeout_s: float = _CLOSE_S) -> None:
         """Let the pages show how the run ended, within a time limit; then end the server."""
         feed = self._feed
         if feed is not None and not feed.closing and feed.close(timeout_s, STAYS, ended):
@@ -138,7 +134,7 @@ class Console:
                     self._message = f"console: {self.url}"
                     self._accepts.set()
                 else:
-                    feed.tell(Verdict(words["ticket"], self._do(words)))
+                    feed.tell(CommandReply(words["ticket"], self._do(words)))
         if feed.closing:
             return
         feed.process.wait()

@@ -1,10 +1,10 @@
-"""What the run tells the process of the console, besides its ticks."""
+"""Messages from the run to the console's process, besides the ticks."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-from flowrec.view.scene import Scene
+from flowrec.view import Scene
 
 STAYS = "flowrec: shows its pages how the run ended"  # what the process says last; it ends by itself a moment later
 
@@ -25,8 +25,8 @@ class Begin(NamedTuple):
     rerun_port: int | None
 
 
-class Verdict(NamedTuple):
-    """What the run made of a command.
+class CommandReply(NamedTuple):
+    """Answer of the run to a command.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Verdict(NamedTuple):
     refusal: str
 
 
-class Ended(NamedTuple):
+class RunEnded(NamedTuple):
     """The last: how the run ended, and where its file is."""
 
     outcome: str

@@ -1,4 +1,4 @@
-"""What the console's page shows of a run: numbers and words, the camera's image, and what is drawn over it.
+"""Content of the console's page: numbers and words of a run, the camera's image, and the drawing over it.
 
 All that is drawn lies where the image shows it, also where a refinement has found another registration than stated.
 Pixels are those of the camera's image, counted from the corner of the first one, as a browser counts them.
@@ -14,19 +14,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.enums import Phase
-from flowrec.errors import printable
-from flowrec.store.viewer_scene import ChipCamera
-from flowrec.topics import Tick
-from flowrec.units import seconds
-from flowrec.view.feed import Batch
-from flowrec.view.scene import Scene
-from flowrec.view.status_bar import state_text
+from flowrec.core import Phase, Tick, printable, seconds, shift_px
+from flowrec.store import ChipCamera
+from flowrec.view import Batch, Scene, state_text
 
 # What the page shows depends on these fields of a tick.
 SHOWN = ("frame", "refined", "route", "estimate", "mission", "demand", "currents", "event", "timing", "losses")
 _QUALITY = 80  # of the JPEG
-_EDGE_PX = 3  # of the mask's border, so that its openings are not drawn as walls
+_EDGE_PX = 3  # by which the mask goes on beyond its border, so that its openings are not drawn as walls
 _SMOOTHING_PX = 0.7  # of the walls, in pixels of the mask
 
 Drawing = dict[str, Any]
@@ -52,8 +47,9 @@ class PageState:
             event = changes.get("event")
             if event is not None:
                 events.append({"s": round(seconds(event.stamp_ns), 2), "level": event.level, "text": event.text})
-            if changes.get("refined") is not None:
-                self._image = self._camera.picture(self.tick.refined.registration)  # type: ignore[union-attr]
+            if changes.get("refined") is not None or changes.get("shift") is not None:
+                refined = self.tick.refined
+                self._image = self._camera.picture(None if refined is None else refined.registration, self.tick.shift)
         self._step = batch.step
         self.remarks = batch.remarks
         return events
@@ -64,7 +60,7 @@ class PageState:
         return x, y
 
     def drawing(self) -> Drawing:
-        """What moves rarely: walls, route, goal; and the sizes."""
+        """Content that changes rarely: walls, route, goal; and the sizes."""
         width, height = self._camera.size_px
         route, mission = self.tick.route, self.tick.mission
         goal = mission.goal_um if mission is not None and np.isfinite(mission.goal_um).all() else None
@@ -81,10 +77,10 @@ class PageState:
         }
 
     def state(self) -> dict[str, Any]:
-        """What changes with each tick."""
+        """Content that changes with each tick."""
         tick, mission, estimate = self.tick, self.tick.mission, self.tick.estimate
         field = tick.currents
-        at = None if estimate is None else self._scene.to_plane(estimate.position_um).tolist()
+        at = None if estimate is None else (self._scene.to_plane(estimate.position_um) + shift_px(tick.shift)).tolist()
         error_um = tick.demand.error_um if tick.demand is not None else math.nan
         return {
             "time_s": round(seconds(max(tick.stamp_ns, 0)), 2),

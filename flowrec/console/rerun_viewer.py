@@ -31,7 +31,7 @@ _KEPT = ("content-type", "grpc-status", "grpc-message", "grpc-encoding")
 
 
 class RerunViewer:
-    """What the routes answer with; the program is asked for when a browser does, and kept."""
+    """Responses of the viewer's routes; the viewer starts with the first request of a browser, and runs on."""
 
     def __init__(self, port: int | None) -> None:
         self._port = port
@@ -71,7 +71,7 @@ class RerunViewer:
             return PlainTextResponse("too long\n", 413)
         self._streams += 1
         try:
-            upstream = await _Upstream.asked(self._port, request.url.path, request.headers.items(), body)
+            upstream = await _Upstream.request(self._port, request.url.path, request.headers.items(), body)
         except (OSError, h11.RemoteProtocolError):
             self._streams -= 1
             return PlainTextResponse("Rerun's server does not answer\n", 502)
@@ -90,7 +90,7 @@ class _Upstream:
         self.status, self.headers = 502, dict[str, str]()
 
     @classmethod
-    async def asked(cls, port: int, path: str, headers: list[tuple[str, str]], body: bytes) -> _Upstream:
+    async def request(cls, port: int, path: str, headers: list[tuple[str, str]], body: bytes) -> _Upstream:
         """Send a request and wait for the head of the answer."""
         self = cls(*await asyncio.open_connection(viewer.LOOPBACK, port))
         kept = [(name, value) for name, value in headers if name in ("content-type", "accept") or name[:5] == "grpc-"]

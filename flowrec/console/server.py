@@ -20,11 +20,11 @@ import uvicorn
 
 from flowrec.console.app import application
 from flowrec.console.board import Board
-from flowrec.console.messages import STAYS, Begin, Ended, Verdict
-from flowrec.view.viewer import LOOPBACK
+from flowrec.console.messages import STAYS, Begin, CommandReply, RunEnded
+from flowrec.view import LOOPBACK
 
 PORT = 8460  # where it is free: the operator's tunnel and bookmark stay from run to run
-_NOTHING_SAID = Ended("the run's process has ended without a word; flowrec recover makes a session of its file")
+_NOTHING_SAID = RunEnded("the run's process has ended without a word; flowrec recover makes a session of its file")
 _LONGEST_MESSAGE_BYTES = 4096
 _CLOSE_S = 2.0  # for pages to take the last state
 
@@ -90,10 +90,10 @@ def _read(source: Any, board: Board) -> None:
             news = pickle.load(source)  # noqa: S301 - from our own parent
         except (EOFError, pickle.UnpicklingError):  # the run ended, or was killed while it wrote
             break
-        if isinstance(news, Ended):
+        if isinstance(news, RunEnded):
             ended = news
             print(STAYS, flush=True)
-        elif isinstance(news, Verdict):
+        elif isinstance(news, CommandReply):
             board.settle(news)
         else:
             board.take(news)

@@ -12,14 +12,9 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from flowrec.config_tree import without_none
-from flowrec.declarations import Image
-from flowrec.errors import SessionError, printable
-from flowrec.messages import Applied, Frame
-from flowrec.movies.notes import MovieNotes
-from flowrec.session import Session
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.core import Applied, Frame, Image, SessionError, Tick, printable, seconds, without_none
+from flowrec.movies import MovieNotes
+from flowrec.store import Session
 
 _SAMPLED = 9  # images that determine the scale of grey levels
 _DARKEST, _BRIGHTEST = 0.1, 99.9  # percentiles of grey levels that become black and white
@@ -53,7 +48,7 @@ def image_stamps(session: Session) -> list[int]:
 
 
 def _repeats(applied: Applied | None, stamp_ns: int) -> bool:
-    """Whether the camera gave the image of that stamp before."""
+    """True if the camera gave the image of that stamp before."""
     return applied is not None and applied.stamp_ns == stamp_ns and applied.repeats_image
 
 
@@ -128,7 +123,7 @@ class GreyScale:
 
 
 def notes_of(session: Session, first: Frame, grey: GreyScale, *, drawn: bool = False, zoom: int = 1) -> MovieNotes:
-    """What is written into a movie of a session.
+    """Notes that are written into a movie of a session.
 
     Parameters
     ----------
@@ -142,7 +137,7 @@ def notes_of(session: Session, first: Frame, grey: GreyScale, *, drawn: bool = F
     return MovieNotes(
         session=session.path.name,
         session_key=session.key,
-        started=started(session),
+        started=start_time(session),
         first_stamp_ns=first.stamp_ns,
         um_per_px=config.camera.um_per_px / zoom,
         width_px=width,
@@ -158,7 +153,7 @@ def notes_of(session: Session, first: Frame, grey: GreyScale, *, drawn: bool = F
     )
 
 
-def started(session: Session) -> str:
+def start_time(session: Session) -> str:
     """Wall time of the start of the run, ISO 8601 with its zone; '' if the session does not state one."""
     text = session.provenance.get("wall_time", "")
     try:

@@ -14,8 +14,8 @@ from typing import Any
 
 import pyarrow as pa
 
-from flowrec.session import Session
-from flowrec.version import __version__
+from flowrec.core import __version__
+from flowrec.store import Session
 
 FILE = "datapackage.json"
 _TYPES = (

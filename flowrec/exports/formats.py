@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from flowrec.methods import Method, Methods
-from flowrec.session import Session
+from flowrec.core import Method, Methods
+from flowrec.store import Session
 
 EXPORTS = Methods(
     "--format",
@@ -32,13 +32,14 @@ EXPORTS = Methods(
         "OME-TIFF, the camera's images without loss, which flowrec import reads",
         extra="export",
     ),
-    Method("nwb", "flowrec.exports.nwb:NwbExport", "Neurodata Without Borders, the pose by ndx-pose", extra="export"),
     Method("zarr", "flowrec.exports.zarr:ZarrExport", "images and flow fields in chunks, for xarray", extra="export"),
+    group="flowrec.exports",
+    verb="write",
 )
 
 
 class Exporter(Protocol):
-    """What a row of EXPORTS implements.
+    """Interface of a row of EXPORTS.
 
     Attributes
     ----------

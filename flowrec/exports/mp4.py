@@ -22,13 +22,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flowrec.core import NS_PER_S, seconds
 from flowrec.exports.camera_images import GreyScale, first_frame, notes_of, refuse_windows, title_of, with_images
-from flowrec.movies.notes import MovieNotes
-from flowrec.session import Session
-from flowrec.units import NS_PER_S, seconds
-from flowrec.view.overlay import Overlay
-from flowrec.view.scene import Scene
-from flowrec.view.window_images import WindowCompleter
+from flowrec.movies import MovieNotes
+from flowrec.store import Session
+from flowrec.view import Overlay, Scene, WindowCompleter
 
 TIME_BASE = Fraction(1, 1_000_000)
 PRESET = "fast"
@@ -61,7 +59,7 @@ class Mp4Export:
         notes = notes_of(session, first, grey, drawn=True, zoom=overlay.zoom)
         with Mp4Writer(part, overlay.size_px, notes, session, full_range=False) as writer:
             for tick, frame in with_images(session):
-                image = frame.image if windows is None else windows.completed(frame.image)
+                image = frame.image if windows is None else windows.complete(frame.image)
                 picture = overlay.draw(grey(image), tick)
                 planes = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2YUV_I420), np.uint8)
                 writer.write(frame.stamp_ns - first.stamp_ns, planes)

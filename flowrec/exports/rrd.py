@@ -9,26 +9,23 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.chip.chip import Chip
-from flowrec.config import ResolvedConfig
-from flowrec.errors import SessionError
-from flowrec.pipeline import Pipeline, assemble
-from flowrec.replay_figures import ReplayFiles, before_after
-from flowrec.session import Session
-from flowrec.store.run_files import files_of
-from flowrec.summary import DOUBTS
-from flowrec.system.outputs import RRD, Output
-from flowrec.view.entities import PAIR, REPLAY
-from flowrec.view.rrd_file import write_rrd
-from flowrec.view.scene import Scene
-from flowrec.view.summary_text import (
+from flowrec.core import DOUBTS, RRD, Output, SessionError
+from flowrec.physics import Chip
+from flowrec.run import ReplayFiles, before_after
+from flowrec.stages import Pipeline, ResolvedConfig, assemble
+from flowrec.store import Session, files_of
+from flowrec.view import (
     FIGURES,
+    PAIR,
+    REPLAY,
+    Scene,
     document_of_run,
     doubts_remark,
     note_of,
     registration_remark,
     rows_of_run,
     summary_document,
+    write_rrd,
 )
 
 if TYPE_CHECKING:

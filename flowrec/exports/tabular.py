@@ -17,36 +17,32 @@ import pyarrow.compute
 import pyarrow.csv
 import pyarrow.parquet
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError, seconds, summary_of
 from flowrec.exports.datapackage import write_datapackage
-from flowrec.meanings import summary_of
-from flowrec.session import Session
-from flowrec.tables.arrow import schema_of
-from flowrec.tables.field_tables import field_values, observed_flow
-from flowrec.topics import BY_FIELD, TOPICS
-from flowrec.units import seconds
+from flowrec.store import Session, field_values, observed_flow
 
 _RUN = "^[=+\\-@\t\r'＝＋－＠]"  # what a text begins with that a spreadsheet may take for a formula
 _LEVEL = 1  # of zstd: a quarter of the time of level 3 for a tenth more bytes
 
 
 class _Tables:
-    """What both formats share: implements flowrec.exports.formats.Exporter but for the writer of a file."""
+    """Base of both formats: implements flowrec.exports.formats.Exporter but for the writer of a file."""
 
     suffixes = ("",)
     folder = True
     suffix: str
 
     @abstractmethod
-    def opened(self, path: Path, schema: pa.Schema) -> Any:
+    def open_writer(self, path: Path, schema: pa.Schema) -> Any:
         """A writer of record batches with that schema, as a context manager with `write`."""
 
-    def kept(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
+    def select(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
         """The columns that the format holds."""
         return table
 
     def write(self, session: Session, part: Path, progress: Callable[[float], None]) -> None:
-        topics = [topic.field for topic in TOPICS if session.topics.get(topic.path)]
+        known = session.reader.topics
+        topics = [topic.field for topic in known.topics if session.topics.get(topic.path)]
         if not topics:
             raise SessionError(f"{session.path}: holds no messages, so there are no tables; see flowrec info")
         begin_s = seconds(session.run.first_ns)
@@ -54,18 +50,26 @@ class _Tables:
         with ExitStack() as stack:
             writers: dict[str, Any] = {}
             for topic in topics:
-                name, schema = topic + self.suffix, self.kept(schema_of(topic))
-                writers[topic] = stack.enter_context(self.opened(part / name, schema))
-                about[name] = schema, f"{summary_of(BY_FIELD[topic].type)}; {BY_FIELD[topic].path}, a row a message"
+                name, schema = _file_stem(topic) + self.suffix, self.select(session.schema(topic))
+                writers[topic] = stack.enter_context(self.open_writer(part / name, schema))
+                about[name] = (
+                    schema,
+                    f"{summary_of(known.by_field[topic].type)}; {known.by_field[topic].path}, a row a message",
+                )
             for topic, batch in session.batches(topics):
-                writers[topic].write(self.kept(batch))
+                writers[topic].write(self.select(batch))
                 progress(batch.column("time_s")[-1].as_py() - begin_s)
         for name, table, meaning in _places(session):
-            with self.opened(part / (name + self.suffix), table.schema) as writer:
+            with self.open_writer(part / (name + self.suffix), table.schema) as writer:
                 for batch in table.to_batches():
                     writer.write(batch)
             about[name + self.suffix] = table.schema, meaning
         write_datapackage(part, session, about)
+
+
+def _file_stem(topic: str) -> str:
+    """File stem of the table of a topic: its field or, of an extra one, its path with dots, so all differ."""
+    return f"extra{topic.replace('/', '.')}" if topic.startswith("/") else topic
 
 
 def _places(session: Session) -> Iterator[tuple[str, pa.Table, str]]:
@@ -85,13 +89,13 @@ class ParquetExport(_Tables):
     suffix = ".parquet"
     advice = "a table a topic, for pandas.read_parquet, DuckDB and others, is in"
 
-    def opened(self, path: Path, schema: pa.Schema) -> Any:
+    def open_writer(self, path: Path, schema: pa.Schema) -> Any:
         writer = pyarrow.parquet.ParquetWriter(path, schema, compression="zstd", compression_level=_LEVEL)
         return _Batches(writer)
 
 
 class _Batches:
-    """Of a ParquetWriter, with the method names that CSVWriter has."""
+    """Adapter of a ParquetWriter to the method names of CSVWriter."""
 
     def __init__(self, writer: Any) -> None:
         self._writer = writer
@@ -119,11 +123,11 @@ class CsvExport(_Tables):
     suffix = ".csv"
     advice = "a table a topic, for spreadsheets and everything else, is in"
 
-    def opened(self, path: Path, schema: pa.Schema) -> Any:
+    def open_writer(self, path: Path, schema: pa.Schema) -> Any:
         flat = pa.schema([field if not pa.types.is_nested(field.type) else _text(field) for field in schema])
         return pyarrow.csv.CSVWriter(path, flat)
 
-    def kept(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
+    def select(self, table: pa.RecordBatch | pa.Table | pa.Schema) -> Any:
         schema = table if isinstance(table, pa.Schema) else table.schema
         kept = [field for field in schema if not _is_raster(field.type)]
         if table is schema:
@@ -148,7 +152,7 @@ def _text(field: pa.Field) -> pa.Field:
 
 
 def _is_raster(kind: pa.DataType) -> bool:
-    """Whether the cells of a column are arrays of float32: fields on the pixels of the chip, and looks of the robot."""
+    """True if the cells of a column are arrays of float32: fields on the pixels of the chip, and looks of the robot."""
     while pa.types.is_nested(kind):
         kind = kind.value_type
     return bool(pa.types.is_float32(kind))

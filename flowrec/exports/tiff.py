@@ -13,13 +13,10 @@ from typing import Any
 
 import tifffile
 
-from flowrec.declarations import Image
-from flowrec.errors import SessionError
+from flowrec.core import Image, SessionError, seconds
 from flowrec.exports.camera_images import GreyScale, first_frame, image_stamps, notes_of, title_of, with_images
-from flowrec.movies.notes import MovieNotes
-from flowrec.movies.ome import NAMESPACE
-from flowrec.session import Session
-from flowrec.units import seconds
+from flowrec.movies import NAMESPACE, MovieNotes
+from flowrec.store import Session
 
 _BIG_BYTES = 3_900_000_000  # of pixels; a plain TIFF ends at 4 GiB, and headers and the text are in it, too
 _LEVEL = 3  # of Deflate

@@ -17,10 +17,8 @@ import numcodecs
 import numpy as np
 import zarr
 
-from flowrec.errors import SessionError
-from flowrec.session import Session
-from flowrec.tables.columns import columns_of
-from flowrec.units import seconds
+from flowrec.core import SessionError, seconds
+from flowrec.store import Session, columns_of
 
 _CHUNK_BYTES = 8 << 20
 _FORMAT = 2

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
+from flowrec.core import BoundedProcess, Image, MovieError
 from flowrec.movies.movie import MOVIE_READERS, Movie, MovieFacts, ReadOptions
-from flowrec.system.bounded_process import BoundedProcess
 
 _CPU_S = 60.0  # to open it, and for each image; a chunk of a gigabyte takes some 5 s
 _open: list[Movie] = []  # of the child: the movie that it reads
@@ -20,7 +18,7 @@ class BoundedMovie(Movie):
         super().__init__(path, options)
         self._process = BoundedProcess(str(path), _CPU_S, error=MovieError)
         try:
-            self.facts = self._process.call(_opened, path, reader, options)
+            self.facts = self._process.call(_open_movie, path, reader, options)
         except BaseException:
             self._process.close()
             raise
@@ -32,7 +30,7 @@ class BoundedMovie(Movie):
         self._process.close()
 
 
-def _opened(path: Path, reader: str, options: ReadOptions) -> MovieFacts:
+def _open_movie(path: Path, reader: str, options: ReadOptions) -> MovieFacts:
     movie: Movie = MOVIE_READERS[reader].load()(path, options)
     _open.append(movie)
     return movie.facts

@@ -11,8 +11,7 @@ import numpy as np
 from PIL import Image as Header
 from PIL import UnidentifiedImageError
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
+from flowrec.core import Image, MovieError
 from flowrec.movies.grey import grey_image
 from flowrec.movies.movie import MOST_PIXELS, Movie, MovieFacts, ReadOptions, checked_size, depth_of
 
@@ -31,7 +30,7 @@ class FolderMovie(Movie):
             kinds = ", ".join(suffix.lstrip(".") for suffix in SUFFIXES)
             raise MovieError(f"{path}: no image is in this folder; images are {kinds}")
         first = self._header(self._files[0])
-        array = _decoded(self._files[0])
+        array = _decode(self._files[0])
         significant = 16 if array.dtype == np.uint16 else 8
         remarks = []
         if significant == 16 and options.bits is None:
@@ -59,7 +58,7 @@ class FolderMovie(Movie):
                 f"{file}: has {width} x {height} pixels, {self._files[0].name} {facts.width_px} x {facts.height_px}; "
                 "images of a movie have one size: move the others to a folder of their own"
             )
-        array = _decoded(file)
+        array = _decode(file)
         if array.ndim == 3:
             array = array[..., [2, 1, 0, *range(3, array.shape[2])]]  # OpenCV puts blue first
         return grey_image(array, self.options.channel, facts.bits, file, index)
@@ -107,7 +106,7 @@ def natural(name: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(0, int(part), "") if part.isdecimal() and len(part) < 4000 else (1, 0, part) for part in parts], name
 
 
-def _decoded(file: Path) -> np.ndarray:
+def _decode(file: Path) -> np.ndarray:
     data = np.fromfile(file, np.uint8)  # OpenCV itself does not open every name
     array = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size else None
     if array is None:

@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.errors import MovieError
+from flowrec.core import DATES, NS_PER_S, TIME_UNITS, MovieError, Table, read_table
 from flowrec.movies.movie import MovieFacts, whole_ns
-from flowrec.system.table_file import DATES, TIME_UNITS, Table, read_table
-from flowrec.units import NS_PER_S
 
 _MOST_IMAGES = 1 << 40
 

@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
-from flowrec.messages import pixel_type
+from flowrec.core import Image, MovieError, pixel_type
 
 CHANNELS = ("red", "green", "blue", "grey")
 

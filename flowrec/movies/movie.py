@@ -14,12 +14,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
-from flowrec.messages import PIXEL_BITS, pixel_type
-from flowrec.methods import Method, Methods
+from flowrec.core import NS_PER_S, PIXEL_BITS, Image, Method, Methods, MovieError, pixel_type
 from flowrec.movies.notes import MovieNotes
-from flowrec.units import NS_PER_S
 
 # A row's class is made with (path, options) and is a Movie.
 MOVIE_READERS = Methods(
@@ -52,7 +48,7 @@ class MovieFrame:
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """How a movie is read.
+    """Options for reading a movie.
 
     Attributes
     ----------
@@ -68,7 +64,7 @@ class ReadOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovieFacts:
-    """What a file tells of itself.
+    """Metadata of a movie file.
 
     Attributes
     ----------

@@ -13,8 +13,7 @@ import nd2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
+from flowrec.core import Image, MovieError
 from flowrec.movies.grey import grey_image
 from flowrec.movies.movie import (
     Movie,

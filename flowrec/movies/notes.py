@@ -1,4 +1,4 @@
-"""What flowrec writes of a session into the movies that it exports, so that `flowrec import` need not be told.
+"""Metadata of a session in the movies that flowrec exports, so that `flowrec import` need not be told.
 
 It is JSON: the description of an MP4 file, and a structured annotation in OME-TIFF.
 """
@@ -13,8 +13,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from flowrec.errors import MovieError
-from flowrec.system.toml_file import parse_toml
+from flowrec.core import MovieError, parse_toml
 
 _KEY, _VERSION = "flowrec_movie", 1
 _MOST_CHARACTERS = 32_000_000
@@ -23,7 +22,7 @@ _LARGEST_NS = 1 << 62
 
 @dataclass(frozen=True, slots=True)
 class MovieNotes:
-    """What a movie file says of the session that it was exported from.
+    """Metadata of the session that a movie was exported from.
 
     Attributes
     ----------
@@ -70,7 +69,7 @@ class MovieNotes:
         return float(radius) if isinstance(radius, (int, float)) and math.isfinite(radius) and radius > 0.0 else None
 
     def chip_files(self) -> tuple[bytes, str]:
-        """PNG and TOML of the chip, see chip/io.py."""
+        """PNG and TOML of the chip, see physics/chip/io.py."""
         return base64.b64decode(self.chip_png), self.chip_toml
 
 
@@ -86,7 +85,7 @@ def notes_in(text: str, path: Path) -> MovieNotes | None:
     try:
         tree = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise _damaged(path, f"no JSON, {error}") from error
+        raise _damage_error(path, f"no JSON, {error}") from error
     if not isinstance(tree, dict) or _KEY not in tree:
         return None
     if tree[_KEY] != _VERSION:
@@ -96,12 +95,12 @@ def notes_in(text: str, path: Path) -> MovieNotes | None:
     given: dict[str, Any] = {each.name: tree.get(each.name) for each in fields(MovieNotes)}
     wrong = next((name for name, value in given.items() if not _fits(name, value)), None)
     if wrong is not None:
-        raise _damaged(path, f"{wrong} is {str(given[wrong])[:40]!r}")
+        raise _damage_error(path, f"{wrong} is {str(given[wrong])[:40]!r}")
     notes = MovieNotes(**given)
     try:
         notes.chip_files()
     except (binascii.Error, ValueError) as error:
-        raise _damaged(path, "chip_png is not base64") from error
+        raise _damage_error(path, "chip_png is not base64") from error
     return notes
 
 
@@ -128,7 +127,7 @@ def _fits(name: str, value: Any) -> bool:
     return type(value).__name__ == kind
 
 
-def _damaged(path: Path, why: str) -> MovieError:
+def _damage_error(path: Path, why: str) -> MovieError:
     return MovieError(
         f"{path}: what flowrec wrote into it is damaged ({why}); export it again, or remove its description"
     )

@@ -1,4 +1,4 @@
-"""What OME-XML says of the planes: acquisition times, pixel size, significant bits."""
+"""Reader of OME-XML: acquisition times of the planes, pixel size, significant bits."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def ome_facts(xml: str, frames: int) -> OmeFacts:
     bits = _number(given.get("SignificantBits"))
     return OmeFacts(
         _times_s(pixels, frames),
-        _scaled(given.get("TimeIncrement"), given.get("TimeIncrementUnit", "s"), _S_PER),
-        _scaled(given.get("PhysicalSizeX"), given.get("PhysicalSizeXUnit", "µm"), _UM_PER),
+        _scale(given.get("TimeIncrement"), given.get("TimeIncrementUnit", "s"), _S_PER),
+        _scale(given.get("PhysicalSizeX"), given.get("PhysicalSizeXUnit", "µm"), _UM_PER),
         int(bits) if bits is not None and 1 <= bits <= 16 else None,
     )
 
@@ -51,7 +51,7 @@ def annotation_in(xml: str) -> str:
 
 
 def declared_planes(xml: str) -> int:
-    """How many planes the images of an OME-XML text declare in all, whether they exist or not; at least 1."""
+    """Number of planes that the images of an OME-XML text declare, whether they exist or not; at least 1."""
     root = _root(xml)
     if root is None:
         return 1
@@ -91,7 +91,7 @@ def _times_s(pixels: ElementTree.Element, frames: int) -> NDArray[np.float64] | 
     axis = "TheT" if len({each.get("TheT") for each in planes}) > 1 else "TheZ"
     found: dict[int, float] = {}
     for each in planes:
-        number, time_s = _number(each.get(axis)), _scaled(each.get("DeltaT"), each.get("DeltaTUnit", "s"), _S_PER)
+        number, time_s = _number(each.get(axis)), _scale(each.get("DeltaT"), each.get("DeltaTUnit", "s"), _S_PER)
         if number is not None and time_s is not None:
             found.setdefault(int(number), time_s)
     if len(found) < frames or any(number not in found for number in range(frames)):
@@ -99,7 +99,7 @@ def _times_s(pixels: ElementTree.Element, frames: int) -> NDArray[np.float64] | 
     return np.array([found[number] for number in range(frames)])
 
 
-def _scaled(text: str | None, unit: str, factors: dict[str, float]) -> float | None:
+def _scale(text: str | None, unit: str, factors: dict[str, float]) -> float | None:
     number, factor = _number(text), factors.get(unit)
     return None if number is None or factor is None else number * factor
 

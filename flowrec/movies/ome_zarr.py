@@ -9,8 +9,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
+from flowrec.core import Image, MovieError, refuse_irregular
 from flowrec.movies.grey import grey_image, refuse_other_type
 from flowrec.movies.movie import (
     Movie,
@@ -23,7 +22,6 @@ from flowrec.movies.movie import (
     whole_ns,
 )
 from flowrec.movies.ome import OmeFacts, ome_facts, seconds_per, um_per
-from flowrec.system.regular_file import refuse_irregular
 
 _LARGEST_CHUNK_BYTES = 1 << 30
 _XML = Path("OME", "METADATA.ome.xml")
@@ -38,7 +36,7 @@ class ZarrMovie(Movie):
             if not each.is_dir():
                 refuse_irregular(each, MovieError)
         try:
-            self._array, axes, scale, self._ome = _found(path)
+            self._array, axes, scale, self._ome = _find_array(path)
         except MovieError:
             raise
         except Exception as error:
@@ -115,7 +113,7 @@ class ZarrMovie(Movie):
         return plane
 
 
-def _found(path: Path) -> tuple[Any, list[str], list[tuple[float, str | None]], OmeFacts]:
+def _find_array(path: Path) -> tuple[Any, list[str], list[tuple[float, str | None]], OmeFacts]:
     """The array, the names of its axes, their scales with units, and what OME-XML beside it says."""
     node = zarr.open(str(path), mode="r")
     if isinstance(node, zarr.Array):

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flowrec.errors import MovieError
+from flowrec.core import MovieError, refuse_irregular
 from flowrec.movies.bounded import BoundedMovie
 from flowrec.movies.movie import MOVIE_READERS, Movie, ReadOptions
-from flowrec.system.regular_file import refuse_irregular
 
 _BEGINNINGS = {
     b"II*\0": "tiff",

@@ -12,8 +12,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
+from flowrec.core import Image, MovieError
 from flowrec.movies.grey import grey_image, refuse_other_type
 from flowrec.movies.movie import Movie, MovieFacts, ReadOptions, checked_count, checked_size, depth_of, whole_ns
 from flowrec.movies.notes import notes_in, refuse_drawn
@@ -30,7 +29,7 @@ class TiffMovie(Movie):
         super().__init__(path, options)
         with ExitStack() as refused:
             try:
-                with _logged() as complaints:
+                with _collect_errors() as complaints:
                     self._file = refused.enter_context(tifffile.TiffFile(path))
                     if self._file.is_ome:  # before tifffile makes a list of all that the text declares
                         checked_count(path, declared_planes(self._file.ome_metadata or ""))
@@ -132,7 +131,7 @@ class TiffMovie(Movie):
     def image(self, index: int) -> Image:
         page = self._pages[index]
         try:
-            array = np.asarray(page) if isinstance(page, np.ndarray) else _decoded(page)
+            array = np.asarray(page) if isinstance(page, np.ndarray) else _decode(page)
         except Exception as error:  # of many kinds, by the codec
             raise MovieError(f"{self.path}: image {index} can not be decoded ({error})") from error
         if array.ndim == 3 and array.shape[0] in (3, 4) and array.shape[2] not in (3, 4):  # one plane per colour
@@ -140,7 +139,7 @@ class TiffMovie(Movie):
         return grey_image(array, self.options.channel, self.facts.bits, self.path, index)
 
 
-def _decoded(page: Any) -> NDArray[Any]:
+def _decode(page: Any) -> NDArray[Any]:
     """The pixels of a page; tifffile has closed the other files of an OME series."""
     file = page.parent.filehandle
     was_closed = file.closed
@@ -154,8 +153,8 @@ def _decoded(page: Any) -> NDArray[Any]:
 
 
 @contextmanager
-def _logged() -> Iterator[list[str]]:
-    """What tifffile logs as an error: it goes on with the pages that it has found."""
+def _collect_errors() -> Iterator[list[str]]:
+    """Collect the errors that tifffile logs: it goes on with the pages that it has found."""
     complaints: list[str] = []
     handler = logging.Handler(logging.ERROR)
     handler.emit = lambda record: complaints.append(record.getMessage().rpartition("> ")[2])  # type: ignore[method-assign]

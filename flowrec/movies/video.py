@@ -17,13 +17,10 @@ import av.logging
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import MovieError
-from flowrec.messages import pixel_type
+from flowrec.core import NS_PER_S, Image, MovieError, pixel_type
 from flowrec.movies.grey import CHANNELS, grey_image, refuse_colour
 from flowrec.movies.movie import Movie, MovieFacts, MovieFrame, ReadOptions, checked_size, depth_of
 from flowrec.movies.notes import notes_in, refuse_drawn
-from flowrec.units import NS_PER_S
 
 _LOSSLESS = {
     "ffv1",
@@ -42,6 +39,7 @@ _LOSSLESS |= {"v210", "v410", "r210", "flashsv", "bmp", "cscd", "msrle", "rle", 
 _ONLY_LOGS = ("ffv1",)  # decoders that replace a damaged part by that of the image before, and only log it
 _NOMINAL = ("avi",)  # containers that state a rate only, not the time of each image
 _RANGES = {1: "limited range, 16 to 235 as stored", 2: "full range"}
+_ROUNDED_MS = 1.1  # difference of equal intervals in a container that rounds times to whole ms
 _GREY_CHROMA = 4  # largest deviation of a chroma sample from its middle in a grey movie, in 8-bit levels
 _COLOURED_SHARE = 1e-3  # fraction of chroma samples beyond it from which on the movie is in colour
 _PLANAR_LUMA = (
@@ -69,7 +67,7 @@ class VideoMovie(Movie):
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
         super().__init__(path, options)
-        self._container, self._stream = _opened(path)
+        self._container, self._stream = _open_stream(path)
         try:
             self.facts = self._facts()
         except BaseException:
@@ -102,7 +100,7 @@ class VideoMovie(Movie):
         if timed and (not nominal or rate):
             times = np.array([self._time_ns(p) for p in self._pts], np.int64)
             text = _times_text(times, nominal, float(rate) if rate else 0.0)
-        promised = self._promised(times)
+        promised = self._header_frames(times)
         if promised > len(pts) or damaged:
             why = f"breaks off: its header promises {max(promised, len(pts))} images, {len(pts) - damaged} are there"
             self.broken_off(len(pts) - damaged, why)
@@ -143,11 +141,11 @@ class VideoMovie(Movie):
             self.broken_off(len(pts), f"breaks off after {len(pts)} images ({_text(error)})", error)
         return pts, damaged
 
-    def _promised(self, times: NDArray[np.int64] | None) -> int:
-        """How many images the header promises; 0 if it does not."""
+    def _header_frames(self, times: NDArray[np.int64] | None) -> int:
+        """Number of images that the header states; 0 if it states none."""
         if self._stream.frames:
             return int(self._stream.frames)
-        # Matroska states a duration, which ends with the last image or, of unequal intervals, near it.
+        # Matroska states a duration, which ends with the last image or, of unequal intervals, within 3.5 of them.
         duration = self._container.duration
         if times is None or len(times) < 3 or duration is None or len(self._container.streams) > 1:
             return 0
@@ -174,9 +172,9 @@ class VideoMovie(Movie):
 
     def frames(self) -> Iterator[MovieFrame]:
         count = 0
-        container, stream = _opened(self.path)
+        container, stream = _open_stream(self.path)
         try:
-            for frame in self._decoded(container, stream):
+            for frame in self._decode(container, stream):
                 if count == self.facts.frames:
                     break  # what follows is cut off
                 time_ns = (
@@ -193,7 +191,7 @@ class VideoMovie(Movie):
         if not count:
             raise MovieError(f"{self.path}: no image of it can be decoded; the file is damaged")
 
-    def _decoded(self, container: Any, stream: Any) -> Iterator[Any]:
+    def _decode(self, container: Any, stream: Any) -> Iterator[Any]:
         frames = container.decode(stream)
         while True:
             with _complaints(stream) as complaints:
@@ -208,10 +206,10 @@ class VideoMovie(Movie):
         if not self._pts:
             return next(each.image for each in self.frames() if each.index == index)
         target = self._pts[index]
-        container, stream = _opened(self.path)
+        container, stream = _open_stream(self.path)
         try:
             container.seek(target, stream=stream, backward=True)
-            for frame in self._decoded(container, stream):
+            for frame in self._decode(container, stream):
                 if frame.pts is not None and frame.pts >= target:
                     return self._grey(frame, index)
         except av.FFmpegError as error:
@@ -235,12 +233,12 @@ class VideoMovie(Movie):
         if luma is None:
             array = frame.to_ndarray(format="rgb24" if frame.format.components[0].bits <= 8 else "rgb48le")
             return grey_image(array, channel, facts.bits, self.path, index)
-        if channel is None and _coloured(frame):
+        if channel is None and _has_colour(frame):
             raise refuse_colour(self.path, index)
         return grey_image(luma[: facts.height_px, : facts.width_px], channel, facts.bits, self.path, index)
 
 
-def _opened(path: Path) -> tuple[Any, Any]:
+def _open_stream(path: Path) -> tuple[Any, Any]:
     """The container and its video stream, with a decoder that reports damaged data instead of concealing it."""
     try:
         container = av.open(str(path), options={"err_detect": "explode"})
@@ -259,7 +257,7 @@ def _opened(path: Path) -> tuple[Any, Any]:
 
 @contextmanager
 def _complaints(stream: Any) -> Iterator[list[str]]:
-    """What a decoder of _ONLY_LOGS logs as an error. It decodes in this thread: libav logs under Python's lock."""
+    """Collect what a decoder of _ONLY_LOGS logs as an error. It decodes in this thread: libav logs under the GIL."""
     complaints: list[str] = []
     if stream.codec_context.name not in _ONLY_LOGS:
         yield complaints
@@ -275,14 +273,16 @@ def _complaints(stream: Any) -> Iterator[list[str]]:
 
 
 def _times_text(times: NDArray[np.int64], nominal: bool, rate_hz: float) -> str:
-    """Where the times come from."""
+    """Origin of the times, as text."""
     if nominal:
         return f"the file's nominal rate, {rate_hz:g} Hz; it does not say when each image was taken"
     steps_ms = np.diff(times) / 1e6
     if not len(steps_ms):
         return "presentation times"
     low, high = steps_ms.min(), steps_ms.max()
-    spread = f"intervals of {low:.4g} to {high:.4g} ms" if high - low > 1.1 else f"every {steps_ms.mean():.4g} ms"
+    spread = (
+        f"intervals of {low:.4g} to {high:.4g} ms" if high - low > _ROUNDED_MS else f"every {steps_ms.mean():.4g} ms"
+    )
     return f"presentation times, {spread}"
 
 
@@ -302,8 +302,8 @@ def _luma(frame: Any) -> NDArray[Any] | None:
     return samples >> (16 - frame.format.components[0].bits) if name.startswith(_HIGH_BITS) else samples
 
 
-def _coloured(frame: Any) -> bool:
-    """Whether chroma samples differ from grey by more than the noise of a lossy codec."""
+def _has_colour(frame: Any) -> bool:
+    """True if chroma samples differ from grey by more than the noise of a lossy codec."""
     name, bits = frame.format.name, frame.format.components[0].bits
     if name.startswith("gray"):
         return False

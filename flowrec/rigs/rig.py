@@ -12,11 +12,8 @@ from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from flowrec.declarations import Image
-from flowrec.errors import RigError
-from flowrec.messages import Currents, Frame
-from flowrec.pipeline import Inputs
-from flowrec.units import seconds
+from flowrec.core import Currents, Frame, Image, RigError, seconds
+from flowrec.stages import Inputs
 
 _ROW_STEP = 16  # a camera's noise changes some pixel of these rows in every image
 _REJECTED_LIMIT = 50  # frames in a row, then the robot is out of control
@@ -88,7 +85,8 @@ class Picturing(Protocol):
 def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callable[[], None]) -> Iterator[Inputs]:
     """Inputs whose stamps increase; `rejected` is called for every other one.
 
-    The turns of a rejected frame are added to those of the next one, so that no rotation of the field is lost.
+    The turns of a rejected frame are added to those of the next one, so that no rotation of the field is lost; its
+    messages of extra topics come with the next one.
 
     Raises
     ------
@@ -97,8 +95,7 @@ def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callabl
     lost: list[Inputs] = []
     for arrived in inputs:
         if arrived.stamp_ns > after_ns:
-            turns = sum((one.applied.turns for one in lost), arrived.applied.turns)
-            yield replace(arrived, applied=replace(arrived.applied, turns=turns)) if lost else arrived
+            yield _with_lost(arrived, lost) if lost else arrived
             after_ns = arrived.stamp_ns
             lost.clear()
             continue
@@ -109,6 +106,12 @@ def increasing_stamps(inputs: Iterator[Inputs], after_ns: int, rejected: Callabl
                 f"the rig's frames have gone back in time by {seconds(after_ns - arrived.stamp_ns):.3f} s, {len(lost)}"
                 " in a row; see to the camera's clock, then record again"
             )
+
+
+def _with_lost(arrived: Inputs, lost: list[Inputs]) -> Inputs:
+    turns = sum((one.applied.turns for one in lost), arrived.applied.turns)
+    extra = {path: message for one in (*lost, arrived) for path, message in one.extra.items()}
+    return replace(arrived, applied=replace(arrived.applied, turns=turns), extra=extra)
 
 
 def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int], bits: int = 8) -> Iterator[Inputs]:
@@ -143,6 +146,6 @@ def checked_images(inputs: Iterator[Inputs], image_shape: tuple[int, int], bits:
 
 
 def _same(one: Frame, other: Frame) -> bool:
-    """Whether two images are equal. A few rows are compared first, so that a new image costs microseconds."""
+    """True if two images are equal. A few rows are compared first, so that a new image costs microseconds."""
     a, b = one.image, other.image
     return np.array_equal(a[::_ROW_STEP], b[::_ROW_STEP]) and np.array_equal(a, b)

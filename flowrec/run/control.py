@@ -19,10 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from flowrec.enums import Action
-from flowrec.errors import UsageError
-from flowrec.messages import OperatorEvent
-from flowrec.units import NS_PER_S
+from flowrec.core import NS_PER_S, Action, OperatorEvent, UsageError
 
 Result = TypeVar("Result")
 
@@ -159,7 +156,7 @@ class RunControl:
 
     @property
     def pending(self) -> bool:
-        """Whether events wait for a tick."""
+        """True if events wait for a tick."""
         return bool(self._waiting)
 
     @property
@@ -169,7 +166,7 @@ class RunControl:
 
     @property
     def overdue(self) -> bool:
-        """Whether the run should have ended by now, and its field is off."""
+        """True if the run should have ended by now, and its field is off."""
         return self._zero_sent
 
     @contextmanager
@@ -205,7 +202,7 @@ class RunControl:
 
     @property
     def must_interrupt(self) -> bool:
-        """Whether the loop must end and can: `Interrupted` may be raised in its thread."""
+        """True if the loop must end and can: `Interrupted` may be raised in its thread."""
         if not self.reason:
             return False
         late = self._late_s() > RAMP_PATIENCE_S + _TICK_PATIENCE_S or not self.ticking
@@ -213,7 +210,7 @@ class RunControl:
 
     @property
     def stuck(self) -> bool:
-        """Whether the loop's thread is in a call that does not return: the loop should have ended long ago."""
+        """True if the loop's thread is in a call that does not return: the loop should have ended long ago."""
         return self._looping and self._late_s() > _STUCK_S
 
     def _late_s(self) -> float:
@@ -222,7 +219,7 @@ class RunControl:
 
 
 class _Block:
-    """Whether a thread is in a block; entered and left a few times a tick."""
+    """True if a thread is in a block; entered and left a few times a tick."""
 
     def __init__(self) -> None:
         self.entered = False

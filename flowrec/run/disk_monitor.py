@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError
 
 _PERIOD_S = 1.0
 _SAMPLES = 30  # over which the rate is taken

@@ -31,7 +31,7 @@ _ESCAPE, _ENTER, _RUBOUT, _KILL_LINE = "\x1b", ("\r", "\n"), ("\x7f", "\x08"), "
 
 
 class Keyboard:
-    """What the keys mean, independent of the terminal.
+    """Meaning of the keys, independent of the terminal.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class _Terminal:
                 termios.tcsetattr(self.descriptor, termios.TCSANOW, self._found)
 
     def _in_foreground(self) -> bool:
-        """Whether this process is in the foreground; in the background, reading the terminal would stop the run."""
+        """True if this process is in the foreground; in the background, reading the terminal would stop the run."""
         try:
             return os.tcgetpgrp(self.descriptor) == os.getpgrp()
         except OSError:

@@ -12,17 +12,25 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from flowrec.clocks import ClockMonitor
-from flowrec.diagnostics import Timing
-from flowrec.enums import Action, Outcome, Phase
-from flowrec.messages import Applied, OperatorEvent
-from flowrec.pipeline import Inputs, Pipeline, step, with_inputs
-from flowrec.rigs.rig import Rig, checked_images, increasing_stamps
+from flowrec.core import (
+    NS_PER_S,
+    Action,
+    Applied,
+    ClockMonitor,
+    OperatorEvent,
+    Outcome,
+    Phase,
+    Tick,
+    Timing,
+    nanoseconds,
+    seconds,
+)
+from flowrec.rigs import Rig, checked_images, increasing_stamps
 from flowrec.run.control import RunControl
+from flowrec.run.streams import Streams
 from flowrec.run.watchdog import Watchdog
 from flowrec.run.workers import Results, Worker
-from flowrec.topics import Tick
-from flowrec.units import NS_PER_S, nanoseconds, seconds
+from flowrec.stages import Inputs, Pipeline, recorded_extra, step, with_inputs
 
 SWITCH_S = 1e-4
 _END_NS, _AFTER_NS = NS_PER_S // 1000, NS_PER_S // 2  # from the last frame to the tick of its end; between later ticks
@@ -37,7 +45,7 @@ class Sink(Protocol):
 
 @dataclass(slots=True)
 class RunReport:
-    """How a run went, for the outcome record and the summary."""
+    """Figures of a run, for the outcome record and the summary."""
 
     outcome: str = Outcome.TIME_OVER
     note: str = ""
@@ -81,6 +89,7 @@ def run(
     clocks: ClockMonitor | None = None,
     watchdog: Watchdog | None = None,
     paced: bool = False,
+    streams: Streams | None = None,
 ) -> RunReport:
     """Run until the rig ends, the mission is finished and the coils are at zero, or `control` stops the run.
 
@@ -89,6 +98,9 @@ def run(
     However it ends, the watchdog takes the field away before anything else is done. A stage that fails leaves its
     inputs, and only those, as the last tick in the sinks. A frame whose stamp does not increase enters no stage and is
     counted.
+
+    Long because one tick's calls stand in the order in which they may fail: the commands after all stages, the sinks
+    after the commands. They share the ticks, the times and the report.
 
     Parameters
     ----------
@@ -99,6 +111,7 @@ def run(
     clocks : records the clocks, and the frames whose stamp did not increase.
     watchdog : that of this rig; None: one without a timer.
     paced : the worker takes real time, and the ticks after the end of the rig wait for it.
+    streams : of other programs and devices, whose messages join the inputs.
 
     Raises
     ------
@@ -129,6 +142,8 @@ def run(
         stack.callback(watchdog.field_off)
         stack.enter_context(control.interrupted_when_overdue())
         arriving = increasing_stamps(rig.inputs(), tick.stamp_ns, reject)
+        if streams is not None:
+            arriving = stack.enter_context(streams).joined(arriving)
         if live:
             arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
             arriving = _and_afterwards(arriving, lambda: tick, paced=paced)
@@ -147,7 +162,7 @@ def run(
                     tick = step(pipeline, last, inputs, watch.lap)
             except Exception:
                 watchdog.take_away()
-                _write(sinks, with_inputs(last, inputs))
+                _write(sinks, with_inputs(last, inputs, pipeline.topics))
                 raise
             mission, currents = tick.mission, tick.currents
             assert mission is not None and currents is not None
@@ -168,7 +183,12 @@ def run(
                 dropped_frames=dropped,
             )
             recorded = replace(
-                tick, timing=timing, truth=inputs.truth, true_field=inputs.true_field, losses=inputs.losses
+                tick,
+                timing=timing,
+                truth=inputs.truth,
+                true_field=inputs.true_field,
+                losses=inputs.losses,
+                extra=recorded_extra(tick, inputs, pipeline.topics),
             )
             if clocks is not None:
                 recorded = replace(recorded, clocks=clocks.update(tick.stamp_ns, inputs.clock))
@@ -208,7 +228,7 @@ def _and_afterwards(arriving: Iterator[Inputs], state: Callable[[], Tick], *, pa
             return
         if paced and ended:
             time.sleep(seconds(_AFTER_NS))
-        stamp_ns, zeros = last.stamp_ns + (_AFTER_NS if ended else _END_NS), np.zeros(3)
+        stamp_ns, zeros = last.stamp_ns + (_AFTER_NS if ended else _END_NS), np.zeros_like(applied.currents_a)
         nothing = Applied(stamp_ns, 0.0, 0.0, 0.0, zeros, np.zeros(2), applied.image_since_ns, stamp_ns)
         event = None if ended else OperatorEvent(stamp_ns, Action.END, "the frames have ended")
         yield Inputs(stamp_ns, None, nothing, operator=event)

@@ -1,11 +1,11 @@
-"""What an operator can ask of a run: one table for the keys of the terminal and the buttons of the console."""
+"""Commands of an operator to a run: one table for the keys of the terminal and the buttons of the console."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flowrec.enums import Action
+from flowrec.core import Action
 from flowrec.run.control import LONGEST_TEXT, RunControl
 
 LONGEST_NOTE = LONGEST_TEXT

@@ -7,16 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.enums import Phase
-from flowrec.estimation.kalman import memory_s
-from flowrec.flow.uncertainty import FlowUncertainty
-from flowrec.messages import Mission, Observations, Route
-from flowrec.pipeline import Pipeline
-from flowrec.planning.replanning import better_route, route_elsewhere
-from flowrec.planning.survey_design import Sampling, SurveyOrder
-from flowrec.robot import Robot
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.core import Mission, Observations, Phase, Route, Tick, seconds
+from flowrec.physics import FlowUncertainty, Robot
+from flowrec.stages import Pipeline, Sampling, SurveyOrder, better_route, memory_s, route_elsewhere
 
 _RECENT = 20  # observations, of which the noise of the next ones is expected
 

@@ -25,15 +25,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
-from typing import Any
 
+from flowrec.core import Priority, realtime_priority, said_within, status_of, stopped_by
 from flowrec.run.control import RunControl
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog
-from flowrec.system.endings import status_of, stopped_by
-from flowrec.system.processes import Priority, realtime_priority
-from flowrec.system.stderr import said_within
 
 assert sys.platform != "win32"  # there is no SIGHUP, SIGTSTP or pthread_kill
 
@@ -87,23 +84,33 @@ class Signals:
         always = [signal.SIGINT, signal.SIGTERM]
         wanted = [one for one in wanted if one in always or signal.getsignal(one) != signal.SIG_IGN]
         reading, writing = os.pipe()
+        os.set_blocking(reading, False)
         os.set_blocking(writing, False)
-        before: dict[int, Any] = {number: signal.signal(number, _nothing) for number in wanted}
-        before[signal.SIGALRM] = signal.signal(signal.SIGALRM, self._interrupt)
-        pipe_before = signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
-        thread = threading.Thread(target=self._listen, args=(reading,), name="signals", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            self._over = True
-            os.write(writing, b"\0")
-            thread.join()  # it may have to stop the process
-            signal.set_wakeup_fd(pipe_before)
-            for number, handler in before.items():
-                signal.signal(number, handler)
-            os.close(reading)
-            os.close(writing)
+        with ExitStack() as stack:
+            stack.callback(os.close, reading)
+            stack.callback(os.close, writing)
+            stack.callback(self._take_late, reading)
+            # The pipe outlasts the handlers: a signal that no handler of before sees is in it.
+            stack.callback(signal.set_wakeup_fd, signal.set_wakeup_fd(-1))
+            signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+            for number in wanted:
+                stack.callback(signal.signal, number, signal.signal(number, _nothing))
+            stack.callback(signal.signal, signal.SIGALRM, signal.signal(signal.SIGALRM, self._interrupt))
+            thread = threading.Thread(target=self._listen, args=(reading,), name="signals", daemon=True)
+            thread.start()
+            try:
+                yield
+            finally:
+                self._over = True
+                os.write(writing, b"\0")
+                thread.join()  # it may have to stop the process
+
+    def _take_late(self, pipe: int) -> None:
+        """The signals that came after the thread had ended: they end what follows the run."""
+        with suppress(BlockingIOError):
+            for number in os.read(pipe, 64):
+                if number in _ENDING:
+                    self._handle(number)
 
     def _interrupt(self, _number: int, _frame: FrameType | None) -> None:
         self._control.interrupt()

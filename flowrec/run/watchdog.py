@@ -19,9 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from flowrec.errors import RigError
-from flowrec.messages import Currents
-from flowrec.system.processes import Priority, realtime_priority
+from flowrec.core import Currents, Priority, RigError, realtime_priority
 
 ZERO_PATIENCE_S = 2.0  # time for zero() to succeed, with all its repetitions; then the run fails
 _RETRY_S = 0.02
@@ -29,7 +27,7 @@ _POLL_S = 0.002
 _IDLE_S = 0.5  # between checks without a timer
 
 
-class Coils(Protocol):
+class CoilOutput(Protocol):
     """The part of rigs.rig.Rig that the watchdog needs."""
 
     def apply(self, currents: Currents) -> None: ...
@@ -59,7 +57,7 @@ class Watchdog:
 
     def __init__(
         self,
-        rig: Coils,
+        rig: CoilOutput,
         timeout_s: float | None = None,
         tripped: Callable[[str], None] = lambda _reason: None,
         alarm: Callable[[str], None] = lambda _text: None,
@@ -163,7 +161,7 @@ class Watchdog:
 
     @property
     def off(self) -> bool:
-        """Whether every request for zero() is fulfilled."""
+        """True if every request for zero() is fulfilled."""
         return self._zeroed == self._requested
 
     def wait_off(self, timeout_s: float) -> bool:

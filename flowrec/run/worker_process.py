@@ -21,12 +21,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, BinaryIO
 
-from flowrec.errors import FlowrecError
-from flowrec.pipeline import Pipeline
-from flowrec.planning import warm_up
+from flowrec.core import WORKER_FIELDS, FlowrecError, Tick, child_command, child_environment
 from flowrec.run.workers import Result, Results, ordered, work
-from flowrec.system.processes import child_command, child_environment
-from flowrec.topics import WORKER_FIELDS, Tick
+from flowrec.stages import Pipeline, warm_up
 
 _NAME = "the process that solves and plans"
 _LOG_BYTES = 65_536  # the last part of what the process printed
@@ -131,7 +128,7 @@ class ProcessWorker:
         except OSError:
             pass  # it has ended; the receiver reports that
         except Exception as error:  # noqa: BLE001  the mission must not wait for an order that was never sent
-            self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_described(error)})"))
+            self._results.put(FlowrecError(f"{_NAME} can not be sent an order ({_describe(error)})"))
 
     def _receive(self) -> None:
         pipe = self._process.stdout
@@ -143,7 +140,7 @@ class ProcessWorker:
             self._results.put(FlowrecError(f"{_NAME} has ended unasked ({self._cause()}); {self._log()}"))
         except BaseException as error:  # noqa: BLE001  after any error the mission must not wait for ever
             self._results.put(
-                FlowrecError(f"{_NAME} gave an answer that can not be read ({_described(error)}); {self._log()}")
+                FlowrecError(f"{_NAME} gave an answer that can not be read ({_describe(error)}); {self._log()}")
             )
 
     def _cause(self) -> str:
@@ -168,7 +165,7 @@ class ProcessWorker:
         return f"see {name} for what it printed"
 
 
-def _described(error: BaseException) -> str:
+def _describe(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
@@ -183,7 +180,7 @@ def _answer(pipeline: Pipeline, order: Tick) -> bytes:
             pickle.loads(sent)  # noqa: S301 - an exception may be written without complaint and not be readable
             if isinstance(error, Exception):
                 return sent
-        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_described(error)})"), pickle.HIGHEST_PROTOCOL)
+        return pickle.dumps(FlowrecError(f"{_NAME} failed ({_describe(error)})"), pickle.HIGHEST_PROTOCOL)
 
 
 def _serve(orders: BinaryIO, results: BinaryIO) -> None:

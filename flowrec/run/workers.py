@@ -12,17 +12,24 @@ from typing import Protocol
 
 import numpy as np
 
-from flowrec.declarations import Message
-from flowrec.enums import Phase, WorkOrder
-from flowrec.errors import FlowError, NotFiniteError
-from flowrec.messages import FlowField, Mission, Route
-from flowrec.pipeline import Pipeline
-from flowrec.planning.route import no_route
-from flowrec.refine.refiner import kept
+from flowrec.core import (
+    ANSWERED_BY,
+    WORKER_FIELDS,
+    FlowError,
+    FlowField,
+    Message,
+    Mission,
+    NotFiniteError,
+    Observations,
+    Phase,
+    Route,
+    Tick,
+    WorkOrder,
+    nanoseconds,
+    one_blas_thread,
+)
 from flowrec.run.route_orders import observations_of, route, survey_route
-from flowrec.system.blas_threads import one_blas_thread
-from flowrec.topics import ANSWERED_BY, WORKER_FIELDS, Tick
-from flowrec.units import nanoseconds
+from flowrec.stages import Pipeline, keep_flow, no_route
 
 Result = FlowField | Route
 Results = Mapping[str, Result]  # by field of Tick
@@ -38,16 +45,20 @@ def ordered(tick: Tick) -> tuple[Mission, str]:
 def work(pipeline: Pipeline, order: Tick) -> Result:
     """Do what `order.mission` wants with what was known in that tick; the result has the order's stamp and number.
 
-    A result that is not finite, or that the numerics can not give, is refused: what is in use stays, and the result
-    says why (`refused`). Where nothing is in use yet the run ends with the error.
+    A result that is not finite, is made from what is not, or that the numerics can not give, is refused: what is in use
+    stays, and the result says why (`refused`). Where nothing is in use yet the run ends with the error.
 
     Raises
     ------
     FlowrecError : bad settings; nothing is in use that could stay.
     """
-    mission, _ = ordered(order)
+    mission, name = ordered(order)
     try:
-        result = _done(pipeline, order, mission)
+        for each in ("mission", *WORKER_FIELDS[name].reads):
+            message = getattr(order, each)
+            if message is not None and not isinstance(message, Observations):  # of those the finite ones count
+                message.refuse_not_finite()  # the numerics would raise anything, or return what is of no worth
+        result = _compute(pipeline, order, mission)
         return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
     except (NotFiniteError, np.linalg.LinAlgError) as error:
         if mission.wanted == WorkOrder.SOLVE:
@@ -56,18 +67,18 @@ def work(pipeline: Pipeline, order: Tick) -> Result:
     return replace(result, stamp_ns=mission.requested_ns, request=mission.request)
 
 
-def _done(pipeline: Pipeline, order: Tick, mission: Mission) -> Result:
+def _compute(pipeline: Pipeline, order: Tick, mission: Mission) -> Result:
     if mission.wanted == WorkOrder.SOLVE:
         solved = pipeline.solver.solve(pipeline.chip)
         return replace(solved, error_share=pipeline.refiner.prior_error_share(pipeline.chip, pipeline.solver))
     if mission.wanted == WorkOrder.REFINE:
-        return _refined(pipeline, order, mission)
+        return _refine(pipeline, order, mission)
     if mission.wanted == WorkOrder.SURVEY_ROUTE:
         return survey_route(pipeline, order, mission)
     return route(pipeline, order, mission)
 
 
-def _refined(pipeline: Pipeline, order: Tick, mission: Mission) -> FlowField:
+def _refine(pipeline: Pipeline, order: Tick, mission: Mission) -> FlowField:
     """The refined flow; on the way to the goal the one before, where the new one can not be computed."""
     assert order.assumed is not None and order.field is not None
     observations = observations_of(pipeline, order)
@@ -79,15 +90,15 @@ def _refined(pipeline: Pipeline, order: Tick, mission: Mission) -> FlowField:
             raise
         if refiner.adopt == "always":  # as sessions have it that were recorded before maps were tested
             return replace(order.refined, note=f"not refined again: {error}")
-        return kept(order.refined, str(error))
-    return refiner.chosen(found, order.field)
+        return keep_flow(order.refined, str(error))
+    return refiner.choose(found, order.field)
 
 
 def _in_use(pipeline: Pipeline, order: Tick, mission: Mission, why: str) -> Result:
-    """What is in use at an order whose result is refused; no route where the robot is not on one."""
+    """Result that stays in use at an order whose new one is refused; no route where the robot is not on one."""
     if mission.wanted == WorkOrder.REFINE:
         assert order.field is not None
-        return kept(order.field, why)
+        return keep_flow(order.field, why)
     if order.route is not None and mission.phase in (Phase.SURVEY, Phase.NAVIGATE):
         # A survey ends with this stretch: the next one would be refused as well.
         return replace(order.route, reason=f"route kept: {why}", more=False, refused=why)

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from mcap.records import ChunkIndex
 
-from flowrec.declarations import Message, shape_error
-from flowrec.errors import SessionError
+from flowrec.core import FIXED, Message, SessionError, TopicTable, seconds, shape_error
 from flowrec.store.channels import SessionContents
 from flowrec.store.digest import FileDigest
 from flowrec.store.mcap_format import Record
@@ -19,8 +18,6 @@ from flowrec.store.roi import Region
 from flowrec.store.run_files import RunFile, files_of
 from flowrec.store.scan import Scan, scan
 from flowrec.store.session_metadata import SessionHeader, SessionMetadata
-from flowrec.topics import BY_FIELD
-from flowrec.units import seconds
 
 See = Callable[[str, int, Message], None]  # field of Tick, time of the tick in ns, message
 
@@ -49,6 +46,7 @@ class Audit:
     region : which window of most images was recorded (roi.py); None: the images are not cut.
     edits : what differs from the digest that was recorded; None where there is no digest, or no end.
     missing : by field, messages that are missing between others, by their sequence numbers; not of images.
+    topics : those that this flowrec knows, and those that the file declares.
     """
 
     path: Path
@@ -73,6 +71,7 @@ class Audit:
     edits: list[str] | None = None
     missing: Counter[str] = field(default_factory=Counter)
     region: Region | None = None
+    topics: TopicTable = FIXED
 
     @property
     def duration_s(self) -> float:
@@ -83,7 +82,7 @@ class Audit:
     def run_file(self) -> RunFile:
         """The file as run_files.py compares it with others."""
         part = self.header.part if self.header is not None else None
-        counts = {BY_FIELD[name].path: count for name, count in self.counts.items()}
+        counts = {self.topics.by_field[name].path: count for name, count in self.counts.items()}
         version, size_bytes = self.flowrec_version, self.size_bytes
         return RunFile(self.path, part, self.first_ns, self.last_ns, counts, self.outcome, version, size_bytes)
 
@@ -115,14 +114,14 @@ def audit(
         found.why_not = error.what if isinstance(error, DamageError) else _first_part(error, path)
     with contents:
         found.flowrec_version, found.outcome = contents.flowrec_version, contents.outcome
-        found.region = contents.region
+        found.region, found.topics = contents.region, contents.topics
         try:
             found.header = contents.header
         except SessionError as error:
             found.header_fault = error.what if isinstance(error, DamageError) else _first_part(error, path)
         if begin is not None:
             begin(found)
-        reading = _Reading(found, contents, see)
+        reading = _ChunkAudit(found, contents, see)
         scanned = scan(contents.source, reading.take, progress)
         found.lost, found.first_lost = scanned.lost_bytes, scanned.first_lost
         for channel, name in contents.fields.items():
@@ -153,7 +152,7 @@ def digest_faults(path: Path) -> dict[Path, list[str] | None]:
     return found
 
 
-class _Reading:
+class _ChunkAudit:
     """Decodes chunk after chunk and counts."""
 
     def __init__(self, found: Audit, contents: SessionContents, see: See) -> None:
@@ -185,7 +184,7 @@ class _Reading:
                 wrong = str(error)
             if wrong:
                 found.undecodable[name] += 1
-                fault = f"{BY_FIELD[name].path} in the chunk at byte {offset}: {wrong}"
+                fault = f"{found.topics.by_field[name].path} in the chunk at byte {offset}: {wrong}"
                 found.first_undecodable = found.first_undecodable or fault
                 continue
             stamp_ns = message.stamp_ns
@@ -205,7 +204,7 @@ def _contents_without_index(path: Path) -> SessionContents:
 
 
 def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool, str]]:
-    """Where the index differs from what was read, and whether reading by it fails."""
+    """Differences between the index and what was read, each with whether reading by the index fails."""
     listed = {chunk.chunk_start_offset: chunk for chunk in contents.chunks}
     seen = {chunk.chunk_start_offset: chunk for chunk in found.summary.chunks}
     if listed.keys() - seen:
@@ -236,7 +235,7 @@ def disagreements(contents: SessionContents, found: Scan) -> Iterator[tuple[bool
 
 
 def _describes(listed: ChunkIndex, seen: ChunkIndex) -> bool:
-    """Whether the index of a chunk is right for a reader."""
+    """True if the index of a chunk is right for a reader."""
     return (
         listed.message_start_time <= seen.message_start_time
         and seen.message_end_time <= listed.message_end_time

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from flowrec.errors import SessionError, UsageError
+from flowrec.core import SessionError, UsageError
 from flowrec.store.object_requests import NOT_OFFERED, in_a_line, of_status, reason
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError, RefusedError, TransientError, answered, timeout_s
@@ -41,7 +41,7 @@ class StoreError(SessionError):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What a file holds.
+    """Size and hashes of a file.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class LocalParts:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with self._blamed():
+        with self._read_errors():
             self._file = path.open("rb")
             self._stat = os.fstat(self._file.fileno())
         self.size = self._stat.st_size
@@ -94,7 +94,7 @@ class LocalParts:
 
     def read(self, number: int) -> bytes:
         """The bytes of a part, from 1."""
-        with self._blamed():
+        with self._read_errors():
             self._file.seek((number - 1) * self.part_bytes)
             data = self._file.read(self.length(number))
             now = os.fstat(self._file.fileno())
@@ -107,7 +107,7 @@ class LocalParts:
         self._file.close()
 
     @contextmanager
-    def _blamed(self) -> Iterator[None]:
+    def _read_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -137,7 +137,7 @@ class _Hashes:
 
 
 def content_of_file(path: Path, progress: Callable[[int], None] = lambda _: None) -> Content:
-    """What a file holds; `progress` takes the bytes that have been read. SessionError if it can not be read."""
+    """Size and hashes of a file; `progress` takes the bytes that have been read. SessionError if it can not be read."""
     parts, hashes = LocalParts(path), _Hashes()
     try:
         for number in range(1, parts.count + 1):
@@ -166,7 +166,7 @@ class Bucket:
             raise UsageError(f"{folder}: writing to S3 needs a package; pip install 'flowrec[remote]'") from error
 
     def url(self, name: str) -> UrlPath:
-        """Of an object in the folder."""
+        """URL of an object in the folder."""
         return self._folder / name
 
     def stored(self, name: str) -> tuple[int, str] | None:
@@ -239,7 +239,7 @@ class _Upload:
 
     def run(self, progress: Callable[[int], None]) -> Sent | None:
         """Send what is missing and make the object; None if there is one of that name by now."""
-        upload_id = self._interrupted() or self._begun()
+        upload_id = self._find_interrupted() or self._begin_upload()
         hashes = _Hashes()
         threads = ThreadPoolExecutor(_TOGETHER, "upload")
         try:
@@ -271,18 +271,18 @@ class _Upload:
             return None
         return Sent(hashes.content, self._sent_bytes, _etag(made))
 
-    def _begun(self) -> str:
+    def _begin_upload(self) -> str:
         self._there.clear()
         upload_id: str = self._ask("create_multipart_upload")["UploadId"]
         return upload_id
 
-    def _interrupted(self) -> str | None:
+    def _find_interrupted(self) -> str | None:
         """An interrupted upload of this file: one of its name, whose first part holds the same."""
         uploads = (self._ask("list_multipart_uploads") or {}).get("Uploads", [])
         named = [each for each in uploads if each["Key"] == self._key]
         newest = sorted(named, key=lambda each: str(each.get("Initiated")), reverse=True)
         for upload in newest[:_CANDIDATES]:
-            listed = dict(self._listed(upload))
+            listed = dict(self._list_parts(upload))
             fits = {number: etag for number, (size, etag) in listed.items() if self._is_part(number, size)}
             if fits and fits[first := min(fits)] == _md5(self._parts.read(first)).hex():
                 self._there = fits
@@ -290,7 +290,7 @@ class _Upload:
                 return upload_id
         return None
 
-    def _listed(self, upload: Mapping[str, Any]) -> Iterator[tuple[int, tuple[int, str]]]:
+    def _list_parts(self, upload: Mapping[str, Any]) -> Iterator[tuple[int, tuple[int, str]]]:
         marker: dict[str, int] = {}
         while True:
             found = self._ask("list_parts", UploadId=upload["UploadId"], **marker)

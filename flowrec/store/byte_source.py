@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError, refuse_irregular
 from flowrec.store.session_path import UrlPath
-from flowrec.system.regular_file import refuse_irregular
 
 
 class ByteSource(Protocol):
@@ -122,7 +121,7 @@ def open_bytes(path: Path) -> ByteSource:
 
 
 def is_there(path: Path) -> bool:
-    """Whether a path or URL names a file, which is not opened if it is on this machine.
+    """True if a path or URL names a file, which is not opened if it is on this machine.
 
     Raises
     ------

@@ -17,9 +17,22 @@ from google.protobuf import descriptor_pb2
 from mcap.records import Channel
 from mcap.records import Schema as SchemaRecord
 
-from flowrec.declarations import Role, defaulted_fields
-from flowrec.errors import SessionError, UsageError
-from flowrec.messages import PIXEL_BITS, Frame
+from flowrec.core import (
+    BY_FIELD,
+    FIXED,
+    PIXEL_BITS,
+    TOPICS,
+    Frame,
+    Role,
+    SessionError,
+    Topic,
+    TopicTable,
+    UsageError,
+    __version__,
+    declaration,
+    declared_topic,
+    defaulted_fields,
+)
 from flowrec.store.codec import Codec, codec_of, decode
 from flowrec.store.frame_encodings import FrameEncoding, frame_codec
 from flowrec.store.mcap_format import Record, Summary
@@ -27,13 +40,13 @@ from flowrec.store.roi import Region, region_from
 from flowrec.store.schema import Schema
 from flowrec.store.session_metadata import SessionMetadata
 from flowrec.store.viewer_topics import VIEWER_TOPICS
-from flowrec.topics import BY_FIELD, BY_PATH, TOPICS
-from flowrec.version import __version__
 
 FRAMES, STATE, VIEW = "frames", "state", "view"
 GROUPS = (FRAMES, STATE, VIEW)
 FRAME_PATH = BY_FIELD["frame"].path
 
+_OWN_TYPES = frozenset(topic.type for topic in TOPICS)
+_DECLARATION = "declaration"  # in the metadata of the channel of an extra topic
 _BITS = "bits"  # in the metadata of the frames' channel: depth of the images; 8 where it is not stated
 
 # A replay continues from what the stages recorded; without images it takes the tracks as they were recorded.
@@ -60,6 +73,11 @@ def message_codec(message_type: type[Any], schema_name: str = "", bits: int = 8)
     return codec_of(message_type)
 
 
+def codec_of_extra(topic: Topic) -> Codec:
+    """The codec of a topic that is no field of `Tick`: of its path, because packages may name types alike."""
+    return codec_of(topic.type, "" if topic.type in _OWN_TYPES else topic.path)
+
+
 def _slots() -> Iterator[tuple[str, Slot]]:
     for number, topic in enumerate(TOPICS, 1):
         group = FRAMES if topic.field == "frame" else STATE
@@ -73,10 +91,30 @@ SLOTS: dict[str, Slot] = dict(_slots())
 VIEWED = frozenset(view.path for view in VIEWER_TOPICS)
 
 
-def declarations(frames: FrameEncoding, region: Region | None = None) -> Iterator[SchemaRecord | Channel]:
+def slots_of(topics: TopicTable) -> dict[str, Slot]:
+    """The slots of all topics of a file by path; those of extra topics follow ours.
+
+    Raises
+    ------
+    UsageError : an extra topic has the path of a viewer topic.
+    """
+    if not topics.extra:
+        return SLOTS
+    slots = dict(SLOTS)
+    for number, topic in enumerate(topics.extra, len(SLOTS) + 1):
+        if topic.path in SLOTS:
+            raise UsageError(f"{topic.path}: is a topic of flowrec; choose another path")
+        metadata = {"role": topic.role.value, _DECLARATION: declaration(topic)}
+        slots[topic.path] = Slot(number, STATE, codec_of_extra(topic).schema, metadata)
+    return slots
+
+
+def declarations(
+    frames: FrameEncoding, region: Region | None = None, topics: TopicTable = FIXED
+) -> Iterator[SchemaRecord | Channel]:
     """The schema and channel records of a file, each schema before the first channel that uses it."""
     schemas: dict[str, int] = {}
-    for path, slot in SLOTS.items():
+    for path, slot in slots_of(topics).items():
         schema, metadata = slot.schema, slot.metadata
         if path == FRAME_PATH:
             schema = frames.codec.schema
@@ -90,11 +128,11 @@ def declarations(frames: FrameEncoding, region: Region | None = None) -> Iterato
 
 
 def is_left_out(path: str, patterns: Iterable[str]) -> bool:
-    """Whether a topic matches one of the patterns."""
+    """True if a topic matches one of the patterns."""
     return any(fnmatchcase(path, pattern) for pattern in patterns)
 
 
-def left_out(patterns: Iterable[str]) -> frozenset[str]:
+def left_out(patterns: Iterable[str], topics: TopicTable = FIXED) -> frozenset[str]:
     """The topics that match names or patterns; `/view/*` matches all viewer topics, also those under the images' topic.
 
     Raises
@@ -102,15 +140,16 @@ def left_out(patterns: Iterable[str]) -> frozenset[str]:
     UsageError : a pattern matches no topic, or one without which the session could not be replayed.
     """
     chosen: set[str] = set()
+    needed_ones = _NEEDED | {topic.path for topic in topics.extra if topic.role in (Role.INPUT, Role.OUTPUT)}
     for pattern in patterns:
-        found = {path for path in SLOTS if is_left_out(path, [pattern])}
+        found = {path for path in slots_of(topics) if is_left_out(path, [pattern])}
         found |= {path for path in VIEWED if is_left_out(f"/view{path}", [pattern])}
         if not found:
             raise UsageError(
                 f"recording.leave_out: no topic is called {pattern!r}; flowrec info lists those of a session"
             )
-        if needed := sorted(found & _NEEDED):
-            free = ", ".join(path for path in SLOTS if path not in _NEEDED | VIEWED)
+        if needed := sorted(found & needed_ones):
+            free = ", ".join(path for path in slots_of(topics) if path not in needed_ones | VIEWED)
             raise UsageError(
                 f"recording.leave_out: a replay needs {needed[0]}; what can be left out is {free} and /view/*"
             )
@@ -123,7 +162,8 @@ class SessionContents(SessionMetadata):
 
     Attributes
     ----------
-    fields : field of Tick by channel number, for the topics that this flowrec knows.
+    topics : those that this flowrec knows and those that the file declares.
+    fields : field of Tick by channel number, for these topics; of an extra one its path.
     codecs : how their messages are decoded, by channel number.
     recorded_fields : by field of Tick, the fields that its messages have in this file; an older file lacks some.
     frame_encoding : name of the encoding of frames (frame_encodings.py); empty in files that do not say.
@@ -133,6 +173,7 @@ class SessionContents(SessionMetadata):
 
     def _open(self, summary: Summary | None) -> None:
         super()._open(summary)
+        self.topics = self._topics()
         self.fields: dict[int, str] = {}
         self.codecs: dict[int, Codec] = {}
         self.recorded_fields: dict[str, frozenset[str]] = {}
@@ -144,9 +185,23 @@ class SessionContents(SessionMetadata):
                 self.frame_encoding = channel.metadata.get("encoding", "")
                 self.frame_bits = bits_from(channel.metadata)
                 self.region = region_from(channel.metadata)
-            if channel.topic in BY_PATH:
-                self.fields[channel.id] = BY_PATH[channel.topic].field
+            if channel.topic in self.topics.by_path:
+                self.fields[channel.id] = self.topics.by_path[channel.topic].field
                 self._check_schema(channel.id)
+
+    def _topics(self) -> TopicTable:
+        declared: dict[str, Topic] = {}
+        for channel in self.channels.values():
+            text = channel.metadata.get(_DECLARATION)
+            if text is None:
+                continue
+            try:
+                topic = declared_topic(channel.topic, text)
+                if declared.setdefault(topic.path, topic) != topic:
+                    raise UsageError(f"{topic.path}: is declared twice, and not alike")
+            except UsageError as error:
+                raise SessionError(f"{self.source.path}: {error}; the file was damaged or edited") from error
+        return TopicTable(declared.values()) if declared else FIXED
 
     def decode(self, record: Record) -> Any:
         """The message in a record of a known topic.
@@ -155,15 +210,17 @@ class SessionContents(SessionMetadata):
         ------
         SessionError : it is damaged.
         """
-        kind = BY_FIELD[self.fields[record.channel]].type
+        kind = self.topics.by_field[self.fields[record.channel]].type
         assert isinstance(record.payload, memoryview)
         return decode(kind, self.codecs[record.channel], record.payload, record.sequence, self.source.start_unix_ns)
 
     def _check_schema(self, channel_number: int) -> None:
         channel = self.channels[channel_number]
         found = self.schemas[channel.schema_id]
-        kind = BY_PATH[channel.topic].type
-        codec = self.codecs[channel_number] = message_codec(kind, found.name, self.frame_bits)
+        topic = self.topics.by_path[channel.topic]
+        kind, extra = topic.type, topic in self.topics.extra
+        codec = codec_of_extra(topic) if extra else message_codec(kind, found.name, self.frame_bits)
+        self.codecs[channel_number] = codec
         expected = codec.schema
         ours_all = frozenset(part.name for part in fields(kind))  # type: ignore[arg-type]
         self.recorded_fields[self.fields[channel_number]] = ours_all

@@ -17,9 +17,8 @@ import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 
-from flowrec.errors import SessionError
-from flowrec.messages import Frame
-from flowrec.store.channels import FRAMES, GROUPS, SLOTS, STATE
+from flowrec.core import FIXED, Frame, SessionError, TopicTable
+from flowrec.store.channels import FRAMES, GROUPS, STATE, codec_of_extra, slots_of
 from flowrec.store.channels import VIEW as VIEW_GROUP
 from flowrec.store.codec import Payload, codec_of, encode_record
 from flowrec.store.digest import message_digest
@@ -28,7 +27,6 @@ from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGE_HEAD, RECORD_HE
 from flowrec.store.roi import WindowCutter
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
-from flowrec.topics import BY_FIELD
 
 _CHUNK_BYTES = {FRAMES: 1 << 20, STATE: 1 << 18, VIEW_GROUP: 1 << 18}  # a chunk is sealed beyond
 # A message must leave room in the largest chunk that is read for what surrounds it.
@@ -44,7 +42,7 @@ _size_of = attrgetter("size")
 Sink = Callable[[list[SealedChunk]], None]
 
 
-def detached(chunks: Iterable[SealedChunk]) -> list[SealedChunk]:
+def copy_chunks(chunks: Iterable[SealedChunk]) -> list[SealedChunk]:
     """Chunks that own their bytes."""
     return [replace(chunk, data=bytes(chunk.data)) for chunk in chunks]
 
@@ -133,7 +131,7 @@ class ChunkEncoder:
     views : makes the viewer topics; shared by all files of a run, because it remembers the colour scale.
     sink : receives sealed chunks and must not keep views of them after it returns. May be replaced between calls.
     start_unix_ns : Unix time of stamp 0, which is added to all times that MCAP and foxglove's schemas hold.
-    copied_images : frames are not encoded, because their chunks are copied.
+    topics : those of the run.
 
     Attributes
     ----------
@@ -142,21 +140,16 @@ class ChunkEncoder:
     """
 
     def __init__(
-        self,
-        encoding: FrameEncoding,
-        views: ViewerTopics,
-        sink: Sink,
-        start_unix_ns: int,
-        *,
-        copied_images: bool = False,
+        self, encoding: FrameEncoding, views: ViewerTopics, sink: Sink, start_unix_ns: int, topics: TopicTable = FIXED
     ) -> None:
         self.sink = sink
         self.sequences: Counter[str] = Counter()
         self.start_unix_ns = start_unix_ns
         self._encoding = encoding
         self._views = views
-        self._copied_images = copied_images
         self._cutter = WindowCutter()
+        self._topics, self._slots = topics.by_field, slots_of(topics)
+        self._extra = {topic.path: codec_of_extra(topic) for topic in topics.extra}
         self._builders = {
             group: ChunkBuilder(compressed=encoding.compressed_chunks or group != FRAMES) for group in GROUPS
         }
@@ -175,15 +168,13 @@ class ChunkEncoder:
         """
         for field, message in entry.messages.items():
             if isinstance(message, Frame):
-                if self._copied_images:
-                    continue
                 codec = self._encoding.codec
                 if entry.window is not None:
                     message = self._cutter.cut(message, entry.window)  # noqa: PLW2901  the builder copies it
             else:
-                codec = codec_of(type(message))
+                codec = self._extra.get(field) or codec_of(type(message))
             sequence, payload = encode_record(message, codec, self.start_unix_ns)
-            self._append(BY_FIELD[field].path, entry.stamp_ns, message.stamp_ns, payload, sequence)
+            self._append(self._topics[field].path, entry.stamp_ns, message.stamp_ns, payload, sequence)
         for path, stamp_ns, payload in self._views.of(entry.messages):
             self._append(path, entry.stamp_ns, stamp_ns, payload, None)
         full = [builder for group, builder in self._builders.items() if builder.size >= _CHUNK_BYTES[group]]
@@ -200,7 +191,7 @@ class ChunkEncoder:
         if sequence is None:
             sequence = self.sequences[path]
             self.sequences[path] = (sequence + 1) % 2**32
-        slot = SLOTS[path]
+        slot = self._slots[path]
         size = sum(map(len, payload))
         if size > _MESSAGE_LIMIT_BYTES:
             raise SessionError(f"a message of {path} has {size} bytes, more than a chunk may hold; use a smaller chip")

@@ -1,7 +1,7 @@
 """Message <-> bytes: one codec per message type, bit for bit.
 
 Events travel in foxglove.Log, camera frames in foxglove's image schemas (frame_encodings.py), all other messages in the
-schemas derived from messages.py (schema.py). The protobuf runtime serialises and parses. Only large byte fields bypass
+schemas derived from their types (schema.py). The protobuf runtime serialises and parses. Only large byte fields bypass
 it, because it copies them three times while it holds the interpreter lock: protobuf allows fields in any order, so a
 large field follows the serialised rest as tag, length and bytes, and is cut out again before parsing.
 https://protobuf.dev/programming-guides/encoding
@@ -21,12 +21,18 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from flowrec.declarations import MessageField, as_read, message_fields
-from flowrec.enums import Level
-from flowrec.errors import SessionError
-from flowrec.messages import Event, Frame, OperatorEvent
+from flowrec.core import (
+    NS_PER_S,
+    Event,
+    Frame,
+    Level,
+    MessageField,
+    OperatorEvent,
+    SessionError,
+    as_read,
+    message_fields,
+)
 from flowrec.store.schema import ARRAY_DATA, Schema, array_schema, foxglove_schema, schema_of
-from flowrec.units import NS_PER_S
 
 Payload = tuple[bytes | memoryview, ...]
 
@@ -46,7 +52,7 @@ _OPERATOR_NAME = "operator."
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """How one message type is stored.
+    """Encoding of one message type.
 
     Attributes
     ----------
@@ -64,12 +70,12 @@ class Codec:
     has_unix_time: bool = False
 
 
-_CODECS: dict[type[Any], Codec] = {}
+_CODECS: dict[tuple[type[Any], str], Codec] = {}
 
 
-def codec_of(message_type: type[Any]) -> Codec:
-    """The codec of a message type other than Frame, which has several (frame_encodings.py)."""
-    codec = _CODECS.get(message_type)
+def codec_of(message_type: type[Any], path: str = "") -> Codec:
+    """The codec of a message type other than Frame, which has several (frame_encodings.py); `path`: as of schema_of."""
+    codec = _CODECS.get((message_type, path))
     if codec is None:
         if message_type is Frame:
             raise TypeError("the codec of a Frame depends on its encoding")
@@ -78,9 +84,9 @@ def codec_of(message_type: type[Any]) -> Codec:
         elif message_type is OperatorEvent:
             codec = _operator_codec()
         else:
-            schema = schema_of(message_type)
+            schema = schema_of(message_type, path)
             codec = Codec(schema, _encoder(message_type, schema), _decoder(message_type, schema))
-        _CODECS[message_type] = codec
+        _CODECS[message_type, path] = codec
     return codec
 
 
@@ -169,7 +175,7 @@ def cut_byte_fields(payload: memoryview, numbers: Container[int]) -> tuple[bytes
     return b"".join(rest), found
 
 
-def detached(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int, memoryview]:
+def detach_fields(payload: memoryview, fields: Mapping[int, memoryview]) -> dict[int, memoryview]:
     """The cut-out fields, copied where a view would keep a much larger buffer in memory."""
     buffer = payload.obj
     copy = not isinstance(buffer, bytes | bytearray) or len(buffer) > 2 * sum(map(len, fields.values()))
@@ -229,7 +235,7 @@ def _decoder(message_type: type[Any], schema: Schema) -> Callable[[bytes | memor
             parsed = parse(payload)
             return message_type(*[unpack(parsed) for unpack in unpackers])
         rest, found = cut_byte_fields(memoryview(payload), arrays)
-        parsed, found = parse(rest), detached(memoryview(payload), found)
+        parsed, found = parse(rest), detach_fields(memoryview(payload), found)
         return message_type(
             *[
                 _cut_array(found[number], arrays[number].dtype) if number in found else unpack(parsed)

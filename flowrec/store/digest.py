@@ -25,10 +25,9 @@ from dataclasses import dataclass, field
 
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from flowrec.errors import SessionError, printable
+from flowrec.core import SessionError, printable, seconds
 from flowrec.store.mcap_format import Record
 from flowrec.store.session_metadata import DIGEST, SessionMetadata, is_header_file
-from flowrec.units import seconds
 
 _MODULUS = 1 << 256
 _MESSAGE = struct.Struct("<IQ")  # sequence, log time
@@ -39,14 +38,14 @@ _FAULTS_LIMIT, _TEXT_LIMIT = 40, 200  # a made-up file may name any number of to
 
 
 def message_digest(sequence: int, log_ns: int, payload: bytes | memoryview) -> int:
-    """What one message adds to the sum of its topic; `log_ns` as in the file."""
+    """Term of one message in the sum of its topic; `log_ns` as in the file."""
     hashed = hashlib.sha256(_MESSAGE.pack(sequence, log_ns))
     hashed.update(payload if len(payload) < _LARGE_BYTES else _LARGE.pack(len(payload), zlib.crc32(payload)))
     return int.from_bytes(hashed.digest(), "little")
 
 
 def head_digest(record: Metadata | Attachment) -> int:
-    """What one record outside the chunks adds to the sum of the head; 0 where it is none of flowrec's."""
+    """Term of one record outside the chunks in the sum of the head; 0 where it is none of flowrec's."""
     if isinstance(record, Metadata):
         if record.name == DIGEST or not record.name.startswith(_PREFIX):
             return 0
@@ -105,7 +104,7 @@ class FileDigest:
             self.sums[record.channel] += message_digest(record.sequence, log_ns, record.payload)
 
     def faults(self, file: SessionMetadata) -> list[str] | None:
-        """Where a finished file differs from the digest that it contains, as far as known; None: it contains none.
+        """Differences of a finished file from the digest that it contains, as far as known; None: it contains none.
 
         Topics and records that flowrec has not written are passed over.
         """

@@ -14,16 +14,13 @@ from typing import Any
 
 from mcap.records import ChunkIndex
 
-from flowrec.declarations import Message, shape_error
-from flowrec.errors import SessionError
-from flowrec.messages import Frame, pixel_type
+from flowrec.core import Frame, Message, SessionError, pixel_type, shape_error
 from flowrec.store.channels import SessionContents
 from flowrec.store.frame_encodings import ENCODINGS, PIXELS_LIMIT
 from flowrec.store.mcap_format import CHUNK_LIMIT_BYTES, MESSAGES_LIMIT, Record, records_in
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.rows import Row, row_decoder
 from flowrec.store.write_queue import NewMessages
-from flowrec.topics import BY_FIELD
 
 Cache = dict[tuple[Path, int, int], Message]  # by file, channel and time; oldest use first
 _CACHED_MESSAGES = 64  # of restored states
@@ -97,7 +94,7 @@ class FileReader:
         """All messages of one topic, each with the stamp of its tick."""
         channels = self._channels_of({field})
         with _threads() as executor:
-            for record in _merged(self._source, self._chunks_with(channels), executor, self._decoded_frame):
+            for record in _merge(self._source, self._chunks_with(channels), executor, self._decoded_frame):
                 if record.channel in channels:
                     message = self._message(record)
                     if message is not None:
@@ -108,12 +105,12 @@ class FileReader:
         channels = self._channels_of(fields)
         decoders = {channel: row_decoder(self.contents, channel) for channel in channels}
         with _threads() as executor:
-            for record in _merged(self._source, self._chunks_with(channels), executor):
+            for record in _merge(self._source, self._chunks_with(channels), executor):
                 if record.channel in channels:
                     try:
                         row = decoders[record.channel](record)
                     except SessionError as error:
-                        path = BY_FIELD[self._fields[record.channel]].path
+                        path = self.contents.channels[record.channel].topic
                         raise DamageError(self.path, f"{path} at {record.log_ns} ns: {error}") from error
                     yield record.log_ns, self._fields[record.channel], row
 
@@ -137,7 +134,7 @@ class FileReader:
         however often it is asked for.
         """
         latest = self._latest(stamp_ns, self._channels_of(fields))
-        state = {field: message for field, record in latest.items() if (message := self._restored(record)) is not None}
+        state = {field: message for field, record in latest.items() if (message := self._restore(record)) is not None}
         return max((record.log_ns for record in latest.values()), default=-1), state
 
     def close(self) -> None:
@@ -154,7 +151,7 @@ class FileReader:
             fault = str(error)
         if not fault:
             return message
-        fault = f"{BY_FIELD[self._fields[record.channel]].path} at {record.log_ns} ns: {fault}"
+        fault = f"{self.contents.channels[record.channel].topic} at {record.log_ns} ns: {fault}"
         if self._skip is None:
             raise DamageError(self.path, fault)
         self._skip(fault)
@@ -171,7 +168,7 @@ class FileReader:
         sound = not shape_error(frame) and frame.image.nbytes <= _GROWTH * len(record.payload)
         return record._replace(payload=frame) if sound else record
 
-    def _restored(self, record: Record) -> Any:
+    def _restore(self, record: Record) -> Any:
         # `tick_before(t - 1)` and what `ticks(t)` starts from are compared by identity, so they share their messages.
         key = (self.path, record.channel, record.log_ns)
         message = self._cache.pop(key, None) or self._message(record)
@@ -189,9 +186,9 @@ class FileReader:
         wanted = set(self._fields) if with_frames else set(self._fields) - self._frame_channels
         read = dict.fromkeys(wanted, 0)
         with _threads() as executor:
-            streams = [_merged(self._source, state, executor)]
+            streams = [_merge(self._source, state, executor)]
             if with_frames:
-                streams.append(_merged(self._source, frames, executor, self._decoded_frame))
+                streams.append(_merge(self._source, frames, executor, self._decoded_frame))
             for record in heapq.merge(*streams, key=_by_time):
                 if record.log_ns >= start and record.channel in wanted:
                     read[record.channel] += 1
@@ -204,7 +201,7 @@ class FileReader:
         for channel, count in read.items():
             announced = self.contents.statistics.channel_message_counts.get(channel, 0)
             if count != announced:
-                path = BY_FIELD[self._fields[channel]].path
+                path = self.contents.channels[channel].topic
                 raise DamageError(self.path, f"{announced} messages of {path} are announced, {count} were read")
 
     def _chunks_from(self, start_ns: int) -> tuple[list[ChunkIndex], list[ChunkIndex]]:
@@ -251,12 +248,12 @@ class FileReader:
                     size.add(field_name, record)
                     latest[field_name] = record
             if chunk.uncompressed_size > _LARGE_CHUNK_BYTES:  # it is not kept in memory for a few messages in it
-                latest = {field: _detached(record) for field, record in latest.items()}
+                latest = {field: _detach(record) for field, record in latest.items()}
         return latest
 
 
 def _likely(chunks: list[ChunkIndex], channels: set[int], stamp_ns: int) -> list[ChunkIndex]:
-    """Of chunks, the latest first, those that probably hold the latest message of each channel at a stamp."""
+    """Chunks, the latest first, that probably hold the latest message of each channel at a stamp."""
     likely: list[ChunkIndex] = []
     missing = set(channels)
     for chunk in chunks:
@@ -289,7 +286,7 @@ class _StateSize:
             raise DamageError(self._path, what)
 
 
-def _detached(record: Record) -> Record:
+def _detach(record: Record) -> Record:
     """The record with a copy of its payload instead of a view of its chunk."""
     payload = record.payload
     return record._replace(payload=memoryview(bytes(payload))) if isinstance(payload, memoryview) else record
@@ -309,7 +306,7 @@ def _threads() -> Iterator[Executor]:
     executor.shutdown()
 
 
-def _merged(
+def _merge(
     source: McapReader, chunks: Iterable[ChunkIndex], executor: Executor, decode: _Decode | None = None
 ) -> Iterator[Record]:
     """The messages of chunks in order of time; those of equal time stay in file order.
@@ -373,7 +370,7 @@ def _size(bundle: list[ChunkIndex]) -> int:
 
 
 def _contents(source: McapReader, bundle: list[ChunkIndex], decode: _Decode | None) -> list[_ChunkContent]:
-    """Of each chunk its content, or its messages decoded."""
+    """Content of each chunk, or its messages decoded."""
     found: list[_ChunkContent] = []
     for chunk in bundle:
         content = source.chunk(chunk)

@@ -26,10 +26,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import Image
-from flowrec.errors import RigError, UsageError
-from flowrec.messages import Frame, pixel_type
-from flowrec.store.codec import Codec, Payload, byte_field_head, cut_byte_fields, detached, stamp_of, timestamp
+from flowrec.core import Frame, Image, RigError, UsageError, pixel_type
+from flowrec.store.codec import Codec, Payload, byte_field_head, cut_byte_fields, detach_fields, stamp_of, timestamp
 from flowrec.store.schema import foxglove_schema
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -52,12 +50,12 @@ _PNG_OPTIONS = (
 
 def png(image: Image) -> Payload:
     """A PNG file, compressed with Huffman codes."""
-    return (_encoded(".png", image, _PNG_OPTIONS),)
+    return (_encode_image(".png", image, _PNG_OPTIONS),)
 
 
 def jpeg(image: Image) -> Payload:
     """A JPEG file of quality 90; its pixels are off by some grey levels."""
-    return (_encoded(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY)),)
+    return (_encode_image(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY)),)
 
 
 def row_differences(image: Image) -> Payload:
@@ -151,7 +149,7 @@ def _sums(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image
 
 
-def _encoded(kind: str, image: Image, options: tuple[int, ...]) -> memoryview:
+def _encode_image(kind: str, image: Image, options: tuple[int, ...]) -> memoryview:
     _refuse_empty(image)
     try:
         return cv2.imencode(kind, image, options)[1].reshape(-1).data
@@ -258,7 +256,7 @@ def _raw_image(bits: int) -> Codec:
     def decode(payload: bytes | memoryview, sequence: int) -> Frame:
         rest, found = cut_byte_fields(memoryview(payload), (_RAW_IMAGE_DATA,))
         parsed = schema.wire.FromString(rest)
-        data = detached(memoryview(payload), found).get(_RAW_IMAGE_DATA, parsed.data)
+        data = detach_fields(memoryview(payload), found).get(_RAW_IMAGE_DATA, parsed.data)
         shape = parsed.height, parsed.width
         size = nbytes * shape[0] * shape[1]
         if parsed.encoding != name or parsed.step != nbytes * shape[1] or len(data) != size:

@@ -9,7 +9,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.messages import Frame
+from flowrec.core import Frame
 from flowrec.store.reader import SessionReader
 
 

@@ -17,7 +17,7 @@ from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Schema, Statistics
 
 if TYPE_CHECKING:  # with it would come numpy, which those who only list files do without
-    from flowrec.declarations import Message
+    from flowrec.core import Message
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the body
@@ -178,7 +178,7 @@ def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def stream_of(data: bytes | memoryview) -> ReadDataStream:
-    """What mcap's records parse themselves from."""
+    """Stream from which mcap's records parse themselves."""
     return ReadDataStream(io.BytesIO(data))
 
 

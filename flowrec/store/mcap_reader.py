@@ -19,7 +19,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, ChunkIndex, Footer, Header, MessageIndex, Metadata, MetadataIndex
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.mcap_format import (
     ATTACHMENT_HEAD,
@@ -203,17 +203,17 @@ class McapReader:
             if LONG.unpack_from(body, at)[0] != length - RECORD_HEAD.size - begin:
                 raise ValueError("the chunk is not as long as announced")
             if not whole and _can_be_streamed(body[begin:], compression):
-                content: bytes | memoryview = self._streamed(
+                content: bytes | memoryview = self._decompress_stream(
                     offset + RECORD_HEAD.size + begin, offset + length, body[begin:], size
                 )
             else:
                 body = body if whole else self.body(offset, length, Opcode.CHUNK)
-                content = _decompressed(body[begin:], compression, size)
+                content = _decompress(body[begin:], compression, size)
             if crc and zlib.crc32(content) != crc:
                 raise ValueError("the checksum of the chunk is wrong")
         return content
 
-    def _streamed(self, start: int, end: int, begin: memoryview, size: int) -> memoryview:
+    def _decompress_stream(self, start: int, end: int, begin: memoryview, size: int) -> memoryview:
         """The zstd frame from byte `start` to `end`, which starts with `begin`, decompressed in small steps."""
         _refuse_bomb(size, end - start)
         _refuse_other_size(begin, size)
@@ -338,11 +338,11 @@ def _refuse_other_size(data: memoryview, size: int) -> None:
 
 
 def _can_be_streamed(begin: memoryview, compression: str) -> bool:
-    """Whether streamed decompression needs little memory besides its output."""
+    """True if streamed decompression needs little memory besides its output."""
     return compression == "zstd" and zstandard.get_frame_parameters(begin).window_size <= _WINDOW_LIMIT_BYTES
 
 
-def _decompressed(data: memoryview, compression: str, size: int) -> bytes | memoryview:
+def _decompress(data: memoryview, compression: str, size: int) -> bytes | memoryview:
     _refuse_bomb(size, len(data))
     if compression == "":
         content: bytes | memoryview = data

@@ -34,9 +34,9 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from flowrec.core import open_new
 from flowrec.store.digest import channel_digest, digest_record, head_digest
 from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MAGIC, RECORD_HEAD, SealedChunk, Summary
-from flowrec.system.locks import open_new
 
 _BUFFERS_PER_WRITE = 1024
 

@@ -13,14 +13,12 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flowrec.errors import SessionError, UsageError
+from flowrec.core import SessionError, UsageError, append_line, refuse_irregular
 from flowrec.store.byte_source import open_bytes
 from flowrec.store.session_path import UrlPath, on_this_machine
 from flowrec.store.traffic import MissingError
-from flowrec.system.durable import append_line
-from flowrec.system.regular_file import refuse_irregular
 
-SUFFIX = ".notes.jsonl"
+NOTES_SUFFIX = ".notes.jsonl"
 TEXT_LIMIT = 10_000  # characters of a note
 _LINE_LIMIT = 200_000  # bytes; a longer line was not written by flowrec
 _FILE_LIMIT = 64 << 20  # bytes that are read
@@ -45,7 +43,7 @@ class Note:
 
 def notes_file(session: Path) -> Path:
     """The file of the notes of a session or run X.mcap."""
-    return session.with_name(session.name + SUFFIX)
+    return session.with_name(session.name + NOTES_SUFFIX)
 
 
 def read_notes(session: Path, key: str) -> list[Note]:
@@ -55,7 +53,7 @@ def read_notes(session: Path, key: str) -> list[Note]:
     ------
     SessionError : the file can not be read.
     """
-    return [note for line in _lines(notes_content(notes_file(session))) if (note := _parsed(line, key)) is not None]
+    return [note for line in _lines(notes_content(notes_file(session))) if (note := _parse(line, key)) is not None]
 
 
 def append_note(session: Path, key: str, text: str, tags: Sequence[str], author: str) -> Note:
@@ -106,7 +104,7 @@ def _lines(content: bytes) -> Iterator[bytes]:
     return (line for line in content.split(b"\n") if 0 < len(line) <= _LINE_LIMIT)
 
 
-def _parsed(line: bytes, key: str) -> Note | None:
+def _parse(line: bytes, key: str) -> Note | None:
     """The note of a line; None if it is damaged or of another session."""
     try:
         found = json.loads(line)

@@ -17,7 +17,7 @@ from datetime import timedelta
 from typing import Any, Protocol
 from urllib.parse import urljoin, urlsplit
 
-from flowrec.errors import SessionError, UsageError
+from flowrec.core import SessionError, UsageError
 from flowrec.store.traffic import AbsentError, ForbiddenError, RefusedError, TransientError
 
 CONNECTIONS = 32  # requests at a time
@@ -88,7 +88,7 @@ def requests_for(url: str, timeout_s: float) -> ObjectRequests:
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class ListedObject:
     """An object of a bucket.
 
     Attributes
@@ -103,7 +103,7 @@ class Listed:
     version: str
 
 
-def listing(url: str, begin: str, timeout_s: float) -> list[Listed]:
+def listing(url: str, begin: str, timeout_s: float) -> list[ListedObject]:
     """The objects of a folder in a bucket, without folders in it, in order of name.
 
     Parameters
@@ -174,14 +174,14 @@ class _Bucket:
             raise TransientError(f"the server sent {len(data)} of {end - begin} bytes")
         return Answer(data, begin, meta["size"], _version(meta))
 
-    def objects(self, begin: str) -> Iterator[Listed]:
+    def objects(self, begin: str) -> Iterator[ListedObject]:
         import obstore
 
         folder = f"{self._key}/" if self._key else ""
         with _bucket_faults():
             if not begin:
                 for meta in obstore.list_with_delimiter(self._store, self._key or None)["objects"]:
-                    yield Listed(meta["path"].removeprefix(folder), meta["size"], _version(meta))
+                    yield ListedObject(meta["path"].removeprefix(folder), meta["size"], _version(meta))
                 return
             # Keys come in their order, so those that begin alike come together.
             for some in obstore.list(self._store, self._key or None, offset=folder + begin, chunk_size=1000):
@@ -190,12 +190,12 @@ class _Bucket:
                     if not name.startswith(begin):
                         return
                     if "/" not in name:
-                        yield Listed(name, meta["size"], _version(meta))
+                        yield ListedObject(name, meta["size"], _version(meta))
 
 
 @dataclass(slots=True)
 class _Faults:
-    """Whether the object turned out to be empty, of which no range can be had."""
+    """State of a request to a bucket: `empty` if the object has no bytes, of which no range can be had."""
 
     empty: bool = False
 
@@ -279,7 +279,7 @@ class _Http:
                     target = response.get_redirect_location()
                     if not target:
                         return _answer(response, first, length, end_s)
-                    url = _redirected(url, urljoin(url, target))
+                    url = _redirect_target(url, urljoin(url, target))
                 finally:
                     response.close()  # gives a connection back that was read to its end, and cuts any other
         except urllib3.exceptions.HTTPError as error:
@@ -323,7 +323,7 @@ def _answer(response: Any, first: int | None, length: int, end_s: float) -> Answ
     return Answer(bytes(data), begin, size, version)
 
 
-def _redirected(url: str, target: str) -> str:
+def _redirect_target(url: str, target: str) -> str:
     """The target of a redirect; RefusedError where it leads from a public host to a private one, or to no http."""
     before, after = urlsplit(url), urlsplit(target)
     if after.scheme not in ("http", "https") or (before.scheme == "https" and after.scheme == "http"):
@@ -334,7 +334,7 @@ def _redirected(url: str, target: str) -> str:
 
 
 def _is_private(host: str | None) -> bool:
-    """Whether any address of a host is not of the public network."""
+    """True if any address of a host is not of the public network."""
     try:
         found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
     except OSError:
@@ -348,7 +348,7 @@ def in_a_line(error: BaseException) -> str:
 
 
 def reason(text: str) -> str:
-    """What a library says about a failed connection, in a few words that can not hold a credential."""
+    """Error of a library about a failed connection, in a few words that can not hold a credential."""
     lower = text.lower()
     if "timed out" in lower or "kind: timeout" in lower:
         return "the server does not answer in time"

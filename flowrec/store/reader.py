@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import replace
+import itertools
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from flowrec.errors import SessionError
-from flowrec.messages import Frame
+from flowrec.core import COILS, Frame, SessionError, Tick, TopicTable, array_shapes, seconds
 from flowrec.store.byte_source import is_there
 from flowrec.store.channels import SessionContents
 from flowrec.store.file_reader import Cache, FileReader
@@ -19,8 +18,6 @@ from flowrec.store.rows import Row
 from flowrec.store.run_files import Run, RunFile
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.session_path import session_path
-from flowrec.topics import BY_FIELD, BY_PATH, TOPICS, Tick
-from flowrec.units import seconds
 
 _OPEN_FILES = 4
 
@@ -71,7 +68,16 @@ class SessionReader:
         self.first_ns, self.last_ns = self._run.first_ns, self._run.last_ns
         self.outcome = self._run.outcome
         self.flowrec_version = self._run.files[0].flowrec_version
-        self._fields = [{topic.field for topic in TOPICS if topic.path in file.counts} for file in self._run.files]
+
+    @functools.cached_property
+    def topics(self) -> TopicTable:
+        """The topics that this flowrec knows, and those that the session declares."""
+        return self._file(0).contents.topics
+
+    @functools.cached_property
+    def _fields(self) -> list[set[str]]:
+        """The topics of each file by field."""
+        return [{topic.field for topic in self.topics.topics if topic.path in file.counts} for file in self._run.files]
 
     @functools.cached_property
     def header(self) -> SessionHeader:
@@ -80,7 +86,7 @@ class SessionReader:
 
     @functools.cached_property
     def region(self) -> Region | None:
-        """Which window of most images was recorded, the rest being black (roi.py); None: the images are not cut."""
+        """Window of most images that was recorded, the rest being black (roi.py); None: the images are not cut."""
         return self._file(0).contents.region
 
     @functools.cached_property
@@ -90,8 +96,19 @@ class SessionReader:
 
     @functools.cached_property
     def counts(self) -> dict[str, int]:
-        """Number of messages by field of Tick, for the topics that have any."""
-        return {BY_PATH[path].field: count for path, count in self._run.counts().items() if path in BY_PATH}
+        """Number of messages by field of Tick, for the topics that have any; of an extra topic by its path."""
+        known = self.topics.by_path
+        return {known[path].field: count for path, count in self._run.counts().items() if path in known}
+
+    def coils_of(self, fields: Iterable[str]) -> int:
+        """Number of coils, as the first message about them has it, if the tables of some topics need it; else 3."""
+        kinds: list[Any] = [self.topics.by_field[field].type for field in fields]
+        return self._coils if any(COILS in lengths for kind in kinds for _, lengths in array_shapes(kind)) else 3
+
+    @functools.cached_property
+    def _coils(self) -> int:
+        first = next(itertools.chain(self.messages("applied"), self.messages("currents")), None)
+        return 3 if first is None else len(first.currents_a)
 
     @property
     def recorded_fields(self) -> dict[str, frozenset[str]]:
@@ -124,7 +141,7 @@ class SessionReader:
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
             for stamp_ns, new in self._file(number).new_messages(late_ns, with_frames=with_frames):
                 if not number or stamp_ns > file.first_ns:
-                    tick = replace(tick, stamp_ns=stamp_ns, **new)
+                    tick = self.topics.updated(tick, stamp_ns, new)
                     yield tick
 
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:
@@ -134,7 +151,7 @@ class SessionReader:
         message of its first tick is new if and only if it is another object.
         """
         begun = [number for number, file in enumerate(self._run.files) if file.first_ns <= stamp_ns]
-        wanted = {field for field in BY_FIELD if with_frames or field != "frame"}
+        wanted = {field for field in self.topics.by_field if with_frames or field != "frame"}
         found_ns, known = -1, dict[str, Any]()
         # The keyframe of a part has the state; what is missing there is searched for in the parts before.
         for number in reversed(begun):
@@ -142,22 +159,29 @@ class SessionReader:
             if missing:
                 latest_ns, state = self._file(number).state_at(stamp_ns, missing)
                 found_ns, known = max(found_ns, latest_ns), known | state
-        return Tick(found_ns, **known)
+        return self.topics.updated(Tick(), found_ns, known)
 
     def messages(self, field: str) -> Iterator[Any]:
-        """All messages of one topic, named by its field of Tick.
+        """All messages of one topic, named by its field of Tick or by its path.
 
         Raises
         ------
         SessionError : no such field, or damage in the file.
         """
-        if field not in BY_FIELD:
-            raise SessionError(f"{self.path}: there is no topic {field!r}; the topics are {', '.join(BY_FIELD)}")
+        field = self.field_of(field)
         for number, file in enumerate(self._run.files):
             if field in self._fields[number]:
                 for stamp_ns, message in self._file(number).messages(field):
                     if not number or stamp_ns > file.first_ns:
                         yield message
+
+    def field_of(self, name: str) -> str:
+        """The field of Tick of a topic, named by its field or by its path; SessionError if there is none."""
+        topic = self.topics.by_field.get(name) or self.topics.by_path.get(name)
+        if topic is None:
+            known = ", ".join(self.topics.by_field)
+            raise SessionError(f"{self.path}: there is no topic {name!r}; the topics are {known}")
+        return topic.field
 
     def rows(self, fields: Collection[str]) -> Iterator[tuple[str, Row]]:
         """Field of Tick and row of plain values (see rows.py) of each message of some topics, in order of time.

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flowrec.enums import Outcome
-from flowrec.errors import SessionError
+from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, held, put_in_place, refuse_irregular
 from flowrec.store.audit import disagreements
 from flowrec.store.channels import SessionContents
+from flowrec.store.chunk_copies import ChunkCopier
 from flowrec.store.digest import FileDigest
-from flowrec.store.frame_encodings import ENCODINGS
-from flowrec.store.image_chunks import ImageChunk, ImageChunks, stored, with_images
+from flowrec.store.losses import Losses, RecoveryTally, losses
 from flowrec.store.mcap_reader import DamageError, McapReader
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import (
@@ -28,7 +26,7 @@ from flowrec.store.run_files import (
     unfinished_of,
 )
 from flowrec.store.scan import Scan, scan
-from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_file import WriterOptions, disk_errors, new_mcap
 from flowrec.store.session_metadata import (
     CHIP_FILE,
     CHIP_IMAGE_FILE,
@@ -39,15 +37,7 @@ from flowrec.store.session_metadata import (
 )
 from flowrec.store.session_path import on_this_machine
 from flowrec.store.writer import SessionWriter
-from flowrec.system.durable import put_in_place
-from flowrec.system.locks import held
-from flowrec.system.outputs import MCAP, Output, OutputError
-from flowrec.system.regular_file import refuse_irregular
-from flowrec.topics import BY_PATH, Tick
-from flowrec.units import seconds
 
-_POLL_S = 1e-3
-_QUEUE_BYTES = 32 << 20  # nothing is gained by reading far ahead of the writer
 _REMAINS_SUFFIX = ".remains"
 _HEAD = frozenset({SESSION, PROVENANCE, CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE})
 
@@ -78,37 +68,23 @@ class Recovered:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing was lost."""
+        """True if nothing was lost."""
         return not self.lost
 
 
-@dataclass(slots=True)
-class _Skipped:
-    """Messages that were skipped because they can not be decoded."""
-
-    count: int = 0
-    first: str = ""
-
-    def add(self, fault: str) -> None:
-        self.count += 1
-        self.first = self.first or fault
-
-
-def recover(path: Path, out: Path | None = None, *, copy_images: bool = True) -> Recovered:
+def recover(path: Path, out: Path | None = None) -> Recovered:
     """Write everything intact of a session to a new file.
 
-    A tick is complete when it has both inputs and outputs. The images of a killed run are often ahead of the rest: they
-    are kept as ticks with nothing but an image, which a replay skips. Viewer topics are derived again. The outcome of
-    the new session says what is missing. The file `X.mcap.partial` is removed once `X.mcap` is complete, unless it has
-    topics that this flowrec does not know. Any other file stays as it is, and so does a complete one, which at most
-    gets the name that its run could not give it.
+    Intact chunks are copied as they are stored, whatever topics they hold; only messages that make no sense are left
+    out. A tick is complete when it has both inputs and outputs. The images of a killed run are often ahead of the rest:
+    they are kept as ticks with nothing but an image, which a replay skips. The outcome of the new session says what is
+    missing. The file `X.mcap.partial` is removed once `X.mcap` is complete. Any other file stays as it is, and so does
+    a complete one, which at most gets the name that its run could not give it.
 
     Parameters
     ----------
     path : the unfinished, cut or damaged file.
     out : file to make; by default X.mcap for X.mcap.partial, else X_recovered.mcap.
-    copy_images : take over the images of an undamaged beginning in the chunks in which they are stored. False: encode
-        each image again, which takes several times as long and makes a file of the same messages.
 
     Raises
     ------
@@ -117,7 +93,7 @@ def recover(path: Path, out: Path | None = None, *, copy_images: bool = True) ->
     refuse_irregular(path, SessionError)
     try:
         with held(path):
-            return _recover(path, out, copy_images)
+            return _recover(path, out)
     except BlockingIOError as error:
         raise SessionError(
             f"{path}: is being recorded just now, or recovered; stop that process with Ctrl-C, which completes the file"
@@ -159,7 +135,7 @@ def recover_run(path: Path, out: Path | None = None) -> list[Recovered]:
     return done
 
 
-def _recover(path: Path, out: Path | None, copy_images: bool) -> Recovered:
+def _recover(path: Path, out: Path | None) -> Recovered:
     partial = path.name.endswith(PARTIAL_SUFFIX)
     final = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
     target = out or (final if partial else path.with_name(f"{path.stem}_recovered.mcap"))
@@ -170,7 +146,7 @@ def _recover(path: Path, out: Path | None, copy_images: bool) -> Recovered:
     if partial and path.is_file() and not path.stat().st_size:
         raise NothingSavedError(f"{path}: is empty; nothing was recorded into it; remove the file")
     with _without_circular_advice(path):
-        intact = _checked(path)
+        intact = _check_intact(path)
         if intact is not None:
             if not partial:
                 return intact
@@ -178,42 +154,58 @@ def _recover(path: Path, out: Path | None, copy_images: bool) -> Recovered:
             _rename(path, target)
             return Recovered(target, intact.ticks, intact.duration_s)
         with contextlib.closing(McapReader(path)) as source:
-            images = ImageChunks(source, found := Scan())
-            scan(source, images.visit if copy_images else None, found=found)
-        if partial and not found.summary.chunks:
-            raise NothingSavedError(f"{path}: nothing can be saved: no message was on the disk; remove the file")
-        skipped = _Skipped()
-        contents = SessionContents(path, found.summary)
-        reader = SessionReader(path, contents, skipped.add)
-        _require_head(path, found)
-        # Pixels decoded from JPEG are stored losslessly: encoding them again would change them.
-        known = ENCODINGS.get(contents.frame_encoding)
-        frames = known.name if known is not None and known.lossless else "zstd"
-        end_ns = _last_whole_ns(path, reader, found)
-        copied = images.copyable(contents, ENCODINGS[frames].of(reader.frame_bits)) if copy_images else []
+            declared = scan(source, heads_only=True)
+        if partial and not declared.chunks_passed:
+            raise _nothing_on_disk(path)
+        _require_head(path, declared)
+        contents = SessionContents(path, declared.summary)
     _refuse_if_taken(target)
-    draft = target.with_name(f"{target.stem}.recovering{target.suffix}")
+    draft = partial_path(target.with_name(f"{target.stem}.recovering{target.suffix}"))
     try:
-        ticks, lost = _rewrite(reader, found, end_ns, draft, frames, skipped, contents.source, copied)
-        done = _verified(draft)
+        with contents:
+            found, kept = _copy_intact(contents, draft)
+        done = _verify(draft)
         if done is None:
             raise SessionError(f"{draft}: can not be read back; is the disk sound?")
         _refuse_if_taken(target)
         _rename(draft, target)
+    except NothingSavedError:
+        raise
     except SessionError as error:
         # The advice of the error is about the draft, which is removed.
         raise SessionError(f"{path}: is left as it was; {str(error).split('; ')[0]}") from error
     finally:
-        reader.close()
-        for remains in (draft, partial_path(draft)):
-            with contextlib.suppress(OSError):  # a read-only disk has raised an error above
-                remains.unlink(missing_ok=True)
-    if partial and target == final and not _unknown_topics(found):
+        with contextlib.suppress(OSError):  # a read-only disk has raised an error above
+            draft.unlink(missing_ok=True)
+    if partial and target == final:
         path.unlink()
-    return Recovered(target, ticks, done.duration_s, found.lost_bytes, lost)
+    return Recovered(target, kept.ticks, done.duration_s, found.lost_bytes, kept.lost)
 
 
-def _checked(path: Path) -> Recovered | None:
+def _copy_intact(contents: SessionContents, draft: Path) -> tuple[Scan, Losses]:
+    """Copy everything intact of a file into a new one, and complete that."""
+    path = contents.source.path
+    tally = RecoveryTally(contents.part.keyframe_ns if contents.part is not None else None)
+    with contextlib.closing(new_mcap(draft, overwrite=True)) as out, disk_errors(draft):
+        copier = ChunkCopier(contents, found := Scan(), out, tally)
+        scan(contents.source, copier.visit, found=found)
+        if not found.summary.chunks and path.name.endswith(PARTIAL_SUFFIX):
+            raise _nothing_on_disk(path)
+        if tally.end_ns is None:
+            raise NothingSavedError(
+                f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; "
+                "remove the file"
+            )
+        kept = losses(contents, found, tally, tally.end_ns)
+        copier.finish(kept.outcome)
+    return found, kept
+
+
+def _nothing_on_disk(path: Path) -> NothingSavedError:
+    return NothingSavedError(f"{path}: nothing can be saved: no message was on the disk; remove the file")
+
+
+def _check_intact(path: Path) -> Recovered | None:
     """A file of which every chunk is intact; None for any other."""
     try:
         with SessionReader(path, contents := SessionContents(path)) as reader:
@@ -229,7 +221,7 @@ def _checked(path: Path) -> Recovered | None:
         return None
 
 
-def _verified(draft: Path) -> Recovered | None:
+def _verify(draft: Path) -> Recovered | None:
     """A file that was just written; None unless every message is as it was meant, and the index agrees with them."""
     try:
         with SessionReader(draft, contents := SessionContents(draft)) as reader:
@@ -252,117 +244,6 @@ def _require_head(path: Path, found: Scan) -> None:
             f"{path}: nothing can be saved: {', '.join(missing)} of its header is missing or damaged,"
             " without which the session can not be interpreted; remove the file"
         )
-
-
-def _last_whole_ns(path: Path, reader: SessionReader, found: Scan) -> int:
-    """Stamp of the last tick with inputs and outputs, which are always in the same chunk."""
-    ends = [found.last_ns.get(_channel(found, topic)) for topic in ("/coils/applied", "/robot/track")]
-    if any(end is None for end in ends):
-        raise NothingSavedError(
-            f"{path}: nothing can be saved: the run ended before its first whole tick was on the disk; remove the file"
-        )
-    return min(end for end in ends if end is not None)
-
-
-def _channel(found: Scan, topic: str) -> int:
-    return next((number for number, channel in found.summary.channels.items() if channel.topic == topic), -1)
-
-
-def _unknown_topics(found: Scan) -> list[str]:
-    """Topics of another flowrec or program, which can not be written again."""
-    channels = found.summary.channels.values()
-    return sorted({c.topic for c in channels if c.topic not in BY_PATH and c.metadata.get("role") != "view"})
-
-
-def _rewrite(
-    reader: SessionReader,
-    found: Scan,
-    end_ns: int,
-    draft: Path,
-    frames: str,
-    skipped: _Skipped,
-    source: McapReader,
-    copied: list[ImageChunk],
-) -> tuple[int, str]:
-    """Write all ticks, of which those after `end_ns` are incomplete; the number of complete ones and what was lost.
-
-    Where there are chunks to be `copied`, they hold the images.
-    """
-    before = Tick()
-    complete = images_missing = images_ahead = dropped = 0
-    # Only replays are written without images.
-    has_images = "frame" in reader.counts or not reader.header.parent
-    options = WriterOptions(
-        frames=frames,
-        overwrite=True,
-        block=True,
-        queue_limit_bytes=_QUEUE_BYTES,
-        region=reader.region,
-        bits=reader.frame_bits,
-        copied_images=bool(copied),
-    )
-    ticks = (
-        with_images(reader.ticks(with_frames=False), copied) if copied else ((tick, None) for tick in reader.ticks())
-    )
-    with SessionWriter(draft, reader.header, options) as writer:
-        for tick, images in ticks:
-            if tick.stamp_ns > end_ns:
-                images_ahead += tick.frame is not before.frame
-            elif tick.stamp_ns == reader.keyframe_ns:
-                pass  # the keyframe was counted where it was recorded
-            elif tick.applied is not before.applied and tick.track is not before.track:
-                complete += 1
-                lacks = has_images and tick.frame is before.frame
-                images_missing += lacks and not (tick.applied is not None and tick.applied.without_image)
-                dropped = tick.timing.dropped_frames if tick.timing is not None else dropped
-            writer.write(tick)
-            if images is not None:
-                writer.add_chunk(stored(source, images))
-            before = tick
-            while writer.queue_bytes > _QUEUE_BYTES:  # a large message must not wait while the next one is read
-                time.sleep(_POLL_S)
-        lost = "; ".join(_losses(reader, found, images_missing - dropped, images_ahead, skipped))
-        writer.close(_outcome(reader, lost, end_ns, dropped))
-    return complete, lost
-
-
-def _losses(
-    reader: SessionReader, found: Scan, images_missing: int, images_ahead: int, skipped: _Skipped
-) -> Iterator[str]:
-    if not found.ended:
-        yield "the last moments, which were not on the disk"
-    if found.lost_bytes:
-        yield f"{found.lost_bytes} damaged or cut-off bytes, the first at {found.first_lost}"
-    # The sequence numbers of a part may continue those of the part before.
-    begin_ns = -1 if reader.keyframe_ns is None else reader.keyframe_ns
-    gaps = [gap for gap in found.gaps.get(_channel(found, "/coils/applied"), []) if gap.before_ns > begin_ns]
-    if gaps:
-        from_s = seconds(gaps[0].before_ns - reader.first_ns)
-        yield f"{sum(gap.messages for gap in gaps)} ticks on the way (from {from_s:.2f} s on a replay is not exact)"
-    # A topic that the file does not declare was not recorded, unless there are messages that belong to none.
-    if found.undeclared:
-        absent = sorted(set(BY_PATH) - {channel.topic for channel in found.summary.channels.values()})
-        yield f"{found.undeclared} messages of topics whose declaration is damaged ({', '.join(absent) or 'unknown'})"
-    if unknown := _unknown_topics(found):
-        yield f"{', '.join(unknown)}, which this flowrec does not know (the old file is kept)"
-    if images_missing > 0:
-        yield f"{images_missing} images"
-    if images_ahead:
-        yield f"all but the image of the last {images_ahead} ticks, which a replay passes over"
-    if skipped.count:
-        yield f"{skipped.count} messages that make no sense, the first is {skipped.first}"
-
-
-def _outcome(reader: SessionReader, lost: str, end_ns: int, dropped: int) -> Mapping[str, str]:
-    counted = ("ticks", "dropped_frames", "frames_dropped")  # the last one in older files
-    recorded = {key: value for key, value in reader.outcome.items() if key not in counted}
-    marks = {"recovered_from": reader.path.name, "dropped_frames": str(dropped)}
-    if not lost:
-        return {"outcome": Outcome.ENDED, **recorded, **marks}
-    if "outcome" in recorded:
-        marks["ended_as"] = recorded["outcome"]
-    until_s = seconds(end_ns - reader.first_ns)
-    return {**recorded, **marks, "outcome": Outcome.CUT, "note": f"recovered up to {until_s:.2f} s; lost: {lost}"}
 
 
 def _refuse_if_taken(target: Path) -> None:
@@ -391,7 +272,7 @@ def _end_of_run(path: Path, last: SessionReader, part: Part) -> Recovered:
     target = part_path(path, part.number + 1)
     header = replace(last.header, part=Part(part.run, part.number + 1, keyframe_ns=last.last_ns))
     lost = f"everything after {last.path.name}"
-    with SessionWriter(target, header, WriterOptions(block=True, bits=last.frame_bits)) as writer:
+    with SessionWriter(target, header, WriterOptions(block=True, bits=last.frame_bits, topics=last.topics)) as writer:
         writer.write(replace(last.tick_before(last.last_ns), stamp_ns=last.last_ns))
         writer.close({"outcome": Outcome.CUT, "note": f"lost: {lost}", "recovered_from": last.path.name})
     return Recovered(target, 0, 0.0, lost=lost)

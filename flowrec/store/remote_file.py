@@ -17,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError
 from flowrec.store.object_requests import CONNECTIONS, Answer, ObjectRequests, requests_for
 from flowrec.store.traffic import TRAFFIC, MissingError, answered, timeout_s
 
@@ -77,7 +77,7 @@ class RemoteFile:
         self._last_end = 0
         self._lock = threading.Lock()
         try:
-            self._object = self._opened()
+            self._object = self._open()
         except BaseException:
             self.close()
             raise
@@ -94,13 +94,13 @@ class RemoteFile:
         for known in opened.ends:
             if known.first <= offset and end <= known.first + len(known.data):
                 return known.data[offset - known.first : end - known.first]
-        ahead = self._taken(offset, end)
+        ahead = self._take_ahead(offset, end)
         if ahead is not None:
             answer = ahead.result()
         elif end > opened.ends[1].first - _NEAR_BYTES and opened.ends[1].first - offset <= _JOINED_BYTES:
             answer = self._longer_tail(opened, offset)
         else:
-            answer = self._unannounced(offset, end)
+            answer = self._fetch_unannounced(offset, end)
         return answer.data[offset - answer.first : end - answer.first]
 
     def prefetch(self, ranges: Iterable[tuple[int, int]]) -> None:
@@ -131,7 +131,7 @@ class RemoteFile:
     def close(self) -> None:
         self._closer()
 
-    def _taken(self, offset: int, end: int) -> Future[Answer] | None:
+    def _take_ahead(self, offset: int, end: int) -> Future[Answer] | None:
         """The range ahead that has these bytes; it is forgotten with the last one that was announced."""
         with self._lock:
             for each in self._ahead:
@@ -142,7 +142,7 @@ class RemoteFile:
                     return each.answer
         return None
 
-    def _unannounced(self, offset: int, end: int) -> Answer:
+    def _fetch_unannounced(self, offset: int, end: int) -> Answer:
         """A range that holds these bytes; who reads on from where the last one ended gets more at a time."""
         with self._lock:
             block, last_end = self._block, self._last_end
@@ -168,7 +168,7 @@ class RemoteFile:
                 _remembered[self._url] = self._object
         return longer
 
-    def _opened(self) -> _Opened:
+    def _open(self) -> _Opened:
         with _remembering:
             known = _remembered.get(self._url)
         if known is not None and time.monotonic() < known.until_s:
@@ -178,7 +178,7 @@ class RemoteFile:
         tail = self._answer(asked, None, _END_BYTES)
         ends = (head.result(), tail)
         if (ends[0].version, ends[0].size) != (tail.version, tail.size):
-            raise self._changed()
+            raise self._changed_error()
         opened = _Opened(asked, tail.size, tail.version, ends, time.monotonic() + _REMEMBERED_S)
         with _remembering:
             _remembered[self._url] = opened
@@ -190,12 +190,12 @@ class RemoteFile:
     def _range(self, first: int, length: int) -> Answer:
         answer = self._answer(self._object.requests, first, length)
         if (answer.version, answer.size) != (self._object.version, self._object.size):
-            raise self._changed()
+            raise self._changed_error()
         if (answer.first, len(answer.data)) != (first, length):
             raise SessionError(f"{self.path}: the server sent other bytes than those that were asked for")
         return answer
 
-    def _changed(self) -> SessionError:
+    def _changed_error(self) -> SessionError:
         forget(self.path)
         return SessionError(f"{self.path}: was replaced while it was read; open it again")
 
@@ -212,7 +212,7 @@ def forget(path: Path) -> None:
 
 
 def are_there(paths: Sequence[Path]) -> list[bool]:
-    """Whether objects can be opened, asked for together; those that can are opened again without a request.
+    """True for each object that can be opened, asked for together; those are opened again without a request.
 
     Raises
     ------

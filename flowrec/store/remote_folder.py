@@ -7,8 +7,8 @@ import glob
 from collections.abc import Sequence
 from pathlib import Path
 
-from flowrec.errors import SessionError
-from flowrec.store.object_requests import Listed, listing
+from flowrec.core import SessionError
+from flowrec.store.object_requests import ListedObject, listing
 from flowrec.store.session_path import UrlPath
 from flowrec.store.traffic import MissingError, answered
 
@@ -16,11 +16,11 @@ _WEB = ("http://", "https://")
 
 
 def is_listed(url: Path) -> bool:
-    """Whether the folders of this server can be listed."""
+    """True if the folders of this server can be listed."""
     return not str(url).startswith(_WEB)
 
 
-def objects_in(folder: UrlPath, begin: str = "") -> list[tuple[UrlPath, Listed]]:
+def objects_in(folder: UrlPath, begin: str = "") -> list[tuple[UrlPath, ListedObject]]:
     """The objects of a folder in a bucket, in order of name, and what the listing says of each.
 
     Parameters

@@ -13,11 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from flowrec.diagnostics import Drops
-from flowrec.enums import Action, Level, Outcome
-from flowrec.messages import Event, OperatorEvent
+from flowrec.core import Action, Drops, Event, Level, OperatorEvent, Outcome, nanoseconds, seconds
 from flowrec.store.channels import FRAMES
-from flowrec.store.chunk import ChunkEncoder, Sink, detached
+from flowrec.store.chunk import ChunkEncoder, Sink, copy_chunks
 from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.run_files import partial_path, snapshot_path
 from flowrec.store.segments import Counters, SegmentRouter, keyframe
@@ -25,7 +23,6 @@ from flowrec.store.session_file import AsyncFileWriter, SessionFile, Snapshot, W
 from flowrec.store.session_metadata import Part, SessionHeader
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry, NewMessages
-from flowrec.units import nanoseconds, seconds
 
 _SEGMENT_S, _SEGMENTS = 1.0, 8  # length of a segment in s, at most this fraction of the ring
 _EVENTS_LISTED = 20  # of one snapshot
@@ -69,7 +66,7 @@ class _RingSegment:
 
     @property
     def nbytes(self) -> int:
-        """Of its chunks in memory."""
+        """Size of its chunks in memory."""
         return sum(len(chunk.data) for chunks in (self.chunks, self.image) for chunk in chunks)
 
     def add(self, entry: Entry) -> None:
@@ -100,7 +97,7 @@ class _RingSegment:
 
     @staticmethod
     def _keep(chunks: list[SealedChunk]) -> Sink:
-        return lambda sealed: chunks.extend(detached(sealed))
+        return lambda sealed: chunks.extend(copy_chunks(sealed))
 
 
 class RingBuffer:
@@ -167,7 +164,7 @@ class RingBuffer:
     @property
     def size(self) -> int:
         """Bytes of the files. May be asked for by another thread."""
-        return self._finished_bytes + sum(snapshot.file.size for snapshot in self._unfinished())
+        return self._finished_bytes + sum(snapshot.file.size for snapshot in self._unfinished_files())
 
     @property
     def timeout_s(self) -> float | None:
@@ -221,7 +218,7 @@ class RingBuffer:
 
     def close(self, reason: str = "") -> None:
         """Close all files as they are."""
-        for snapshot in self._unfinished():
+        for snapshot in self._unfinished_files():
             snapshot.file.close()
 
     def segment_ended(self, segment: _RingSegment, counters: Counters) -> None:
@@ -237,7 +234,7 @@ class RingBuffer:
             self._trim()
         self._free.append(segment.encoder)
 
-    def _unfinished(self) -> tuple[_SnapshotFile, ...]:
+    def _unfinished_files(self) -> tuple[_SnapshotFile, ...]:
         return (*self._finishing, *((self._snapshot,) if self._snapshot is not None else ()))
 
     def _segment(self, state: NewMessages, keyframe_ns: int | None) -> _RingSegment:
@@ -245,7 +242,8 @@ class RingBuffer:
         return _RingSegment(self, encoder, state, keyframe_ns)
 
     def _encoder(self, views: ViewerTopics, sequences: Counter[str]) -> ChunkEncoder:
-        encoder = ChunkEncoder(self._options.encoding, views, _discard, self._header.start_unix_ns)
+        options, start_unix_ns = self._options, self._header.start_unix_ns
+        encoder = ChunkEncoder(options.encoding, views, _discard, start_unix_ns, options.topics)
         encoder.sequences = sequences
         return encoder
 
@@ -267,7 +265,7 @@ class RingBuffer:
         ]
 
     def _is_old(self, segment: _RingSegment) -> bool:
-        """Whether the ring is long enough without the segments before this one."""
+        """True if the ring is long enough without the segments before this one."""
         last_ns = self._router.last_ns
         return last_ns is not None and segment.begin_ns is not None and last_ns - segment.begin_ns >= self._before_ns
 
@@ -351,7 +349,7 @@ class RingBuffer:
 
     def _collect_finished(self, *, wait: bool = False) -> None:
         """Note the files that are complete; raises the error of a file."""
-        for snapshot in self._unfinished():
+        for snapshot in self._unfinished_files():
             snapshot.file.check(wait=wait)
         while self._finishing and self._finishing[0].file.finished:
             file = self._finishing.pop(0).file

@@ -12,9 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowrec.declarations import Image
-from flowrec.messages import Frame, Track
-from flowrec.units import nanoseconds
+from flowrec.core import Frame, Image, Track, nanoseconds
 
 Window = tuple[int, int, int, int]  # x0, y0, x1, y1 in camera px, the latter two exclusive
 
@@ -25,7 +23,7 @@ _ROBOT = "robot"
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """Which images are reduced to a window, and to which.
+    """Rule by which images are reduced to a window around the robot.
 
     Attributes
     ----------
@@ -42,7 +40,7 @@ class Region:
 
     @property
     def notes(self) -> dict[str, str]:
-        """What a reader must know, for the metadata of the channel."""
+        """Metadata of the channel that a reader of such images needs."""
         return {
             _NOTE: _ROBOT,
             _PAD: str(self.pad_px),
@@ -71,13 +69,13 @@ class WindowSelector:
 
     def window_of(self, frame: Frame, track: Track | None) -> Window | None:
         """The window of an image that is to be recorded; None: the whole image."""
-        window = self._searched(frame, track)
+        window = self._searched_window(frame, track)
         if window is None or self._whole_ns is None or frame.stamp_ns >= self._whole_ns + self._every_ns:
             self._whole_ns = frame.stamp_ns
             return None
         return window
 
-    def _searched(self, frame: Frame, track: Track | None) -> Window | None:
+    def _searched_window(self, frame: Frame, track: Track | None) -> Window | None:
         # A track of another image, the last before a failure, says nothing about this one.
         if (
             not self._region.cut

@@ -13,20 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.declarations import MessageField, array_shapes, message_fields, shape_fault
-from flowrec.errors import SessionError
+from flowrec.core import MessageField, SessionError, array_shapes, message_fields, shape_fault
 from flowrec.store.channels import SessionContents
 from flowrec.store.codec import array_of
 from flowrec.store.mcap_format import Record
-from flowrec.topics import BY_FIELD
 
 Row = tuple[Any, ...]
 _SMALL_BYTES = 1 << 14  # of a payload that is parsed as a whole
 
 
 def row_decoder(contents: SessionContents, channel: int) -> Callable[[Record], Row]:
-    """What makes the row of a record of a channel, not of images; it raises SessionError for a damaged record."""
-    kind: type = BY_FIELD[contents.fields[channel]].type
+    """Function from a record of a channel, not of images, to its row; it raises SessionError for a damaged record."""
+    kind: type = contents.topics.by_field[contents.fields[channel]].type
     codec = contents.codecs[channel]
     names = [each.name for each in message_fields(kind)]
 

@@ -17,18 +17,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from flowrec.enums import Outcome
-from flowrec.errors import SessionError
+from flowrec.core import Outcome, SessionError, is_growing, seconds
 from flowrec.store.byte_source import is_there
 from flowrec.store.mcap_reader import UnfinishedError
 from flowrec.store.session_metadata import Part, SessionMetadata
 from flowrec.store.session_path import UrlPath
-from flowrec.system.locks import is_growing
-from flowrec.units import seconds
 
-SUFFIX = ".mcap"
+SESSION_SUFFIX = ".mcap"
 PARTIAL_SUFFIX = ".partial"
-TRIAL_PREFIX = ".flowrec-admission-"  # of a file that only measures what the machine holds
 _ASKED, _PROBED, _OPENED = 8, 1000, 64  # parts at a URL: asked for at a time, by number at most, opened at a time
 _NUMBERED = re.compile(r"(?P<stem>.+)\.(?P<kind>part|snap)(?P<number>\d{3,6})")
 
@@ -50,7 +46,7 @@ def partial_path(path: Path) -> Path:
 
 def run_path(path: Path) -> Path:
     """X.mcap for any of its files, finished or not."""
-    complete, match = _matched(path)
+    complete, match = _match_name(path)
     return complete if match is None else complete.with_name(match["stem"] + complete.suffix)
 
 
@@ -91,7 +87,7 @@ def runs_in(folder: Path) -> set[Path]:
 
 
 def is_snapshot(path: Path) -> bool:
-    """Whether a finished file is a snapshot by its name."""
+    """True if a finished file is a snapshot by its name."""
     match = _NUMBERED.fullmatch(path.stem)
     return match is not None and match["kind"] == "snap"
 
@@ -107,11 +103,11 @@ def _parts_among(files: Sequence[Path], suffix: str) -> list[Path]:
 
 def part_number(path: Path) -> int:
     """The number of a part of a run, finished or not, by its name; 0 for any other file."""
-    match = _matched(path)[1]
+    match = _match_name(path)[1]
     return int(match["number"]) if match is not None and match["kind"] == "part" else 0
 
 
-def _matched(path: Path) -> tuple[Path, re.Match[str] | None]:
+def _match_name(path: Path) -> tuple[Path, re.Match[str] | None]:
     """The file under its final name, and the parts of that name where it has a number."""
     complete = path.with_name(path.name.removesuffix(PARTIAL_SUFFIX))
     return complete, _NUMBERED.fullmatch(complete.stem)
@@ -135,7 +131,7 @@ class RunFile:
 
     @classmethod
     def of(cls, file: SessionMetadata) -> Self:
-        """Of an open file."""
+        """Description of an open file."""
         statistics = file.statistics
         first_ns, last_ns = statistics.message_start_time, statistics.message_end_time
         source, version = file.source, file.flowrec_version
@@ -156,7 +152,7 @@ class Run:
 
     @classmethod
     def at(cls, path: Path) -> Self:
-        """What `path` names; SessionError as `files_of` and `check_continuity`."""
+        """Run of the files that `path` names; SessionError as `files_of` and `check_continuity`."""
         found = []
         for path_of_file in files_of(path):
             with SessionMetadata(path_of_file) as file:
@@ -168,12 +164,12 @@ class Run:
 
     @property
     def in_parts(self) -> bool:
-        """Whether it is a run of parts, rather than the file that was named."""
+        """True if it is a run of parts, rather than the file that was named."""
         return self.files[0].path != self.path
 
     @property
     def part(self) -> Part | None:
-        """Which file of a run it is; None for all parts of a run together."""
+        """Number and kind of this file in its run; None for all parts of a run together."""
         return None if self.in_parts else self.files[0].part
 
     @property
@@ -207,7 +203,7 @@ class Run:
 
 
 def files_of(path: Path) -> list[Path]:
-    """What `path` names: itself or, where there is no such file, the parts of the run in order.
+    """Files that `path` names: itself or, where there is no such file, the parts of the run in order.
 
     Raises
     ------
@@ -269,7 +265,7 @@ def check_continuity(path: Path, run: Sequence[RunFile]) -> None:
 
 
 def continuity_fault(file: RunFile, number: int, before: RunFile | None) -> str | None:
-    """Why a file is not part `number` of a run after `before`; None where it is."""
+    """Reason that a file is not part `number` of a run after `before`; None where it is."""
     part = file.part
     if part is None or part.kind != "part":
         return "is named like a part of a run and is none"
@@ -290,5 +286,5 @@ def continuity_fault(file: RunFile, number: int, before: RunFile | None) -> str 
 
 
 def is_continued(outcome: Mapping[str, str]) -> bool:
-    """Whether the outcome of a part says that the run is continued in another part."""
+    """True if the outcome of a part says that the run is continued in another part."""
     return Outcome.CONTINUED in (outcome.get("outcome"), outcome.get("ended_as"))

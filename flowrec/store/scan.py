@@ -15,7 +15,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, Metadata, MetadataIndex, Schema
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError
 from flowrec.store.mcap_format import (
     CHUNK_HEAD,
     CHUNK_LIMIT_BYTES,
@@ -41,7 +41,7 @@ _TIMES_DECLARED = 2  # in the file and in its index
 Visit = Callable[[int, list[Record]], None]
 
 
-class Gap(NamedTuple):
+class SequenceGap(NamedTuple):
     """Messages of one channel that are missing before a time, by their sequence numbers."""
 
     before_ns: int
@@ -61,15 +61,17 @@ class Scan:
     last_ns : time of the last message, by channel.
     ended : the outcome of the run was found, which is written after its last message.
     counts : number of messages by channel.
+    chunks_passed : that were not read, because only the declarations were wanted.
     """
 
     summary: Summary = field(default_factory=Summary)
     lost_bytes: int = 0
     first_lost: int = 0
-    gaps: dict[int, list[Gap]] = field(default_factory=dict)
+    gaps: dict[int, list[SequenceGap]] = field(default_factory=dict)
     last_ns: dict[int, int] = field(default_factory=dict)
     ended: bool = False
     counts: Counter[int] = field(default_factory=Counter)
+    chunks_passed: int = 0
     _sequences: dict[int, int] = field(default_factory=dict)
 
     def add(self, source: McapReader, visit: Visit | None, opcode: int, offset: int, length: int) -> bool:
@@ -99,11 +101,6 @@ class Scan:
         except SessionError:
             return False
         return True
-
-    @property
-    def undeclared(self) -> int:
-        """Messages of channels whose declaration was not found, or is damaged."""
-        return sum(count for channel, count in self.counts.items() if channel not in self.summary.channels)
 
     def lose(self, offset: int, nbytes: int) -> None:
         """Note bytes that were skipped."""
@@ -145,7 +142,7 @@ class Scan:
         for log_ns, channel, sequence, _ in records:
             missing = (sequence - self._sequences.get(channel, -1) - 1) % _SEQUENCES
             if missing:
-                self.gaps.setdefault(channel, []).append(Gap(log_ns, missing))
+                self.gaps.setdefault(channel, []).append(SequenceGap(log_ns, missing))
             self._sequences[channel] = sequence
             self.counts[channel] += 1
             self.last_ns[channel] = max(log_ns, self.last_ns.get(channel, 0))
@@ -156,6 +153,8 @@ def scan(
     visit: Visit | None = None,
     progress: Callable[[int], None] | None = None,
     found: Scan | None = None,
+    *,
+    heads_only: bool = False,
 ) -> Scan:
     """Read all of a file and index its intact records; one chunk is in memory at a time.
 
@@ -164,6 +163,7 @@ def scan(
     visit : receives offset and messages of every intact chunk, in file order.
     progress : receives the byte up to which the file has been read.
     found : an empty one, which is filled; where `visit` needs what was found before.
+    heads_only : pass over the content of chunks: only what is declared outside them is found.
 
     Raises
     ------
@@ -181,6 +181,10 @@ def scan(
         declared += opcode in _DECLARING
         if declared > _TIMES_DECLARED * DECLARED_LIMIT:
             raise source.damaged(at, f"more than {_TIMES_DECLARED * DECLARED_LIMIT} records besides chunks")
+        if end and heads_only and opcode == Opcode.CHUNK:
+            found.chunks_passed += 1
+            at = end
+            continue
         if end and found.add(source, visit, opcode, at, end - at):
             if opcode == Opcode.FOOTER:
                 break

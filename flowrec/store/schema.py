@@ -1,4 +1,4 @@
-"""Protobuf schemas: ours derived from the dataclasses in messages.py, the standard ones taken from foxglove-sdk.
+"""Protobuf schemas: ours derived from the dataclasses of core/messages, the standard ones taken from foxglove-sdk.
 
 This file defines the wire layout. Fields are numbered in the order of the dataclass:
 
@@ -16,7 +16,7 @@ from typing import Any
 import foxglove.messages
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from flowrec.declarations import message_fields
+from flowrec.core import message_fields
 
 _Field = descriptor_pb2.FieldDescriptorProto
 _SCALARS: dict[Any, Any] = {
@@ -61,10 +61,14 @@ def array_schema() -> Schema:
     return _add(file, "flowrec.Array")
 
 
-def schema_of(message_type: type[Any]) -> Schema:
-    """The schema derived from a message dataclass; to be called once per type, codec.py caches it."""
-    name = message_type.__name__
-    file = descriptor_pb2.FileDescriptorProto(name=f"flowrec/{name}.proto", package="flowrec", syntax="proto3")
+def schema_of(message_type: type[Any], path: str = "") -> Schema:
+    """The schema derived from a message dataclass; to be called once per type, codec.py caches it.
+
+    `path` : of an extra topic, whose type may be called like another one: its schema has a name and a pool of its own.
+    """
+    name, package = message_type.__name__, "flowrec" + (".extra" + path.replace("/", ".") if path else "")
+    file_name = f"{package.replace('.', '/')}/{name}.proto"
+    file = descriptor_pb2.FileDescriptorProto(name=file_name, package=package, syntax="proto3")
     message = file.message_type.add(name=name)
     for number, form in enumerate(message_fields(message_type), 1):
         field = message.field.add(name=form.name, number=number, label=_Field.LABEL_OPTIONAL)
@@ -80,7 +84,7 @@ def schema_of(message_type: type[Any]) -> Schema:
             if form.optional:  # proto3 declares presence as a one-of with a single member
                 field.proto3_optional, field.oneof_index = True, len(message.oneof_decl)
                 message.oneof_decl.add(name=f"_{form.name}")
-    return _add(file, f"flowrec.{name}")
+    return _add(file, f"{package}.{name}", alone=bool(path))
 
 
 @functools.cache
@@ -108,13 +112,22 @@ def plot_schema(name: str, numbers: Iterable[str], lists: Iterable[str] = ()) ->
     return _add(file, f"flowrec.{name}")
 
 
-def _add(file: descriptor_pb2.FileDescriptorProto, name: str) -> Schema:
-    _files[file.name] = file
-    _pool.Add(file)
-    closure = descriptor_pb2.FileDescriptorSet(file=[*(_files[needed] for needed in file.dependency), file])
-    return _schema(name, closure.SerializeToString(deterministic=True))
+def _add(file: descriptor_pb2.FileDescriptorProto, name: str, *, alone: bool = False) -> Schema:
+    """The schema in a file; `alone`: in a pool of its own."""
+    needed = [_files[each] for each in file.dependency]
+    if alone:
+        pool = descriptor_pool.DescriptorPool()
+        for each in needed:
+            pool.Add(each)
+    else:
+        pool = _pool
+        _files[file.name] = file
+    pool.Add(file)
+    return _schema(
+        name, descriptor_pb2.FileDescriptorSet(file=[*needed, file]).SerializeToString(deterministic=True), pool
+    )
 
 
-def _schema(name: str, data: bytes) -> Schema:
-    wire = message_factory.GetMessageClass(_pool.FindMessageTypeByName(name))
+def _schema(name: str, data: bytes, pool: descriptor_pool.DescriptorPool = _pool) -> Schema:
+    wire = message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
     return Schema(name, data, wire)

@@ -12,8 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Generic, Protocol, TypeVar
 
-from flowrec.declarations import Message
-from flowrec.messages import Frame
+from flowrec.core import Frame, Message
 from flowrec.store.frame_encodings import FrameEncoding
 from flowrec.store.write_queue import Entry, NewMessages
 

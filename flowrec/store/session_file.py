@@ -17,9 +17,19 @@ from pathlib import Path
 
 from mcap.records import Metadata
 
-from flowrec.errors import SessionError
+from flowrec.core import (
+    FIXED,
+    MCAP,
+    Output,
+    SessionError,
+    TopicTable,
+    __version__,
+    put_in_place,
+    sync_directory,
+    taken,
+)
 from flowrec.store.channels import declarations, left_out
-from flowrec.store.chunk import ChunkEncoder, detached
+from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.frame_encodings import ENCODINGS, FrameEncoding
 from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.mcap_writer import McapWriter
@@ -27,14 +37,11 @@ from flowrec.store.roi import Region
 from flowrec.store.run_files import PARTIAL_SUFFIX, partial_path, run_files
 from flowrec.store.session_metadata import OUTCOME, PROFILE, VIEW, SessionHeader, header_records
 from flowrec.store.write_queue import Entry
-from flowrec.system.durable import put_in_place, sync_directory
-from flowrec.system.outputs import MCAP, Output, taken
-from flowrec.version import __version__
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """When a part of a run is finished and the next one begins. With neither limit, a run is in one file.
+    """Limits at which a part of a run is finished and the next one begins. With neither limit, a run is in one file.
 
     Attributes
     ----------
@@ -51,7 +58,7 @@ class Split:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What is recorded around an event: a mark, a note, a warning, the first lost image, a bad end.
+    """Interval that is recorded around an event: a mark, a note, a warning, the first lost image, a bad end.
 
     Attributes
     ----------
@@ -66,7 +73,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class WriterOptions:
-    """How a session is written; the section [recording] of the configuration, resolved.
+    """Options of a recording; the section [recording] of the configuration, resolved.
 
     Attributes
     ----------
@@ -86,7 +93,7 @@ class WriterOptions:
     bits : depth of the images; another one is refused.
     keep_failed : False: a session that an exception ends leaves no file, and what `overwrite` would replace stays.
     clock : monotonic time in s, by which data is flushed and synced.
-    copied_images : the images are chunks of another file (SessionWriter.add_chunk); those in the ticks stand for them.
+    topics : those of the run.
     start_by_clocks : stamp 0 is at the time of day that the first tick's /run/clocks says; the header's is a guess.
     """
 
@@ -103,16 +110,16 @@ class WriterOptions:
     keep_failed: bool = True
     clock: Callable[[], float] = time.monotonic
     start_by_clocks: bool = False
-    copied_images: bool = False
+    topics: TopicTable = FIXED
 
     @property
     def left_out_topics(self) -> frozenset[str]:
         """The topics that match `leave_out`; raises UsageError as channels.left_out."""
-        return left_out(self.leave_out)
+        return left_out(self.leave_out, self.topics)
 
     @property
     def encoding(self) -> FrameEncoding:
-        """Of the images; raises UsageError if it can not hold their depth."""
+        """Encoding of the images; raises UsageError if it can not hold their depth."""
         return ENCODINGS[self.frames].of(self.bits)
 
     @property
@@ -156,10 +163,7 @@ class SessionFile:
         self.failed = False
         self._name_synced = False
         self._options = options
-        try:
-            self._file = McapWriter(self.partial_path, overwrite=options.overwrite)
-        except OSError as error:
-            raise _not_writable(self.partial_path, error) from error
+        self._file = new_mcap(self.partial_path, overwrite=options.overwrite)
         try:
             self._write_head(header)
         except BaseException as error:
@@ -170,13 +174,14 @@ class SessionFile:
 
     def restart(self, header: SessionHeader) -> None:
         """Write another header into a file that holds nothing but its header."""
-        with self._checked():
+        with self._mark_failed():
             self._file.clear()
             self._write_head(header)
 
     def _write_head(self, header: SessionHeader) -> None:
+        options = self._options
         self._file.start(PROFILE, f"flowrec {__version__}")
-        for record in (*header_records(header), *declarations(self._options.encoding, self._options.region)):
+        for record in (*header_records(header), *declarations(options.encoding, options.region, options.topics)):
             self._file.add(record)
 
     @property
@@ -186,12 +191,12 @@ class SessionFile:
 
     def add_chunks(self, chunks: list[SealedChunk]) -> None:
         """Append chunks, all in one write."""
-        with self._checked():
+        with self._mark_failed():
             self._file.add_chunks(chunks)
 
     def sync(self) -> None:
         """Force what was appended to the disk."""
-        with self._checked():
+        with self._mark_failed():
             self._file.sync()
             if not self._name_synced:
                 sync_directory(self.partial_path.parent)  # otherwise a power failure may leave the file without a name
@@ -199,7 +204,7 @@ class SessionFile:
 
     def complete(self, outcome: Mapping[str, str], top_um_s: float | None) -> None:
         """Write outcome, colour scale of the views and summary, sync, and rename the file."""
-        with self._checked():
+        with self._mark_failed():
             if top_um_s is not None:
                 self._file.add(Metadata(VIEW, {"speed_scale_um_s": repr(top_um_s)}))
             self._file.add(Metadata(OUTCOME, dict(outcome)))
@@ -223,14 +228,30 @@ class SessionFile:
         )
 
     @contextlib.contextmanager
-    def _checked(self) -> Iterator[None]:
+    def _mark_failed(self) -> Iterator[None]:
         try:
-            yield
-        except BaseException as error:
+            with disk_errors(self.partial_path):
+                yield
+        except BaseException:
             self.failed = True
-            if isinstance(error, OSError):
-                raise _disk_failed(self.partial_path, error) from error
             raise
+
+
+def new_mcap(path: Path, *, overwrite: bool) -> McapWriter:
+    """Begin a file; raises FileError where it can not be made."""
+    try:
+        return McapWriter(path, overwrite=overwrite)
+    except OSError as error:
+        raise _not_writable(path, error) from error
+
+
+@contextlib.contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Turns an OSError of writing the file into a FileError that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise _disk_failed(path, error) from error
 
 
 def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
@@ -311,7 +332,7 @@ class AsyncFileWriter(SessionFile):
 
     def put(self, chunks: list[SealedChunk]) -> None:
         """Append chunks."""
-        for chunk in detached(chunks):
+        for chunk in copy_chunks(chunks):
             with self._written:
                 self._written.wait_for(lambda: self._failure is not None or self._waiting_bytes <= self._limit_bytes)
                 self._waiting_bytes += len(chunk.data)

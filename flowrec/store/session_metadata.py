@@ -14,10 +14,9 @@ from typing import Literal, Self
 
 from mcap.records import Attachment, Metadata, Statistics
 
-from flowrec.errors import SessionError
+from flowrec.core import SessionError, __version__
 from flowrec.store.mcap_format import Summary
 from flowrec.store.mcap_reader import ForeignError, McapReader
-from flowrec.version import __version__
 
 FORMAT_VERSION = 1
 PROFILE = "flowrec"
@@ -45,7 +44,7 @@ _DIGITS = 20  # more than a number of 64 bit has
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Which file of a run this is, where a run has several.
+    """Position of this file in its run, where a run has several.
 
     Every file but the first starts with a keyframe: the full state at the last tick before it, at that tick's stamp.
     It makes the file readable alone; readers of the whole run skip it.
@@ -95,7 +94,7 @@ class SessionHeader:
     pictures: Mapping[str, bytes] = field(default_factory=dict)
 
     def is_same_run(self, other: SessionHeader) -> bool:
-        """Whether two headers differ in their part at most."""
+        """True if two headers differ in their part at most."""
         return replace(self, part=None) == replace(other, part=None)
 
 
@@ -122,7 +121,7 @@ def header_records(header: SessionHeader) -> Iterator[Metadata | Attachment]:
 
 
 def is_header_file(name: str) -> bool:
-    """Whether an attachment is part of a session's header."""
+    """True if an attachment is part of a session's header."""
     return name in (CONFIG_FILE, CHIP_IMAGE_FILE, CHIP_FILE) or name.startswith((_WEIGHTS, _PICTURES))
 
 
@@ -194,7 +193,7 @@ class SessionMetadata:
         return self._by_topic(self.statistics.channel_message_counts)
 
     def counts_until(self, stamp_ns: int) -> dict[str, int]:
-        """The same of messages at or before a stamp; reads the chunks that begin by then."""
+        """Count the messages of each topic at or before a stamp; reads the chunks that begin by then."""
         counts: Counter[int] = Counter()
         for chunk in self.chunks:
             if chunk.message_start_time <= stamp_ns:
@@ -265,7 +264,7 @@ class SessionMetadata:
 
 
 def _part_of(records: Mapping[str, Mapping[str, str]]) -> Part | None:
-    """Which file of a run it is, from its metadata records.
+    """Position of a file in its run, from its metadata records.
 
     Raises
     ------

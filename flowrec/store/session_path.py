@@ -1,4 +1,4 @@
-"""Where a session is: a path on this machine or a URL."""
+"""Location of a session: a path on this machine or a URL."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flowrec.errors import UsageError
+from flowrec.core import UsageError
 
 # A path keeps one slash of the two after the scheme; `az` is Azure, `gs` Google.
 _URL = re.compile(r"(s3|gs|az|https?):/{1,2}(?=[^/])", re.IGNORECASE)

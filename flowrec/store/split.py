@@ -13,9 +13,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from flowrec.enums import Outcome
-from flowrec.errors import SessionError
-from flowrec.store.chunk import ChunkEncoder, detached
+from flowrec.core import Outcome, SessionError, nanoseconds, seconds
+from flowrec.store.chunk import ChunkEncoder, copy_chunks
 from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.run_files import part_path
 from flowrec.store.segments import Counters, OpenSegment, SegmentRouter, keyframe
@@ -23,8 +22,6 @@ from flowrec.store.session_file import FileError, SessionFile, Split, WriterOpti
 from flowrec.store.session_metadata import Part, SessionHeader
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
-from flowrec.topics import BY_FIELD
-from flowrec.units import nanoseconds, seconds
 
 _POLL_S = 0.05
 
@@ -55,15 +52,10 @@ class PartFile(SessionFile):
     def __init__(self, parts: Parts, number: int, path: Path, header: SessionHeader, first: Entry | None) -> None:
         super().__init__(path, header, parts.options)
         self.number = number
+        self._start_unix_ns = header.start_unix_ns
         self.flushed_ns: int | None = None
         self._parts = parts
-        self._encoder = ChunkEncoder(
-            self._options.encoding,
-            parts.views,
-            self.add_chunks,
-            header.start_unix_ns,
-            copied_images=self._options.copied_images,
-        )
+        self._encoder = self._new_encoder(parts.views)
         self._first_bytes = self.size  # of head and keyframe
         self._image_bytes = 0  # of the keyframe's image
         self._raw_bytes = 1  # of what was added
@@ -85,9 +77,8 @@ class PartFile(SessionFile):
                 raise
             return
         self._encoder.sink = self._hold
-        self._encoder.sequences.update(BY_FIELD[field].path for field in first.messages)
-        beside = ChunkEncoder(self._options.encoding, parts.views.copy(), self.add_chunks, header.start_unix_ns)
-        self._writing_keyframe = self._side.submit(_encode_all, beside, first)
+        self._encoder.sequences.update(self._options.topics.by_field[field].path for field in first.messages)
+        self._writing_keyframe = self._side.submit(_encode_all, self._new_encoder(parts.views.copy()), first)
 
     @property
     def timeout_s(self) -> float | None:
@@ -110,7 +101,7 @@ class PartFile(SessionFile):
         self.sync()
 
     def is_larger_than(self, megabytes: float, awaited_bytes: int) -> bool:
-        """Whether the part has reached a size; with a keyframe of more than half of that, twice the keyframe's size.
+        """True if the part has reached a size; with a keyframe of more than half of that, twice the keyframe's size.
 
         For images that are still queued the compression ratio of the part so far is assumed.
         """
@@ -132,9 +123,6 @@ class PartFile(SessionFile):
         if self._since_ns is None:
             self._since_ns = entry.stamp_ns
         self._last_ns = max(self._last_ns, entry.stamp_ns)
-        if entry.chunk is not None:
-            self.add_chunks([entry.chunk])
-            return
         try:
             self._encoder.add(entry)
         except FileError:
@@ -178,6 +166,10 @@ class PartFile(SessionFile):
         self._side.shutdown()
         super().close()
 
+    def _new_encoder(self, views: ViewerTopics) -> ChunkEncoder:
+        options = self._options
+        return ChunkEncoder(options.encoding, views, self.add_chunks, self._start_unix_ns, options.topics)
+
     @property
     def _all_bytes(self) -> int:
         """Bytes in the file and bytes that are not written yet, of which most are not compressed yet."""
@@ -193,7 +185,7 @@ class PartFile(SessionFile):
             self.flushed_ns = self._last_ns
 
     def _hold(self, chunks: list[SealedChunk]) -> None:
-        self._held += detached(chunks)
+        self._held += copy_chunks(chunks)
 
     def _check_keyframe(self, *, wait: bool) -> None:
         """Write the chunks that were held back, once the keyframe is in the file."""
@@ -326,18 +318,18 @@ class Parts:
     def finish_part(self, part: PartFile, counters: Counters) -> None:
         """Finish a part that is not the last, in the side thread."""
         part.flush()
-        outcome = {**self._continued(part), **counters.summary(self.options.encoding)}
+        outcome = {**self._continued_outcome(part), **counters.summary(self.options.encoding)}
         self._finishing.append((part, self._side.submit(part.finish, outcome)))
 
     def _finish_after_failure(self, place: OpenSegment[PartFile], reason: str) -> None:
         place.counters.dropped_frames += place.awaited
         part, is_last = place.segment, place is self._router.current
-        outcome = {"outcome": Outcome.FAILED, "reason": reason} if is_last else self._continued(part)
+        outcome = {"outcome": Outcome.FAILED, "reason": reason} if is_last else self._continued_outcome(part)
         part.finish({**outcome, **place.counters.summary(self.options.encoding)})
         self.files.append(part.path)
 
     def _is_due(self, stamp_ns: int) -> bool:
-        """Whether a tick is the first one of another part."""
+        """True if a tick is the first one of another part."""
         split, place = self._split, self._router.current
         if place.begin_ns is None or not split:
             return False
@@ -361,7 +353,7 @@ class Parts:
         keyframe_ns = first.stamp_ns if first is not None else None
         return replace(self._header, part=Part(self._run, number, keyframe_ns=keyframe_ns))
 
-    def _continued(self, part: PartFile) -> dict[str, str]:
+    def _continued_outcome(self, part: PartFile) -> dict[str, str]:
         return {"outcome": Outcome.CONTINUED, "next": part_path(self._path, part.number + 1).name}
 
     def _collect_finished(self, *, wait: bool) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from flowrec.errors import SessionError, UsageError
+from flowrec.core import SessionError, UsageError
 
 TIMEOUT_KEY = "FLOWREC_TIMEOUT_S"  # environment variable; the option --timeout sets it
 _TIMEOUT_S = 30.0
@@ -46,7 +46,7 @@ class HiddenError(MissingError):
 
 @dataclass(slots=True)
 class Traffic:
-    """What was asked of servers by this process.
+    """Statistics of the requests of this process to servers.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Traffic:
 
     @property
     def line(self) -> str:
-        """How many requests were repeated and why; '' where none was."""
+        """Number of requests that were repeated, with the reasons; '' where none was."""
         count = self.reasons.total()
         if not count:
             return ""

@@ -14,11 +14,10 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
 
-from flowrec.messages import Estimate, FlowField, Route, Track
+from flowrec.core import M_PER_UM, Estimate, FlowField, Route, Track
 from flowrec.store.codec import Payload, byte_field_head
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.viewer_scene import CHIP, MAP, Picture, ViewerScene, speed_um_s
-from flowrec.units import M_PER_UM
 
 _GRID_DATA, _CIRCLES, _POINTS, _TRANSFORMS = 9, 1, 2, 1  # numbers of fields
 # The robot and the goal are drawn as rings: a single point of Rerun's default size is hidden by the path.
@@ -32,18 +31,18 @@ _ROBOT, _UNSEEN, _PATH, _GOAL = (255, 112, 32, 255), (200, 200, 200, 255), (0, 2
 
 
 def transforms(stamp_ns: int, scene: ViewerScene) -> Payload:
-    """Where chip and cameras are."""
+    """Coordinate frames of chip and cameras."""
     stamp, parts = scene.stamp(stamp_ns), [transform.encode() for transform in scene.transforms()]
     return tuple(byte_field_head(_TRANSFORMS, len(stamp) + len(part)) + stamp + part for part in parts)
 
 
 def camera(picture: Picture, _scene: ViewerScene) -> Payload:
-    """How a camera maps the chip to its image."""
+    """Calibration of a camera: the projection of the chip to its image."""
     return (picture.calibration().encode(),)
 
 
 def robot_pose(robot: Estimate | Track, scene: ViewerScene) -> Payload:
-    """Where the robot is on the chip, in m."""
+    """Pose of the robot on the chip, in m."""
     return _pose_field(*scene.place_um(robot.position_um)), _IN_CHIP
 
 
@@ -54,7 +53,7 @@ def robot_points(robot: Estimate | Track, scene: ViewerScene) -> Payload:
 
 
 def robot_mark(robot: Estimate | Track, scene: ViewerScene) -> Payload:
-    """The same on the camera's image, in px."""
+    """Ring around the robot on the camera's image, in px."""
     assert scene.picture is not None
     place = scene.picture.pixel(*scene.place_um(robot.position_um))
     ring_px = _RING_RADII * scene.robot_um / scene.picture.um_per_px
@@ -68,7 +67,7 @@ def path(route: Route, _scene: ViewerScene) -> Payload:
 
 
 def path_points(route: Route, _scene: ViewerScene) -> Payload:
-    """The same as points."""
+    """The route as points on the chip, in m."""
     return (_cloud(route.waypoints_um, _PATH, _pose(0.0, 0.0)).encode(),)
 
 
@@ -90,7 +89,7 @@ def route_mark(stamp_ns: int, scene: ViewerScene) -> Payload:
     stamp, width_px = scene.stamp(stamp_ns), scene.picture.width_px
     parts: Payload = ()
     if scene.route is not None:
-        way_px = scene.picture.to_px(thinned(scene.route.waypoints_um, scene.picture.um_per_px))
+        way_px = scene.picture.to_px(thin_line(scene.route.waypoints_um, scene.picture.um_per_px))
         parts += _line(stamp, way_px, "LINE_STRIP", width_px, _PATH)
     if scene.goal_um is not None:
         place, ring_px = scene.picture.to_px(scene.goal_um), _RADII_OF_GOAL * scene.robot_um / scene.picture.um_per_px
@@ -101,7 +100,7 @@ def route_mark(stamp_ns: int, scene: ViewerScene) -> Payload:
     return parts
 
 
-def thinned(points_um: NDArray[np.float64], step_um: float) -> NDArray[np.float64]:
+def thin_line(points_um: NDArray[np.float64], step_um: float) -> NDArray[np.float64]:
     """Points (n, 2) of a line: the first of each step along it, and its last one."""
     if len(points_um) < 2:
         return points_um
@@ -236,5 +235,5 @@ _IN_CHIP = fg.PoseInFrame(frame_id=CHIP).encode()
 
 
 def is_finite(place: NDArray[np.float64]) -> bool:
-    """Whether a place (2,) can be drawn on an image."""
+    """True if a place (2,) can be drawn on an image."""
     return all(map(math.isfinite, place.tolist()))

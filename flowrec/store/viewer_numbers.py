@@ -10,11 +10,10 @@ import math
 
 import numpy as np
 
-from flowrec.flow import sample
-from flowrec.messages import Estimate, Observations, Route, Track
+from flowrec.core import Estimate, Observations, Route, Track
 from flowrec.store.codec import Payload
 from flowrec.store.schema import plot_schema
-from flowrec.store.viewer_drawings import distance_um, thinned
+from flowrec.store.viewer_drawings import distance_um, thin_line
 from flowrec.store.viewer_scene import ViewerScene
 
 _ROUTE_POINTS = 200  # along a route, at most; more are not visible
@@ -102,11 +101,13 @@ def route_flow(route: Route, scene: ViewerScene) -> Payload:
     """The flow along the route."""
     way_um = route.waypoints_um
     if len(way_um) > _ROUTE_POINTS:
-        way_um = thinned(way_um, distance_um(way_um)[-1] / (_ROUTE_POINTS - 1) or 1.0)
+        way_um = thin_line(way_um, distance_um(way_um)[-1] / (_ROUTE_POINTS - 1) or 1.0)
     along = np.gradient(way_um, axis=0) if len(way_um) > 1 else np.zeros_like(way_um)
     along /= np.maximum(np.hypot(*along.T), 1e-12)[:, None]
     flow, std = np.full(way_um.shape, math.nan), np.full(way_um.shape, math.nan)
     if scene.field is not None:
+        from flowrec.physics import sample  # late: what reads a session needs no compiled kernels
+
         flow = sample(scene.field, way_um)
         if scene.field.std_um_s is not None:
             height, width = scene.field.std_um_s.shape[:2]
@@ -125,5 +126,7 @@ def _map_at(scene: ViewerScene, x_um: float, y_um: float) -> tuple[float, float]
     """The map's flow at a place on the chip; NaN without a map."""
     if scene.field is None or not (math.isfinite(x_um) and math.isfinite(y_um)):
         return math.nan, math.nan
+    from flowrec.physics import sample  # late, as above
+
     u, v = sample(scene.field, (x_um, y_um)).tolist()
     return u, v

@@ -1,4 +1,4 @@
-"""What viewers must know to draw a session: coordinate frames, cameras, and the map, route and goal of the moment.
+"""State that viewers need to draw a session: coordinate frames, cameras, and the map, route and goal of the moment.
 
 Frames, in m: `chip` has its origin at the centre of the mask's pixel (0, 0), x right, y down, z away from who looks at
 the mask; all that is drawn lies in its plane z = 0. `camera` and `map` are pinhole cameras (x right, y down, z ahead)
@@ -22,15 +22,12 @@ import numpy as np
 from foxglove import messages as fg
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.chip.registration import Calibration, on_chip
-from flowrec.declarations import Matrix, Message
-from flowrec.errors import FlowrecError
-from flowrec.messages import FlowField, Mission, Route
+from flowrec.core import M_PER_UM, FlowField, FlowrecError, Matrix, Message, Mission, Route, Shift, shift_px
+from flowrec.physics import Calibration, on_chip
 from flowrec.store.codec import timestamp
 from flowrec.store.frame_encodings import CAMERA_FRAME
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_metadata import SessionHeader
-from flowrec.units import M_PER_UM
 
 ROOT, CHIP, MAP = "tf#/", "chip", "map"
 # Of the cameras over the chip. Rerun clips what is nearer than 0.1 m; Foxglove's depth buffer resolves 2 um there.
@@ -60,7 +57,7 @@ class Picture:
 
     @property
     def mirrored(self) -> bool:
-        """Whether the chip is seen as in a mirror."""
+        """True if the chip is seen as in a mirror."""
         return self._determinant < 0.0
 
     @property
@@ -91,7 +88,7 @@ class Picture:
         return np.stack((x, y), -1)
 
     def pixel(self, x_um: _Number, y_um: _Number) -> tuple[_Number, _Number]:
-        """The same of one point, or of arrays of coordinates."""
+        """Pixel of one point, or of arrays of coordinates."""
         (xx, xy, x0), (yx, yy, y0) = self._inverse
         return xx * x_um + xy * y_um + x0, yx * x_um + yy * y_um + y0
 
@@ -108,7 +105,7 @@ class Picture:
         )
 
     def transform(self) -> fg.FrameTransform:
-        """Where the pinhole camera is: over the middle of the image, or behind it if that is mirrored."""
+        """Pose of the pinhole camera: over the middle of the image, or behind it if that is mirrored."""
         middle = np.array([0.5 * self.width_px - _HALF_PX, 0.5 * self.height_px - _HALF_PX, 1.0])
         x, y = (M_PER_UM * (self.matrix @ middle)).tolist()
         sin, cos = math.sin(0.5 * self.angle_rad), math.cos(0.5 * self.angle_rad)
@@ -135,27 +132,28 @@ class ChipCamera:
     def of(cls, header: SessionHeader) -> ChipCamera | None:
         """The camera of a session; None where its settings or its chip can not be read, as in a damaged file."""
         # Loaded late: listing sessions needs no settings.
-        from flowrec.chip import chip_from_files
-        from flowrec.config import calibration_of, config_from_toml
+        from flowrec.physics import chip_from_files
+        from flowrec.stages import calibration_of, config_from_toml
 
         try:
-            config = config_from_toml(header.config_toml, "config.toml")
+            config = config_from_toml(header.config_toml, "config.toml", header.provenance)
             calibration = calibration_of(config, chip_from_files(header.chip_png, header.chip_toml))
         except FlowrecError:
             return None
         return cls(calibration, (config.camera.width_px, config.camera.height_px), config.robot.radius_um)
 
-    def picture(self, registration: Matrix | None) -> Picture:
-        """The camera's image on the chip, by the registration that a refinement found."""
+    def picture(self, registration: Matrix | None, shift: Shift | None = None) -> Picture:
+        """The camera's image on the chip, by the registration that a refinement found and the shift of the image."""
         if registration is not None and not _is_similarity(registration):
             registration = None
-        corners = on_chip(registration, self.calibration.to_um([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
+        calibration = self.calibration.for_shift(shift_px(shift))
+        corners = on_chip(registration, calibration.to_um([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]))
         matrix = np.column_stack((corners[1] - corners[0], corners[2] - corners[0], corners[0]))
         return Picture(CAMERA_FRAME, *self.size_px, matrix)
 
 
 def _is_similarity(registration: Matrix) -> bool:
-    """Whether a registration (2, 3) turns, shifts and scales only; one of a damaged file may do anything."""
+    """True if a registration (2, 3) turns, shifts and scales only; one of a damaged file may do anything."""
     if registration.shape != (2, 3) or not np.isfinite(registration).all():
         return False
     (a, b, _), (c, d, _) = registration.tolist()
@@ -163,7 +161,7 @@ def _is_similarity(registration: Matrix) -> bool:
 
 
 class ViewerScene:
-    """What is known so far of camera, flow and route.
+    """Camera, flow and route as far as they are known.
 
     Attributes
     ----------
@@ -185,6 +183,7 @@ class ViewerScene:
         self.picture = camera.picture(None) if camera is not None else None
         self.map: Picture | None = None
         self._refined: FlowField | None = None
+        self._shift: Shift | None = None
 
     @property
     def robot_um(self) -> float:
@@ -198,11 +197,11 @@ class ViewerScene:
         return math.nan if share is None else share
 
     def on_chip(self, measured_um: ArrayLike) -> NDArray[np.float64]:
-        """Where measured places (..., 2) in um lie on the chip."""
+        """Places on the chip, in um, of measured places (..., 2) in um."""
         return on_chip(self._refined.registration if self._refined is not None else None, measured_um)
 
     def place_um(self, measured_um: NDArray[np.float64]) -> tuple[float, float]:
-        """The same of one place (2,), quicker."""
+        """Place on the chip of one measured place (2,), quicker than `on_chip`."""
         x, y = measured_um.tolist()
         if self._refined is None or self._refined.registration is None:
             return x, y
@@ -215,13 +214,19 @@ class ViewerScene:
             field = messages.get(name)
             if isinstance(field, FlowField) and drawable(field):
                 if self.top_um_s is None:
-                    self.top_um_s = float(speed_um_s(field).max()) or 1.0
+                    self.top_um_s = brightest_um_s(field)
                 if name == "refined":
                     self._refined = field
-                    self.picture = self.camera.picture(field.registration) if self.camera is not None else None
                 if name == "refined" or self._refined is None:
                     self.field = field
                 self.map = _map(field) or self.map
+        shift, refined = messages.get("shift"), self._refined
+        if isinstance(shift, Shift):
+            self._shift = shift
+        moved = isinstance(shift, Shift) or (refined is not None and refined is messages.get("refined"))
+        if moved and self.camera is not None:
+            registration = self._refined.registration if self._refined is not None else None
+            self.picture = self.camera.picture(registration, self._shift)
         route, mission = messages.get("route"), messages.get("mission")
         if isinstance(route, Route) and route.waypoints_um.shape[1:] == (2,):
             self.route = route
@@ -254,7 +259,7 @@ def _map(field: FlowField) -> Picture | None:
 
 
 def drawable(field: FlowField) -> bool:
-    """Whether a field has velocities on pixels."""
+    """True if a field has velocities on pixels."""
     return field.velocity_um_s.shape[2:] == (2,) and field.velocity_um_s.size > 0
 
 
@@ -264,3 +269,8 @@ def speed_um_s(field: FlowField) -> NDArray[np.float32]:
         speed: NDArray[np.float32] = np.hypot(field.velocity_um_s[..., 0], field.velocity_um_s[..., 1])
     np.nan_to_num(speed, copy=False, posinf=0.0)
     return speed
+
+
+def brightest_um_s(field: FlowField) -> float:
+    """The end of the colour scale of a session whose first field this is."""
+    return float(speed_um_s(field).max()) or 1.0

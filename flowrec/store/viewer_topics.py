@@ -13,15 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.declarations import Message
-from flowrec.messages import Estimate, FlowField, Observations, Track
+from flowrec.core import NS_PER_S, Estimate, FlowField, Message, Observations, Track
 from flowrec.store import viewer_drawings as drawings
 from flowrec.store import viewer_numbers as numbers
 from flowrec.store.codec import Payload
 from flowrec.store.schema import Schema, foxglove_schema
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene, drawable
-from flowrec.units import NS_PER_S
 
 _ROBOT_EVERY_NS = NS_PER_S // 125  # a higher rate is not visible
 _NEVER = -(1 << 62)

@@ -10,9 +10,8 @@ import threading
 from collections import deque
 from typing import Any, NamedTuple
 
-from flowrec.store.mcap_format import SealedChunk
+from flowrec.core import NS_PER_S
 from flowrec.store.roi import Window
-from flowrec.units import NS_PER_S
 
 NewMessages = dict[str, Any]  # the new messages of one tick by field of Tick, in the order of the topic table
 
@@ -33,7 +32,6 @@ class Entry(NamedTuple):
     late : this is that image.
     dropped, missing : images that the writer left out, and that the camera has not delivered, since the entry before.
     window : of the image, where not all of it is recorded.
-    chunk : is written as it is, instead of messages.
     """
 
     stamp_ns: int
@@ -45,7 +43,6 @@ class Entry(NamedTuple):
     dropped: int = 0
     missing: int = 0
     window: Window | None = None
-    chunk: SealedChunk | None = None
 
 
 class WriteQueue:
@@ -67,7 +64,7 @@ class WriteQueue:
         return self.nbytes / self._limit
 
     def has_room(self, nbytes: int) -> bool:
-        """Whether that many bytes fit in; an empty queue takes anything."""
+        """True if that many bytes fit in; an empty queue takes anything."""
         return self.nbytes == 0 or self.nbytes + nbytes <= self._limit
 
     def wait_for_room(self, nbytes: int) -> None:
@@ -83,7 +80,7 @@ class WriteQueue:
                 self._changed.notify_all()
                 self._changed.wait_for(lambda: self._abandoned or self._flushed_ns >= stamp_ns)
 
-    def flushed(self, stamp_ns: int) -> None:
+    def mark_flushed(self, stamp_ns: int) -> None:
         """Note that the operating system has the ticks up to a stamp."""
         if stamp_ns > self._flushed_ns:  # set by this thread alone
             with self._changed:
@@ -109,7 +106,7 @@ class WriteQueue:
 
     @property
     def images_wait(self) -> bool:
-        """Whether the next entry may be the image of a tick that was taken before."""
+        """True if the next entry may be the image of a tick that was taken before."""
         return bool(self._images)
 
     def drop_images(self) -> int:
@@ -171,7 +168,7 @@ class FrameDecimation:
         self._changed_ns: int | None = None  # when `every` was last halved or doubled
 
     def keeps(self, fill: float, stamp_ns: int) -> bool:
-        """Whether to keep the next image, the queue being filled to that ratio (0 to 1)."""
+        """True if the next image is kept, the queue being filled to that ratio (0 to 1)."""
         self._number += 1
         wanted: int = 2 ** sum(fill >= limit for limit in _DECIMATE_ABOVE)
         since_s = float("inf") if self._changed_ns is None else (stamp_ns - self._changed_ns) / NS_PER_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import operator
 import os
@@ -16,13 +17,27 @@ from typing import Any, Self
 
 import numpy as np
 
-from flowrec.declarations import Message, array_fields
-from flowrec.diagnostics import Clocks, Drops
-from flowrec.enums import Outcome
-from flowrec.errors import SessionError
-from flowrec.messages import Frame, Track
+from flowrec.core import (
+    NO_EXTRA,
+    NS_PER_S,
+    TOPICS,
+    Clocks,
+    Drops,
+    Extra,
+    Frame,
+    Message,
+    Outcome,
+    Priority,
+    SessionError,
+    Tick,
+    Track,
+    array_fields,
+    nanoseconds,
+    prioritise_thread,
+    remove_idle,
+    shape_error,
+)
 from flowrec.store.channels import FRAME_PATH
-from flowrec.store.mcap_format import SealedChunk
 from flowrec.store.ring_buffer import RingBuffer
 from flowrec.store.roi import Window, WindowSelector
 from flowrec.store.run_files import run_files
@@ -30,10 +45,6 @@ from flowrec.store.session_file import Snapshot, WriterOptions, refuse_if_taken
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.split import Parts
 from flowrec.store.write_queue import Entry, FrameDecimation, NewMessages, WriteQueue
-from flowrec.system.locks import remove_idle
-from flowrec.system.processes import Priority, prioritise_thread
-from flowrec.topics import TOPICS, Tick
-from flowrec.units import NS_PER_S, nanoseconds
 
 _NICE = 5  # of a run that waits for its disk: where there are too few cores for all, the loop goes first
 _DROPS_EVERY_NS = NS_PER_S // 2
@@ -42,10 +53,10 @@ _FIELDS = tuple(topic.field for topic in TOPICS)
 _messages_of: Callable[[Tick], tuple[Any, ...]] = operator.attrgetter(*_FIELDS)
 
 
-# Only images and rasters are counted; the vectors of all other messages are too short to matter.
-_PIXEL_FIELDS = {
-    topic.type: tuple(name for name, dtype in array_fields(topic.type) if dtype != np.float64) for topic in TOPICS
-}
+@functools.cache
+def _pixel_fields(message_type: Any) -> tuple[str, ...]:
+    """Images and rasters, of which the bytes are counted; most vectors are too short to matter."""
+    return tuple(name for name, dtype in array_fields(message_type) if dtype != np.float64)
 
 
 class SessionWriter:
@@ -100,7 +111,8 @@ class SessionWriter:
         self._last_ns = -1
         self._failure: BaseException | None = None
         self._closed = False
-        self._left_out = [topic.field for topic in TOPICS if topic.path in options.left_out_topics]
+        self._topics, self._extra = options.topics, NO_EXTRA
+        self._left_out = [topic.field for topic in self._topics.topics if topic.path in options.left_out_topics]
         refuse_if_taken(self.path, overwrite=options.overwrite, inputs=inputs)
         # Only what was there before this run may be removed after it.
         self._replaced = {file: file.stat().st_ino for file in run_files(self.path)} if options.overwrite else {}
@@ -194,19 +206,6 @@ class SessionWriter:
         )
         self._queue.put(entry, image)
 
-    def add_chunk(self, chunk: SealedChunk) -> None:
-        """Copy a chunk of images of another file, the option `copied_images`; they are those of ticks up to the last.
-
-        Raises
-        ------
-        SessionError : as `write`.
-        """
-        self._raise_failure()
-        entry = Entry(self._last_ns, {}, len(chunk.data), chunk=chunk)
-        self._queue.wait_for_room(entry.nbytes)
-        self._raise_failure()
-        self._queue.put(entry)
-
     def close(self, outcome: Mapping[str, str] | None = None, timeout_s: float | None = None, *, why: str = "") -> None:
         """Finish the file and give it its name; a second call does nothing.
 
@@ -282,14 +281,30 @@ class SessionWriter:
                 before is None or message.stamp_ns != before.stamp_ns or not message.same_as(before)
             ):
                 new[name] = message
+        if tick.extra is not self._extra:
+            self._add_extra(new, tick.extra)
         return new
+
+    def _add_extra(self, new: NewMessages, extra: Extra) -> None:
+        last, self._extra = self._extra, extra
+        for path, message in extra.items():
+            before = last.get(path)
+            if message is before or (before is not None and message.same_as(before)):
+                continue
+            topic = self._topics.by_path.get(path)
+            if topic is None or type(message) is not topic.type:
+                kind = type(message).__name__
+                raise SessionError(f"{self.path}: no topic {path} of {kind} is declared; name its row in `topics`")
+            if fault := shape_error(message):  # of a package: what is written can be read
+                raise SessionError(f"{self.path}: {path}: {fault}")
+            new[path] = message
 
     def _window_of(self, frame: Frame, track: Track | None) -> Window | None:
         """The window of an image that is recorded; None: all of it."""
         return self._selector.window_of(frame, track) if self._selector is not None else None
 
     def _takes(self, frame: Frame) -> bool:
-        """Whether there is room for an image of a live run; counts those that are missing."""
+        """True if there is room for an image of a live run; counts those that are missing."""
         if self._next_index is not None and frame.index > self._next_index:
             self.missing_frames += frame.index - self._next_index
         self._next_index = frame.index + 1
@@ -329,7 +344,7 @@ class SessionWriter:
                 elif entry is None or "frame" in entry.messages or not self._queue.images_wait:
                     self._output.flush_if_due()
                 if (flushed_ns := self._output.flushed_ns) is not None:
-                    self._queue.flushed(flushed_ns)
+                    self._queue.mark_flushed(flushed_ns)
                 if entry is not None:
                     self._queue.done(entry)
         except Exception as error:  # noqa: BLE001  `write` and `close` raise it in the control loop
@@ -369,7 +384,8 @@ class SessionWriter:
 
 def _nbytes(message: Message) -> int:
     nbytes = _MESSAGE_BYTES
-    for name in _PIXEL_FIELDS[type(message)]:
+    kind: Any = type(message)
+    for name in _pixel_fields(kind):
         pixels = getattr(message, name)
         if pixels is not None:
             nbytes += pixels.nbytes

@@ -1,1 +1,5 @@
-"""Ticks to Rerun: the only room that imports rerun."""
+"""Ticks to what Rerun and Foxglove show, live or of a file."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from collections.abc import Set as AbstractSet
 
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
-from flowrec.store.channels import SLOTS
+from flowrec.store import SLOTS
 from flowrec.view import colours
 from flowrec.view.bare_plots import EVENTS, IMAGE, MAPS, ON_IMAGE, PLOTS, STATES, Plot
 from flowrec.view.entities import points
@@ -19,10 +19,13 @@ _MISSION = "/run/mission"
 _LEGEND = 0.5  # of the time shown, kept free for a legend beside the curves
 
 
-def bare_blueprint(present: AbstractSet[str], begin_ns: int, end_ns: int) -> rrb.Blueprint:
+def bare_blueprint(
+    present: AbstractSet[str], begin_ns: int, end_ns: int, extra: Sequence[tuple[str, Plot]] = ()
+) -> rrb.Blueprint:
     """The layout for a file that holds messages of the topics `present`; views that would be empty are left out.
 
-    `begin_ns` and `end_ns` are the Unix times between which it was recorded.
+    `begin_ns` and `end_ns` are the Unix times between which it was recorded, `extra` the plots of extra topics, each
+    after the name of its schema.
     """
     camera = _picture("Camera: robot (orange), route (cyan), goal (green)", IMAGE, present, 1.2)
     maps = _existing(_picture(name, topic, present, 0.9) for topic, name in MAPS.items())
@@ -30,6 +33,7 @@ def bare_blueprint(present: AbstractSet[str], begin_ns: int, end_ns: int) -> rrb
     plots = _existing(
         _tabs(*(_plot(plot, axis) for plot in group if plot.topic in present)) for group in PLOTS.values()
     )
+    plots += _existing([_tabs(*(_plot(plot, axis, schema) for schema, plot in extra))])
     events = rrb.TextLogView(
         name="Events",
         origin="/",
@@ -65,12 +69,16 @@ def _picture(name: str, topic: str, present: AbstractSet[str], width: float) -> 
     )
 
 
-def _plot(plot: Plot, axis: rrb.TimeAxis) -> rrb.View:
-    """Fields of a message over time."""
+def _plot(plot: Plot, axis: rrb.TimeAxis, schema: str = "") -> rrb.View:
+    """Fields of a message over time; of an extra topic its single numbers."""
     series = []
     for field, label in plot.lines.items():
+        if "[" in field:
+            continue
         shown = rr.SeriesPoints(names=label) if plot.points else rr.SeriesLines(names=label)
-        series.append(shown.visualizer(mappings=[_mapping("Scalars:scalars", plot.topic, field)]))
+        series.append(
+            shown.visualizer(mappings=[_mapping("Scalars:scalars", schema or SLOTS[plot.topic].schema.name, field)])
+        )
     return rrb.TimeSeriesView(
         name=plot.title,
         origin=plot.topic,
@@ -90,14 +98,16 @@ def _axis(begin_ns: int, end_ns: int) -> rrb.TimeAxis:
 
 def _state(topic: str) -> rrb.Visualizer:
     """A field of a message as states."""
-    return rr.StateChange().visualizer(mappings=[_mapping("StateChange:state", topic, STATES[topic][0])])
+    return rr.StateChange().visualizer(
+        mappings=[_mapping("StateChange:state", SLOTS[topic].schema.name, STATES[topic][0])]
+    )
 
 
-def _mapping(target: str, topic: str, field: str) -> VisualizerComponentMapping:
+def _mapping(target: str, schema: str, field: str) -> VisualizerComponentMapping:
     return VisualizerComponentMapping(
         target=target,
         source_kind=ComponentSourceKind.SourceComponent,
-        source_component=f"{SLOTS[topic].schema.name}:message",
+        source_component=f"{schema}:message",
         selector=f".{field}",
     )
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from flowrec.core import Message, Topic, message_fields
+
 
 @dataclass(frozen=True, slots=True)
 class Plot:
@@ -50,3 +52,15 @@ IMAGE = "/camera/frame"
 MAPS = {"/view/flow_assumed": "Assumed flow", "/view/flow_refined": "Refined flow"}
 ON_IMAGE = ("/camera/frame/path", "/camera/frame/goal", "/camera/frame/robot")  # points on the chip
 EVENTS = ("/run/events", "/operator/events")
+_LINES = 12  # of one plot
+
+
+def plot_of(topic: Topic, first: Message | None) -> Plot | None:
+    """The plot of an extra topic: all of its floats and, by its first message, the elements of its vectors."""
+    lines: list[str] = []
+    for each in message_fields(topic.type):
+        if each.is_float and each.dtype is None:
+            lines.append(each.name)
+        elif each.kind == "vector" and first is not None:
+            lines += [f"{each.name}[{number}]" for number in range(len(getattr(first, each.name)))]
+    return Plot(topic.path, topic.path, {line: line for line in lines[:_LINES]}) if lines else None

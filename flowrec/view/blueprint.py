@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
-from flowrec.units import seconds
+from flowrec.core import seconds
 from flowrec.view import colours
 from flowrec.view import entities as e
 from flowrec.view.entities import entity_path, points
@@ -23,6 +23,7 @@ _SUMMARY = 0.31  # width of the text panel
 # Pixels on a small screen: its width, the height of all, that of text and plots below, the frame of the lanes and each.
 _WIDTH_PX, _ALL_PX, _BELOW_PX, _LANES_PX, _LANE_PX = 1280.0, 653.0, 345.0, 60.0, 40.0
 _FEW_LANES, _MOST_LANES = 2, 5  # more than few make the area below higher; more than most are scrolled
+_MOST_EXTRA = 6  # plots of extra topics beside each other
 _TITLE_PX = 28.0
 _LEGEND_LIVE_S = 6.0  # least time kept free for a legend in a view that follows the run
 _LEGEND = 0.5  # of the time shown, kept free for a legend beside the curves
@@ -114,6 +115,11 @@ class _Views:
             axis_x=self._time_axis() if legend else None,
         )
 
+    @property
+    def extra(self) -> list[str]:
+        """The entities of the extra topics that are shown."""
+        return sorted(name for name in self.present if name.startswith(f"{e.EXTRA}/"))[:_MOST_EXTRA]
+
     def _time_axis(self) -> rrb.TimeAxis:
         """From the start to the end, and longer for the legend."""
         end = rr.TimeRangeBoundary.absolute(seconds=(1.0 + _LEGEND) * self.end_s)
@@ -194,7 +200,7 @@ class _Views:
 
     @property
     def camera_share(self) -> float:
-        """Of the width: what the chip needs on a small screen."""
+        """Fraction of the width that the chip needs on a small screen."""
         left, top, right, bottom = self.scene.shown_bounds()
         height_px = _ALL_PX - self.below_px - _TITLE_PX
         return min(max((right - left) / (bottom - top) * height_px / _WIDTH_PX, 0.28), 0.62)
@@ -280,6 +286,7 @@ def _plots(v: _Views) -> tuple[Part, ...]:
             v.plot("Field (mT)", e.AMPLITUDE),
         ),
         _row("Timing", v.plot("Timing (ms)", e.TIMING, needs="timing")),
+        _row("Other topics", *(v.plot(entity.removeprefix(e.EXTRA), entity) for entity in v.extra)),
     )
 
 

@@ -7,14 +7,14 @@ import importlib.util
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from flowrec.errors import FlowrecError, UsageError
+from flowrec.core import FlowrecError, UsageError
 from flowrec.view.viewer import LOOPBACK
 
 DATASET = "sessions"
 
 
 @contextlib.contextmanager
-def served(recordings: Sequence[Path], port: int | None = None) -> Iterator[str]:
+def serve_recordings(recordings: Sequence[Path], port: int | None = None) -> Iterator[str]:
     """Serve recordings as a dataset for as long as the block runs; yields the URL for Rerun and its clients.
 
     Raises

@@ -50,7 +50,7 @@ _TABLES: dict[Table, NDArray[Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ColourScale:
     """Values from `low` to `high` in the colours of one table, with round ticks."""
 
     table: Table
@@ -64,7 +64,7 @@ class Scale:
         return "s" if self.table == "time" else "µm/s"
 
     @classmethod
-    def up_to(cls, largest: float, table: Table) -> Scale:
+    def up_to(cls, largest: float, table: Table) -> ColourScale:
         """From zero (a change: from its negative) to a round number that is not below `largest`."""
         largest = max(largest, 1e-9)
         step = _round_step(largest / (3.0 if table == "change" else 6.0))

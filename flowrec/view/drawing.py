@@ -38,7 +38,7 @@ class Layer:
 
     def lines(self, lines: Iterable[Points], colour: Rgb, width_px: float) -> None:
         """Polylines, each (n, 2) as x, y."""
-        polylines = [fixed(each) for each in lines if drawable(each)]
+        polylines = [to_fixed_point(each) for each in lines if drawable(each)]
         for shade, width, opacity in ((SOLID, width_px + 2.0, _RIM), (colour, width_px, 1.0)):
             mask = np.zeros(self._kept.shape, np.uint8)
             cv2.polylines(mask, polylines, False, 255, max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
@@ -55,8 +55,8 @@ class Layer:
             head = float(np.clip(_HEAD * length, _HEAD_PX[0] * width_px, _HEAD_PX[1] * width_px))
             across = 0.45 * head * np.array([-along[1], along[0]])
             base = end - head * along
-            polylines.append(fixed(np.array([begin, base])))
-            heads.append(fixed(np.array([end, base + across, base - across])))
+            polylines.append(to_fixed_point(np.array([begin, base])))
+            heads.append(to_fixed_point(np.array([end, base + across, base - across])))
         for shade, rim, opacity in ((SOLID, 2.0, _RIM), (colour, 0.0, 1.0)):
             mask = np.zeros(self._kept.shape, np.uint8)
             cv2.polylines(mask, polylines, False, 255, max(round(width_px + rim), 1), cv2.LINE_AA, SUBPIXEL_BITS)
@@ -86,7 +86,7 @@ class Layer:
         added[inked] = added[inked] * (1.0 - alpha) + alpha * np.array(bgr(colour), np.float32)
 
 
-def outlined(picture: Picture, polylines: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
+def draw_outlines(picture: Picture, polylines: list[NDArray[np.int32]], colour: Rgb, width_px: float) -> None:
     """Polylines, as `fixed` returns them, that are drawn for one image only."""
     for shade, width in ((SOLID, width_px + 1.0), (colour, width_px)):
         cv2.polylines(picture, polylines, False, bgr(shade), max(round(width), 1), cv2.LINE_AA, SUBPIXEL_BITS)
@@ -114,13 +114,13 @@ def restore(picture: Picture, clean: Picture, centre: Points, radius_px: float) 
     picture[y0:y1, x0:x1][inside] = clean[y0:y1, x0:x1][inside]
 
 
-def fixed(points: Points) -> NDArray[np.int32]:
+def to_fixed_point(points: Points) -> NDArray[np.int32]:
     """Points (n, 2) in 1/16 px, as OpenCV takes them."""
     return np.rint(points * (1 << SUBPIXEL_BITS)).astype(np.int32).reshape(-1, 1, 2)
 
 
 def drawable(points: ArrayLike) -> bool:
-    """Whether all points are finite, and not absurdly far away."""
+    """True if all points are finite, and not absurdly far away."""
     return bool((np.abs(np.asarray(points, np.float64)) < _FAR_PX).all())  # NaN is not below
 
 

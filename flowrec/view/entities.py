@@ -15,7 +15,7 @@ from flowrec.view.colours import Rgb
 SESSION_TIME = "session time"
 FRAME = "frame"
 
-MEASURED = "camera/measured"  # what is moved by the registration that a refinement found
+MEASURED = "camera/measured"  # what is moved by the registration that a refinement found, and by the image's shift
 IMAGE = "camera/measured/image"
 OUTLINE = "camera/chip outline"
 ARROWS = "camera/flow arrows"
@@ -58,6 +58,7 @@ LOSSES = "Recording"
 SIGHT = "Robot"
 LANES = (PHASE, ALARM, MARKS, LOSSES, SIGHT)
 LANES_OF_RUN = (MARKS, LOSSES, SIGHT)  # the same in a replay
+EXTRA = "extra"  # before the path of an extra topic and the field of its message
 SUMMARY = "summary"
 EVENTS = "run/events"
 OPERATOR = "run/operator"
@@ -67,7 +68,7 @@ points = rr.Radius.ui_points  # a width on the screen, at any zoom
 
 @dataclass(frozen=True, slots=True)
 class Style:
-    """How one of up to two sessions in a view is distinguished from the other."""
+    """Style that distinguishes one of up to two sessions in a view from the other."""
 
     word: str
     path: Rgb

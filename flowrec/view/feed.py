@@ -21,9 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flowrec.messages import Frame
-from flowrec.system.processes import child_command, child_environment
-from flowrec.topics import Tick
+from flowrec.core import Frame, Tick, child_command, child_environment
 
 _QUEUE_TICKS = 600  # without images: small
 _PREVIEW_PX = 720  # longer side of the images that are shown
@@ -34,7 +32,7 @@ _FIELDS = tuple(field.name for field in fields(Tick))
 
 
 class Batch(NamedTuple):
-    """What has happened since the last batch.
+    """Changes since the last batch.
 
     Attributes
     ----------
@@ -120,7 +118,7 @@ class Feed:
 
     @property
     def closing(self) -> bool:
-        """Whether `close` was called."""
+        """True if `close` was called."""
         return self._closing.is_set()
 
     @property
@@ -129,8 +127,8 @@ class Feed:
         lines = [line for line in self._text().splitlines() if line.strip()]
         return lines[-1] if lines else "it was killed"
 
-    def said(self, words: str) -> bool:
-        """Whether the process has written these words to its log."""
+    def has_logged(self, words: str) -> bool:
+        """True if the process has written these words to its log."""
         return words in self._text()
 
     def close(self, timeout_s: float, stays: str = "", last: object = None) -> bool:
@@ -145,9 +143,9 @@ class Feed:
         self._ticked.set()
         end = time.monotonic() + timeout_s
         self._thread.join(timeout_s)
-        while self.process.poll() is None and not (stays and self.said(stays)) and time.monotonic() < end:
+        while self.process.poll() is None and not (stays and self.has_logged(stays)) and time.monotonic() < end:
             time.sleep(_POLL_S)
-        staying = self.process.poll() is None and bool(stays) and self.said(stays)
+        staying = self.process.poll() is None and bool(stays) and self.has_logged(stays)
         if not staying:
             self.process.kill()  # SIGKILL also ends a stopped process, which unblocks the thread
             self.process.wait()

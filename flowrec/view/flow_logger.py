@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import rerun as rr
 
-from flowrec.messages import FlowField, Route
-from flowrec.topics import Tick
+from flowrec.core import FlowField, Route, Tick
 from flowrec.view import colours, flow_values, maps
 from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label, points
@@ -34,7 +33,7 @@ class FlowLogger:
         self._grid = flow_values.arrow_grid(scene, flow_values.ARROWS_ACROSS_VIEW)
         self._bar = maps.ColourBar.beside(scene)
         for entity in _MAPS:
-            self._log(entity, maps.placed(scene.mask_placement()), static=True)
+            self._log(entity, maps.transform_of(scene.mask_placement()), static=True)
 
     def log_not_yet(self, refined: FlowField | None, last: Tick) -> None:
         """Label the maps that wait for a refinement, and remove the label when it has arrived."""
@@ -66,7 +65,7 @@ class FlowLogger:
         for name, entity in (("assumed", e.ASSUMED), ("refined", e.REFINED), ("truth", e.TRUE)):
             if name in known and (repaint or name in new):
                 self._present.add(name)
-                self._log(entity, maps.encoded(scale.paint(flow_values.speed(known[name], self._mask))))
+                self._log(entity, maps.encode_png(scale.paint(flow_values.speed(known[name], self._mask))))
         if {"assumed", "refined"} <= known.keys() and new & {"assumed", "refined"}:
             values = flow_values.change(known["refined"], known["assumed"], self._mask)
             self._log_map("change", e.CHANGE, e.CHANGE_SCALE, values)
@@ -84,14 +83,14 @@ class FlowLogger:
         """A map with a scale of its own."""
         self._present.add(table)
         scale = flow_values.scale_of(values, table)
-        self._log(entity, maps.encoded(scale.paint(values)))
+        self._log(entity, maps.encode_png(scale.paint(values)))
         self._log_scale(scale_entity, scale)
 
-    def _log_scale(self, entity: str, scale: colours.Scale) -> None:
+    def _log_scale(self, entity: str, scale: colours.ColourScale) -> None:
         self._log(f"{entity}/bar", *self._bar.strip(scale))
         self._log(f"{entity}/ticks", *self._bar.ticks(scale))
 
-    def _log_arrows(self, field: FlowField, scale: colours.Scale) -> None:
+    def _log_arrows(self, field: FlowField, scale: colours.ColourScale) -> None:
         origins, vectors, speed = flow_values.flow_arrows(self._scene, field, self._grid)
         light = replace(scale, table="arrows").paint(speed)
         arrows = rr.Arrows2D(

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.flow import sample
-from flowrec.messages import FlowField
-from flowrec.view.colours import Scale, Table
+from flowrec.core import FlowField
+from flowrec.physics import sample
+from flowrec.view.colours import ColourScale, Table
 from flowrec.view.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -43,10 +43,10 @@ def change(refined: FlowField, assumed: FlowField, mask: NDArray[np.bool_]) -> F
     return speed(refined, mask) - speed(assumed, mask)
 
 
-def scale_of(values: Floats, table: Table) -> Scale:
+def scale_of(values: Floats, table: Table) -> ColourScale:
     """A scale for nearly all of a map; the largest half percent are corners and may saturate."""
     known = np.abs(values[np.isfinite(values)])
-    return Scale.up_to(float(np.quantile(known, 0.995)) if known.size else 1.0, table)
+    return ColourScale.up_to(float(np.quantile(known, 0.995)) if known.size else 1.0, table)
 
 
 def arrow_grid(scene: Scene, across: tuple[float, float] = _ARROWS_ACROSS_IMAGE) -> tuple[Floats, float]:

@@ -5,9 +5,11 @@ Both import it with Layouts > Import from file. Topics that a file does not have
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import Any
 
-from flowrec.store.viewer_scene import HEIGHT_M
+from flowrec.store import HEIGHT_M
 from flowrec.view.bare_plots import EVENTS, IMAGE, ON_IMAGE, PLOTS, ROUTE, STATES, Plot
 
 _COLOURS = ("#4e98e2", "#f5774d", "#f7df71")
@@ -16,8 +18,8 @@ _MAP = "/view/flow_refined"
 Panel = dict[str, Any]
 
 
-def foxglove_layout(centre_m: tuple[float, float], size_m: float) -> dict[str, Any]:
-    """The layout as JSON data, for a chip with this centre and longer side."""
+def foxglove_layout(centre_m: tuple[float, float], size_m: float, extra: Sequence[Plot] = ()) -> dict[str, Any]:
+    """The layout as JSON data, for a chip with this centre and longer side; `extra`: plots of the extra topics."""
     panels: dict[str, Panel] = {
         "Image!camera": _image("Camera", IMAGE, "/view/camera"),
         "Image!map": _image("Refined flow", _MAP, "/view/map"),
@@ -27,13 +29,15 @@ def foxglove_layout(centre_m: tuple[float, float], size_m: float) -> dict[str, A
         "RosOut!log": {"searchTerms": [], "minLogLevel": 1, "topicToRender": EVENTS[0]},
         "Tab!maps": _tab({"Refined flow": "Image!map", "Chip (m)": "3D!chip"}),
     }
-    for name, group in PLOTS.items():
+    groups = PLOTS | ({"extra": tuple(extra)} if extra else {})
+    for name, group in groups.items():
         found = {f"Plot!{name}{number}": plot for number, plot in enumerate(group)}
         panels |= {panel: _plot(plot) for panel, plot in found.items()}
         tabs = {plot.title: panel for panel, plot in found.items()}
         panels[f"Tab!{name}"] = _tab(tabs | ({"Route": "Plot!route"} if name == "flow" else {}))
     states = _split("column", "StateTransitions!states", "RosOut!log", 40)
-    below = _split("row", states, _split("row", "Tab!flow", _split("row", "Tab!error", "Tab!coils", 50), 36), 28)
+    coils = _split("row", "Tab!coils", "Tab!extra", 50) if extra else "Tab!coils"
+    below = _split("row", states, _split("row", "Tab!flow", _split("row", "Tab!error", coils, 50), 36), 28)
     return {
         "configById": panels,
         "globalVariables": {},
@@ -100,7 +104,7 @@ def _plot(plot: Plot) -> Panel:
             "showLine": not plot.points,
             "lineSize": 2.5 if plot.points else 1.5,
         }
-        for (field, label), colour in zip(plot.lines.items(), _COLOURS, strict=False)
+        for (field, label), colour in zip(plot.lines.items(), itertools.cycle(_COLOURS), strict=False)
     ]
     return {
         "foxglovePanelTitle": plot.title,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Literal, Self
 
-from flowrec.topics import Tick
+from flowrec.core import Tick
 from flowrec.view import live_server, viewer
 from flowrec.view.feed import Feed
 from flowrec.view.scene import Scene
@@ -58,7 +58,7 @@ class LiveView:
 
     @property
     def url(self) -> str:
-        """What a viewer on this machine connects to."""
+        """Address for a viewer on this machine."""
         return viewer.url(self.port)
 
     @property
@@ -91,7 +91,7 @@ class LiveView:
     def _wait_until_it_accepts(self) -> None:
         """Wait for the server, so that its address is said when viewers can connect; end it if it takes too long."""
         feed, end = self._feed, time.monotonic() + _START_S
-        while feed is not None and not feed.ended and not feed.said(live_server.ACCEPTS):
+        while feed is not None and not feed.ended and not feed.has_logged(live_server.ACCEPTS):
             if time.monotonic() > end:
                 feed.process.kill()
                 self._message = f"no live view: its server did not start within {_START_S:g} s; {_WITHOUT}"

@@ -15,8 +15,7 @@ import time
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.core import Tick, seconds
 from flowrec.view import viewer
 from flowrec.view.feed import Batch
 from flowrec.view.scene import Scene
@@ -72,8 +71,9 @@ def serve() -> None:
         news = False
         for changes in batch.changes:
             tick = replace(tick, **changes)
-            logger.log(tick)
             news |= summary.add(tick)
+            logger.doubtful = summary.doubtful
+            logger.log(tick)
         if news:
             stream.log(SUMMARY, summary.document(), static=True)
         begun = len(logger.phases)
@@ -89,18 +89,18 @@ def serve() -> None:
 
 def _stay(port: int, window: subprocess.Popen[bytes] | None) -> None:
     """Wait until no viewer has been connected for ABSENT_S; not at all if none is connected now."""
-    if not _watched(port, window):
+    if not _is_watched(port, window):
         return
     print(STAYS, flush=True)
     seen_s = time.monotonic()
     while time.monotonic() - seen_s < ABSENT_S:
         time.sleep(_POLL_S)
-        if _watched(port, window):
+        if _is_watched(port, window):
             seen_s = time.monotonic()
 
 
-def _watched(port: int, window: subprocess.Popen[bytes] | None) -> bool:
-    """Whether the window is open or a viewer connected."""
+def _is_watched(port: int, window: subprocess.Popen[bytes] | None) -> bool:
+    """True if the window is open or a viewer connected."""
     import psutil  # type: ignore[import-untyped]
 
     if window is not None and window.poll() is None:

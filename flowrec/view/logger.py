@@ -12,14 +12,26 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from flowrec.chip.registration import on_chip
-from flowrec.declarations import Matrix
-from flowrec.diagnostics import Timing
-from flowrec.enums import Level
-from flowrec.flow import sample
-from flowrec.messages import Currents, Demand, Estimate, Event, Frame, Health, Mission, OperatorEvent, Route, Track
-from flowrec.topics import Tick
-from flowrec.units import NS_PER_S, seconds
+from flowrec.core import (
+    NS_PER_S,
+    Currents,
+    Demand,
+    Estimate,
+    Event,
+    Frame,
+    Health,
+    Level,
+    Message,
+    Mission,
+    OperatorEvent,
+    Route,
+    Tick,
+    Timing,
+    Track,
+    message_fields,
+    seconds,
+)
+from flowrec.physics import on_chip, sample
 from flowrec.view import colours, maps
 from flowrec.view import entities as e
 from flowrec.view.entities import EntityLogger, label, points
@@ -81,7 +93,8 @@ class TickLogger:
         angle = np.linspace(0.0, 2.0 * np.pi, 33)
         self._ring = np.stack([np.cos(angle), np.sin(angle)], 1)
         self._states = StateLogger(self._entities, self.present, doubtful=bool(scene.doubts))
-        self._moved = scene.measured_to_plane(None)  # of what was measured, by the registration of the refined field
+        self._moved = scene.image_to_plane(None)  # (2, 3) of measured points, by the registration of the refined field
+        self._placed = self._moved  # (2, 3) of the image, with the shift of a shaking stage
         self._log_static()
         self._by_field: dict[str, Callable[[Any], None]] = {
             "route": self._log_route,
@@ -99,6 +112,15 @@ class TickLogger:
         }
 
     @property
+    def doubtful(self) -> bool:
+        """True if the result is doubtful: then an outcome is amber."""
+        return self._states.doubtful
+
+    @doubtful.setter
+    def doubtful(self, doubtful: bool) -> None:
+        self._states.doubtful = doubtful
+
+    @property
     def phases(self) -> Mapping[str, int]:
         """See StateLogger."""
         return self._states.phases
@@ -112,9 +134,8 @@ class TickLogger:
             self._stream.set_time(e.FRAME, sequence=index)
         else:
             self._stream.disable_timeline(e.FRAME)
-        refined = tick.refined
-        if refined is not None and refined is not self._last.refined:
-            self._log_registration(refined.registration)
+        if tick.refined is not self._last.refined or tick.shift is not self._last.shift:
+            self._log_registration(tick)
         self._states.end_marks(tick.stamp_ns)
         if tick.frame is not None and tick.frame is not self._last.frame:
             self._log_image(tick.frame)
@@ -124,6 +145,20 @@ class TickLogger:
             message = getattr(tick, field)
             if message is not None and message is not getattr(self._last, field):
                 log_message(message)
+        for path, message in tick.extra.items():
+            if message is not self._last.extra.get(path):
+                self._log_extra(path, message)
+
+    def _log_extra(self, path: str, message: Message) -> None:
+        """The floats of a message as lines over time, a vector as a line an element."""
+        for each in message_fields(type(message)):
+            if not each.is_float or each.kind == "array":
+                continue
+            values = np.atleast_1d(np.asarray(getattr(message, each.name), np.float64))  # None becomes NaN
+            if np.isfinite(values).any():
+                entity = f"{e.EXTRA}{path}/{each.name}"
+                self.present.add(entity)
+                self._log(entity, rr.Scalars(values))
 
     def _log_static(self) -> None:
         chip = self._scene.chip
@@ -138,8 +173,8 @@ class TickLogger:
             return
         if self._placed_step != self.image_step:
             self._placed_step = self.image_step
-            self._log(e.IMAGE, maps.placed(self._scene.preview_placement(self.image_step)), static=True)
-        image = self._windows.completed(frame.image) if self._scene.windows else frame.image
+            self._log(e.IMAGE, maps.transform_of(self._scene.preview_placement(self.image_step)), static=True)
+        image = self._windows.complete(frame.image) if self._scene.windows else frame.image
         if frame.bits > 8:
             image = (image >> (frame.bits - 8)).astype(np.uint8)
         done, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
@@ -207,7 +242,7 @@ class TickLogger:
             self._log(e.NIS, rr.Scalars(estimate.nis))
 
     def _place_of_word(self, centre: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where a word about the robot is not cut by the border of the view, nor by that of a second session's robot.
+        """Position of a word about the robot at which neither the view's border nor the second session's robot cuts it.
 
         Rerun centres it below the place.
         """
@@ -273,11 +308,13 @@ class TickLogger:
         whose = f"{self._prefix}: " if self._prefix else ""
         self._log(entity, rr.TextLog(f"{seconds(self._tick.stamp_ns):.1f} s  {whose}{text}", level=level))
 
-    def _log_registration(self, registration: Matrix | None) -> None:
+    def _log_registration(self, tick: Tick) -> None:
         """Move the image, and from now on what was measured."""
-        moved = self._scene.measured_to_plane(registration)
-        if not np.array_equal(moved, self._moved):
-            self._moved = moved
+        registration = tick.refined.registration if tick.refined is not None else None
+        self._moved = self._scene.image_to_plane(registration)
+        moved = self._scene.image_to_plane(registration, tick.shift)
+        if not np.array_equal(moved, self._placed):
+            self._placed = moved
             matrix = np.eye(3)
             matrix[:2, :2] = moved[:, :2]
             self._log(e.MEASURED, rr.Transform3D(translation=[*moved[:, 2], 0.0], mat3x3=matrix))
@@ -287,6 +324,6 @@ class TickLogger:
         return self._moved[:, :2] @ plane + self._moved[:, 2]
 
     def _chip_um(self, measured_um: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The same of a point (2,) in um."""
+        """Position on the chip of a measured point (2,) in um."""
         refined = self._tick.refined
         return on_chip(None if refined is None else refined.registration, measured_um)

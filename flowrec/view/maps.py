@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from flowrec.view import colours
-from flowrec.view.colours import Scale
+from flowrec.view.colours import ColourScale
 from flowrec.view.entities import points
 from flowrec.view.scene import Placement, Scene
 
@@ -23,17 +23,17 @@ _LEAST_BAR = 0.3  # height of a colour bar over the width of the channels
 class SpeedScale:
     """The scale of all maps of speed, also of a recorded and a replayed session in one view."""
 
-    scale: Scale | None = None
+    scale: ColourScale | None = None
     version: int = 0  # incremented when maps must be painted again
 
     def include(self, peak_um_s: float) -> None:
         """Extend the scale to a speed."""
         if self.scale is None or peak_um_s > self.scale.high:
-            self.scale = Scale.up_to(peak_um_s, "speed")
+            self.scale = ColourScale.up_to(peak_um_s, "speed")
             self.version += 1
 
 
-def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: Scale) -> rr.EncodedImage:
+def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: ColourScale) -> rr.EncodedImage:
     """A time to go (h, w) with darker isochrones, two for each tick; red where the goal can not be reached."""
     known = mask & np.isfinite(time_s)
     pixels = scale.paint(np.where(known, time_s, np.nan))
@@ -43,17 +43,17 @@ def wave_fronts(time_s: NDArray[np.float32], mask: NDArray[np.bool_], scale: Sca
     front[:-1] |= (interval[:-1] != interval[1:]) & known[1:]
     pixels[front & known] = (0.6 * pixels[front & known]).astype(np.uint8)
     pixels[mask & ~known] = colours.UNREACHABLE
-    return encoded(pixels)
+    return encode_png(pixels)
 
 
-def encoded(pixels: NDArray[np.uint8]) -> rr.EncodedImage:
+def encode_png(pixels: NDArray[np.uint8]) -> rr.EncodedImage:
     """An image (h, w, 3) in RGB as PNG."""
     done, png = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     assert done
     return rr.EncodedImage(contents=png.tobytes(), media_type="image/png")
 
 
-def placed(placement: Placement) -> rr.Transform3D:
+def transform_of(placement: Placement) -> rr.Transform3D:
     """The transform of an image into the picture plane."""
     matrix = np.diag([placement.scale, placement.scale, 1.0])
     matrix[:2, :2] = placement.scale * placement.axes
@@ -84,13 +84,13 @@ class ColourBar:
         top = self.top - 0.16 * size
         return left - 0.03 * size, top - 0.02 * size, self.left + self.width + 0.34 * size, top + 1.02 * size
 
-    def strip(self, scale: Scale) -> tuple[rr.Image, rr.Transform3D]:
+    def strip(self, scale: ColourScale) -> tuple[rr.Image, rr.Transform3D]:
         """The colours, the highest value on top."""
         values = np.linspace(scale.high, scale.low, _BAR_ROWS)[:, None]
         size = [self.width, self.height / _BAR_ROWS, 1.0]
         return rr.Image(scale.paint(values)), rr.Transform3D(translation=[self.left, self.top, 0.0], scale=size)
 
-    def ticks(self, scale: Scale) -> tuple[rr.LineStrips2D, rr.Points2D]:
+    def ticks(self, scale: ColourScale) -> tuple[rr.LineStrips2D, rr.Points2D]:
         """The ticks with their values to the right of them, and the unit above the bar."""
         fraction = (np.array(scale.ticks) - scale.low) / (scale.high - scale.low)
         y = self.top + self.height * (1.0 - fraction)

@@ -1,8 +1,8 @@
 """Robot, route and flow drawn over the images by OpenCV, with a status bar below them for clock, state and scale.
 
 Nothing covers the robot: within its ring the camera's pixels stay as they are, and all words are in the bar. The image
-stays as the camera took it: where a refinement found another registration, what lies on the chip is drawn where the
-image shows it.
+stays as the camera took it: where it shakes, or a refinement found another registration, what lies on the chip is
+drawn where the image shows it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.messages import Estimate, FlowField, Mission
-from flowrec.topics import Tick
-from flowrec.units import NS_PER_S
+from flowrec.core import NS_PER_S, Estimate, FlowField, Mission, Tick, shift_px
 from flowrec.view import colours
 from flowrec.view.colours import round_below
-from flowrec.view.drawing import CIRCLE, Layer, Picture, Points, drawable, fixed, outlined, restore
+from flowrec.view.drawing import CIRCLE, Layer, Picture, Points, draw_outlines, drawable, restore, to_fixed_point
 from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.scene import Scene
 from flowrec.view.status_bar import FLOW, GOAL, GOAL_SIGN, ROBOT, ROUTE, StatusBar
@@ -60,7 +58,7 @@ class Overlay:
         self._canvas = np.zeros((self.size_px[1], self.size_px[0], 3), np.uint8)
         self._robot_px = self.zoom * scene.length_px(scene.robot.radius_um)
         self._grid = _sparser(*arrow_grid(scene))
-        self._to_image: NDArray[np.float64] = np.eye(2, 3)  # by the refined registration
+        self._to_image: NDArray[np.float64] = np.eye(2, 3)  # by the refined registration and the shift
         self._trail: deque[tuple[int, Points]] = deque()
         um_per_px = scene.calibration.um_per_px / self.zoom
         self._status_bar = StatusBar((self.size_px[0], self.size_px[1] - self._height), letter, um_per_px)
@@ -71,7 +69,7 @@ class Overlay:
     def draw(self, image: NDArray[np.uint8], tick: Tick) -> Picture:
         """The picture in BGR of an image (h, w) of 8 bits and its tick; it is valid until the next call."""
         last, self._tick = self._tick, tick
-        if tick.field is not last.field or tick.route is not last.route or _goal(tick.mission) != _goal(last.mission):
+        if _content_key(tick) != _content_key(last):
             self._redraw(tick)
         if self.zoom > 1:
             size = (self._width, self._height)
@@ -88,22 +86,22 @@ class Overlay:
         return canvas
 
     def _to_px(self, points_um: Points) -> Points:
-        """Measured places (..., 2) in um to pixels of the picture, counted at their centres."""
+        """Measured places (..., 2) in um to pixels of a picture without shift, counted at their centres."""
         return self.zoom * self._scene.to_plane(points_um) - 0.5
 
     def _chip_to_px(self, points_um: Points) -> Points:
-        """The same of places on the chip."""
-        return self.zoom * self._shown(self._scene.to_plane(points_um)) - 0.5
+        """Places on the chip to pixels of this picture."""
+        return self.zoom * self._image_points(self._scene.to_plane(points_um)) - 0.5
 
-    def _shown(self, plane: Points) -> Points:
-        """Where the image shows points (..., 2) of the picture plane."""
+    def _image_points(self, plane: Points) -> Points:
+        """Image positions of points (..., 2) of the picture plane."""
         return plane @ self._to_image[:, :2].T + self._to_image[:, 2]
 
     def _redraw(self, tick: Tick) -> None:
         """Draw what does not move: flow, route, goal, and the legend."""
         layer, field, route = Layer((self._height, self._width)), tick.field, tick.route
         registration = None if tick.refined is None else tick.refined.registration
-        inverse = cv2.invertAffineTransform(self._scene.measured_to_plane(registration))
+        inverse = cv2.invertAffineTransform(self._scene.image_to_plane(registration, tick.shift))
         self._to_image = np.asarray(inverse, np.float64)
         flow = None if field is None else self._draw_flow(layer, field, refined=tick.refined is not None)
         path = self._chip_to_px(route.waypoints_um) if route is not None and route.reachable else np.zeros((0, 2))
@@ -126,7 +124,7 @@ class Overlay:
             return None
         fastest = float(np.quantile(speed[known], _FASTEST))
         px_per_speed = _LONGEST * self.zoom * self._scene.length_px(self._grid[1]) / fastest
-        middle = self.zoom * self._shown((origins + 0.5 * vectors)[known]) - 0.5
+        middle = self.zoom * self._image_points((origins + 0.5 * vectors)[known]) - 0.5
         along = vectors[known] @ self._to_image[:, :2].T
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         half = 0.5 * px_per_speed * np.minimum(speed[known], 1.2 * fastest)[:, None] * along
@@ -142,15 +140,22 @@ class Overlay:
         while trail and estimate.stamp_ns - trail[0][0] > _TRAIL_S * NS_PER_S:
             trail.popleft()
         colour = ROBOT if estimate.seen else colours.PALE
-        way = np.array([*(point for _, point in trail), centre])
-        outlined(picture, [fixed(way)], colour, _LINE_PX * unit)
+        off = self.zoom * np.array(shift_px(self._tick.shift))
+        way = np.array([*(point for _, point in trail), centre]) + off
+        centre = centre + off
+        draw_outlines(picture, [to_fixed_point(way)], colour, _LINE_PX * unit)
         ring = self._robot_px + _RING_PX * unit
         restore(picture, clean, centre, ring)
-        outlined(picture, [fixed(centre + ring * CIRCLE)], colour, _LINE_PX * unit)
+        draw_outlines(picture, [to_fixed_point(centre + ring * CIRCLE)], colour, _LINE_PX * unit)
+
+
+def _content_key(tick: Tick) -> tuple[object, ...]:
+    """Key of the content of a tick's layer: it is drawn anew where this changes."""
+    return id(tick.field), id(tick.route), _goal(tick.mission), shift_px(tick.shift)
 
 
 def _goal(mission: Mission | None) -> tuple[float, float] | None:
-    """Where the mission goes; None: nowhere."""
+    """Goal of the mission as (x, y) in um; None: no goal."""
     if mission is None or not drawable(mission.goal_um):
         return None
     x, y = mission.goal_um.tolist()

@@ -12,9 +12,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from flowrec.system.outputs import Output
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.core import Output, Tick, seconds
 from flowrec.view.blueprint import blueprint
 from flowrec.view.entities import REPLAY, SUMMARY
 from flowrec.view.logger import TickLogger
@@ -25,6 +23,7 @@ APPLICATION = "flowrec"
 _PROGRESS_EVERY = 20  # ticks
 _MAGIC = b"RRF"
 _END, _END_BYTES = b"RRF2FOOT", 12  # a number follows
+_PATIENCE_S = 10.0  # for the file to grow
 _HEAD_BYTES = 1024  # contains the names of application and recording as plain text
 
 
@@ -58,23 +57,32 @@ def write_rrd(
                 stream.log(SUMMARY, summary, static=True)
             shown = frozenset({SUMMARY} if summary is not None else ())
             _log_all(stream, scene, ticks, second_ticks, progress, prefixes, shown)
-            with contextlib.suppress(RuntimeError):  # where its thread could not write; the end is missing then
-                stream.flush()
+            _flush(stream, part)
         finally:
             stream.disconnect()
         if not _is_whole(part):  # Rerun writes in a thread, whose errors it only prints
             raise OSError("Rerun could not write all of it; is the disk full?")
 
 
+def _flush(stream: rr.RecordingStream, path: Path) -> None:
+    """Wait for as long as the file grows: where Rerun's thread could not write, its own wait may never end."""
+    written = -1
+    while (size := path.stat().st_size) != written:
+        written = size
+        with contextlib.suppress(RuntimeError):  # could not write, or not within this time
+            stream.flush(timeout_sec=_PATIENCE_S)
+            return
+
+
 def _is_whole(path: Path) -> bool:
-    """Whether a file has the end that Rerun writes last."""
+    """True if a file has the end that Rerun writes last."""
     with path.open("rb") as file:
         file.seek(-min(_END_BYTES, path.stat().st_size), os.SEEK_END)
         return _END in file.read()
 
 
 def is_made_from(path: Path, key: str) -> bool:
-    """Whether a file is an .rrd that flowrec made from the session with this key (see Scene)."""
+    """True if a file is an .rrd that flowrec made from the session with this key (see Scene)."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_BYTES)
@@ -116,7 +124,7 @@ def _log_all(
     first_ns: int | None = None
     stamp_ns = 0
     index: int | None = None
-    for count, (stamp_ns, again, tick) in enumerate(_merged(ticks, second_ticks or ())):
+    for count, (stamp_ns, again, tick) in enumerate(_merge(ticks, second_ticks or ())):
         first_ns = stamp_ns if first_ns is None else first_ns
         if again:
             assert second is not None
@@ -135,10 +143,10 @@ def _log_all(
     stream.send_blueprint(blueprint(scene, prefixes if both else ("",), present, seconds(stamp_ns), phases))
 
 
-def _merged(ticks: Iterable[Tick], second: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
+def _merge(ticks: Iterable[Tick], second: Iterable[Tick]) -> Iterator[tuple[int, bool, Tick]]:
     """Both in the order of their stamps, the first session's tick before the second's."""
 
-    def named(source: Iterable[Tick], again: bool) -> Iterator[tuple[int, bool, Tick]]:
+    def label(source: Iterable[Tick], again: bool) -> Iterator[tuple[int, bool, Tick]]:
         return ((tick.stamp_ns, again, tick) for tick in source)
 
-    return heapq.merge(named(ticks, False), named(second, True), key=lambda item: item[:2])
+    return heapq.merge(label(ticks, False), label(second, True), key=lambda item: item[:2])

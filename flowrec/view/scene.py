@@ -1,4 +1,4 @@
-"""What does not change during a session, and where it is in a picture.
+"""The part of a picture that is constant during a session, and its place in the picture.
 
 All pictures share one plane: the camera's pixels as Rerun draws them. Rerun counts from the corner of the first pixel,
 flowrec from its centre; the half pixel between the two is added here and nowhere else.
@@ -11,10 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.registration import Calibration, on_chip
-from flowrec.declarations import Matrix
-from flowrec.robot import Robot
+from flowrec.core import Matrix, Shift, shift_px
+from flowrec.physics import Calibration, Chip, Robot, on_chip
 
 _HALF_PX = 0.5
 _MARGIN = 0.03  # around the channels, of their longer side
@@ -31,7 +29,7 @@ class Placement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is shown. The properties are listed with the recording, the key identifies the session."""
+    """Constant content of views. The properties are listed with the recording, the key identifies the session."""
 
     chip: Chip
     calibration: Calibration
@@ -48,15 +46,17 @@ class Scene:
         """Chip coordinates (..., 2) in um to the picture plane (..., 2)."""
         return self.calibration.to_px(points_um) + _HALF_PX
 
-    def measured_to_plane(self, registration: Matrix | None) -> NDArray[np.float64]:
-        """(2, 3): where a point (x, y, 1) of the camera's image, as measured, lies in the picture plane.
+    def image_to_plane(self, registration: Matrix | None, shift: Shift | None = None) -> NDArray[np.float64]:
+        """(2, 3): where a point (x, y, 1) of the camera's image lies in the picture plane.
 
-        `registration` (2, 3) is that of a FlowField: of a measured place in um to the chip. None: as stated.
+        `registration` (2, 3) is that of a FlowField: of a measured place in um to the chip. None: as stated. `shift` is
+        that of the image; without it, the point is one as measured, from which the shift has been taken.
         """
-        if registration is None:
+        off_px = shift_px(shift)
+        if registration is None and not any(off_px):
             return np.eye(2, 3)
         corners = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-        measured_um = self.calibration.to_um(corners - _HALF_PX)
+        measured_um = self.calibration.for_shift(off_px).to_um(corners - _HALF_PX)
         moved = self.to_plane(on_chip(registration, measured_um))
         return np.column_stack((moved[1] - moved[0], moved[2] - moved[0], moved[0]))
 
@@ -87,7 +87,7 @@ class Scene:
         return left, top, right, bottom
 
     def fluid_bounds(self) -> tuple[float, float, float, float]:
-        """The same of the channels of the chip, inside the box of the mask."""
+        """Bounds of the channels of the chip, inside the box of the mask."""
         rows, columns = (np.flatnonzero(self.chip.mask.any(axis=axis)) for axis in (1, 0))
         if not rows.size:
             return self.chip_bounds()

@@ -13,11 +13,8 @@ from typing import TypeVar
 import numpy as np
 from rerun.experimental import ViewerClient, ViewerState
 
-from flowrec.errors import FlowrecError
-from flowrec.store.mcap_reader import ForeignError
-from flowrec.store.session_metadata import SessionMetadata
-from flowrec.system.outputs import PICTURE, Output
-from flowrec.units import nanoseconds
+from flowrec.core import PICTURE, FlowrecError, Output, nanoseconds
+from flowrec.store import ForeignError, SessionMetadata
 from flowrec.view import viewer
 from flowrec.view.entities import SESSION_TIME
 
@@ -55,7 +52,7 @@ def screenshot(
         _headless(size) as (client, began),
     ):
         client.open(path.as_uri())
-        state = _until(lambda: _loaded(client), _LOAD_S)
+        state = _until(lambda: _wait_loaded(client), _LOAD_S)
         if state is None:
             raise FlowrecError(f"{path}: the viewer shows nothing of it; `rerun rrd verify {path}` says more")
         ends_ns = {line.name: line.end for recording in state.recordings for line in recording.timelines}
@@ -96,7 +93,7 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple[ViewerClient, float]]:
             raise FlowrecError(f"no screenshot: {error.strerror or error}; `pip install rerun-sdk`") from error
         try:
             began = time.monotonic()
-            client = _until(lambda: _connected(port, process), _START_S)
+            client = _until(lambda: _connect(port, process), _START_S)
             if client is None:
                 raise FlowrecError(f"no screenshot: the viewer does not start; {_why(log)}")
             yield client, began
@@ -108,7 +105,7 @@ def _headless(size: tuple[int, int]) -> Iterator[tuple[ViewerClient, float]]:
             process.wait()
 
 
-def _connected(port: int, process: subprocess.Popen[bytes]) -> ViewerClient | None:
+def _connect(port: int, process: subprocess.Popen[bytes]) -> ViewerClient | None:
     """A client, once the viewer responds."""
     if process.poll() is not None:
         raise ConnectionError
@@ -120,7 +117,7 @@ def _connected(port: int, process: subprocess.Popen[bytes]) -> ViewerClient | No
     return client
 
 
-def _loaded(client: ViewerClient) -> ViewerState | None:
+def _wait_loaded(client: ViewerClient) -> ViewerState | None:
     """The state of the viewer, once nothing is loading."""
     state = client.get_state()
     return state if not state.loading and any(recording.timelines for recording in state.recordings) else None

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import rerun as rr
 
-from flowrec.diagnostics import CameraLosses, Drops
-from flowrec.enums import Action, Alarm, Outcome, Phase
-from flowrec.messages import Mission, OperatorEvent
-from flowrec.units import NS_PER_S
+from flowrec.core import NS_PER_S, Action, Alarm, CameraLosses, Drops, Mission, OperatorEvent, Outcome, Phase
 from flowrec.view import colours
 from flowrec.view import entities as e
 from flowrec.view.colours import Rgb
@@ -37,7 +34,7 @@ class StateLogger:
     def __init__(self, entities: EntityLogger, present: set[str], *, doubtful: bool = False) -> None:
         self._log = entities.log
         self._present = present
-        self._doubtful = doubtful  # the result: its outcome is amber
+        self.doubtful = doubtful  # the result: its outcome is amber
         self.phases: dict[str, int] = {}  # stamp at which each phase, and the outcome, first began
         self._now: dict[str, str] = {}
         self._colours: dict[str, dict[str, Rgb]] = {}  # of the states of each lane so far
@@ -47,7 +44,7 @@ class StateLogger:
         """The phase, and at the end the outcome."""
         if mission.finished and mission.outcome:
             done = mission.outcome in set(Outcome) and Outcome(mission.outcome).completes_mission
-            good = colours.YELLOW if self._doubtful else colours.GREEN
+            good = colours.YELLOW if self.doubtful else colours.GREEN
             self._log_phase(mission, mission.outcome, good if done else colours.RED)
         else:
             self._log_phase(mission, mission.phase, _PHASE_COLOURS.get(mission.phase, colours.GREY))

@@ -7,9 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flowrec.errors import printable
-from flowrec.messages import Estimate, Mission
-from flowrec.units import seconds
+from flowrec.core import Estimate, Mission, printable, seconds
 from flowrec.view import colours
 from flowrec.view.colours import round_below
 from flowrec.view.drawing import CIRCLE, CROSS, Layer, Picture, bgr, draw_mask
@@ -40,7 +38,7 @@ class StatusBar:
         self._parts: list[Picture] = []
 
     def set_legend(self, *, goal: bool, route: bool, flow: tuple[str, float, float] | None) -> None:
-        """What the legend explains besides the robot.
+        """Set the entries of the legend besides the robot.
 
         Parameters
         ----------
@@ -120,7 +118,7 @@ def length_text(length_um: float) -> str:
 
 
 def state_text(mission: Mission | None, estimate: Estimate | None) -> str:
-    """What happens, in a few words."""
+    """Current state of the mission, in a few words."""
     words = ""
     if mission is not None:
         if mission.finished:

@@ -7,15 +7,21 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 import rerun as rr
 
-from flowrec.chip.registration import on_chip
-from flowrec.errors import printable
-from flowrec.messages import FlowField
-from flowrec.run_figures import RunStatistics, figures_of
-from flowrec.summary import DOUBTS, Row, Value, comparison_for_people, doubts_text
-from flowrec.topics import FLOW_FIELDS, Tick
-from flowrec.units import seconds
+from flowrec.core import (
+    DOUBTS,
+    FLOW_FIELDS,
+    FlowField,
+    Row,
+    Tick,
+    Value,
+    comparison_for_people,
+    doubts_text,
+    printable,
+    seconds,
+)
+from flowrec.physics import on_chip
+from flowrec.stages import MotionOfRun, RunStatistics, TrackQuality, figures_of
 from flowrec.view.scene import Scene
-from flowrec.vision.track_quality import TrackQuality
 
 _MARKDOWN = str.maketrans({character: f"\\{character}" for character in "\\`*_{}[]()<>#+!|~"})
 _LETTERS = 200  # of one cell: names and notes come from the file
@@ -24,6 +30,7 @@ FIGURES = (
     "outcome",
     "duration_s",
     "covered",  # of a replay or an import
+    "axes_check",
     "assumed_flow_error",
     "refined_flow_error",
     "planned_s",
@@ -39,7 +46,7 @@ _NEWS = ("mission", "route", "drops", "true_field", *FLOW_FIELDS)  # messages th
 def summary_document(columns: Sequence[str], rows: Iterable[Row], remarks: Iterable[str]) -> rr.TextDocument:
     """A table with one or two columns of values, then the remarks as paragraphs; '' is none.
 
-    Rows are key and values, as flowrec.summary reads them; of one column the second value is not shown.
+    Rows are key and values, as flowrec.core.summary reads them; of one column the second value is not shown.
     """
     cells = [[name, *values[: len(columns)]] for name, *values in comparison_for_people(rows)]
     lines = [[_cell(each) for each in row] for row in (["", *columns], *cells)]
@@ -66,7 +73,7 @@ def document_of_run(title: str, last: Tick, figures: Mapping[str, Value]) -> rr.
 
 
 def doubts_remark(figures: Mapping[str, Value], whose: str = "") -> str:
-    """Why the result is doubtful; '' if it is not."""
+    """Reason why the result is doubtful; '' if it is not."""
     text = figures.get(DOUBTS)
     return f"{whose}Doubtful: {text}" if text else ""
 
@@ -78,13 +85,14 @@ def note_of(figures: Mapping[str, Value], whose: str = "") -> str:
 
 
 class LiveSummary:
-    """The same panel of a run that is under way; at its end it states what the panel of its session states."""
+    """Summary panel of a run that is under way; at its end it states what the panel of its session states."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._statistics = RunStatistics()
         shape = scene.camera_shape or scene.chip.mask.shape[:2]
         self._quality = TrackQuality(scene.calibration, (shape[0], shape[1]), scene.robot)
+        self._motion = MotionOfRun(scene.robot)
         self._last = Tick()
         self._first_ns: int | None = None
 
@@ -93,9 +101,16 @@ class LiveSummary:
         news = any(getattr(tick, name) is not getattr(self._last, name) for name in _NEWS)
         self._statistics.write(tick)
         self._quality.write(tick)
+        self._motion.write(tick)
         self._last = tick
         self._first_ns = tick.stamp_ns if self._first_ns is None else self._first_ns
         return news
+
+    @property
+    def doubtful(self) -> bool:
+        """True if the run has ended and its result is doubtful."""
+        mission = self._last.mission
+        return mission is not None and mission.finished and bool(self._quality.doubts())
 
     def document(self) -> rr.TextDocument:
         """The panel at the last tick."""
@@ -104,7 +119,7 @@ class LiveSummary:
         mission, timing = last.mission, last.timing
         if mission is not None and mission.finished:
             figures |= {"outcome": mission.outcome, "note": mission.note}
-            figures[DOUBTS] = doubts_text(self._quality.doubts())
+            figures[DOUBTS] = doubts_text([*self._quality.doubts(), *self._motion.doubts()])
             figures["duration_s"] = seconds(last.stamp_ns - (self._first_ns or 0))
             figures["tracking_error_um"] = seen.tracking_error_um or None  # a policy has no reference
         elif mission is not None:

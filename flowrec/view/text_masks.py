@@ -43,7 +43,7 @@ def text_mask(text: str, height_px: int) -> Mask:
 
 
 def clock_mask(text: str, height_px: int) -> Mask:
-    """The same of a text that changes all the time: every digit is as wide as the widest, so nothing jumps."""
+    """Mask of a text that changes all the time: every digit is as wide as the widest, so nothing jumps."""
     widest = max(text_mask(digit, height_px).shape[1] for digit in _DIGITS)
     parts = []
     for letter in text:

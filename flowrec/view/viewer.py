@@ -46,7 +46,7 @@ def executable() -> Path | None:
 
 
 def has_display() -> bool:
-    """Whether a window can open."""
+    """True if a window can open."""
     if platform.system() in ("Darwin", "Windows"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -70,7 +70,7 @@ def wait_for_server(port: int, limit_s: float, given_up: Callable[[], bool] = la
 
 
 def url(port: int) -> str:
-    """What a viewer on this machine connects to."""
+    """Address for a viewer on this machine."""
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from flowrec.declarations import Image
-from flowrec.store.roi import nonzero_window
+from flowrec.core import Image
+from flowrec.store import nonzero_window
 
 _DIMMING = 0.6  # factor on the older image, which shows that it is older
 
@@ -15,7 +15,7 @@ class WindowCompleter:
         self._complete: Image | None = None  # the last image without a region, and the same dimmed
         self._dimmed: Image | None = None
 
-    def completed(self, image: Image) -> Image:
+    def complete(self, image: Image) -> Image:
         """A recorded region (h, w) within the last complete image, which is dimmed."""
         x0, y0, x1, y1 = nonzero_window(image)
         if (x0, y0) == (0, 0) and (y1, x1) == image.shape:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from flowrec.bench import figure_flow, flow
-from flowrec.bench.figure_flow import Picture, draw, median_case
+from flowrec.bench.figure_flow import FlowPanels, draw, median_case
 from flowrec.bench.flow import make_up
 from flowrec.bench.harness import need_matplotlib
-from flowrec.chip.vessel_case import read_observations, read_vessel_case
-from flowrec.errors import ChipError, UsageError
-from flowrec.flow import FlowSolver
-from flowrec.refine import Pinn, Refiner
+from flowrec.core.errors import ChipError, UsageError
+from flowrec.physics.chip.vessel_case import read_observations, read_vessel_case
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.stages.refine import Pinn, Refiner
 
 TRUTHS = ("vx", "vy", "p", "mu", "nu", "rho", "op_u_true", "op_p_true")
 
@@ -30,6 +30,7 @@ def without_truth(path, out):
     return out
 
 
+@pytest.mark.slow("a whole bench: solves, refines and draws")
 def test_rows_and_summary_have_the_promised_names_and_numbers(folder, tmp_path):
     figures = flow.measure(folder, "assimilate", k=1, fields=tmp_path / "fields", figure=tmp_path / "one.png")
     (row,) = figures["rows"]
@@ -46,6 +47,7 @@ def test_rows_and_summary_have_the_promised_names_and_numbers(folder, tmp_path):
     assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow("a bench with every method")
 def test_no_truth_is_read_before_there_is_a_result_to_score(folder, tmp_path, monkeypatch):
     order = []
     solve, refine, read = FlowSolver.solve, Refiner.refine, flow.read_true_velocity
@@ -61,6 +63,7 @@ def test_no_truth_is_read_before_there_is_a_result_to_score(folder, tmp_path, mo
     assert order[-1] == "truth" and order.count("truth") == 1, "all but the score is there"
 
 
+@pytest.mark.slow("a bench with every method")
 def test_a_case_without_its_truth_is_refined_to_the_same_bytes(folder, tmp_path):
     fields = []
     for path in (folder / "made_up_00.npz", without_truth(folder / "made_up_00.npz", tmp_path / "made_up_00.npz")):
@@ -115,7 +118,7 @@ def test_a_figure_is_drawn_even_where_a_method_is_far_off_or_perfect(tmp_path):
     truth = np.where(mask[..., None], [3000.0, 0.0], 0.0)
     fields = {"fvm": truth, "ni": -5.0 * truth}
     points = rng.uniform([0, 110], [310, 190], (7, 2))
-    picture = Picture("a", mask, 10.0, truth, fields, points, np.full((7, 2), 2000.0))
+    picture = FlowPanels("a", mask, 10.0, truth, fields, points, np.full((7, 2), 2000.0))
     rows = [row(name, method, error) for name in "ab" for method, error in (("fvm", 0.0), ("ni", 6.0))]
     draw(tmp_path / "a.png", picture, rows)
     assert (tmp_path / "a.png").stat().st_size > 20_000

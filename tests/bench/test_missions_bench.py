@@ -10,18 +10,18 @@ import pytest
 
 from flowrec.bench import missions
 from flowrec.bench.figures import draw_missions
-from flowrec.bench.harness import paired, wilson
-from flowrec.bench.missions import MissionLog, World, chip_of, compared, fly, optimum_s, results_of, summary
-from flowrec.chip import load_chip
-from flowrec.chip.chip import ChipSettings
-from flowrec.control.amplifier import Amplifier
-from flowrec.control.coils import Coils
-from flowrec.errors import UsageError
-from flowrec.rig_settings import OutputLimits
-from flowrec.rigs.lab.amplifiers.limits import Limits
-from tests.estimation.lap import ROBOT
-from tests.planning.worlds import channel, field_of, open_water, robot
-from tests.planning.worlds import chip_of as made_up
+from flowrec.bench.harness import paired_ratio, wilson
+from flowrec.bench.missions import MissionLog, TrueWorld, chip_of, compare_times, fly, optimum_s, results_of, summary
+from flowrec.core.errors import UsageError
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.stages.control.amplifier import AmplifierSettings
+from flowrec.stages.control.coils import Coils
+from flowrec.stages.rig_settings import OutputLimits
+from tests.stages.estimation.lap import ROBOT
+from tests.stages.planning.worlds import channel, field_of, open_water, robot
+from tests.stages.planning.worlds import chip_of as made_up
 
 TINY = ("chip.name=straight", "camera.width_px=320", "camera.height_px=80", "mission.goal=[2400.0, 620.0]")
 
@@ -37,14 +37,19 @@ def test_the_interval_of_a_share_is_wilsons(successes, count, interval):
     assert (1.0 - high, 1.0 - low) == pytest.approx(interval, abs=6e-5)
 
 
+def test_no_rounding_takes_wilsons_interval_out_of_0_to_1():
+    for count in range(1, 200):
+        assert (wilson(0, count)[0], wilson(count, count)[1]) == (0.0, 1.0), count
+
+
 def test_pairs_are_compared_by_their_ratios():
-    same = paired(np.full(10, 0.8))
+    same = paired_ratio(np.full(10, 0.8))
     assert (same["mean"], *same["interval_95"]) == pytest.approx((0.8, 0.8, 0.8))
     assert same["less"] == 10 and same["sign_p"] == pytest.approx(2 / 2**10)
-    even = paired(np.array([0.5, 2.0, 0.8, 1.25]))
+    even = paired_ratio(np.array([0.5, 2.0, 0.8, 1.25]))
     assert even["mean"] == pytest.approx(1.0) and even["sign_p"] == 1.0
     assert even["interval_95"][0] < 1.0 < even["interval_95"][1]
-    assert paired(np.zeros(0)) == {"count": 0}
+    assert paired_ratio(np.zeros(0)) == {"count": 0}
 
 
 @pytest.mark.parametrize("flow", [0.0, 60.0, -60.0])
@@ -59,14 +64,18 @@ def test_there_is_no_optimum_against_a_flow_that_is_too_fast():
     assert optimum_s(field_of(mask, -120.0), (100.0, 200.0), (900.0, 200.0), 10.0, made_up(mask), robot()) is None
 
 
+MISSION = pytest.mark.slow("needs a mission of the bench")
+
+
 @pytest.fixture(scope="module")
 def flown():
     ticks = []
     sets = "plan.method=astar_time", "observer.method=kalman_map"
-    row = fly(3, TINY, "down", "assumed", "vector", World("inlet", "real", sets), ticks.append)
+    row = fly(3, TINY, "down", "assumed", "vector", TrueWorld("inlet", "real", sets), ticks.append)
     return row, ticks
 
 
+@MISSION
 def test_a_row_says_what_the_ticks_say(flown):
     row, ticks = flown
     going = [tick for tick in ticks if tick.mission.phase == "navigate"]
@@ -85,6 +94,7 @@ def test_a_row_says_what_the_ticks_say(flown):
     assert row.optimum_s == pytest.approx(way_um / true_um_s, rel=0.02)
 
 
+@MISSION
 def test_the_true_flow_is_wrong_by_what_was_asked(flown):
     _, ticks = flown
     inlet_um_s = [opening.value for opening in load_chip(ChipSettings("straight")).openings if opening.kind == "inlet"]
@@ -93,6 +103,7 @@ def test_the_true_flow_is_wrong_by_what_was_asked(flown):
     assert abs(share - 1.0) == pytest.approx(0.1)
 
 
+@MISSION
 def test_observations_of_a_mission_that_corrects_a_map_are_taken_from_the_filter_without_it(flown):
     _, ticks = flown
     taken = [now for last, now in pairwise(ticks) if now.observations is not last.observations and now.mapless]
@@ -101,10 +112,11 @@ def test_observations_of_a_mission_that_corrects_a_map_are_taken_from_the_filter
     assert all(tick.mapless.flow_um_s.tolist() != tick.estimate.flow_um_s.tolist() for tick in taken)
 
 
+@MISSION
 def test_the_world_flies_as_it_is_with_its_walls_its_robot_and_its_coils(flown):
     ticks = []
     row = fly(
-        3, (*TINY, "mission.navigate_limit_s=0.1"), "down", "assumed", "vector", World("hard", "real"), ticks.append
+        3, (*TINY, "mission.navigate_limit_s=0.1"), "down", "assumed", "vector", TrueWorld("hard", "real"), ticks.append
     )
     note = ticks[0].true_field.note
     for drawn in ("world hard", "depth", "um per revolution", "step-out", "walls", "coils up to 3 % off"):
@@ -112,11 +124,14 @@ def test_the_world_flies_as_it_is_with_its_walls_its_robot_and_its_coils(flown):
     assert row.world == "hard" and "world" not in flown[1][0].true_field.note
 
 
+@MISSION
 def test_a_command_that_an_amplifier_would_change_or_an_output_beyond_its_limit_is_counted(flown):
     _, ticks = flown
-    coils = Coils(amplifier=Amplifier(kind="voltage"))
+    coils = Coils(amplifier=AmplifierSettings(kind="voltage"))
     tick = next(tick for tick in ticks if tick.currents.amplitude_mt == 4.0 and tick.currents.frequency_hz > 5.0)
-    fine, weak = (MissionLog(Limits(c, ROBOT, OutputLimits())) for c in (coils, replace(coils, max_current_a=1.0)))
+    fine, weak = (
+        MissionLog(CommandLimits(c, ROBOT, OutputLimits())) for c in (coils, replace(coils, max_current_a=1.0))
+    )
     for log in (fine, weak):
         log.write(tick)
     assert (fine.beyond, weak.beyond) == (0, 1)
@@ -124,10 +139,11 @@ def test_a_command_that_an_amplifier_would_change_or_an_output_beyond_its_limit_
     assert fine.beyond == 1
 
 
+@MISSION
 def test_a_flow_too_swift_is_refused_before_the_robot_is_let_in():
     swift = (*TINY, "chip.inlet_speed_um_s=60000")
     ticks = []
-    row = fly(3, swift, "down", "assumed", "vector", World(sets=("plan.method=astar_time",)), ticks.append)
+    row = fly(3, swift, "down", "assumed", "vector", TrueWorld(sets=("plan.method=astar_time",)), ticks.append)
     assert row.world == "kind"
     assert row.outcome == "refused" and "too swift to be steered" in row.note
     assert not ticks
@@ -146,7 +162,7 @@ def test_a_summary_counts_and_pairs_what_arrived(flown, tmp_path, capsys):
     assert (ours["reached"]["count"], ours["honest"]["count"], ours["without_contact"]["count"]) == (1, 2, 2)
     assert (theirs["reached"]["count"], theirs["honest"]["count"], theirs["without_contact"]["count"]) == (1, 1, 1)
     assert ours["ratio"]["median"] == row.ratio and theirs["failed"] == ["straight 4 down assumed: timeout"]
-    pair = compared(rows, "vector", "paper")
+    pair = compare_times(rows, "vector", "paper")
     assert pair["count"] == 1 and pair["mean"] == pytest.approx(0.5)
     hard = replace(row, world="hard", outcome="left the chip", seconds=None, ratio=None, beyond=2)
     figures = results_of([*rows, hard], ["inlet", "hard"], ["vector", "paper"]) | {"seeds": 2, "coils": "real"}

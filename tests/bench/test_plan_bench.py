@@ -6,8 +6,8 @@ import pytest
 from flowrec.bench.plan import FULL, measure, show
 from flowrec.bench.reserves import drive
 from flowrec.bench.trips import SPEED_UM_S, best_time, draw_trip, worlds
-from flowrec.errors import UsageError
-from tests.planning.worlds import PX, chip_of, field_of, open_water, robot
+from flowrec.core.errors import UsageError
+from tests.stages.planning.worlds import PX, chip_of, field_of, open_water, robot
 
 START, GOAL = np.array([300.0, 300.0]), np.array([900.0, 500.0])
 
@@ -19,6 +19,7 @@ def drawn():
             yield world, trip
 
 
+@pytest.mark.slow("a whole bench: three planners on two trips")
 def test_the_bench_measures_every_planner_against_the_least_time_and_nobody_is_faster(tmp_path, capsys):
     figure = tmp_path / "plan.png"
     methods = ("time_field", "astar_paper", "astar_length:8")
@@ -34,6 +35,7 @@ def test_the_bench_measures_every_planner_against_the_least_time_and_nobody_is_f
         measure(methods="dijkstra")
 
 
+@pytest.mark.slow("a bench on a fine grid")
 def test_the_least_time_on_a_finer_grid_is_what_a_finer_grid_still_finds():
     for world, trip in itertools.islice(drawn(), 2):
         ends = trip.ends("up")

@@ -6,9 +6,10 @@ import pytest
 from flowrec.bench.complex_fluids import bend_drop, law_bend_case
 from flowrec.bench.published_flows import cavity_case, cylinder_case
 from flowrec.bench.solver import measure, show
-from flowrec.chip.fluid import PowerLaw
+from flowrec.physics.chip.fluid import PowerLaw
 
 
+@pytest.mark.slow("a whole bench: ten flows on several grids")
 def test_the_quick_bench_has_every_case_and_fits_into_json():
     figures = measure(quick=True)
     show(figures)

@@ -1,10 +1,12 @@
 """Every bench has the rows of the tables of methods and a null model, so that a new method is measured by itself."""
 
+import pytest
+
 from flowrec.bench import flow, missions, observer, plan, track, worlds
-from flowrec.control.controller import CONTROLLERS
-from flowrec.estimation.observer import OBSERVERS
-from flowrec.planning import PLANNERS
-from flowrec.refine.refiner import REFINERS
+from flowrec.stages.control.controller import CONTROLLERS
+from flowrec.stages.estimation.observer import OBSERVERS
+from flowrec.stages.planning import PLANNERS
+from flowrec.stages.refine.refiner import REFINERS
 
 
 def test_every_refiner_and_every_planner_has_a_row():
@@ -15,6 +17,7 @@ def test_every_refiner_and_every_planner_has_a_row():
     assert "fvm" in worlds.METHODS and ("gain" in worlds.METHODS) == ("gain" in REFINERS), "null models"
 
 
+@pytest.mark.slow("a bench of every observer")
 def test_every_observer_has_a_row_and_knowing_no_flow_is_the_worst_of_all():
     case = observer.CASES[0]
     run = observer.drive(case)

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import signal
 import subprocess
 import sys
 from importlib import import_module
@@ -13,8 +14,9 @@ import typer
 from typer.testing import CliRunner
 
 from flowrec.bench import harness
-from flowrec.bench.verbs import BENCHES, MOVED, bench
-from flowrec.errors import UsageError
+from flowrec.bench.bench_verb import BENCHES, MOVED, bench
+from flowrec.core.errors import UsageError
+from flowrec.core.system.endings import Ended
 
 PERF = sorted(path.stem for path in (Path(__file__).parents[1] / "perf").glob("*.py"))
 
@@ -40,7 +42,8 @@ def test_a_bench_that_has_moved_says_where_to(name):
     with pytest.raises(UsageError, match=rf"has moved: run 'python -m {MOVED[name]} ") as refused:
         CliRunner().invoke(bench, [name, "--quick", "word"], catch_exceptions=False)
     assert "\n" not in str(refused.value)
-    assert import_module(MOVED[name])
+    place = Path(__file__).parents[2] / MOVED[name].replace(".", "/")
+    assert place.with_suffix(".py").exists() or (place / "__main__.py").exists()
 
 
 def test_results_that_count_faults_end_with_status_1_after_they_are_written(tmp_path):
@@ -59,6 +62,25 @@ def test_results_that_count_faults_end_with_status_1_after_they_are_written(tmp_
     assert ended.value.code == 2
 
 
+@pytest.mark.parametrize("within", ["measure", "show"])
+def test_a_bench_that_is_stopped_says_so_and_leaves_no_file(within, tmp_path, capsys):
+    def stopped_in(place):
+        if place == within:
+            raise Ended(signal.SIGTERM)
+
+    def measure(count: Annotated[int, typer.Option()] = 3):
+        stopped_in("measure")
+        return {}
+
+    words = ["--out", str(tmp_path / "a.json"), *(["--json"] if within == "measure" else [])]
+    with pytest.raises(SystemExit) as ended:
+        harness.run(measure, lambda _: stopped_in("show"), words, "a", "b")
+    said = capsys.readouterr()
+    assert ended.value.code == 143 and said.err == "flowrec: stopped (SIGTERM)\n" and not list(tmp_path.iterdir())
+    assert not said.out or json.loads(said.out)["exit_status"] == 143
+    assert bool(said.out) == (within == "measure")
+
+
 HELP_OF_EACH = """
 import runpy, sys
 for name in sys.argv[1:]:
@@ -70,6 +92,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow("imports the libraries of six measurements in a process of its own")
 def test_engineering_measurements_run_as_modules():
     names = ("clocks", "fuzz", "grid", "large", "stops", "store")
     words = [sys.executable, "-c", HELP_OF_EACH, *names]  # one process: most of its time are the libraries

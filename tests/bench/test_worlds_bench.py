@@ -9,17 +9,27 @@ import pytest
 
 from flowrec.bench import worlds
 from flowrec.bench.harness import mean_with_interval
-from flowrec.bench.planted_causes import named, planted_causes
-from flowrec.bench.world_flights import WORLDS, Case, Given, chip_sets, fly, in_world, prepared, refine, scored
-from flowrec.config import load_config
-from flowrec.errors import UsageError
-from flowrec.pipeline import assemble
+from flowrec.bench.planted_causes import count_causes, planted_causes
+from flowrec.bench.world_flights import (
+    WORLDS,
+    FlightCase,
+    Given,
+    chip_sets,
+    fly,
+    in_world,
+    prepare_case,
+    refine,
+    score_field,
+)
+from flowrec.core.errors import UsageError
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.simulated_settings import WORLDS as PRESETS
-from flowrec.simulated_settings import Simulated
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import assemble
+from flowrec.stages.simulated_settings import WORLDS as PRESETS
+from flowrec.stages.simulated_settings import Simulated
 
 TINY = ("camera.width_px=320", "camera.height_px=80", "mission.goal=[2400.0, 620.0]")
-CASE = Case("slip", "straight", 3, TINY)
+CASE = FlightCase("slip", "straight", 3, TINY)
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +39,7 @@ def flown():
     return flight
 
 
+@pytest.mark.slow("a flight and its refinements, again from what was kept")
 def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(flown, tmp_path, monkeypatch, capsys):
     assert (flown.outcome, flown.contacts) == ("reached", 0)
     assert flown.refined["assimilate"]["warned"] == ("% less per revolution" in flown.refined["assimilate"]["note"])
@@ -37,7 +48,7 @@ def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(f
     file = tmp_path / "rows.jsonl"
     line = json.dumps(worlds.as_line(flown))
     file.write_text(line + "\n" + line[:1000])  # killed while it wrote
-    (kept,) = worlds.kept(file)
+    (kept,) = worlds.read_flights(file)
     assert worlds.as_line(kept) == json.loads(line) | {"sets": TINY}
     again = replace(kept, refined={})
     refine(again, ["assimilate"])
@@ -49,8 +60,8 @@ def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(f
     assert file.read_text() == line + "\n"  # nothing was left to do
     assert found["flights"][0]["refined"] == flown.refined
     worlds.measure(methods="assimilate", again=True, **options)
-    assert len(list(worlds.kept(file))) == 2
-    assert {"slip"} == {one.world for one in worlds.kept(file)} and list(worlds.kept(file))[-1].code
+    assert len(list(worlds.read_flights(file))) == 2
+    assert {"slip"} == {one.world for one in worlds.read_flights(file)} and list(worlds.read_flights(file))[-1].code
     assert "flown by" in capsys.readouterr().err  # the fixture's flight states no code
     json.dumps(found)
     worlds.show(found)
@@ -58,10 +69,10 @@ def test_a_kept_flight_is_refined_as_the_mission_did_and_needs_no_other_flight(f
 
 
 def test_every_world_can_be_made_and_a_fault_is_as_large_as_its_name_says():
-    config, chip = prepared(replace(CASE, world="offset"))
+    config, chip = prepare_case(replace(CASE, world="offset"))
     place_um, camera = config.simulated.centre_um, config.camera
     assert math.dist(place_um, (2550.0, 630.0)) == pytest.approx(2.0 * camera.um_per_px, abs=0.01)
-    kind, _ = prepared(replace(CASE, world="kind"))
+    kind, _ = prepare_case(replace(CASE, world="kind"))
     sizes = set()
     for seed in range(6):
         given = Given(np.random.default_rng(seed), kind, chip)
@@ -76,21 +87,21 @@ def test_every_world_can_be_made_and_a_fault_is_as_large_as_its_name_says():
 
 
 def test_scores_are_the_published_ones():
-    config, chip = prepared(CASE)
+    config, chip = prepare_case(CASE)
     truth = SimulatedRig.of(assemble(config, chip), config).true_world().field
     rng = np.random.default_rng(0)
     std = np.full((*chip.mask.shape, 2), 8.0, np.float32)
     noisy = truth.velocity_um_s + rng.normal(0.0, 8.0, truth.velocity_um_s.shape).astype(np.float32)
-    score = scored(replace(truth, velocity_um_s=noisy, std_um_s=std), truth.velocity_um_s, chip.mask)
+    score = score_field(replace(truth, velocity_um_s=noisy, std_um_s=std), truth.velocity_um_s, chip.mask)
     rms = math.sqrt((truth.velocity_um_s[chip.mask].astype(float) ** 2).sum(axis=1).mean())
     assert score["error"] == pytest.approx(8.0 * math.sqrt(2.0) / rms, rel=0.02)
     assert score["within_2_sigma"] == pytest.approx(0.9545, abs=0.006)
     # The mean CRPS of a right Gaussian is sigma / sqrt(pi); wider and narrower ones score worse.
     assert score["crps"] == pytest.approx(8.0 / math.sqrt(math.pi) / rms, rel=0.03)
     for factor in (0.5, 2.0):
-        other = scored(replace(truth, velocity_um_s=noisy, std_um_s=factor * std), truth.velocity_um_s, chip.mask)
+        other = score_field(replace(truth, velocity_um_s=noisy, std_um_s=factor * std), truth.velocity_um_s, chip.mask)
         assert other["crps"] > 1.02 * score["crps"]
-    bare = scored(replace(truth, velocity_um_s=noisy, std_um_s=None), truth.velocity_um_s, chip.mask)
+    bare = score_field(replace(truth, velocity_um_s=noisy, std_um_s=None), truth.velocity_um_s, chip.mask)
     assert bare["crps"] == pytest.approx(8.0 * math.sqrt(2.0 / math.pi) / rms, rel=0.03)
     assert bare["within_2_sigma"] is None
 
@@ -135,16 +146,17 @@ def test_a_warning_counts_where_it_names_the_planted_cause_on_its_side(fault, se
     def note(clause):
         return f"assimilated 8 observations; 1 more distrusted as outliers; {clause}; they scatter 2.0 times more"
 
-    assert named(note(sentence), causes(fault)) == (1, 0)
-    assert named(note(sentence), causes()) == (0, 1)  # nothing is planted
+    assert count_causes(note(sentence), causes(fault)) == (1, 0)
+    assert count_causes(note(sentence), causes()) == (0, 1)  # nothing is planted
     if other_side:
-        assert named(note(sentence.replace(*other_side)), causes(fault)) == (0, 1)
+        assert count_causes(note(sentence.replace(*other_side)), causes(fault)) == (0, 1)
     # A wrong scale also moves the chip, to a side that depends on where the survey was.
     moved = "the chip lies 27 +- 10 um from where the registration puts it (25 um to the right, 11 um up)"
-    assert named(moved, causes(fault))[0] == int("um_per_px" in fault or "angle" in fault)
-    assert named("assimilated 8 observations; they say nothing about outlet 1 (right)", causes(fault)) == (0, 0)
+    assert count_causes(moved, causes(fault))[0] == int("um_per_px" in fault or "angle" in fault)
+    assert count_causes("assimilated 8 observations; they say nothing about outlet 1 (right)", causes(fault)) == (0, 0)
 
 
+@pytest.mark.slow("needs a flight and its refinements")
 def test_a_summary_counts_worse_maps_and_those_of_which_nothing_was_said(flown):
     def made(assumed, refined, note):
         found = {"assumed": {"error": assumed}, "gain": {**SCORE, "error": 0.1}}

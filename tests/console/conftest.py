@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.registration import Calibration
-from flowrec.messages import Frame, Mission
-from flowrec.robot import Robot
-from flowrec.topics import Tick
+from flowrec.core.messages import Frame, Mission
+from flowrec.core.topics import Tick
+from flowrec.physics.chip.chip import Chip
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.robot import Robot
 from flowrec.view.scene import Scene
 
 CALIBRATION = Calibration(2.5, (400.0, -100.0), 120.0, mirror=True)

@@ -14,23 +14,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.chip import load_chip
-from flowrec.commands import replay as again
-from flowrec.config import calibration_of, load_config
-from flowrec.console.console import PACKAGES
-from flowrec.messages import OperatorEvent
-from flowrec.resolve import resolve
-from flowrec.session import Session
+from flowrec.core.messages import OperatorEvent
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import calibration_of, load_config
+from flowrec.stages.resolve import resolve
 from flowrec.store.reader import SessionReader
+from flowrec.store.session import Session
+from flowrec.verbs import session_replay as again
 from tests.conftest import HANG_S
+from tests.extras import why
 from tests.short_missions import LONG
 
-for _package in ("playwright.sync_api", *PACKAGES):
-    pytest.importorskip(_package)
+pytest.importorskip("playwright", reason=why("playwright"))
 CHROMIUM = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), ""
 )
-pytestmark = pytest.mark.skipif(not CHROMIUM, reason="needs chromium")
+pytestmark = [
+    pytest.mark.skipif(not CHROMIUM, reason="needs chromium"),
+    pytest.mark.slow("clicks in a real browser, beside a run in real time"),
+]
 
 # The camera is turned and mirrored, so that a click is nowhere where it would be without its calibration.
 CAMERA = ["camera.angle_deg=90", "camera.mirror=true", "camera.width_px=256", "camera.height_px=320"]
@@ -153,5 +155,5 @@ def test_a_run_is_steered_by_clicks_and_its_recording_replays_the_same(
     speed, goal, stop = asked[-3:]
     assert (speed.speed_limit_um_s, stop.text) == (90.0, "operator: zero field (console)")
     np.testing.assert_allclose(goal.goal_um, GOAL_UM, atol=Session(out).calibration.um_per_px)
-    done = again.replay(out, again.Change(), verify=True)
+    done = again.replay_session(out, again.Change(), verify=True)
     assert done.comparison.identical, str(done.comparison.first)

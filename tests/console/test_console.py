@@ -22,22 +22,20 @@ import pytest
 
 from flowrec.console import console as console_module
 from flowrec.console.app import application
-from flowrec.console.board import MOST_PAGES, Board, Shown
-from flowrec.console.messages import Ended, Verdict
+from flowrec.console.board import MOST_PAGES, Board, PageProgress
+from flowrec.console.messages import CommandReply, RunEnded
 from flowrec.console.page_state import PageState
-from flowrec.enums import Action
-from flowrec.errors import UsageError
-from flowrec.messages import Event, FlowField, OperatorEvent
+from flowrec.core.enums import Action
+from flowrec.core.errors import UsageError
+from flowrec.core.messages import Event, FlowField, OperatorEvent
+from flowrec.core.topics import Tick
 from flowrec.run.control import RunControl
 from flowrec.run.operator_commands import COMMANDS
-from flowrec.topics import Tick
 from flowrec.view.feed import Batch
 from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene
-from tests.conftest import until
+from tests.conftest import HANG_S, until
 
-for _package in console_module.PACKAGES:
-    pytest.importorskip(_package)
 sync_client = importlib.import_module("websockets.sync.client")
 ConnectionClosed, InvalidStatus = (
     getattr(importlib.import_module("websockets.exceptions"), name) for name in ("ConnectionClosed", "InvalidStatus")
@@ -55,7 +53,7 @@ class Answer(NamedTuple):
 
 
 def asked(port: int, path: str, method: str, body: bytes | None, headers: dict[str, str | None]) -> Answer:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=HANG_S)
     try:
         connection.request(method, path, body, {name: value for name, value in headers.items() if value is not None})
         answer = connection.getresponse()
@@ -204,10 +202,14 @@ def test_what_a_page_asks_becomes_an_event_and_nonsense_is_refused(scene: Scene)
             assert answer(command=name, text="look\x1b[31m") == ""
         assert answer(command="goal", x_px=10.0, y_px=20.0) == ""
         assert answer(command="speed", limit_um_s=120) == ""
-        for _ in range(12):
-            page.send(json.dumps({"number": 7, "command": "mark"}))
-        told = [words["refusal"] for words in itertools.islice(answers_to(page), 12)]
-        assert any("too many" in refusal for refusal in told)
+        told: list[str] = []
+        for _ in range(10):  # on a busy machine a dozen may take more than the second in which they are counted
+            for _ in range(12):
+                page.send(json.dumps({"number": 7, "command": "mark"}))
+            told += [words["refusal"] for words in itertools.islice(answers_to(page), 12)]
+            if any("too many at once" in refusal for refusal in told):
+                break
+        assert any("too many at once" in refusal for refusal in told)
         until(lambda: len(served.control._waiting) >= 5 and all(map(len, served.control._steering.values())))
         # The stop is never one too many, and it is before all that waits.
         assert answer(command="zero") == ""
@@ -249,7 +251,7 @@ def test_pages_that_flood_the_run_are_refused_after_ten_commands_in_a_second(
 
     def take(words: dict[str, Any]) -> None:
         given.append(words)
-        board.settle(Verdict(words["ticket"], ""))
+        board.settle(CommandReply(words["ticket"], ""))
 
     async def page() -> None:
         board.loop = asyncio.get_running_loop()
@@ -261,7 +263,7 @@ def test_pages_that_flood_the_run_are_refused_after_ten_commands_in_a_second(
 
 def test_an_event_is_sent_to_a_page_once(scene: Scene) -> None:
     async def seen() -> list[list[str]]:
-        board, shown, told = Board(scene, "a.mcap"), Shown(), []
+        board, shown, told = Board(scene, "a.mcap"), PageProgress(), []
         for text in ("first", None, "second", None):
             changes = {} if text is None else {"event": Event(1, "info", text)}
             board.take(Batch(1, [changes], {}))
@@ -287,6 +289,8 @@ REFUSED = {
     "a negative speed": ({"command": "speed", "limit_um_s": -5}, "speed limit -5 um/s"),
     "a speed of no robot": ({"command": "speed", "limit_um_s": 1e300}, "speed limit 1e+300 um/s"),
     "a goal off every chip": ({"command": "goal", "x_px": 1e308, "y_px": 0}, "goal "),
+    "a goal that is no number": ({"command": "goal", "x_px": float("nan"), "y_px": 0}, "not a number"),
+    "a speed without end": ({"command": "speed", "limit_um_s": float("inf")}, "not a number"),
     "a note without text": ({"command": "note", "text": "  "}, "a note without a text"),
 }
 
@@ -336,7 +340,7 @@ def test_a_frozen_page_costs_nothing_and_the_others_go_on(
     scene: Scene, ticks: Ticks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(console_module, "_MAX_HZ", 500.0)
-    made = list(ticks(250))  # 0.3 MB each as a picture
+    made = list(ticks(100))  # 0.3 MB each as a picture
     with (served := Served(scene)).console, served.page() as awake, served.page():  # the other one takes 16 messages
         process = psutil.Process(served.console.pid)
 
@@ -347,16 +351,16 @@ def test_a_frozen_page_costs_nothing_and_the_others_go_on(
                 if isinstance(words, str) and json.loads(words)["state"].get("time_s") == tick.stamp_ns / 1e9:
                     return
 
-        for tick in made[:50]:
+        for tick in made[:30]:
             served.console.write(tick)
             time.sleep(0.005)
-        shows(made[50])
+        shows(made[30])
         before_bytes = process.memory_info().rss
-        for tick in made[51:-1]:
+        for tick in made[31:-1]:
             served.console.write(tick)
             time.sleep(0.005)  # so that each is a picture of its own
         shows(made[-1])
-        assert process.memory_info().rss - before_bytes < 30e6
+        assert process.memory_info().rss - before_bytes < 5e6  # of 14 MB, or 9 on a busy machine
         awake.send(json.dumps({"command": "mark"}))
         until(lambda: served.control.pending)
     assert served.console.dropped == 0
@@ -389,7 +393,7 @@ def test_the_end_is_shown_and_the_server_ends(scene: Scene, ticks: Ticks) -> Non
         pid = served.console.pid
         for tick in ticks(3):
             served.console.write(tick)
-        served.console.close(Ended("reached", "a.mcap (1 MB)", good=True))
+        served.console.close(RunEnded("reached", "a.mcap (1 MB)", good=True))
         words = json.loads([each for each in page if isinstance(each, str)][-1])
         assert words["ended"] == {"outcome": "reached", "files": "a.mcap (1 MB)", "good": True}
         assert words["state"]["time_s"] == 0.03

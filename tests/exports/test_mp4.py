@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.errors import SessionError
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import Applied, Frame
+from flowrec.core.topics import Tick
 from flowrec.exports import mp4
 from flowrec.exports.camera_images import with_images
-from flowrec.messages import Applied, Frame
-from flowrec.topics import Tick
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 STAMPS_NS = [0, 33_333_333, 66_666_667, 500_000_001, 533_333_333]  # one interval is a loss
@@ -140,6 +140,29 @@ def test_flow_route_and_goal_are_where_the_image_shows_them_by_the_registration_
     inside = np.s_[20:-20, 20:-20]
     assert np.abs(shown - stated)[inside].max() > 50
     assert np.abs(shown - expected)[inside].max() <= 8
+
+
+def test_route_goal_and_robot_are_where_a_shaken_image_shows_them(session):
+    from dataclasses import replace
+
+    from flowrec.core.messages import Shift
+    from flowrec.view.overlay import Overlay
+    from flowrec.view.scene import Scene
+
+    at_rest = replace(session.at(5.0), shift=None)
+    grey = np.full(at_rest.frame.image.shape, 100, np.uint8)
+    off_px = np.array([4.0, -2.0])
+    scene = Scene(session.chip, session.calibration, session.config.robot, "", image_px=grey.shape[::-1])
+    # One overlay draws both, as in a movie: the layer is drawn anew for the shift alone.
+    overlay = Overlay(scene, grey.shape[::-1])
+    rest, shaken = (
+        overlay.draw(grey, replace(at_rest, shift=shift))[: 3 * grey.shape[0]].astype(int)
+        for shift in (None, Shift(at_rest.stamp_ns, off_px, found=True, alike=1.0))
+    )
+    right, down = (3 * off_px).astype(int)
+    inside = np.s_[20:-20, 20:-20]
+    assert np.abs(shaken - rest)[inside].max() > 50
+    assert np.abs(shaken - np.roll(rest, (down, right), (0, 1)))[inside].max() <= 8
 
 
 def test_odd_sizes_are_made_even_and_deep_images_keep_the_scale_of_their_levels(session, tmp_path):

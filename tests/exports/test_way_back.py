@@ -12,13 +12,12 @@ import pytest
 import tifffile
 
 import flowrec
-from flowrec.commands.align import aligned
-from flowrec.commands.import_movie import asked_import
-from flowrec.commands.record import prepare
-from flowrec.config import Config, to_toml
-from flowrec.errors import MovieError
+from flowrec.core.errors import MovieError
 from flowrec.movies import open_movie
 from flowrec.rigs.movie.rig import MovieRig, fitted_to_movie
+from flowrec.stages.config import Config, to_toml
+from flowrec.verbs.align import asked_import, fit_import
+from flowrec.verbs.preparation import prepare
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 
@@ -51,13 +50,13 @@ def test_a_plain_movie_has_nearly_the_same_images_and_stamps_to_half_a_microseco
 
 
 @pytest.mark.parametrize("kind", ["mp4_plain", "tiff"])
-def test_an_import_need_not_be_told_scale_robot_chip_and_clock(kind, exported):
+def test_an_import_need_not_be_told_scale_robot_chip_and_clock(kind, exported, tmp_path):
     session = flowrec.open(GOLDEN)
     asked = asked_import(exported[kind], coils=exported["csv"] / "applied.csv")
-    config, facts, _ = fitted_to_movie(aligned(asked)[0])
+    config, facts, _ = fitted_to_movie(fit_import(asked, tmp_path).asked)
     assert config.camera.um_per_px == session.config.camera.um_per_px
     assert config.robot.radius_um == session.config.robot.radius_um
-    assert (flowrec.chip.load_chip(config.chip).mask == session.chip.mask).all()
+    assert (flowrec.physics.chip.io.load_chip(config.chip).mask == session.chip.mask).all()
     assert facts["source_started"] == session.provenance["wall_time"]
     assert facts["source_session_key"] == session.key
 
@@ -90,7 +89,7 @@ def test_robot_and_pose_of_the_camera_come_from_the_movie_or_from_the_tables_and
     rate = {} if movie == "tiff" else {"fps": 15.0}
     asked = asked_import(slow_robot[movie], coils=slow_robot["log"], **rate)
     assert (asked.robot.um_per_rev, asked.robot.delay_s, asked.camera.angle_deg) == (30.0, 0.08, 12.0)
-    assert (flowrec.chip.load_chip(asked.chip).mask == flowrec.open(GOLDEN).chip.mask).all()
+    assert (flowrec.physics.chip.io.load_chip(asked.chip).mask == flowrec.open(GOLDEN).chip.mask).all()
     usual = Config()
     given = replace(usual, robot=replace(usual.robot, um_per_rev=28.0), camera=replace(usual.camera, angle_deg=10.0))
     asked = asked_import(slow_robot[movie], given, coils=slow_robot["log"], **rate)
@@ -99,8 +98,9 @@ def test_robot_and_pose_of_the_camera_come_from_the_movie_or_from_the_tables_and
     assert asked_import(slow_robot[movie], measured, coils=slow_robot["log"], **rate).camera.angle_deg == 0.0
 
 
-def test_what_the_robot_rolled_between_two_images_is_what_the_session_holds_whatever_the_latency(slow_robot):
-    asked, _ = aligned(asked_import(slow_robot["tiff"], coils=slow_robot["log"]))
+@pytest.mark.slow("exports and reads a whole session")
+def test_what_the_robot_rolled_between_two_images_is_what_the_session_holds_whatever_the_latency(slow_robot, tmp_path):
+    asked = fit_import(asked_import(slow_robot["tiff"], coils=slow_robot["log"]), tmp_path, "1").asked
     config, _, pipeline, *_ = prepare(asked, aloud=False)
     assert config.robot.delay_s == 0.08
     with MovieRig.of(pipeline, config) as rig:
@@ -111,10 +111,12 @@ def test_what_the_robot_rolled_between_two_images_is_what_the_session_holds_what
     np.testing.assert_allclose([each.applied.turns for each in inputs], turns, atol=1e-9)
 
 
+@pytest.mark.slow("aligns a whole movie by its motion")
 def test_the_log_of_another_session_is_not_taken_to_have_the_clock_of_the_movie(exported, tmp_path):
     other = Path(shutil.copytree(exported["csv"], tmp_path / "tables"))
     marker = other / "flowrec_export.json"
     marker.write_text(json.dumps(json.loads(marker.read_text()) | {"session_key": "another"}))
-    assert aligned(asked_import(exported["tiff"], coils=exported["csv"] / "applied.csv"))[1] == {}
-    _, facts = aligned(asked_import(exported["tiff"], coils=other / "applied.csv"))
+    own = asked_import(exported["tiff"], coils=exported["csv"] / "applied.csv")
+    assert "alignment" not in fit_import(own, tmp_path).facts
+    facts = fit_import(asked_import(exported["tiff"], coils=other / "applied.csv"), tmp_path).facts
     assert abs(json.loads(facts["alignment"])["offset_s"]) < 0.01

@@ -12,8 +12,9 @@ import pytest
 import tifffile
 import zstandard
 
-from flowrec.errors import MovieError
+from flowrec.core.errors import MovieError
 from flowrec.movies import ReadOptions, open_movie
+from tests.extras import needs
 from tests.movies import makers
 
 COUNT, HEIGHT, WIDTH = 12, 48, 64
@@ -57,7 +58,12 @@ LOSSLESS = {
 }
 
 
-@pytest.mark.parametrize("kind", LOSSLESS)
+def with_nd2(kinds):
+    """Parameters of a test; that of ND2 needs its package."""
+    return [pytest.param(kind, marks=needs("nd2")) if kind == "nd2" else kind for kind in kinds]
+
+
+@pytest.mark.parametrize("kind", with_nd2(LOSSLESS))
 def test_grey_levels_come_out_as_they_went_in(kind, tmp_path):
     bits, make = LOSSLESS[kind]
     images = pictures(bits)
@@ -73,18 +79,20 @@ def test_grey_levels_come_out_as_they_went_in(kind, tmp_path):
         assert movie.median_image(5).shape == (HEIGHT, WIDTH)
 
 
-def test_times_are_those_of_the_file_where_it_has_them(tmp_path):
-    images, times_ns = pictures(), np.array(TIMES_MS) * 1_000_000
-    made = [
-        makers.video(tmp_path / "v.mkv", "ffv1", images, times_ms=TIMES_MS),
-        makers.video(tmp_path / "v.mp4", "h264", images, times_ms=TIMES_MS),
-        makers.ome_tiff(tmp_path / "v.ome.tif", images, np.array(TIMES_MS) / 1e3),
-        makers.nd2(tmp_path / "v.nd2", images, np.array(TIMES_MS) / 1e3, 8),
-    ]
-    for path in made:
-        facts, frames, _ = read(path)
-        assert [frame.time_ns for frame in frames] == times_ns.tolist() == facts.times_ns.tolist(), path
-        assert "nominal" not in facts.times
+TIMED = {
+    "mkv": lambda d, images: makers.video(d / "v.mkv", "ffv1", images, times_ms=TIMES_MS),
+    "mp4": lambda d, images: makers.video(d / "v.mp4", "h264", images, times_ms=TIMES_MS),
+    "ome.tif": lambda d, images: makers.ome_tiff(d / "v.ome.tif", images, np.array(TIMES_MS) / 1e3),
+    "nd2": lambda d, images: makers.nd2(d / "v.nd2", images, np.array(TIMES_MS) / 1e3, 8),
+}
+
+
+@pytest.mark.parametrize("kind", with_nd2(TIMED))
+def test_times_are_those_of_the_file_where_it_has_them(kind, tmp_path):
+    times_ns = np.array(TIMES_MS) * 1_000_000
+    facts, frames, _ = read(TIMED[kind](tmp_path, pictures()))
+    assert [frame.time_ns for frame in frames] == times_ns.tolist() == facts.times_ns.tolist()
+    assert "nominal" not in facts.times
 
 
 def test_a_rate_that_no_clock_has_measured_is_called_nominal(tmp_path):

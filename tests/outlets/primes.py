@@ -11,11 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.chip import ChipSettings, load_chip
-from flowrec.chip.chip import Chip
-from flowrec.config import ResolvedConfig, load_config
-from flowrec.diagnostics import CameraLosses, Timing
-from flowrec.messages import (
+from flowrec.core.diagnostics import CameraLosses, Timing
+from flowrec.core.messages import (
     Applied,
     Currents,
     Demand,
@@ -30,10 +27,13 @@ from flowrec.messages import (
     Track,
     Truth,
 )
-from flowrec.resolve import resolve
-from flowrec.session_writer import session_writer
-from flowrec.system.outputs import MCAP, Output
-from flowrec.topics import Tick
+from flowrec.core.system.outputs import MCAP, Output
+from flowrec.core.topics import Tick
+from flowrec.physics.chip.chip import Chip, ChipSettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import ResolvedConfig, load_config
+from flowrec.stages.resolve import resolve
+from flowrec.store.session_writer import session_writer
 
 ROWS, COLUMNS, UM_PER_PX = 29, 61, 13.0  # of the mask
 FIRST_ROW, LAST_ROW = 6, 22  # of the channel, which goes from left to right

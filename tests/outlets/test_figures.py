@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,13 +13,13 @@ from matplotlib import pyplot
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from flowrec.reporting import style
-from flowrec.reporting.map_figure import MapFigure, _panels
-from flowrec.reporting.motion_figure import MotionFigure
-from flowrec.reporting.path_figure import PathFigure, scale_bar
-from flowrec.reporting.path_flow_figure import PathFlowFigure
-from flowrec.reporting.report_data import ReportData
-from flowrec.session import Session
+from flowrec.exports.report import style
+from flowrec.exports.report.map_figure import MapFigure, _panels
+from flowrec.exports.report.motion_figure import MotionFigure
+from flowrec.exports.report.path_figure import PathFigure, scale_bar
+from flowrec.exports.report.path_flow_figure import PathFlowFigure
+from flowrec.exports.report.report_data import ReportData, picture_of
+from flowrec.store.session import Session
 from tests.outlets import primes as p
 
 WIDE_MM = 180.0
@@ -52,6 +54,17 @@ CURVES = {
     "distance to the route": (p.ERROR_UM, "distance (µm)"),
     "error of the estimate": (5.0, "distance (µm)"),
 }
+
+
+@pytest.mark.parametrize(("width", "step"), [(899, 1), (900, 1), (901, 2), (1800, 2), (1801, 3)])
+def test_the_picture_is_thinned_by_the_least_step_that_makes_it_900_pixels_wide(width: int, step: int) -> None:
+    image = np.full((4, width), 7, np.uint8)
+    image[:, ::2] = 200
+    frame = SimpleNamespace(image=image, index=0)
+    reader = SimpleNamespace(counts={"frame": 1}, tick_before=lambda _stamp_ns: SimpleNamespace(frame=frame))
+    picture = picture_of(cast(Session, SimpleNamespace(reader=reader, run=SimpleNamespace(first_ns=0, last_ns=1))))
+    assert picture is not None and picture.step == step
+    assert picture.image.shape[1] == -(-width // step) <= 900
 
 
 def test_the_curves_of_motion_are_what_their_labels_say(data: ReportData) -> None:

@@ -9,8 +9,10 @@ import pytest
 import tifffile
 
 import flowrec
+from flowrec.core.errors import SessionError
+from flowrec.exports.camera_images import image_stamps
 from flowrec.movies import open_movie
-from flowrec.session import Session
+from flowrec.store.session import Session
 from tests.movies import makers
 from tests.outlets import primes as p
 
@@ -30,6 +32,15 @@ def test_a_tiff_states_its_pixel_size_in_its_own_tags_and_in_ome(session: Sessio
         assert [plane["DeltaT"] for plane in stated["Plane"][:2]] == pytest.approx([3.0, 3.1])
         assert stated["Plane"][0]["DeltaTUnit"] == "s"
         np.testing.assert_array_equal(file.asarray()[5], p.image(5))
+
+
+def test_a_tiff_of_fewer_images_than_the_index_names_is_not_left(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flowrec.exports.tiff.image_stamps", lambda opened: [*image_stamps(opened), 10**12])
+    with pytest.raises(SessionError, match=rf"its index names {p.COUNT + 1} images, {p.COUNT} are there"):
+        flowrec.export(session, tmp_path / "a.ome.tif", file_format="tiff")
+    assert not list(tmp_path.glob("a*"))
 
 
 def test_grey_levels_of_a_deep_movie_span_those_of_all_its_images(session: Session, tmp_path: Path) -> None:

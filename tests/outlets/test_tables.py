@@ -12,7 +12,7 @@ import pytest
 import xarray
 
 import flowrec
-from flowrec.session import Session
+from flowrec.store.session import Session
 from tests.outlets import primes as p
 
 # By table: the columns, each with its unit and its value in the last row; {} stands for x, y and z, a column each.
@@ -87,6 +87,8 @@ def test_a_table_of_a_topic_has_the_values_and_units_of_its_messages(name: str, 
         units = {each["name"]: each.get("unit") for each in stated["schema"]["fields"]}
         for column, (unit, _) in columns_of(name).items():
             assert units[column] == unit, (kind, column)
+        types = {each["name"]: each["type"] for each in stated["schema"]["fields"]}
+        assert (types["stamp_ns"], types.get("seen", "boolean")) == ("integer", "boolean")
     for column, (unit, value) in columns_of(name).items():
         about = table.schema.field(column).metadata or {}
         assert about.get(b"unit", b"").decode() == (unit or ""), column
@@ -148,7 +150,7 @@ def test_the_observed_flow_has_a_row_for_each_observation_and_is_read_back_as_it
 
 
 def test_a_persons_table_without_deviations_counts_each_at_a_twentieth_of_the_usual_speed() -> None:
-    from flowrec.tables.observed import observations_of
+    from flowrec.store.tables.observed import observations_of
 
     table = {"x_um": [1.0, 2.0], "y_um": [3.0, 4.0], "u_um_s": [30.0, 0.0], "v_um_s": [40.0, 50.0]}  # 50 um/s each
     np.testing.assert_allclose(observations_of(table).std_um_s, 2.5)

@@ -15,11 +15,12 @@ from mcap.reader import make_reader
 from rerun.chunk import RrdReader
 
 import flowrec
-from flowrec.chip.registration import Calibration
-from flowrec.messages import FlowField
-from flowrec.session import Session
-from flowrec.topics import Tick
-from flowrec.view import colours, foxglove_layout
+from flowrec.core.messages import FlowField
+from flowrec.core.topics import Tick
+from flowrec.physics.chip.registration import Calibration
+from flowrec.store.session import Session
+from flowrec.view import colours
+from flowrec.view.foxglove_layout import foxglove_layout
 from flowrec.view.overlay import Overlay
 from flowrec.view.scene import Scene
 from tests.outlets import primes as p
@@ -197,7 +198,7 @@ def test_the_flow_of_foxglove_is_a_grid_of_cells_in_metres(foxglove: dict[str, A
 
 
 def test_foxglove_looks_at_the_chip_from_where_the_camera_is(foxglove: dict[str, Any]) -> None:
-    layout = foxglove_layout.foxglove_layout((0.1, 0.2), 0.3)
+    layout = foxglove_layout((0.1, 0.2), 0.3)
     view = layout["configById"]["3D!chip"]["cameraState"]
     # phi counts from +z: at 0 the view is from +z, with x to the right and y up; at 180 from -z, and y is down.
     at_z = math.cos(math.radians(view["phi"]))
@@ -249,6 +250,16 @@ def test_robot_and_goal_are_drawn_where_the_image_shows_their_places(scene: Scen
     np.testing.assert_allclose(centre_of(robot, bare), wanted, atol=0.25)
     goal = drawn(Overlay(scene, scene.image_px), Tick(p.FIRST_NS, mission=replace(tick.mission, goal_um=at_um)))
     np.testing.assert_allclose(centre_of(goal, bare), wanted, atol=0.25)
+
+
+def test_an_image_of_an_odd_width_is_made_even_by_its_last_column(scene: Scene) -> None:
+    width, height = 481, 283
+    overlay = Overlay(replace(scene, image_px=(width, height)), (width, height))
+    grey = np.tile(np.linspace(20, 220, width).astype(np.uint8), (height, 1))
+    picture = overlay.draw(grey, Tick(p.FIRST_NS))
+    assert picture.shape[1] == width + 1
+    np.testing.assert_array_equal(picture[:height, width], picture[:height, width - 1])
+    assert (picture[:height, width] == 220).all()
 
 
 def test_the_arrow_of_the_legend_is_as_long_as_an_arrow_of_the_speed_that_it_names(scene: Scene) -> None:

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 import flowrec
 from flowrec.bench.harness import Results, run
-from flowrec.commands.calibrate_motion import ANYWHERE, fit_log
-from flowrec.commands.record import record
-from flowrec.config import load_config
-from flowrec.control.field_log import FieldLog
-from flowrec.errors import UsageError
-from flowrec.messages import FlowField
-from flowrec.terminal import progress, table
-from flowrec.units import NS_PER_S, nanoseconds
+from flowrec.core.errors import UsageError
+from flowrec.core.messages import FlowField
+from flowrec.core.terminal import progress, table
+from flowrec.core.units import NS_PER_S, nanoseconds
+from flowrec.measure.calibrate_motion import ANYWHERE, fit_log
+from flowrec.stages.config import load_config
+from flowrec.stages.control.field_log import FieldLog
+from flowrec.verbs.record import record
 
 Floats = NDArray[np.float64]
 SESSIONS = Path(__file__).parents[2] / "sessions"
@@ -228,7 +228,7 @@ def measured(missions: list[Mission], foreign: int, names: tuple[str, ...]) -> l
                 if pool
             ]
             for kind, given, source in cases:
-                log = source.log.shifted(nanoseconds(shift_s))
+                log = source.log.shift_clock(nanoseconds(shift_s))
                 middle_s = float(given.stamps_ns.mean()) / NS_PER_S
                 true_s = rate * middle_s + shift_s - one.delay_s
                 for name in names:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec.chip import load_chip
-from flowrec.config import load_config
-from flowrec.pipeline import assemble
-from flowrec.resolve import resolve
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import assemble
+from flowrec.stages.resolve import resolve
 from tests.twins.coils import device
 from tests.twins.gige import Aravis, port
 from tests.twins.lab import COMMON, RATE, recorder

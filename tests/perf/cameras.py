@@ -26,15 +26,15 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run
-from flowrec.clocks.device_clock import envelope
+from flowrec.core.clocks.device_clock import envelope
+from flowrec.core.terminal import table
+from flowrec.core.units import NS_PER_S
 from flowrec.rigs.lab.cameras.camera import Camera, Grabbed, Wanted
 from flowrec.rigs.lab.cameras.genicam import GenicamCamera
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.rigs.lab.cameras.mmcore import MmcoreCamera
 from flowrec.rigs.lab.cameras.pylon import PylonCamera
-from flowrec.session import Session
-from flowrec.terminal import table
-from flowrec.units import NS_PER_S
+from flowrec.store.session import Session
 from tests.perf.camera_killed import trial
 from tests.rigs.lab.cameras.watching import adds_up
 from tests.twins.emulator import emulated, showing

@@ -21,15 +21,15 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from flowrec.archive.catalog.find import find
+from flowrec.archive.catalog.format import NAME
+from flowrec.archive.catalog.refresh import refresh
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.cataloguing.find import find
-from flowrec.cataloguing.format import NAME
-from flowrec.cataloguing.refresh import refresh
-from flowrec.messages import OperatorEvent
-from flowrec.session import Session
+from flowrec.core.messages import OperatorEvent
+from flowrec.core.terminal import progress
+from flowrec.store.session import Session
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.terminal import progress
 
 SOURCE = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
 QUERIES = (

@@ -16,10 +16,10 @@ import typer
 from numpy.typing import NDArray
 
 from flowrec.bench.harness import Results, Seed, run
-from flowrec.clocks import DeviceClock, Fit
-from flowrec.clocks.device_clock import envelope
-from flowrec.terminal import table
-from flowrec.units import NS_PER_S
+from flowrec.core.clocks import DeviceClock, Fit
+from flowrec.core.clocks.device_clock import envelope
+from flowrec.core.terminal import table
+from flowrec.core.units import NS_PER_S
 
 _RATE_HZ = 100.0
 _SKEW = 50e-6

@@ -17,15 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
-from flowrec.commands.record import prepare
-from flowrec.commands.watching import Watching
-from flowrec.config import load_config
+from flowrec.core.system.processes import realtime_priority
 from flowrec.run.control import RunControl
 from flowrec.run.loop import Sink
-from flowrec.session_writer import session_header
+from flowrec.stages.config import load_config
 from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_writer import session_header
 from flowrec.store.writer import SessionWriter
-from flowrec.system.processes import realtime_priority
+from flowrec.verbs.preparation import prepare
+from flowrec.verbs.watching import Watching
 
 PAGE = """
 import sys

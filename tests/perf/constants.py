@@ -27,7 +27,7 @@ import typer
 
 import flowrec
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.terminal import progress
+from flowrec.core.terminal import progress
 
 PACKAGE = Path(flowrec.__file__).parent
 ROOMS = "vision,estimation,planning,control,refine,flow"
@@ -39,7 +39,7 @@ FLIGHTS = (
         *("mission.goal=inlet", "control.method=policy"),
     ),
 )
-# Numbers that name something, or that only a bench or a training uses.
+# Numbers that name something, or that only a bench uses.
 NOT_QUANTITIES = ("LENGTH, TRAVEL_TIME, PAPER", "USED, SKIPPED, RESTART", "SIGNS", "LEVELS", "OUTPUTS", "INPUTS")
 NOTICED = 0.1  # relative change of a measure
 
@@ -72,8 +72,6 @@ def constants(rooms: list[str]) -> Iterator[Constant]:
     """Module-level numbers and tuples of numbers, each on one line."""
     for room in rooms:
         for file in sorted((PACKAGE / room).rglob("*.py")):
-            if "training" in file.parts:
-                continue
             for node in ast.parse(file.read_text()).body:
                 if not isinstance(node, ast.Assign) or node.lineno != node.end_lineno:
                     continue
@@ -90,14 +88,14 @@ def constants(rooms: list[str]) -> Iterator[Constant]:
 def fly() -> dict[str, Any]:
     """Measures of the flights with the package that is imported here, on one line of stdout."""
     from flowrec.bench.missions import MissionLog
-    from flowrec.chip.io import load_chip
-    from flowrec.config import load_config
-    from flowrec.flow.sampling import relative_rmse
-    from flowrec.pipeline import assemble
-    from flowrec.resolve import resolve
+    from flowrec.physics.chip.io import load_chip
+    from flowrec.physics.flow.sampling import relative_rmse
     from flowrec.rigs.simulated.rig import SimulatedRig
     from flowrec.run.loop import run as fly_mission
     from flowrec.run.workers import LockstepWorker
+    from flowrec.stages.config import load_config
+    from flowrec.stages.pipeline import assemble
+    from flowrec.stages.resolve import resolve
 
     measures: dict[str, Any] = {}
     for number, sets in enumerate(FLIGHTS):

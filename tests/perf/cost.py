@@ -18,9 +18,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from flowrec.bench.harness import Results, peak_mb, print_rows, run
-from flowrec.system.processes import child_command, child_environment
-from flowrec.terminal import progress
+from flowrec.bench.harness import Results, print_rows, run
+from flowrec.core.system.processes import child_command, child_environment, peak_mb
+from flowrec.core.terminal import progress
 from tests.store.range_server import served
 
 _SECONDS_PER_YEAR = 365.25 * 24 * 3600
@@ -28,7 +28,7 @@ _SECONDS_PER_YEAR = 365.25 * 24 * 3600
 
 def _head(url: str) -> None:
     import flowrec
-    from flowrec.sweeping.tasks import content_of
+    from flowrec.archive.sweep.tasks import content_of
 
     content_of(flowrec.open(url))
 
@@ -51,8 +51,8 @@ def _task(method: str) -> Callable[[str], None]:
 
     def replayed(url: str) -> None:
         import flowrec
-        from flowrec.sweeping import replay_process
-        from flowrec.sweeping.tasks import Task, content_of
+        from flowrec.archive.sweep import replay_process
+        from flowrec.archive.sweep.tasks import Task, content_of
 
         row = replay_process._row(Task(url, content_of(flowrec.open(url)), (("refine", method),)))
         assert not row.get("error"), row["error"]
@@ -107,7 +107,7 @@ def _extrapolated(name: str, measured: list[dict[str, float]], count: float, gig
 
 def _work(name: str, warming: str, url: str) -> None:
     """Runs in a process of its own; prints its cost as JSON."""
-    from flowrec import terminal
+    from flowrec.core import terminal
     from flowrec.store.remote_file import TRAFFIC
 
     terminal.console.quiet = True

@@ -22,15 +22,16 @@ from typing import Annotated, Any
 
 import typer
 
-from flowrec.bench.harness import Results, Seed, peak_mb, run
-from flowrec.commands.check import check
-from flowrec.commands.info import info
-from flowrec.commands.ls import list_sessions
-from flowrec.errors import FlowrecError, printable
-from flowrec.session import Session
+from flowrec.bench.harness import Results, Seed, run
+from flowrec.core.errors import FlowrecError, printable
+from flowrec.core.system.processes import forget_peak, peak_mb
+from flowrec.core.terminal import progress, table
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
-from flowrec.terminal import progress, table
+from flowrec.store.session import Session
+from flowrec.verbs.check import check
+from flowrec.verbs.info import info
+from flowrec.verbs.ls import ls
 from tests.perf.mutate import blind, corrupt
 from tests.store.drafts import Draft, small_draft
 
@@ -67,7 +68,7 @@ class Campaign:
         if check(path).word != "good":
             raise FlowrecError(f"{path}: the session to corrupt is not good; repair tests/store/drafts.py first")
         path.unlink()
-        _forget_peak()
+        forget_peak()
         self._base_mb = peak_mb()
         self.kinds: Counter[str] = Counter()
         self.ends: Counter[str] = Counter()
@@ -80,7 +81,7 @@ class Campaign:
         self.kinds[kind] += 1
         path = self._work / ("case.mcap.partial" if seed % 5 == 0 else "case.mcap")
         path.write_bytes(data)
-        _forget_peak()
+        forget_peak()
         began = time.perf_counter()
         faults = self._read(path, kind)
         self.worst_s = max(self.worst_s, time.perf_counter() - began)
@@ -126,7 +127,7 @@ class Campaign:
         sound = {}
         for name, verb in (
             ("info", lambda: info(path)),
-            ("ls", lambda: list_sessions(self._work)),
+            ("ls", lambda: ls([self._work])),
             ("open", opened),
             ("middle", middle),
             ("ticks", ticks),
@@ -239,12 +240,6 @@ def _without_waiting_for_the_disk() -> Iterator[None]:
         yield
     finally:
         os.fsync = fsync
-
-
-def _forget_peak() -> None:
-    """Reset the peak memory of this process (Linux)."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 if __name__ == "__main__":

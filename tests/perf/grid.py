@@ -14,11 +14,11 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run, vessel_cases
-from flowrec.chip.vessel_case import read_true_chip, read_true_velocity, read_vessel_case
-from flowrec.errors import UsageError
-from flowrec.flow import FlowSolver
-from flowrec.refine.discretisation_error import local_rms
-from flowrec.terminal import table
+from flowrec.core.errors import UsageError
+from flowrec.core.terminal import table
+from flowrec.physics.chip.vessel_case import read_true_chip, read_true_velocity, read_vessel_case
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.stages.refine.discretisation_error import local_rms
 
 WITHIN_TWO = 0.9545  # of a Gaussian
 

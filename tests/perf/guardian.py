@@ -28,8 +28,8 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run
-from flowrec.rigs.lab.amplifiers.limits import Limits
-from flowrec.terminal import progress, table
+from flowrec.core.terminal import progress, table
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from tests.perf import guardian_record, guardian_trial
 from tests.twins.coils import Device, device
 from tests.twins.lab import still_scene
@@ -127,7 +127,7 @@ def blocks(on: Device, seconds: float, silence_s: float = TIMER_S) -> Blocks:
     times, outputs = on.outputs(begin)
     off_ns = on.off_ns(begin_ns, begin)
     kept = outputs[(times >= begin_ns) & (times < min(end_ns, off_ns or end_ns) - 10_000_000)]
-    limits = Limits(guardian_trial.COILS, guardian_trial.ROBOT, guardian_trial.OUTPUT)
+    limits = CommandLimits(guardian_trial.COILS, guardian_trial.ROBOT, guardian_trial.OUTPUT)
     bound = limits.slew_a_s / guardian_trial.COILS.amplifier.output_hz / min(guardian_trial.COILS.amplifier.a_per_v)
     step = float(np.abs(np.diff(kept, axis=0)).max())
     return Blocks(1e-9 * (end_ns - begin_ns), step, bound, ran_dry, off_ns is not None)

@@ -17,9 +17,9 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowrec.errors import FlowrecError
-from flowrec.session import Session
+from flowrec.core.errors import FlowrecError
 from flowrec.store.recovery import NothingSavedError, recover
+from flowrec.store.session import Session
 from tests.twins.coils import Device
 from tests.twins.lab import COMMON, RATE, recorder
 
@@ -136,7 +136,7 @@ def _hold_when_told() -> None:
 
 
 if __name__ == "__main__":
-    from flowrec.cli import main
+    from flowrec.verbs.cli import main
 
     threading.Thread(target=_hold_when_told, daemon=True).start()
     main()

@@ -13,15 +13,15 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-from flowrec.control.coils import Coils
-from flowrec.errors import RigError
-from flowrec.messages import Currents
-from flowrec.rig_settings import OutputLimits
+from flowrec.core.errors import RigError
+from flowrec.core.messages import Currents
+from flowrec.core.system.processes import realtime_priority
+from flowrec.physics.robot import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import Amplifier
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
-from flowrec.robot import Robot
-from flowrec.system.processes import realtime_priority
+from flowrec.stages.control.coils import Coils
+from flowrec.stages.rig_settings import OutputLimits
 from tests.twins.coils import CHANNELS
 
 COILS = Coils(bias_mt=(0.05, 0.0, -0.04))
@@ -37,9 +37,9 @@ def amplifier(kind: str, address: str, silence_s: float = 0.1) -> Amplifier:
 
         return SerialAmplifier(address, 115_200, COILS)
     from flowrec.rigs.lab.amplifiers.ni import NiAmplifier
-    from flowrec.rigs.lab.amplifiers.ni_process import Settings
+    from flowrec.rigs.lab.amplifiers.ni_process import NiSettings
 
-    return NiAmplifier(Settings(CHANNELS, address, COILS, ROBOT, OUTPUT, silence_s))
+    return NiAmplifier(NiSettings(CHANNELS, address, COILS, ROBOT, OUTPUT, silence_s))
 
 
 def currents(frequency_hz: float, heading_rad: float, amplitude_mt: float = 4.0) -> Currents:
@@ -58,7 +58,7 @@ def currents(frequency_hz: float, heading_rad: float, amplitude_mt: float = 4.0)
 
 def record(say: Callable[[str], None], kind: str, address: str, silence_s: float, fault: str) -> None:
     """Drive the coils until it is killed."""
-    with Drive(amplifier(kind, address, silence_s), Limits(COILS, ROBOT, OUTPUT, say), silence_s, 1.0) as drive:
+    with Drive(amplifier(kind, address, silence_s), CommandLimits(COILS, ROBOT, OUTPUT, say), silence_s, 1.0) as drive:
         say(f"guardian {drive._guardian._process.pid}")
         if kind == "ni":
             say(f"process {drive._amplifier._process.pid}")
@@ -71,7 +71,7 @@ def record(say: Callable[[str], None], kind: str, address: str, silence_s: float
                 drive.beat()
             number += 1
             now_ns = time.monotonic_ns()
-            applied = drive.applied(now_ns, before_ns)
+            applied = drive.applied_at(now_ns, before_ns)
             before_ns = now_ns
             if not said and applied.amplitude_mt >= 3.999:
                 say("on")

@@ -23,10 +23,10 @@ import typer
 import zstandard
 
 from flowrec.bench.harness import Results, run
+from flowrec.core.terminal import progress, table
+from flowrec.core.topics import TOPICS
+from flowrec.core.units import NS_PER_S
 from flowrec.store.channels import FRAMES, SLOTS, STATE
-from flowrec.terminal import progress, table
-from flowrec.topics import TOPICS
-from flowrec.units import NS_PER_S
 from tests.store.drafts import (
     CHUNK,
     CHUNK_INDEX,

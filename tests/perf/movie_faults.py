@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 import flowrec
 from flowrec.bench.harness import Results, run
-from flowrec.commands.record import record
-from flowrec.config import load_config, with_sets
-from flowrec.errors import FlowrecError
-from flowrec.flow.sampling import relative_rmse
-from flowrec.messages import Track
-from flowrec.session import Session
-from flowrec.terminal import table
+from flowrec.core.errors import FlowrecError
+from flowrec.core.messages import Track
+from flowrec.core.terminal import table
+from flowrec.physics.flow.sampling import relative_rmse
+from flowrec.stages.config import load_config, with_sets
+from flowrec.store.session import Session
+from flowrec.verbs.record import record
 from tests.movies import makers
 from tests.perf.movies import laboratory, write_table
 

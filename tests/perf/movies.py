@@ -20,12 +20,12 @@ import typer
 
 import flowrec
 from flowrec.bench.harness import Results, run
-from flowrec.chip import chip_files
-from flowrec.commands.record import record
-from flowrec.config import Config, load_config
-from flowrec.flow.sampling import relative_rmse, sample
-from flowrec.session import Session
-from flowrec.terminal import progress, table
+from flowrec.core.terminal import progress, table
+from flowrec.physics.chip.io import chip_files
+from flowrec.physics.flow.sampling import relative_rmse, sample
+from flowrec.stages.config import Config, load_config
+from flowrec.store.session import Session
+from flowrec.verbs.record import record
 from tests.movies import makers
 
 KINDS = ("png", "ome-tiff 12 bit", "ffv1", "ome-zarr", "mjpeg", "h264", "xvid")

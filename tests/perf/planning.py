@@ -20,13 +20,13 @@ from scipy.sparse.csgraph import dijkstra
 
 from flowrec.bench.harness import Results, run
 from flowrec.bench.plan import SIDE_PX
-from flowrec.bench.trips import SPEED_UM_S, Trip, World, draw_trip, world_of, worlds
-from flowrec.planning import Planner
-from flowrec.planning.free_space import FreeSpace, open_space
-from flowrec.terminal import progress, say
+from flowrec.bench.trips import SPEED_UM_S, Trip, TripCase, draw_trip, world_of, worlds
+from flowrec.core.terminal import progress, say
+from flowrec.stages.planning import Planner
+from flowrec.stages.planning.free_space import FreeSpace, open_space
 
 
-def magnified(world: World) -> World | None:
+def magnified(world: TripCase) -> TripCase | None:
     """The same chip as a camera of twice the resolution sees it; the robot is as big as before, in um."""
     mask = world.chip.mask.repeat(2, axis=0).repeat(2, axis=1)
     openings = tuple(replace(o, first=2 * o.first, last=2 * o.last + 1) for o in world.chip.openings)
@@ -50,9 +50,9 @@ def measure(
     return {"rows": sorted(rows, key=lambda row: row["free"])}
 
 
-def _magnified_trips(side_px: int, times: int) -> Iterator[tuple[World, Trip]]:
+def _magnified_trips(side_px: int, times: int) -> Iterator[tuple[TripCase, Trip]]:
     for drawn in worlds(side_px, 100):
-        world: World | None = drawn
+        world: TripCase | None = drawn
         for _ in range(times):
             world = None if world is None else magnified(world)
         trip = None if world is None else draw_trip(world, np.random.default_rng(0))
@@ -60,7 +60,7 @@ def _magnified_trips(side_px: int, times: int) -> Iterator[tuple[World, Trip]]:
             yield world, trip
 
 
-def measured(world: World, trip: Trip, repeats: int) -> dict[str, Any]:
+def measured(world: TripCase, trip: Trip, repeats: int) -> dict[str, Any]:
     """The least CPU times in ms of a plan and of Dijkstra on one chip."""
     field = world.field(0.9)
     planner = Planner()

@@ -8,9 +8,9 @@ import sys
 import time
 from pathlib import Path
 
-from flowrec.bench.harness import peak_mb
+from flowrec.core.system.processes import peak_mb
+from flowrec.core.units import nanoseconds
 from flowrec.store.reader import SessionReader
-from flowrec.units import nanoseconds
 
 
 def read(what: str, path: Path) -> dict[str, float]:

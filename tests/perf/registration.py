@@ -1,7 +1,8 @@
 """`python -m tests.perf.registration`: errors of `flowrec calibrate image` over chips, transformations and looks.
 
-Every look of tests/chip/looks.py and the simulated microscope, as it is and inverted, meets every transformation; chips
-and textures change from case to case. Then pictures that do not show the chip: how many are refused. With `--rivals`
+Every look of tests/physics/chip/looks.py and the simulated microscope, as it is and inverted, meets every
+transformation; chips and textures change from case to case. Then pictures that do not show the chip: how many are
+refused. With `--rivals`
 the search is compared with the log-polar FFT and the fit with OpenCV's ECC, from the same pictures and first poses.
 Of 20 pictures the best pose of our search is within 50 um (5 px) in 18 and takes 1.2 s, log-polar in 8 and 0.05 s. ECC
 is then within 5 um in 7 and our fit, of the poses that are accepted, in all.
@@ -22,16 +23,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flowrec.chip import ChipSettings, load_chip
-from flowrec.chip.chip import Chip
-from flowrec.chip.picture_registration import register
-from flowrec.chip.registration import Calibration
-from flowrec.chip.wall_fit import WallMap
-from flowrec.chip.wall_search import Search
-from flowrec.errors import ChipError
-from flowrec.rig_settings import CameraSettings
+from flowrec.core.errors import ChipError
+from flowrec.measure.picture_registration import register
+from flowrec.measure.wall_fit import WallMap
+from flowrec.measure.wall_search import WallSearch
+from flowrec.physics.chip.chip import Chip, ChipSettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.chip.registration import Calibration
 from flowrec.rigs.simulated.microscope import Microscope
-from tests.chip.looks import LOOKS, picture
+from flowrec.stages.rig_settings import CameraSettings
+from flowrec.stages.simulated_settings import SimulatedImage
+from tests.physics.chip.looks import LOOKS, picture
 
 SIZE_PX, ABOUT_UM, CHIP_UM = (640, 512), 10.0, 20.0
 # Turn in degrees, mirror, shift in um, scale.
@@ -96,14 +98,14 @@ def cases(seed: int, laid: list[np.ndarray]) -> Iterator[Case]:
             centre = np.array(chip.size_um) / 2 - chip.um_per_px / 2
             way = rng.uniform(0, 2 * np.pi)
             centre = centre + shift_um * fill * np.array((np.cos(way), np.sin(way)))
-            truth = Calibration.centred(ABOUT_UM * fill * scale, centre, SIZE_PX, turn, mirror)
+            truth = Calibration.centre_on(ABOUT_UM * fill * scale, centre, SIZE_PX, turn, mirror)
             texture = laid[number % len(laid)] if laid and number % 3 else None
             if look in LOOKS:
                 contrast = 0.25 * max(abs(v) for v in (LOOKS[look].line, LOOKS[look].channel, LOOKS[look].shade))
                 image = picture(chip.mask, chip.um_per_px, truth, SIZE_PX, LOOKS[look], rng, texture, contrast)
             else:
                 camera = CameraSettings(*SIZE_PX)
-                seen = Microscope(chip.mask, chip.um_per_px, truth, camera, number)
+                seen = Microscope(chip.mask, chip.um_per_px, truth, camera, SimulatedImage(), number)
                 robot = np.array(truth.to_um((300.0, 200.0)))
                 image = seen.image(robot, 5 * truth.um_per_px, np.zeros(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
                 image = 255 - image if "inverted" in look else image
@@ -179,7 +181,7 @@ def strangers(seed: int, laid: list[np.ndarray]) -> Iterator[Stranger]:
         scale = {"another chip near by": 0.6, "another scale": float(rng.choice((0.7, 1.4)))}.get(kind, 1.0)
         centre = np.array(shown.size_um) / 2 + rng.uniform(-0.1, 0.1, 2) * shown.size_um
         turn, mirror = float(rng.uniform(0, 360)), kind == "mirror image"
-        view = Calibration.centred(fill * scale, centre, SIZE_PX, turn, mirror)
+        view = Calibration.centre_on(fill * scale, centre, SIZE_PX, turn, mirror)
         image = picture(shown.mask, shown.um_per_px, view, SIZE_PX, looks[number % len(looks)], rng)
         mirrors = (False,) if mirror else (False, True)
         yield Stranger(kind, chip, image, about_um * (scale if "near" in kind else 1.0), mirrors)
@@ -273,9 +275,9 @@ def ecc(case: Case, start: Calibration) -> Calibration | None:
 def rivals(case: Case) -> dict[str, object]:
     walls = WallMap(case.chip.mask, case.chip.um_per_px)
     t0 = time.process_time()
-    first = Search(case.image.astype(np.float32), case.chip.mask, case.chip.um_per_px, walls.clearance_um).candidates(
-        (case.about_um / 1.12, case.about_um * 1.12), (False, True), 4
-    )
+    first = WallSearch(
+        case.image.astype(np.float32), case.chip.mask, case.chip.um_per_px, walls.clearance_um
+    ).candidates((case.about_um / 1.12, case.about_um * 1.12), (False, True), 4)
     t1 = time.process_time()
     rival = log_polar(case)
     t2 = time.process_time()

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import flowrec
+from flowrec.core.units import NS_PER_S
 from flowrec.store import remote_file
-from flowrec.units import NS_PER_S
 from tests.perf.large import LOADS, write_sparse
 from tests.store.range_server import served
 

@@ -1,8 +1,8 @@
 """`python -m tests.perf.segmentation`: chips that `flowrec calibrate chip` makes of pictures: walls, flow, refusals.
 
-Pictures of chips in every look of tests/chip/looks.py, in looks of this file and by the simulated microscope, in
-several poses; then pictures without a chip. Of each: accepted or refused, intersection over union with the true mask,
-distance of the walls from the true ones, and the error of the flow solved on the chip that was found, between the
+Pictures of chips in every look of tests/physics/chip/looks.py, in looks of this file and by the simulated microscope,
+in several poses; then pictures without a chip. Of each: accepted or refused, intersection over union with the true
+mask, distance of the walls from the true ones, and the error of the flow solved on the chip that was found, between the
 openings of the true one, at the same mean speed and at the same flux. `--rivals`: masks by scikit-image and OpenCV from
 the same pictures. `--textures DIR`: pictures (PNG) without a chip. FLOWREC_REFERENCE_DATA adds real vessels and images.
 """
@@ -23,19 +23,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.chip import ChipSettings, load_chip
-from flowrec.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip
-from flowrec.chip.clearance import clearance_um
-from flowrec.chip.io import without_pockets
-from flowrec.chip.openings import check_openings, find_openings, guess_inlets
-from flowrec.chip.registration import Calibration
-from flowrec.chip.segmentation import chip_mask, iou, segment
-from flowrec.errors import FlowrecError
-from flowrec.flow import FlowSolver
-from flowrec.flow.sampling import sample
-from flowrec.rig_settings import CameraSettings
+from flowrec.core.errors import FlowrecError
+from flowrec.measure.segmentation import chip_mask, iou, segment
+from flowrec.physics.chip.chip import WATER_KG_M3, WATER_MPA_S, Chip, ChipSettings
+from flowrec.physics.chip.clearance import clearance_um
+from flowrec.physics.chip.io import load_chip, without_pockets
+from flowrec.physics.chip.openings import check_openings, find_openings, guess_inlets
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.flow.sampling import sample
+from flowrec.physics.flow.solver import FlowSolver
 from flowrec.rigs.simulated.microscope import Microscope
-from tests.chip.looks import LOOKS, Look, picture
+from flowrec.stages.rig_settings import CameraSettings
+from flowrec.stages.simulated_settings import SimulatedImage
+from tests.physics.chip.looks import LOOKS, Look, picture
 
 MORE_LOOKS = {
     "bright channel, dark walls": Look(channel=0.25, line=-0.5, line_um=25.0, vignette=0.3),
@@ -97,13 +97,13 @@ def cases(seed: int, longest_px: int, wanted: Callable[[int], bool] = lambda _: 
             angle, scale = POSES[pose]
             um = chip.size_um[0] / width * scale
             centre = np.array(chip.size_um) / 2 - chip.um_per_px / 2
-            camera = Calibration.centred(um, centre + (rng.uniform(-600, 600, 2) if scale < 1 else 0), size, angle)
+            camera = Calibration.centre_on(um, centre + (rng.uniform(-600, 600, 2) if scale < 1 else 0), size, angle)
             known = LOOKS | MORE_LOOKS
             if look in known:
                 image = picture(chip.mask, chip.um_per_px, camera, size, known[look], rng)
             else:
                 settings = CameraSettings(*size)
-                scope = Microscope(chip.mask, chip.um_per_px, camera, settings, seed + number)
+                scope = Microscope(chip.mask, chip.um_per_px, camera, settings, SimulatedImage(), seed + number)
                 robot = np.array(camera.to_um((0.4 * width, 0.5 * height)))
                 image = scope.image(robot, 5 * um, np.zeros(2), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
                 image = 255 - image if "inverted" in look else image

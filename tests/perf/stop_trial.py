@@ -19,14 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from flowrec import cli
-from flowrec.commands import record as verb
-from flowrec.errors import RigError
-from flowrec.messages import Currents
-from flowrec.pipeline import Inputs
+from flowrec.core.errors import RigError
+from flowrec.core.messages import Currents
 from flowrec.rigs.simulated import rig as simulated
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run import loop
+from flowrec.stages.pipeline import Inputs
+from flowrec.verbs import cli
+from flowrec.verbs import mission_run as verb
 from tests.short_missions import SMALL
 
 AT = 40
@@ -179,7 +179,7 @@ def main(kind: str, out: str, log_path: str, *sets: str) -> None:
     log = Log(Path(log_path))
     LoggedRig.log = staticmethod(log)
     simulated.SimulatedRig = RIGS.get(kind, LoggedRig)  # type: ignore[misc]
-    step, record, ticks = loop.step, verb.record, iter(range(1 << 30))
+    step, record, ticks = loop.step, verb.run_mission, iter(range(1 << 30))
 
     def failing(*arguments: object) -> object:
         if next(ticks) == AT:
@@ -195,7 +195,7 @@ def main(kind: str, out: str, log_path: str, *sets: str) -> None:
 
     if kind in STAGES:
         loop.step = failing  # type: ignore[assignment]
-    verb.record = logged  # type: ignore[assignment]
+    verb.run_mission = logged  # type: ignore[assignment]
     words = [word for setting in (*SETS, *sets) for word in ("--set", setting)]
     sys.argv = ["flowrec", "record", "--realtime", "--out", out, *words]
     cli.main()

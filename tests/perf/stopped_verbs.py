@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +23,10 @@ from typing import Annotated, Any
 import psutil  # type: ignore[import-untyped]
 import typer
 
+from flowrec.bench.flow import make_up
 from flowrec.bench.harness import Results, run
+from flowrec.core.terminal import progress, table
 from flowrec.store.session_metadata import SessionMetadata
-from flowrec.terminal import progress, table
 
 ROOT = Path(__file__).parents[2]
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -39,7 +40,7 @@ _GONE_S = 10.0  # for processes of other sessions to end after their parent
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb as it is typed: `{a}`, `{b}` are sessions, `{out}` a folder.
+    """A verb as it is typed: `{a}`, `{b}` are sessions, `{cases}` is a folder with a vessel case, `{out}` an empty one.
 
     Attributes
     ----------
@@ -53,30 +54,56 @@ class Verb:
 
 
 VERBS = {
-    "verify": Verb("replay {a} --verify", "flowrec.commands.replay"),
-    "verify, 2 jobs": Verb("replay {a} --verify --jobs 2", "flowrec.commands.replay_segments"),
-    "refine": Verb("replay {a} --refine gain -o {out}/r.mcap", "flowrec.commands.replay_report", ("r.mcap",)),
+    "verify": Verb("replay {a} --verify", "flowrec.verbs.session_replay"),
+    "verify, 2 jobs": Verb("replay {a} --verify --jobs 2", "flowrec.verbs.replay_segments"),
+    "refine": Verb("replay {a} --refine gain -o {out}/r.mcap", "flowrec.verbs.replay_report", ("r.mcap",)),
     "refly": Verb(
         "replay {a} --refine gain --refly -o {out}/r.mcap",
-        "flowrec.commands.replay_report",
+        "flowrec.verbs.replay_report",
         ("r.mcap", "r_refly.mcap"),
     ),
-    "check": Verb("check {a}", "flowrec.commands.check"),
-    "compare": Verb("compare {a} {b}", "flowrec.commands.compare"),
+    "check": Verb("check {a}", "flowrec.verbs.check_run"),
+    "compare": Verb("compare {a} {b}", "flowrec.verbs.session_comparison"),
     "import": Verb(
         "import sessions/movie/robot.mp4 sessions/movie/lab.toml --coils sessions/movie/coils.csv -o {out}/i.mcap",
-        "flowrec.commands.import_movie",
+        "flowrec.verbs.align",
         ("i.mcap",),
     ),
-    "calibrate": Verb("calibrate motion {a} -o {out}/m.toml", "flowrec.commands.calibrate_motion"),
-    "export": Verb("export {a} -o {out}/a.rrd", "flowrec.commands.export"),
-    "export tables": Verb("export {a} {out}/tables --format csv", "flowrec.commands.export"),
-    "sweep": Verb(
-        "sweep {a} --grid refine=gain,fvm --workers 1 -o {out}/s.parquet", "flowrec.sweeping.sweep", ("s.parquet",)
+    "calibrate motion": Verb("calibrate motion {a} -o {out}/m.toml", "flowrec.measure.calibrate_motion"),
+    "calibrate coils": Verb("calibrate coils sessions/coils.csv -o {out}/c.toml", "flowrec.measure.calibrate_coils"),
+    "calibrate image": Verb(
+        "calibrate image {a} sessions/golden_moderate.toml -o {out}/i.toml", "flowrec.measure.calibrate_image"
     ),
-    "bench": Verb("bench plan --trips 2 --out {out}/plan.json", "flowrec.bench.plan"),
-    "report": Verb("report {a} -o {out}/r.html", "flowrec.commands.report"),
-    "view": Verb("view {a} --no-open -o {out}/v.rrd", "flowrec.commands.export"),
+    "calibrate chip": Verb(
+        "calibrate chip sessions/upstream.png --um-per-px 5 -o {out}/c.toml", "flowrec.measure.calibrate_chip"
+    ),
+    "export": Verb("export {a} -o {out}/a.rrd", "flowrec.exports.export"),
+    "export tables": Verb("export {a} {out}/tables --format csv", "flowrec.exports.export"),
+    "sweep": Verb(
+        "sweep {a} --grid refine=gain,fvm --workers 1 -o {out}/s.parquet", "flowrec.archive.sweep.sweep", ("s.parquet",)
+    ),
+    "bench flow": Verb(
+        "bench flow --cases {cases} --methods gain --fields {out}/fields --out {out}/b.json",
+        "flowrec.bench.flow",
+        ("fields", "fields/made_up_00.gain.npz"),
+    ),
+    "bench survey": Verb("bench survey --cases {cases} --draws 1 --out {out}/b.json", "flowrec.bench.survey"),
+    "bench plan": Verb("bench plan --trips 2 --quick --out {out}/b.json", "flowrec.bench.plan"),
+    "bench observer": Verb("bench observer --session {a} --out {out}/b.json", "flowrec.bench.observer"),
+    "bench track": Verb("bench track --seeds 1 --out {out}/b.json", "flowrec.bench.track"),
+    "bench missions": Verb(
+        "bench missions --seeds 1 --policies policy,plain --worlds kind --jobs 2 --out {out}/b.json",
+        "flowrec.bench.missions",
+    ),
+    "bench worlds": Verb(
+        "bench worlds --worlds kind --chips straight --seeds 2 --methods gain --rows {out}/rows --out {out}/b.json",
+        "flowrec.bench.worlds",
+        ("rows",),
+    ),
+    "bench solver": Verb("bench solver --quick --out {out}/b.json", "flowrec.bench.solver"),
+    "bench loop": Verb("bench loop --ticks 30 --out {out}/b.json", "flowrec.bench.loop"),
+    "report": Verb("report {a} -o {out}/r.html", "flowrec.verbs.report_page"),
+    "view": Verb("view {a} --no-open -o {out}/v.rrd", "flowrec.exports.export"),
 }
 
 
@@ -182,15 +209,19 @@ def faults(verb: Verb, ended: Trial, number: int, folder: Path) -> list[str]:
 def measure(
     session: Annotated[Path, typer.Option(help="A small session.")] = ROOT / "sessions" / "golden_moderate.mcap",
     only: Annotated[list[str] | None, typer.Option(metavar="VERB", help="Only this verb; may be repeated.")] = None,
+    share: Annotated[
+        list[float] | None, typer.Option(help="Only after this share of its work; may be repeated.")
+    ] = None,
 ) -> Results:
     """Statuses, sentences and what is left, by verb, signal and moment."""
     verbs = {name: VERBS[name] for name in only} if only else VERBS
     rows: list[dict[str, Any]] = []
-    count = len(verbs) * len(SIGNALS) * (len(SHARES) + len(IMPORTS))
+    imports, shares = ((), tuple(share)) if share else (IMPORTS, SHARES)
+    count = len(verbs) * len(SIGNALS) * (len(shares) + len(imports))
     with tempfile.TemporaryDirectory(prefix="flowrec-trials-") as name, progress("stopping", count, "trials") as done:
         sessions = _sessions(session, Path(name))
         for title, verb in verbs.items():
-            for row in _rows(title, verb, sessions, Path(name)):
+            for row in _rows(title, verb, sessions, Path(name), imports, shares):
                 rows.append(row)
                 done(len(rows))
     return {"rows": rows, "fault_count": sum(bool(row["faults"]) for row in rows)}
@@ -205,25 +236,34 @@ def _sessions(session: Path, folder: Path) -> dict[str, str]:
         check=True,
         capture_output=True,
     )
-    return {"a": str(first), "b": str(second)}
+    (cases := folder / "cases").mkdir()
+    make_up(cases, 1)
+    return {"a": str(first), "b": str(second), "cases": str(cases)}
 
 
-def _rows(title: str, verb: Verb, sessions: dict[str, str], folder: Path) -> Iterator[dict[str, Any]]:
+def _rows(
+    title: str,
+    verb: Verb,
+    sessions: dict[str, str],
+    folder: Path,
+    imports: Sequence[float],
+    shares: Sequence[float],
+) -> Iterator[dict[str, Any]]:
     def words(out: Path) -> list[str]:
         out.mkdir()
         return verb.words.format(**sessions, out=out).split()
 
     whole = trial(words(folder / f"{uuid.uuid4().hex}"), folder / "a.mcap")
     imported = subprocess.run(
-        [sys.executable, "-c", f"import flowrec.cli, {verb.imports}, time; print(time.process_time())"],
+        [sys.executable, "-c", f"import flowrec.verbs.cli, {verb.imports}, time; print(time.process_time())"],
         cwd=ROOT,
         check=True,
         capture_output=True,
         text=True,
     )
     imports_s = min(float(imported.stdout), whole.cpu_s)
-    moments = {f"imports, {share:g}": share * imports_s for share in IMPORTS}
-    moments |= {f"work, {share:g}": imports_s + share * (whole.cpu_s - imports_s) for share in SHARES}
+    moments = {f"imports, {share:g}": share * imports_s for share in imports}
+    moments |= {f"work, {share:g}": imports_s + share * (whole.cpu_s - imports_s) for share in shares}
     for number in SIGNALS:
         for moment, at_cpu_s in moments.items():
             out = folder / uuid.uuid4().hex

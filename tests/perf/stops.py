@@ -20,10 +20,10 @@ from typing import Annotated
 import typer
 
 from flowrec.bench.harness import Results, run
-from flowrec.errors import FlowrecError
+from flowrec.core.errors import FlowrecError
+from flowrec.core.terminal import progress, table
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
-from flowrec.terminal import progress, table
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP, signal.SIGUSR1, signal.SIGUSR2]
 _RAMP_S, _HANG_S, _SIGHT_S = 0.9, 0.5, 1.4

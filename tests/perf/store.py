@@ -18,11 +18,11 @@ import numpy as np
 import typer
 
 from flowrec.bench.harness import Results, run
+from flowrec.core.terminal import progress, table
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.terminal import progress, table
 from tests.perf import store_equal
 from tests.perf.store_kills import kills
 from tests.perf.store_kills import show as show_kills

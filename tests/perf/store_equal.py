@@ -24,8 +24,11 @@ import numpy as np
 import zstandard
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
-from flowrec.declarations import Message, message_fields
-from flowrec.messages import FlowField, Track
+from flowrec.core.declarations import Message, message_fields
+from flowrec.core.messages import FlowField, Track
+from flowrec.core.system.processes import realtime_priority
+from flowrec.core.terminal import progress, table
+from flowrec.core.topics import BY_FIELD
 from flowrec.run.loop import SWITCH_S
 from flowrec.store import chunk, codec, mcap_writer
 from flowrec.store.channels import SLOTS, declarations, message_codec
@@ -33,9 +36,6 @@ from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.schema import Schema
-from flowrec.system.processes import realtime_priority
-from flowrec.terminal import progress, table
-from flowrec.topics import BY_FIELD
 from tests.perf.store_writers import frames_given, poses_given
 from tests.store.made_up import encode
 

@@ -17,18 +17,17 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from flowrec.bench.harness import peak_mb
 from flowrec.bench.loop import RATE_HZ, paced_run, prepare_inputs
-from flowrec.commands.record import prepare
-from flowrec.config import load_config
-from flowrec.declarations import Image
-from flowrec.messages import Frame, OperatorEvent
+from flowrec.core.declarations import Image
+from flowrec.core.messages import Frame, OperatorEvent
+from flowrec.core.system.processes import peak_mb, realtime_priority
+from flowrec.core.terminal import progress
+from flowrec.core.topics import Tick
 from flowrec.run.loop import Sink
+from flowrec.stages.config import load_config
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.system.processes import realtime_priority
-from flowrec.terminal import progress
-from flowrec.topics import Tick
+from flowrec.verbs.preparation import prepare
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _WIDTH, _HEIGHT = 2448, 2048

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from flowrec.declarations import Image
-from flowrec.messages import FlowField, OperatorEvent
+from flowrec.core.declarations import Image
+from flowrec.core.messages import FlowField, OperatorEvent
+from flowrec.core.terminal import progress, table
+from flowrec.core.topics import Tick
 from flowrec.run.loop import SWITCH_S
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.terminal import progress, table
-from flowrec.topics import Tick
 from tests.perf.store_writers import made_up_header, pictures, ticks_of
 
 _RATE_HZ = 60.0

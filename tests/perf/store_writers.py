@@ -13,8 +13,10 @@ import numpy as np
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from mcap.writer import CompressionType, Writer
 
-from flowrec.declarations import Image, Message
-from flowrec.messages import Applied, Estimate, Frame, Track
+from flowrec.core.declarations import Image, Message
+from flowrec.core.messages import Applied, Estimate, Frame, Track
+from flowrec.core.topics import BY_FIELD, Tick
+from flowrec.core.units import nanoseconds
 from flowrec.store.channels import SLOTS, declarations, message_codec
 from flowrec.store.chunk import ChunkBuilder
 from flowrec.store.frame_encodings import ENCODINGS
@@ -22,8 +24,6 @@ from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import SessionHeader
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import BY_FIELD, Tick
-from flowrec.units import nanoseconds
 from tests.store.made_up import encode
 
 _NOISE = 3.0  # grey levels, one sigma: a camera's at this brightness

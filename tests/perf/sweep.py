@@ -23,10 +23,10 @@ import numpy as np
 import psutil
 import typer
 
+from flowrec.archive.sweep.results import read_rows
 from flowrec.bench.harness import Results, print_rows, run
-from flowrec.sweeping.results import read_rows
-from flowrec.system.processes import child_command, child_environment, pool
-from flowrec.terminal import progress
+from flowrec.core.system.processes import child_command, child_environment, pool
+from flowrec.core.terminal import progress
 from tests.short_missions import SMALL
 
 SETTINGS = ("fvm", "assimilate")
@@ -35,8 +35,8 @@ _LOOK_S = 0.2
 # In the replay processes, which find this module first: what a session of that name does.
 _PLANTED = """
 import os, sys
-if "flowrec.sweeping.replay_process" in sys.orig_argv:
-    import flowrec.commands.replay as module
+if "flowrec.archive.sweep.replay_process" in sys.orig_argv:
+    import flowrec.verbs.session_replay as module
     genuine = module.replay
     def replay(session, *rest):
         what = session.path.stem
@@ -108,9 +108,9 @@ def measure(
 
 
 def _fly(mission: tuple[int, Path, float]) -> None:
-    from flowrec import terminal
-    from flowrec.commands.record import record
-    from flowrec.config import load_config
+    from flowrec.core import terminal
+    from flowrec.stages.config import load_config
+    from flowrec.verbs.record import record
 
     terminal.console.quiet = True
     seed, file, length_s = mission

@@ -15,15 +15,16 @@ def no_waiting_for_the_disk(monkeypatch):
     monkeypatch.setattr("os.fsync", lambda fd: None)
 
 
+@pytest.mark.slow("every verb on 38 corrupted sessions")
 def test_whatever_is_done_to_a_session_every_verb_reads_or_refuses_it(tmp_path):
     campaign = Campaign(tmp_path)
     assert not [(seed, faults) for seed in (*KEPT, *range(600, 630)) if (faults := campaign.run(seed))]
     assert len(campaign.kinds) == 8 and campaign.ends["ticks: read"] and campaign.ends["ticks: refused"]
 
 
-def test_three_hundred_corrupted_sessions_are_opened_and_read_or_refused(tmp_path):
+def test_a_hundred_corrupted_sessions_are_opened_and_read_or_refused(tmp_path):
     campaign = Campaign(tmp_path, verbs=("info", "ticks"))
-    assert not [(seed, faults) for seed in range(10_000, 10_300) if (faults := campaign.run(seed))]
+    assert not [(seed, faults) for seed in range(10_000, 10_100) if (faults := campaign.run(seed))]
 
 
 def test_the_campaign_notices_what_may_not_happen(tmp_path, monkeypatch):
@@ -39,7 +40,7 @@ def test_the_campaign_notices_what_may_not_happen(tmp_path, monkeypatch):
 
 
 def test_the_session_that_is_corrupted_holds_every_topic(tmp_path):
-    from flowrec.topics import TOPICS
+    from flowrec.core.topics import TOPICS
     from tests.store.drafts import TICKS, small_draft
 
     path = tmp_path / "whole.mcap"

@@ -18,6 +18,7 @@ def test_a_magnified_world_has_the_same_flow_and_the_same_times():
     assert times[1] == pytest.approx(times[0], rel=0.08)
 
 
+@pytest.mark.slow("plans on two chips, beside a search of scipy")
 def test_a_plan_is_timed_beside_dijkstra_on_chips_of_both_resolutions(capsys):
     results = measure(per_size=1, repeats=1, side_px=128)
     show(results)

@@ -3,10 +3,11 @@
 import pytest
 
 from flowrec.bench.flow import make_up
-from flowrec.errors import UsageError
+from flowrec.core.errors import UsageError
 from tests.perf import grid, large
 
 
+@pytest.mark.slow("fits constants on a grid twice as fine")
 def test_the_constants_of_the_grid_error_are_fitted_to_cases_with_a_finer_truth(tmp_path, capsys):
     make_up(tmp_path, 2)
     results = grid.measure(tmp_path)
@@ -17,6 +18,7 @@ def test_the_constants_of_the_grid_error_are_fitted_to_cases_with_a_finer_truth(
         grid.measure(tmp_path, 1)
 
 
+@pytest.mark.slow("writes and reads 0.2 GB of images")
 def test_poses_of_a_sparse_session_are_read_without_its_pixels(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(large, "LOADS", large.LOADS[:1])
     results = large.measure(0.2, tmp_path)

@@ -24,6 +24,7 @@ def test_every_writer_writes_every_message(load, tmp_path):
         assert 5 in counts.values(), name
 
 
+@pytest.mark.slow("kills writers in processes of their own")
 def test_a_soak_and_a_kill_say_what_they_saw(tmp_path, monkeypatch):
     monkeypatch.setattr(store_kills, "_LONGEST_S", 0.8)
     seen = soak(0.01, tmp_path)
@@ -32,6 +33,7 @@ def test_a_soak_and_a_kill_say_what_they_saw(tmp_path, monkeypatch):
     assert cost["broken"] == 0 and cost["kills"] == len(cost["kinds"]) and not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow("writes with every rival")
 def test_at_equal_terms_every_writer_packs_the_same_bytes_as_well(tmp_path):
     load = store_equal.loads(0.0)[1]
     sizes = []

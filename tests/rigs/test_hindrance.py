@@ -5,20 +5,22 @@ import math
 import numpy as np
 import pytest
 
-from flowrec.chip import ChipSettings, clearance_um, load_chip
-from flowrec.messages import FlowField
+from flowrec.core.messages import FlowField
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.clearance import clearance_um
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.robot import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.hindrance import (
     FLOOR_DRAG,
     Hindrance,
-    carried,
+    approach_mobility,
     drag_along,
     drag_towards,
-    pressed,
+    shear_mobility,
     walls_around,
 )
-from flowrec.robot import Robot
-from flowrec.simulated_settings import Simulated
+from flowrec.stages.simulated_settings import Simulated
 
 QUIET = Simulated(world="kind", position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
 RADIUS_UM, PX = 50.0, 20.0
@@ -69,9 +71,9 @@ def test_the_flow_carries_a_sphere_as_the_lubrication_theory_and_the_reflections
     )
     balance = np.array([[-drag, push], [twist, -spin]])
     speed, _ = np.linalg.solve(balance, [-1.7005 * (1 + gap), -0.5 * 0.944])
-    assert carried(gap) == pytest.approx(speed / (1 + gap), rel=0.01)
-    assert carried(2.0) == pytest.approx(1 - 5 / 16 / 27, rel=3e-3)
-    assert carried(20.0) == pytest.approx(1.0, abs=1e-4)
+    assert shear_mobility(gap) == pytest.approx(speed / (1 + gap), rel=0.01)
+    assert shear_mobility(2.0) == pytest.approx(1 - 5 / 16 / 27, rel=3e-3)
+    assert shear_mobility(20.0) == pytest.approx(1.0, abs=1e-4)
 
 
 def swimmer(place_um, hindrance, velocity):
@@ -116,7 +118,7 @@ def test_a_flow_carries_a_finite_sphere_by_faxens_law_and_a_wall_holds_it_back_b
         undisturbed = 300.0 * (1.0 - ((place - 400.0) / 210.0) ** 2)
         faxen = undisturbed - 300.0 / 3.0 * (RADIUS_UM / 210.0) ** 2
         shear = 2.0 * 300.0 * abs(place - 400.0) / 210.0**2
-        near, far = (RADIUS_UM * (1.0 + gap) * (1.0 - carried(gap)) for gap in gaps)
+        near, far = (RADIUS_UM * (1.0 + gap) * (1.0 - shear_mobility(gap)) for gap in gaps)
         vx, vy = speed_of(swimmer((2000.0, place), 1.0, velocity), 0.0, 0.0)
         assert vx == pytest.approx(faxen - shear * (near - far), rel=3e-3)
         assert vy == pytest.approx(0.0, abs=0.05)
@@ -133,7 +135,7 @@ def test_a_robot_that_a_flow_presses_to_a_wall_can_leave_it_again() -> None:
     robot.advance(1.0, 18.0, -math.pi / 2, 1.0)
     assert robot.position_um[1] < 610.0 - 1.5 * RADIUS_UM
     # Nearly in contact: the force of a stagnation flow, 3.23 times Stokes', over the drag.
-    assert pressed(0.01) == pytest.approx(3.23 / drag_towards(0.01), rel=0.02)
+    assert approach_mobility(0.01) == pytest.approx(3.23 / drag_towards(0.01), rel=0.02)
 
 
 def test_a_sphere_in_a_shear_flow_along_one_wall_is_as_fast_as_goldman_says():

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flowrec.messages import FlowField
+from flowrec.core.messages import FlowField
+from flowrec.physics.robot import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
-from flowrec.robot import Robot
-from flowrec.simulated_settings import Simulated
+from flowrec.stages.simulated_settings import Simulated
 
 
 def drifter(share: float) -> Swimmer:

@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 
 import flowrec
-from flowrec.chip import ChipSettings, clearance_um, load_chip
-from flowrec.commands.record import record
-from flowrec.config import calibration_of, load_config
-from flowrec.errors import ChipError
-from flowrec.interpolation import bilinear
-from flowrec.resolve import resolve
-from flowrec.vision.walls import walls_in_view
+from flowrec.core.errors import ChipError
+from flowrec.core.interpolation import bilinear
+from flowrec.core.topics import Tick
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.clearance import clearance_um
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import calibration_of, load_config
+from flowrec.stages.control import axes_check
+from flowrec.stages.resolve import resolve
+from flowrec.stages.vision.walls import walls_in_view
+from flowrec.verbs.check import check
+from flowrec.verbs.record import record
+from flowrec.view.summary_text import rows_of_run
 from tests.short_missions import SMALL
 
 SURVEY = [*SMALL, "mission.phases=survey,refine"]
@@ -66,3 +72,13 @@ def test_a_run_whose_camera_shows_the_chip_turned_leaves_no_file_and_names_the_s
     with pytest.raises(ChipError, match=r"camera: the image shows the chip turned by 180 .*camera\.angle_deg = 180"):
         record(config, tmp_path / "turned.mcap")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_whose_axes_are_not_confirmed_is_doubtful(tmp_path, monkeypatch):
+    monkeypatch.setattr(axes_check, "LIMIT_S", 0.2)  # too short to tell anything
+    config = load_config(None, [*SMALL, "mission.phases=survey", "mission.check_axes=true", "duration_s=0.7"])
+    recorded = record(config, tmp_path / "short.mcap")
+    assert recorded.facts["axes_check"] == "undecided" and recorded.exit_status == 3
+    assert any("are not confirmed" in doubt for doubt in recorded.doubts)
+    assert any("are not confirmed" in finding.text for finding in check(recorded.path).findings)
+    assert ("axes_check", "undecided", None) in rows_of_run(Tick(), recorded.facts), "as Rerun's panel shows it"

@@ -6,22 +6,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.chip import ChipSettings, load_chip
-from flowrec.chip.registration import Calibration
-from flowrec.control import Coils
-from flowrec.errors import ChipError, RigError, UsageError
-from flowrec.flow import FlowSolver
-from flowrec.messages import Currents, FlowField
-from flowrec.rig_settings import Camera
+from flowrec.core.errors import ChipError, RigError, UsageError
+from flowrec.core.messages import Currents, FlowField
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.physics.robot import Robot
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.rigs.simulated.world import true_chip
-from flowrec.robot import Robot
-from flowrec.simulated_settings import Simulated
+from flowrec.stages.control import Coils
+from flowrec.stages.rig_settings import ResolvedCamera
+from flowrec.stages.simulated_settings import Simulated, SimulatedImage
 
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=600.0, step_out_hz=24.0)
-EXACT = Simulated(world="kind", position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0)
+EXACT = Simulated(
+    world="kind", position_noise_um=0.0, heading_noise_rad=0.0, speed_noise=0.0, image=SimulatedImage(debris=0)
+)
+NOISELESS = replace(EXACT, image=SimulatedImage(photons_per_level=1e9, read_noise=0.0, debris=0))
 STRAIGHT = load_chip(ChipSettings("straight"))  # rows 22 to 41 of 64, 20 um a pixel: y from 430 to 830 um
-CAMERA = Camera(width_px=256, height_px=64, rate_hz=30.0, um_per_px=STRAIGHT.size_um[0] / 256, debris=0)
+CAMERA = ResolvedCamera(width_px=256, height_px=64, rate_hz=30.0, um_per_px=STRAIGHT.size_um[0] / 256)
 MIDDLE = 31.5 * 20.0
 
 
@@ -72,14 +76,13 @@ def test_zero_acts_at_once_and_no_field_comes_back_until_the_rig_is_entered_agai
 
 def test_the_same_seed_and_commands_give_the_same_bytes_at_any_pace():
     commands = {2: command(10.0, 0.3), 9: command(15.0, -0.5)}
-    camera = replace(CAMERA, debris=12)
-    simulated = Simulated(world="kind", seed=5)
-    first, second = (fly(rig_with(simulated=simulated, camera=camera, flow=steady(200.0)), commands) for _ in range(2))
+    simulated = Simulated(world="kind", seed=5, image=SimulatedImage(debris=12))
+    first, second = (fly(rig_with(simulated=simulated, flow=steady(200.0)), commands) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert a.frame.same_as(b.frame)
         assert a.truth.same_as(b.truth)
         assert a.applied.same_as(b.applied)
-    other = fly(rig_with(simulated=replace(simulated, seed=6), camera=camera, flow=steady(200.0)), commands)
+    other = fly(rig_with(simulated=replace(simulated, seed=6), flow=steady(200.0)), commands)
     assert not first[5].frame.same_as(other[5].frame)
 
 
@@ -176,8 +179,7 @@ def test_leaving_a_wall_and_coming_back_is_a_second_contact():
 
 
 def test_a_robot_that_leaves_through_an_opening_is_in_no_image_any_more():
-    camera = replace(CAMERA, photons_per_level=1e9, read_noise=0.0)
-    seen = fly(rig_with(start=(5000.0, MIDDLE), flow=steady(400.0), camera=camera))
+    seen = fly(rig_with(start=(5000.0, MIDDLE), flow=steady(400.0), simulated=NOISELESS))
     with_robot, without = seen[0].frame.image.astype(int), seen[-1].frame.image.astype(int)
     assert with_robot.min() < 0.5 * without.min()
     assert math.isnan(seen[-1].truth.clearance_um)
@@ -186,9 +188,9 @@ def test_a_robot_that_leaves_through_an_opening_is_in_no_image_any_more():
 
 def test_the_robot_is_drawn_where_the_truth_says_to_a_twentieth_of_a_pixel():
     # Radius 4 px, some of it between pixels; the empty image is the one after it has left.
-    camera = replace(CAMERA, width_px=400, height_px=100, photons_per_level=1e9, read_noise=0.0)
-    empty = fly(rig_with(start=(5080.0, MIDDLE), flow=steady(600.0), camera=camera))[-1].frame.image.astype(float)
-    rig = rig_with(start=(1003.7, MIDDLE + 3.1), flow=steady(313.0, 41.0), camera=camera)
+    seen = {"camera": replace(CAMERA, width_px=400, height_px=100), "simulated": NOISELESS}
+    empty = fly(rig_with(start=(5080.0, MIDDLE), flow=steady(600.0), **seen))[-1].frame.image.astype(float)
+    rig = rig_with(start=(1003.7, MIDDLE + 3.1), flow=steady(313.0, 41.0), **seen)
     for inputs in itertools.islice(fly(rig), 0, None, 5):
         dark = np.clip(empty - inputs.frame.image - 5.0, 0.0, None)  # less what rounding leaves everywhere
         rows, columns = np.indices(dark.shape)
@@ -198,9 +200,9 @@ def test_the_robot_is_drawn_where_the_truth_says_to_a_twentieth_of_a_pixel():
 
 
 def test_noise_grows_with_the_square_root_of_light_and_is_fresh_in_every_frame():
-    camera = replace(CAMERA, photons_per_level=4.0, read_noise=0.0)
+    simulated = replace(EXACT, image=SimulatedImage(photons_per_level=4.0, read_noise=0.0, debris=0))
     films = np.array(
-        [i.frame.image[30:34] for i in fly(rig_with(start=(100.0, MIDDLE), camera=camera, duration_s=6.0))]
+        [i.frame.image[30:34] for i in fly(rig_with(start=(100.0, MIDDLE), simulated=simulated, duration_s=6.0))]
     )
     level, variance = films[..., 60:].mean(0), films[..., 60:].var(0)
     # A twelfth comes from rounding to whole grey levels.
@@ -211,9 +213,9 @@ def test_noise_grows_with_the_square_root_of_light_and_is_fresh_in_every_frame()
 
 
 def test_debris_drifts_with_the_flow_and_never_runs_out():
-    camera = replace(CAMERA, debris=12, photons_per_level=1e9, read_noise=0.0)
-    seen = fly(rig_with(start=(2560.0, MIDDLE), flow=steady(500.0), camera=camera, duration_s=20.0))
-    clean = fly(rig_with(start=(2560.0, MIDDLE), flow=steady(500.0), camera=replace(camera, debris=0), duration_s=20.0))
+    flown = {"start": (2560.0, MIDDLE), "flow": steady(500.0), "duration_s": 20.0}
+    seen = fly(rig_with(simulated=replace(NOISELESS, image=replace(NOISELESS.image, debris=12)), **flown))
+    clean = fly(rig_with(simulated=NOISELESS, **flown))
     changed = [np.abs(a.frame.image.astype(int) - b.frame.image).sum() for a, b in zip(seen, clean, strict=True)]
     assert min(changed[::30]) > 0.3 * max(changed[::30])
     assert not np.array_equal(seen[0].frame.image[22:42, :150], seen[5].frame.image[22:42, :150])
@@ -265,8 +267,8 @@ def test_a_world_that_can_not_be_is_refused_in_one_line():
         rig_with(start=(1000.0, 100.0))
     with pytest.raises(ChipError, match="nearer to a wall than 50 um"):
         rig_with(start=(1000.0, 450.0))
-    with pytest.raises(UsageError, match=r"camera\.photons_per_level = 0"):
-        rig_with(camera=replace(CAMERA, photons_per_level=0.0))
+    with pytest.raises(UsageError, match=r"simulated\.image\.photons_per_level = 0"):
+        rig_with(simulated=replace(EXACT, image=SimulatedImage(photons_per_level=0.0)))
     with pytest.raises(UsageError, match=r"inlet_speed_error = 1\.5"):
         rig_with(simulated=replace(EXACT, inlet_speed_error=1.5))
     other = FlowSolver(1).solve(load_chip(ChipSettings("bifurcation")))

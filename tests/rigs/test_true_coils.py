@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.control import Coils
 from flowrec.rigs.simulated.true_coils import TrueCoils
+from flowrec.stages.control import Coils
 from tests.rigs.test_simulated import EXACT, command, fly, rig_with
 
 WRONG = replace(EXACT, seed=4, coil_error=0.05)

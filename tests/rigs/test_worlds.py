@@ -8,24 +8,25 @@ import numpy as np
 import pytest
 import scipy
 
-from flowrec.chip import ChipSettings, clearance_um, load_chip
-from flowrec.chip.clearance import median_width_um
-from flowrec.chip.fluid import PowerLaw, ViscositySettings
-from flowrec.chip.registration import Calibration
-from flowrec.config import config_from_toml, load_config, to_toml, with_sets
-from flowrec.flow import FlowSolver
-from flowrec.flow.sampling import relative_rmse, sample
-from flowrec.messages import Currents, FlowField
-from flowrec.pipeline import assemble
-from flowrec.ranges import faults
-from flowrec.resolve import derived, resolve
+from flowrec.core.messages import Currents, FlowField
+from flowrec.core.ranges import faults
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.clearance import clearance_um, median_width_um
+from flowrec.physics.chip.fluid import PowerLaw, ViscositySettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.flow.sampling import relative_rmse, sample
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.physics.robot import Robot
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.rigs.simulated.true_walls import at_centres, cut_up, true_walls
-from flowrec.rigs.simulated.world import Shake, misregistered, true_chip, true_depth_um, true_pump, true_robot
-from flowrec.robot import Robot
-from flowrec.simulated_settings import WORLDS, Simulated
+from flowrec.rigs.simulated.world import Shake, misregister, true_chip, true_depth_um, true_pump, true_robot
+from flowrec.stages.config import config_from_toml, load_config, to_toml, with_sets
+from flowrec.stages.pipeline import assemble
+from flowrec.stages.resolve import derived_values, resolve
+from flowrec.stages.simulated_settings import WORLDS, Simulated
 from tests.short_missions import SMALL
 
 CHIP = load_chip(ChipSettings("bifurcation"))
@@ -83,7 +84,7 @@ def test_a_session_from_before_the_setting_is_of_the_first_world_and_a_new_one_s
     assert stated.depth_error == 0.3 and stated.um_per_rev_error == WORLDS["hard"]["um_per_rev_error"]
     known = [each.name for each in fields(Simulated) if each.name in WORLDS["hard"]]
     assert set(known) == set(WORLDS["hard"]) and None not in [getattr(stated, name) for name in known]
-    assert not [key for key in derived(load_config(None, SMALL), config) if key.startswith("simulated")]
+    assert not [key for key in derived_values(load_config(None, SMALL), config) if key.startswith("simulated")]
     # The settings of the first release, without a world.
     text = to_toml(config)
     before = text[: text.index("[simulated]")] + "[simulated]\nseed = 3\nstep_out_share = 0.9\n\n"
@@ -236,16 +237,16 @@ def test_the_flow_between_true_walls_is_what_the_finer_field_says_at_the_chips_p
 
 
 def test_the_true_registration_is_off_by_what_the_world_allows_and_turns_about_the_middle():
-    stated, size = Calibration.centred(10.0, (3190.0, 2550.0), (640, 512)), (640, 512)
+    stated, size = Calibration.centre_on(10.0, (3190.0, 2550.0), (640, 512)), (640, 512)
     middle_px = np.array([319.5, 255.5])
-    assert misregistered(stated, Simulated(world="kind"), size) is stated
+    assert misregister(stated, Simulated(world="kind"), size) is stated
     for seed in range(20):
-        true = misregistered(stated, Simulated(world="moderate", seed=seed), size)
+        true = misregister(stated, Simulated(world="moderate", seed=seed), size)
         off_um = np.hypot(*(true.to_um(middle_px) - stated.to_um(middle_px)))
         assert 5.0 <= off_um <= 10.0
         assert abs(true.angle_deg) <= 0.2 and abs(true.um_per_px / 10.0 - 1.0) <= 0.003
     only = Simulated(world="kind", scale_error=0.02, seed=3)
-    assert misregistered(stated, only, size).to_um(middle_px) == pytest.approx(stated.to_um(middle_px))
+    assert misregister(stated, only, size).to_um(middle_px) == pytest.approx(stated.to_um(middle_px))
 
 
 def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth_not_at_all():
@@ -253,8 +254,8 @@ def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth
     assert Shake.of(Simulated(seed=1)) is None
     ways = np.array([swing.at(time) for time in np.linspace(0.0, 1.0, 200)])
     assert np.hypot(*ways.T).max() == pytest.approx(10.0, rel=1e-3) and np.abs(ways.mean(0)).max() < 0.2
-    sets = ("simulated.seed=1", "camera.debris=0", "simulated.world=kind", "camera.read_noise=0",
-            "camera.photons_per_level=1e6")  # fmt: skip
+    sets = ("simulated.seed=1", "simulated.image.debris=0", "simulated.world=kind", "simulated.image.read_noise=0",
+            "simulated.image.photons_per_level=1e6")  # fmt: skip
     still, shaken = (list(rig_of(*sets, *more).inputs())[:12] for more in ((), ("simulated.shake_um=60",)))
     assert all(a.truth.same_as(b.truth) for a, b in zip(still, shaken, strict=True))
     for a, b in zip(still[1:8], shaken[1:8], strict=True):
@@ -266,8 +267,12 @@ def test_a_shaken_stage_moves_the_image_of_everything_and_the_robot_of_the_truth
 
 def test_oblique_light_is_another_profile_whose_centre_the_tracker_still_finds():
     for seed in (1, 2):
-        first = next(iter(rig_of(f"simulated.seed={seed}", "camera.debris=0", "simulated.world=kind").inputs()))
-        lit = next(iter(rig_of(f"simulated.seed={seed}", "camera.debris=0", "simulated.optics=oblique").inputs()))
+        first = next(
+            iter(rig_of(f"simulated.seed={seed}", "simulated.image.debris=0", "simulated.world=kind").inputs())
+        )
+        lit = next(
+            iter(rig_of(f"simulated.seed={seed}", "simulated.image.debris=0", "simulated.optics=oblique").inputs())
+        )
         assert np.abs(first.frame.image.astype(int) - lit.frame.image).max() > 20
         asked = load_config(None, SMALL)
         config = resolve(asked, CHIP)

@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.commands.record import prepare, record
-from flowrec.config import load_config
-from flowrec.errors import NotFiniteError
-from flowrec.estimation import Observer
-from flowrec.messages import Estimate
-from flowrec.pipeline import assemble
+from flowrec.core.errors import NotFiniteError
+from flowrec.core.messages import Estimate
+from flowrec.core.topics import Tick
+from flowrec.core.units import NS_PER_S
 from flowrec.rigs.simulated.rig import SimulatedRig
 from flowrec.run.loop import run
 from flowrec.run.workers import LockstepWorker
+from flowrec.stages.config import load_config
+from flowrec.stages.estimation import Observer
+from flowrec.stages.pipeline import assemble
 from flowrec.store.reader import SessionReader
-from flowrec.topics import Tick
-from flowrec.units import NS_PER_S
+from flowrec.verbs.preparation import prepare
+from flowrec.verbs.record import record
 from tests.short_missions import SMALL
 
 BREAKS_NS = NS_PER_S // 2
@@ -71,7 +72,7 @@ def test_a_stage_that_fails_leaves_the_inputs_that_broke_it_as_the_last_tick_and
         pipeline = assemble(config, chip)
         return replace(pipeline, observer=observer(config.observer.method))
 
-    monkeypatch.setattr("flowrec.commands.record.assemble", planted)
+    monkeypatch.setattr("flowrec.verbs.preparation.assemble", planted)
     path = tmp_path / "broken.mcap"
     with pytest.raises(error, match=said):
         record(load_config(None, SMALL), path)

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.commands import replay
-from flowrec.commands.record import record
-from flowrec.commands.run_summary import Recorded
-from flowrec.config import load_config
-from flowrec.errors import RigError
-from flowrec.messages import Applied, Currents, Event, Frame
-from flowrec.pipeline import Inputs
+from flowrec.core.errors import RigError
+from flowrec.core.messages import Applied, Currents, Event, Frame
 from flowrec.rigs.rig import checked_images
 from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import Inputs
 from flowrec.store.reader import SessionReader
+from flowrec.verbs import session_replay as replay
+from flowrec.verbs.record import record
+from flowrec.verbs.run_summary import Recorded
 from tests.short_missions import SMALL
 
 AT_S = 1.2  # a moment while it navigates
@@ -146,7 +146,7 @@ def test_in_sight_again_the_robot_goes_on_and_the_session_replays_from_every_par
     assert any("in sight again" in text for text in texts)
     assert max(amplitude for stamp, amplitude in log if stamp > AT_S + 2.0) == 4.0
     for from_s in (AT_S + 0.3, AT_S + 1.0, AT_S + 1.8, AT_S + 2.5):
-        replayed = replay.replay(tmp_path / "s.mcap", replay.Change(), from_s=from_s, verify=True)
+        replayed = replay.replay_session(tmp_path / "s.mcap", replay.Change(), from_s=from_s, verify=True)
         assert replayed.comparison.identical, str(replayed.comparison.first)
 
 

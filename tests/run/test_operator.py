@@ -13,20 +13,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.commands import record as verb
-from flowrec.commands import replay as again
-from flowrec.commands.auto_recovery import recover_leftovers
-from flowrec.commands.interactive import Unattended
-from flowrec.config import load_config
-from flowrec.enums import Action
-from flowrec.errors import SessionError
-from flowrec.messages import OperatorEvent
+from flowrec.core.enums import Action
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import OperatorEvent
+from flowrec.core.topics import Tick
+from flowrec.core.units import seconds
 from flowrec.run.control import RunControl
 from flowrec.run.disk_monitor import DiskMonitor, refuse_below
 from flowrec.run.keyboard import Keyboard
+from flowrec.stages.config import load_config
 from flowrec.store.reader import SessionReader
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.verbs import record as verb
+from flowrec.verbs import session_replay as again
+from flowrec.verbs.auto_recovery import recover_leftovers
+from flowrec.verbs.interactive import Unattended
 from tests.conftest import HANG_S
 from tests.short_missions import SMALL
 
@@ -104,10 +104,10 @@ def test_a_held_robot_stays_goes_on_and_arrives_and_a_replay_is_identical(
     events = " ".join(tick.event.text for tick in ticks if tick.event is not None)
     for words in ("held by the operator", "goes on after", "operator: mark: 1", "operator: note: look"):
         assert words in events
-    done = again.replay(recorded.path, again.Change(), verify=True)
+    done = again.replay_session(recorded.path, again.Change(), verify=True)
     assert done.same
     assert done.comparison.identical, str(done.comparison.first)
-    middle = again.replay(recorded.path, again.Change(), from_s=2.5)  # under the second hold
+    middle = again.replay_session(recorded.path, again.Change(), from_s=2.5)  # under the second hold
     assert middle.comparison.identical, str(middle.comparison.first)
 
 
@@ -125,7 +125,7 @@ def test_zero_takes_the_field_away_on_that_very_tick_and_a_replay_agrees(
     assert at.currents.amplitude_mt == 0.0
     assert not at.currents.currents_a.any()
     assert not at.currents.voltages_v.any()
-    done = again.replay(recorded.path, again.Change(), verify=True)
+    done = again.replay_session(recorded.path, again.Change(), verify=True)
     assert done.comparison.identical, str(done.comparison.first)
 
 
@@ -171,13 +171,17 @@ def test_keys_become_events_in_order_and_notes_are_typed_without_being_obeyed() 
     assert Asked.by("mq!")[0][0] == "zero"
 
 
-def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_last(tmp_path: Path) -> None:
+def test_below_its_floor_the_disk_ends_the_run_once_and_says_how_long_it_will_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     left, written, told = [5_000_000_000], [0], []
+    clock = iter((0.0, 1.0, 2.0))
+    monkeypatch.setattr("flowrec.run.disk_monitor.time.monotonic", lambda: next(clock))
     watch = DiskMonitor(tmp_path, lambda: written[0], 1.0, told.append, lambda _folder: left[0])
     assert not watch.sample()
-    written[0] = 100_000_000
+    written[0] = 10_000_000
     assert not watch.sample()
-    assert watch.text.startswith("disk 5 GB left, ")
+    assert watch.text == "disk 5 GB left, 7 min"  # 4 GB until the floor, at 10 MB/s
     left[0] = 900_000_000
     assert watch.sample()
     assert told == [f"disk floor: 0.9 GB left on {tmp_path}"]
@@ -205,7 +209,7 @@ def test_a_disk_that_runs_low_ends_a_run_in_good_order_with_status_3(
                 assert watches[0].sample()
             return super().next_event(stamp_ns, held)
 
-    monkeypatch.setattr(verb, "DiskMonitor", Low)
+    monkeypatch.setattr("flowrec.verbs.mission_run.DiskMonitor", Low)
     recorded = verb.record(
         load_config(None, [*SMALL, "camera.rate_hz=30"]), tmp_path / "low.mcap", control=Unattended(Filling())
     )
@@ -221,7 +225,7 @@ def test_a_disk_that_runs_low_ends_a_run_in_good_order_with_status_3(
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recovery has as long as a busy machine needs."""
-    monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", HANG_S)
+    monkeypatch.setattr("flowrec.verbs.auto_recovery._TIMEOUT_S", HANG_S)
 
 
 @pytest.mark.usefixtures("patient")
@@ -258,7 +262,7 @@ def test_a_recovery_that_takes_too_long_is_given_up_and_leaves_nothing_behind(
     left = tmp_path / "left.mcap.partial"
     left.write_bytes(session.read_bytes()[: session.stat().st_size // 2])
     threads, files = set(threading.enumerate()), set(Path("/dev/fd").iterdir())
-    monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", 0.05)
+    monkeypatch.setattr("flowrec.verbs.auto_recovery._TIMEOUT_S", 0.05)
     assert recover_leftovers(tmp_path) == {}
     assert f"flowrec recover {left}" in capsys.readouterr().err.replace("\n", "")
     assert set(threading.enumerate()) <= threads
@@ -275,9 +279,9 @@ def test_a_recovery_that_hears_no_signal_is_killed(
         "import pathlib, signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN);"
         f"time.sleep(20); pathlib.Path({str(ended)!r}).touch()"
     )
-    monkeypatch.setattr("flowrec.commands.auto_recovery.child_command", lambda *_: [sys.executable, "-c", deaf])
-    monkeypatch.setattr("flowrec.commands.auto_recovery._TIMEOUT_S", 2.0)
-    monkeypatch.setattr("flowrec.commands.auto_recovery._CLEANUP_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("flowrec.verbs.auto_recovery.child_command", lambda *_: [sys.executable, "-c", deaf])
+    monkeypatch.setattr("flowrec.verbs.auto_recovery._TIMEOUT_S", 2.0)
+    monkeypatch.setattr("flowrec.verbs.auto_recovery._CLEANUP_TIMEOUT_S", 0.1)
     assert recover_leftovers(tmp_path) == {}
     assert not ended.exists()
     assert left.exists()

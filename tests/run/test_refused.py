@@ -8,18 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.commands import replay as verb
-from flowrec.commands.record import prepare, record
-from flowrec.config import load_config
-from flowrec.errors import FlowrecError, NotFiniteError
-from flowrec.flow import FlowSolver
-from flowrec.messages import Demand, Estimate, FlowField, Mission, Route
-from flowrec.pipeline import Pipeline, assemble
-from flowrec.planning import Planner, SurveyPlanner
-from flowrec.refine import Refiner
+from flowrec.core.declarations import as_read
+from flowrec.core.errors import FlowrecError, NotFiniteError
+from flowrec.core.messages import Demand, Estimate, FlowField, Mission, Route
+from flowrec.core.topics import Tick
+from flowrec.physics.flow.solver import FlowSolver
 from flowrec.run.workers import work
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import Pipeline, assemble
+from flowrec.stages.planning import Planner, SurveyPlanner
+from flowrec.stages.refine import Refiner
+from flowrec.stages.refine.obstacles import Likelihood
 from flowrec.store.reader import SessionReader
-from flowrec.topics import Tick
+from flowrec.verbs import session_replay as verb
+from flowrec.verbs.preparation import prepare
+from flowrec.verbs.record import record
 from tests.short_missions import SMALL
 
 REASON = "NaN or infinity in velocity_um_s"
@@ -123,9 +126,36 @@ def test_of_a_refused_route_the_one_in_use_stays_and_a_robot_that_is_on_none_get
         assert "arrival_s" in none.refused and none.reason == none.refused
 
 
+def test_of_an_order_with_a_number_that_is_none_the_result_is_refused(pipeline: Pipeline, known: Tick) -> None:
+    assert known.assumed is not None and known.demand is not None
+    with as_read():
+        spoilt = replace(known, assumed=broken(known.assumed), demand=replace(known.demand, progress_s=np.nan))
+    refined = work(pipeline, ordered(spoilt, "refine", "refine"))
+    assert refined.refused.startswith(f"FlowField at 0.000 s refused: {REASON}") and known.refined is not None
+    np.testing.assert_array_equal(refined.velocity_um_s, known.refined.velocity_um_s)
+    for phase, wanted in (("survey", "survey_route"), ("navigate", "route")):
+        route = work(pipeline, ordered(replace(spoilt, assumed=known.assumed), phase, wanted))
+        assert isinstance(route, Route) and known.route is not None
+        assert route.refused.startswith("Demand at 0.000 s refused: NaN or infinity in progress_s")
+        np.testing.assert_array_equal(route.arrival_s, known.route.arrival_s)
+
+
+def test_what_a_fit_has_lost_is_found_before_scipy_is_given_it() -> None:
+    """The search for obstacles comes before there is a message that would be refused."""
+    likelihood = Likelihood(np.zeros(4), np.eye(4), np.eye(4), np.zeros(4), 0.0)
+    known, still = np.zeros((1, 2, 2)), np.zeros((2, 2))
+    lost = np.full((2, 2), np.nan)
+    assert np.isfinite(likelihood.of_flow(still, known, still))
+    for flow in ((lost, known, still), (still, lost[None], still), (still, known, lost)):
+        with pytest.raises(NotFiniteError, match="not finite at the observations"):
+            likelihood.of_flow(*flow)
+    with pytest.raises(NotFiniteError):
+        likelihood.gains(lost[None], np.ones((1, 1)))
+
+
 def test_a_refused_first_flow_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "flowrec.commands.record.assemble", lambda config, chip: replace(assemble(config, chip), solver=Stormy())
+        "flowrec.verbs.preparation.assemble", lambda config, chip: replace(assemble(config, chip), solver=Stormy())
     )
     path = tmp_path / "a.mcap"
     with pytest.raises(NotFiniteError, match=REASON):
@@ -141,7 +171,7 @@ def test_a_replay_refuses_a_refinement_at_the_tick_at_which_the_run_did(
     def planted(config, chip):  # type: ignore[no-untyped-def]
         return replace(assemble(config, chip), refiner=Diverging())
 
-    monkeypatch.setattr("flowrec.commands.record.assemble", planted)
+    monkeypatch.setattr("flowrec.verbs.preparation.assemble", planted)
     recorded = record(load_config(None, [*SMALL, "mission.phases=refine"]), tmp_path / "a.mcap")
     assert recorded.report.outcome == "refine complete"
     assert recorded.exit_status == 3 and any("the flow was not refined" in doubt for doubt in recorded.doubts)
@@ -154,10 +184,10 @@ def test_a_replay_refuses_a_refinement_at_the_tick_at_which_the_run_did(
     assert [event.stamp_ns for event in said] == [refused.stamp_ns]
     assert said[0].level == "warning"
     assert said[0].text.startswith("refined flow refused, the map in use stays: FlowField at")
-    monkeypatch.setattr("flowrec.commands.replay.assemble", planted)
-    assert verb.replay(recorded.path, verb.Change(), verify=True).identical
-    monkeypatch.setattr("flowrec.commands.replay.assemble", assemble)
-    assert not verb.replay(recorded.path, verb.Change(), verify=True).identical
+    monkeypatch.setattr("flowrec.verbs.session_replay.assemble", planted)
+    assert verb.replay_session(recorded.path, verb.Change(), verify=True).identical
+    monkeypatch.setattr("flowrec.verbs.session_replay.assemble", assemble)
+    assert not verb.replay_session(recorded.path, verb.Change(), verify=True).identical
 
 
 def test_bad_settings_of_a_refinement_still_end_the_run(pipeline: Pipeline, known: Tick) -> None:

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from flowrec.enums import Phase
-from flowrec.estimation import Sampler
-from flowrec.planning.route import no_route
-from flowrec.planning.survey import SurveyPlanner
+from flowrec.core.enums import Phase
 from flowrec.run.route_orders import route, survey_route
-from tests.planning.worlds import robot
+from flowrec.stages.estimation import Sampler
+from flowrec.stages.planning.route import no_route
+from flowrec.stages.planning.survey import SurveyPlanner
+from tests.stages.planning.worlds import robot
 
 NOWHERE = no_route("none", "")
 

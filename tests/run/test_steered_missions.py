@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.commands import record as verb
-from flowrec.commands.interactive import Unattended
-from flowrec.commands.replay import Change, replay
-from flowrec.commands.replay_report import refly
-from flowrec.config import load_config
-from flowrec.messages import OperatorEvent
+from flowrec.core.messages import OperatorEvent
+from flowrec.core.system.outputs import MCAP, Output
+from flowrec.core.topics import Tick
+from flowrec.core.units import seconds
 from flowrec.run.control import RunControl
+from flowrec.stages.config import load_config
 from flowrec.store.reader import SessionReader
-from flowrec.system.outputs import MCAP, Output
-from flowrec.topics import Tick
-from flowrec.units import seconds
+from flowrec.verbs import record as verb
+from flowrec.verbs.interactive import Unattended
+from flowrec.verbs.replay_change import Change
+from flowrec.verbs.replay_report import refly
+from flowrec.verbs.session_replay import replay_session
 from tests.short_missions import SMALL
 
 Script = tuple[tuple[float, Callable[[RunControl], object]], ...]
@@ -151,15 +152,16 @@ def test_it_replays_identically_from_every_tick_at_which_something_was_set_order
     ends = [stamp - 1 for stamp in sorted(after)] + [stamps[-1]]
     # The last segment first: what a stage hides would otherwise be as the segment before has left it.
     for start, end in reversed(list(zip(starts, ends, strict=True))):
-        done = replay(path, verify=True, segment_ns=(start, end))
+        done = replay_session(path, verify=True, segment_ns=(start, end))
         assert done.identical, (seconds(start or 0), done.lines())
 
 
+@pytest.mark.slow("replays with another planner and flies again")
 def test_another_planner_and_a_flight_in_the_simulator_go_to_the_goals_that_were_set(
     steered: tuple[Path, list[Tick]],
 ) -> None:
     path, ticks = steered
-    done = replay(path, Change(plan="astar_time"))
+    done = replay_session(path, Change(plan="astar_time"))
     assert done.replayed.mission is not None
     assert ticks[-1].mission is not None
     np.testing.assert_array_equal(done.replayed.mission.goal_um, ticks[-1].mission.goal_um)

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flowrec.enums import Action
-from flowrec.errors import UsageError
+from flowrec.core.enums import Action
+from flowrec.core.errors import UsageError
 from flowrec.run.control import LONGEST_TEXT, RunControl
 
 TICK_NS = 20_000_000

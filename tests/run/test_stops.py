@@ -5,29 +5,32 @@ No assertion is on wall time: `python -m tests.perf.stops` measures.
 
 from __future__ import annotations
 
+import itertools
 import signal
 import sys
 import threading
 from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
+from types import FrameType, SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
-from flowrec.cli import main
-from flowrec.commands import record as verb
-from flowrec.commands.replay import Change, replay
-from flowrec.config import load_config
-from flowrec.messages import OperatorEvent
+from flowrec.core.messages import OperatorEvent
 from flowrec.run.control import RunControl
 from flowrec.run.signals import Signals
 from flowrec.run.watchdog import Watchdog
+from flowrec.stages.config import load_config
 from flowrec.store.reader import SessionReader
+from flowrec.verbs import record as verb
+from flowrec.verbs.cli import main
+from flowrec.verbs.replay_change import Change
+from flowrec.verbs.session_replay import replay_session
 from tests.conftest import until
 from tests.perf.stop_trial import LoggedRig
 from tests.perf.stops import KINDS, Ended, Kind, stop
 from tests.short_missions import SMALL
 
+PROCESS = pytest.mark.slow("a process that records in real time, for a fault that differs little from one beside it")
 PATIENT = "safety.guard_timeout_s=20"  # where the guard's timer has no part
 
 
@@ -44,7 +47,7 @@ def ended(kind: Kind | str, tmp_path: Path, *sets: str) -> Ended:
 def outcome(done: Ended) -> tuple[str, str]:
     """How the file says it ended; it replays identically."""
     reader = SessionReader(done.path)
-    assert replay(done.path, Change(), verify=True).comparison.identical
+    assert replay_session(done.path, Change(), verify=True).comparison.identical
     return reader.outcome["outcome"], reader.outcome["note"]
 
 
@@ -87,6 +90,43 @@ def test_each_signal_ends_the_run_by_its_ramp_or_takes_the_field_away_at_once(na
     assert told[1:] == ([] if ends else ["no ramp"])
 
 
+def test_no_signal_is_lost_where_their_handling_begins_and_ends() -> None:
+    """SIGTERM at each line of `Signals.handled` and before and after it: raised as before, or a request to stop."""
+    raised = 0
+
+    def stopped_at(line: int) -> tuple[bool, bool]:
+        """Whether the lines were that many, and whether the signal that came with this one was noticed."""
+        control, count = RunControl(), itertools.count()
+
+        def at_line(_frame: FrameType, event: str, _argument: object) -> Any:
+            if event == "line" and next(count) == line:
+                signal.raise_signal(signal.SIGTERM)
+            return at_line
+
+        sys.settrace(lambda frame, *_: at_line if frame.f_code is Signals.handled.__wrapped__.__code__ else None)
+        try:
+            with Signals(control).handled():
+                pass
+        except KeyboardInterrupt:
+            return True, True
+        finally:
+            sys.settrace(None)
+        return next(count) > line, bool(control.reason)
+
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        for line in itertools.count():
+            reached, noticed = stopped_at(line)
+            if not reached:
+                break
+            assert noticed, f"lost at line {line}"
+            raised += 1
+        assert signal.getsignal(signal.SIGTERM) is signal.default_int_handler and signal.set_wakeup_fd(-1) == -1
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert raised > 10
+
+
 def test_a_signal_that_takes_the_field_away_at_once_is_recorded_and_ends_the_run(tmp_path: Path) -> None:
     done = ended("SIGTERM twice", tmp_path, PATIENT)
     told = done.after_cause()
@@ -111,7 +151,9 @@ def test_ctrl_z_stops_the_process_with_the_field_off_and_fg_ends_the_run(tmp_pat
     assert events(done) == [("zero", "operator: zero field (SIGTSTP: Ctrl-Z)")]
 
 
-@pytest.mark.parametrize("name", ["zero() takes 30 ms, SIGINT twice", "zero() raises 5 times, SIGINT twice"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("zero() takes 30 ms, SIGINT twice", marks=PROCESS), "zero() raises 5 times, SIGINT twice"]
+)
 def test_no_ctrl_c_interrupts_zero_and_one_that_raises_is_repeated(name: str, tmp_path: Path) -> None:
     done = ended(name, tmp_path, PATIENT)
     told = [event for event, _ in done.after_cause() if event.startswith("zero")]
@@ -125,7 +167,14 @@ def test_no_ctrl_c_interrupts_zero_and_one_that_raises_is_repeated(name: str, tm
     assert done.status == 0
 
 
-@pytest.mark.parametrize("name", ["camera silent", "camera 1.4 s late", "stage never returns"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("camera silent", marks=PROCESS),
+        "camera 1.4 s late",
+        pytest.param("stage never returns", marks=PROCESS),
+    ],
+)
 def test_a_loop_that_hangs_loses_its_field_while_it_hangs_and_the_replay_is_exact(name: str, tmp_path: Path) -> None:
     done = ended(name, tmp_path)
     assert done.after_cause()[:3] == [("cause", 0.0), ("zero-begins", 0.0), ("zero", 0.0)]
@@ -135,14 +184,16 @@ def test_a_loop_that_hangs_loses_its_field_while_it_hangs_and_the_replay_is_exac
     assert events(done) == [("zero", "guard: no tick for 0.5 s")]
 
 
-@pytest.mark.parametrize("name", ["camera stuck in C", "camera stuck in C, SIGINT three times, SIGTERM"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("camera stuck in C", marks=PROCESS), "camera stuck in C, SIGINT three times, SIGTERM"]
+)
 def test_a_camera_that_hangs_in_c_loses_the_field_and_the_process_ends_by_itself(name: str, tmp_path: Path) -> None:
     done = ended(name, tmp_path)
     assert [event for event, _ in done.after_cause()[-3:]] != ["returns"]  # the main thread has never come back
     assert done.status == 1
     assert "the main thread does not answer, the process ends without it" in done.stderr
     assert done.file() in ("whole", "recovered")
-    assert replay(done.path, Change(), verify=True).comparison.identical
+    assert replay_session(done.path, Change(), verify=True).comparison.identical
 
 
 def test_a_stage_that_raises_ends_the_run_after_the_field(tmp_path: Path) -> None:
@@ -166,7 +217,7 @@ def test_record_and_replay_are_functions_of_any_thread(tmp_path: Path) -> None:
     def both() -> None:
         try:
             verb.record(load_config(None, [*SMALL, "duration_s=1", PATIENT]), path, realtime=True)
-            replay(path, Change(), out=tmp_path / "again.mcap")
+            replay_session(path, Change(), out=tmp_path / "again.mcap")
         except BaseException as error:  # noqa: BLE001  told by the test
             errors.append(error)
 

@@ -13,9 +13,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from flowrec.enums import Action
-from flowrec.errors import RigError
-from flowrec.messages import Currents
+from flowrec.core.enums import Action
+from flowrec.core.errors import RigError
+from flowrec.core.messages import Currents
 from flowrec.run.control import RAMP_PATIENCE_S, Interrupted, RunControl
 from flowrec.run.signals import Signals
 from flowrec.run.watchdog import ZERO_PATIENCE_S, Watchdog

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.commands.record import prepare
-from flowrec.config import load_config
-from flowrec.errors import FlowrecError
-from flowrec.messages import Mission
-from flowrec.pipeline import Pipeline
+from flowrec.core.errors import FlowrecError
+from flowrec.core.messages import Mission
+from flowrec.core.topics import Tick
 from flowrec.run.worker_process import ProcessWorker
 from flowrec.run.workers import work
-from flowrec.topics import Tick
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import Pipeline
+from flowrec.verbs.preparation import prepare
 from tests.conftest import HANG_S, until
 from tests.short_missions import SMALL
 
@@ -31,7 +31,7 @@ from tests.short_missions import SMALL
 HURDLES = """
     import sys, threading, time
     from dataclasses import dataclass
-    from flowrec.errors import FlowError
+    from flowrec.core.errors import FlowError
 
     def explode():
         raise RuntimeError("this can not be read back")

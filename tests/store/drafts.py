@@ -16,16 +16,16 @@ import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
 
-from flowrec.chip import load_chip
-from flowrec.config import ResolvedConfig, load_config
-from flowrec.declarations import Message, array_fields, message_fields
-from flowrec.resolve import resolve
-from flowrec.session_writer import session_header
+from flowrec.core.declarations import Message, array_fields, message_fields
+from flowrec.core.topics import TOPICS
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import ResolvedConfig, load_config
+from flowrec.stages.resolve import resolve
 from flowrec.store.channels import FRAMES, SLOTS, STATE, declarations, message_codec
 from flowrec.store.codec import encode_record
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.session_metadata import header_records
-from flowrec.topics import TOPICS
+from flowrec.store.session_writer import session_header
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
@@ -169,7 +169,7 @@ _UNTROUBLED = {"rate": 1.0, "unit": 0.0, "bits": 8} | dict.fromkeys(_COUNTS_OF_F
 
 def made_up(kind: type[Message], stamp_ns: int, number: int, rng: np.random.Generator) -> Message:
     """A message of some type with shapes that fit and numbers that mean nothing."""
-    lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4, "o": 2, "p": 6, "q": 2}
+    lengths = {"h": _HEIGHT, "w": _WIDTH, "n": 5, "m": 3, "k": 4, "o": 2, "p": 6, "q": 2, "coils": 3}
     shapes = {each.name: each.shape.lengths for each in message_fields(kind) if each.shape is not None}
     arrays = dict(array_fields(kind))
     values: dict[str, Any] = {}

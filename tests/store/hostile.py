@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from flowrec.errors import SessionError, printable
+from flowrec.core.errors import SessionError, printable
 from flowrec.store.channels import SLOTS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowrec.diagnostics import Timing
-from flowrec.messages import (
+from flowrec.core.diagnostics import Timing
+from flowrec.core.messages import (
     Applied,
     Currents,
     Demand,
@@ -21,10 +21,10 @@ from flowrec.messages import (
     Track,
     Truth,
 )
+from flowrec.core.topics import Tick
 from flowrec.store import codec
 from flowrec.store.channels import message_codec
 from flowrec.store.session_metadata import SessionHeader
-from flowrec.topics import Tick
 
 
 def encode(message, schema=""):

@@ -11,15 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
-from flowrec.cli import app
-from flowrec.commands.ls import list_sessions
-from flowrec.errors import FlowrecError, SessionError, UsageError
-from flowrec.session import Session
+from flowrec.archive.sweep.tasks import content_of, session_files
+from flowrec.core.errors import FlowrecError, SessionError, UsageError
 from flowrec.store import remote_file, traffic
 from flowrec.store.reader import SessionReader
 from flowrec.store.run_files import part_path
+from flowrec.store.session import Session
 from flowrec.store.session_path import session_path
-from flowrec.sweeping.tasks import content_of, session_files
+from flowrec.verbs.cli import app
+from flowrec.verbs.ls import ls
 from tests.store.range_server import served
 from tests.store.s3_server import BUCKET, KEYS, S3Server, s3_server
 from tests.store.test_run_files import in_parts
@@ -85,7 +85,7 @@ def test_a_run_in_parts_where_nothing_lists_is_the_run(run: Path, monkeypatch: p
         finally:
             run.with_name("away").rename(part_path(run, 4))
         with pytest.raises(SessionError, match="does not list its files"):
-            list_sessions(session_path(server.url + "/"))
+            ls([session_path(server.url + "/")])
 
 
 def test_who_may_read_but_not_list_reads_a_run_in_parts(bucket: S3Server, run: Path) -> None:
@@ -96,6 +96,7 @@ def test_who_may_read_but_not_list_reads_a_run_in_parts(bucket: S3Server, run: P
     assert flowrec.info(far)["parts"] == CUTS + 1
 
 
+@pytest.mark.slow("replays and exports a run of several parts through a server")
 def test_a_replay_and_an_export_of_a_run_in_parts_in_a_bucket(
     bucket: S3Server, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -115,7 +116,7 @@ def test_a_replay_and_an_export_of_a_run_in_parts_in_a_bucket(
 
 def test_a_folder_and_a_pattern_in_a_bucket_are_listed_and_swept(bucket: S3Server, run: Path) -> None:
     folder = f"s3://{BUCKET}/runs/"
-    rows = list_sessions(session_path(folder))
+    rows = ls([session_path(folder)])
     assert [(row.name, row.outcome, row.parts) for row in rows] == [
         ("whole.mcap", "reached", 0),
         ("x.mcap", "reached", 4),

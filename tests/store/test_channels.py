@@ -2,7 +2,7 @@
 
 import pytest
 
-from flowrec.errors import UsageError
+from flowrec.core.errors import UsageError
 from flowrec.store.channels import VIEWED, left_out
 from flowrec.store.reader import SessionReader
 from flowrec.store.session_file import WriterOptions

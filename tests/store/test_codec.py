@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from flowrec.declarations import Matrix, Message, Vector, array_fields, as_read, defaulted_fields, message_fields
-from flowrec.errors import SessionError
-from flowrec.messages import Event, FlowField, Frame, OperatorEvent, Track
+from flowrec.core.declarations import Matrix, Message, Vector, array_fields, as_read, defaulted_fields, message_fields
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import Event, FlowField, Frame, OperatorEvent, Track
+from flowrec.core.topics import TOPICS
 from flowrec.store import codec
 from flowrec.store.channels import message_codec
-from flowrec.topics import TOPICS
 from tests.store.made_up import decode, encode
 
 TYPES = sorted({topic.type for topic in TOPICS}, key=lambda kind: kind.__name__)

@@ -23,8 +23,8 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from flowrec.errors import SessionError
-from flowrec.messages import Currents
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import Currents
 from flowrec.store import channels, file_reader, session_metadata
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader

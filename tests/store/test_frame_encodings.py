@@ -19,17 +19,18 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from mcap.reader import make_reader
 
-from flowrec.config import Recording, load_config
-from flowrec.errors import RigError, SessionError, UsageError
-from flowrec.messages import PIXEL_BITS, Frame, pixel_type
-from flowrec.session_writer import frames_of
+from flowrec.core.errors import RigError, SessionError, UsageError
+from flowrec.core.messages import PIXEL_BITS, Frame, pixel_type
+from flowrec.stages.config import Recording, load_config
 from flowrec.store import codec
 from flowrec.store.frame_encodings import ENCODINGS, decode_image, encoding_for, row_differences
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import WriterOptions
+from flowrec.store.session_writer import frames_of
 from flowrec.store.writer import SessionWriter
+from tests.conftest import HANG_S
 from tests.store.made_up import HEADER, ticks_of
 
 TICKS = list(ticks_of(30, shape=(47, 63)))
@@ -161,7 +162,7 @@ def rerun_reads(path, tmp_path):
     if rerun.exists() or shutil.which("rerun"):
         convert = [rerun if rerun.exists() else "rerun", "mcap", "convert", path, "-o", tmp_path / "s.rrd"]
         home = os.environ | {"HOME": str(tmp_path)}  # where Rerun notes that it was started
-        done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=60, env=home)
+        done = subprocess.run(convert, capture_output=True, text=True, check=False, timeout=HANG_S, env=home)
         assert done.returncode == 0 and "ERROR" not in done.stderr, done.stderr
 
 

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flowrec.chip.io import chip_from_files
-from flowrec.cli import app
-from flowrec.commands.check import check
-from flowrec.commands.export import export
-from flowrec.config import config_from_toml
-from flowrec.declarations import Message, as_read, invalid_numbers, message_fields, shape_error
-from flowrec.errors import SessionError, UsageError, printable
-from flowrec.messages import Estimate, FlowField, Frame
+from flowrec.core.declarations import Message, as_read, invalid_numbers, message_fields, shape_error
+from flowrec.core.errors import SessionError, UsageError, printable
+from flowrec.core.messages import Estimate, FlowField, Frame
+from flowrec.core.topics import BY_FIELD, TOPICS, Tick
+from flowrec.exports.export import export
+from flowrec.physics.chip.io import chip_from_files
+from flowrec.stages.config import config_from_toml
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import BY_FIELD, TOPICS, Tick
+from flowrec.verbs.check import check
+from flowrec.verbs.cli import app
 from tests.store.drafts import (
     ATTACHMENT,
     CHANNEL,

@@ -14,11 +14,11 @@ import zstandard
 from mcap.records import Schema
 from typer.testing import CliRunner
 
-from flowrec.cli import app
-from flowrec.commands.check import check
-from flowrec.errors import SessionError
+from flowrec.core.errors import SessionError
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
+from flowrec.verbs.check import check
+from flowrec.verbs.cli import app
 from tests.store.drafts import (
     CHANNEL,
     CHUNK_INDEX,

@@ -10,12 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowrec.commands import replay as verb
-from flowrec.commands.compare import compare
-from flowrec.commands.replay import Change
-from flowrec.declarations import Role
-from flowrec.errors import SessionError
-from flowrec.rigs.recorded import RecordedRig
+from flowrec.core.declarations import Role
+from flowrec.core.errors import SessionError
+from flowrec.core.system.locks import is_growing
+from flowrec.core.topics import TOPICS
+from flowrec.run.recorded import RecordedRig
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.reader import SessionReader
@@ -24,8 +23,9 @@ from flowrec.store.scan import scan
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.split import PartFile
 from flowrec.store.writer import SessionWriter
-from flowrec.system.locks import is_growing
-from flowrec.topics import TOPICS
+from flowrec.verbs import session_replay as verb
+from flowrec.verbs.compare import compare
+from flowrec.verbs.replay_change import Change
 from tests.store.made_up import HEADER, ticks_of
 from tests.store.test_damage import KILLED, names_in
 
@@ -90,7 +90,7 @@ def test_a_real_recording_cut_anywhere_is_replayed_exactly_after_recovery(sessio
         assert reader.outcome["outcome"] == "cut" and "lost:" in reader.outcome["note"]
         assert reader.header == SessionReader(session).header
         assert reader.outcome["ticks"] == str(done.ticks)
-        replayed = verb.replay(done.path, Change(), verify=True)
+        replayed = verb.replay_session(done.path, Change(), verify=True)
         same, lines = replayed.same, replayed.lines()
         assert same, lines
         assert replayed.report.ticks == done.ticks > 0
@@ -167,13 +167,15 @@ def test_messages_of_a_damaged_declaration_are_counted_as_lost(small, tmp_path):
     assert f"{len(TICKS)} messages of topics whose declaration is damaged (/robot/estimate)" in lost
 
 
-def test_the_remains_are_kept_where_they_hold_topics_of_another_flowrec(small, tmp_path):
-    content = small.read_bytes().replace(b"/coils/command", b"/coils/unknown")
+def test_topics_that_another_flowrec_recorded_are_kept(small, tmp_path):
+    content = small.read_bytes().replace(b"/truth/robot", b"/truth/other")
     path = tmp_path / "s.mcap.partial"
     path.write_bytes(content[: chunks_of(small)[-7][1]])
     done = recover(path)
-    assert "/coils/unknown, which this flowrec does not know (the old file is kept)" in done.lost
-    assert sorted(names_in(tmp_path)) == ["s.mcap", "s.mcap.partial"]
+    assert "other" not in done.lost and names_in(tmp_path) == ["s.mcap"]
+    index = McapReader(done.path).read_summary()
+    other = next(number for number, channel in index.channels.items() if channel.topic == "/truth/other")
+    assert index.statistics.channel_message_counts[other] == done.ticks > 0
 
 
 def test_only_the_index_missing_is_no_loss(small, tmp_path):

@@ -14,15 +14,16 @@ import pytest
 from typer.testing import CliRunner
 
 import flowrec
-from flowrec.cli import app, main
-from flowrec.commands.layout import write_layouts
-from flowrec.errors import FlowrecError, SessionError, UsageError
-from flowrec.session import session_sha256
+from flowrec.core.errors import FlowrecError, SessionError, UsageError
+from flowrec.exports.layout import write_layouts
 from flowrec.store import remote_file, traffic
-from flowrec.store.object_requests import _redirected
+from flowrec.store.object_requests import _redirect_target
+from flowrec.store.session import session_sha256
 from flowrec.store.session_path import UrlPath, session_path
 from flowrec.store.traffic import TIMEOUT_KEY, TRAFFIC, RefusedError
+from flowrec.verbs.cli import app, main
 from tests.conftest import HANG_S
+from tests.extras import needs
 from tests.store.range_server import RangeServer, answer, served, some, status
 from tests.store.s3_server import BUCKET, KEYS, s3_server
 
@@ -219,9 +220,10 @@ def test_a_url_stays_one_as_a_path() -> None:
 )
 def test_a_redirect_to_a_private_or_a_less_safe_place_is_not_followed(url: str, target: str) -> None:
     with pytest.raises(RefusedError, match="not followed"):
-        _redirected(url, target)
+        _redirect_target(url, target)
 
 
+@needs("moto")
 def test_a_session_in_a_bucket_is_the_file_and_credentials_are_never_printed(
     session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

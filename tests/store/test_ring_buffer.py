@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from flowrec.errors import SessionError
-from flowrec.messages import Event, Frame, OperatorEvent
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import Event, Frame, OperatorEvent
+from flowrec.core.units import NS_PER_S
 from flowrec.store.channels import FRAME_PATH
 from flowrec.store.mcap_writer import McapWriter
 from flowrec.store.reader import SessionReader
@@ -21,7 +22,6 @@ from flowrec.store.recovery import recover
 from flowrec.store.run_files import snapshot_path
 from flowrec.store.session_file import Snapshot, WriterOptions
 from flowrec.store.writer import SessionWriter
-from flowrec.units import NS_PER_S
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import slow_disk

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flowrec.commands import replay as verb
-from flowrec.commands.check import check
-from flowrec.commands.info import info
-from flowrec.commands.record import record
-from flowrec.commands.replay import Change
-from flowrec.config import load_config
-from flowrec.errors import UsageError
+from flowrec.core.errors import UsageError
+from flowrec.stages.config import load_config
 from flowrec.store.frame_encodings import ENCODINGS
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover
 from flowrec.store.roi import Region, WindowSelector, nonzero_window
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.writer import SessionWriter
+from flowrec.verbs import session_replay as verb
+from flowrec.verbs.check import check
+from flowrec.verbs.info import info
+from flowrec.verbs.record import record
+from flowrec.verbs.replay_change import Change
 from tests.short_missions import SMALL
 from tests.store.made_up import HEADER, PERIOD_NS, ticks_of
 
@@ -45,7 +45,7 @@ def test_a_window_holds_what_was_searched_and_its_pad_and_is_black_elsewhere(tmp
         for n, tick in enumerate(ticks_of(40, shape=(160, 200)))
     ]
     ticks[7] = replace(ticks[7], track=replace(ticks[7].track, seen=False))
-    ticks[8] = replace(ticks[8], track=ticks[7].track)  # what a stage that failed leaves: a track of another image
+    ticks[8] = replace(ticks[8], track=ticks[6].track)  # what a stage that failed leaves: a track of another image
     ticks[15] = seen_at(ticks[15], (-3, 150, 20, 171))  # at the edge
     reader = written(tmp_path / "s.mcap", ticks, frames, block)
     assert reader.region == replace(REGION, everywhere_px=(0, 0, 0, 0), cut=False)
@@ -79,7 +79,7 @@ def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(
     sets = [*SMALL, "recording.region=robot", "recording.full_every_s=3", "duration_s=4"]
     path = record(load_config(None, sets), tmp_path / "s.mcap").path
     for from_s in (None, 2.345):
-        done = verb.replay(path, Change(), from_s=from_s, verify=True)
+        done = verb.replay_session(path, Change(), from_s=from_s, verify=True)
         same, lines = done.same, done.lines()
         assert same and done.comparison.identical, lines
     assert "black" not in capsys.readouterr().err
@@ -93,7 +93,7 @@ def test_a_mission_in_windows_replays_exactly_from_anywhere_and_says_what_it_is(
     assert "black elsewhere" in info(path)["frames_windows"]
     # Another controller looks at the same pixels; another tracker may not.
     out = tmp_path / "r.mcap"
-    verb.replay(path, Change(sets=("tracker.search_radii=4",)), out=out, frames=True)
+    verb.replay_session(path, Change(sets=("tracker.search_radii=4",)), out=out, frames=True)
     assert "most images are black outside of what the recorded tracker read" in " ".join(
         capsys.readouterr().err.split()
     )

@@ -10,27 +10,27 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from flowrec.chip import load_chip
-from flowrec.cli import app
-from flowrec.commands import replay as verb
-from flowrec.commands.check import check
-from flowrec.commands.compare import compare
-from flowrec.commands.info import info
-from flowrec.commands.ls import list_sessions
-from flowrec.commands.record import record
-from flowrec.commands.replay import Change
-from flowrec.config import load_config
-from flowrec.errors import SessionError
-from flowrec.resolve import resolve
-from flowrec.session import Session, session_sha256
-from flowrec.session_writer import session_header
+from flowrec.core.errors import SessionError
+from flowrec.core.topics import BY_FIELD, Tick
+from flowrec.physics.chip.io import load_chip
+from flowrec.stages.config import load_config
+from flowrec.stages.resolve import resolve
 from flowrec.store.reader import SessionReader
 from flowrec.store.recovery import recover_run
 from flowrec.store.run_files import part_path, partial_path, parts, run_files, run_path, snapshot_path
+from flowrec.store.session import Session, session_sha256
 from flowrec.store.session_file import WriterOptions
 from flowrec.store.session_metadata import Part
+from flowrec.store.session_writer import session_header
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import BY_FIELD, Tick
+from flowrec.verbs import session_replay as verb
+from flowrec.verbs.check import check
+from flowrec.verbs.cli import app
+from flowrec.verbs.compare import compare
+from flowrec.verbs.info import info
+from flowrec.verbs.ls import ls
+from flowrec.verbs.record import record
+from flowrec.verbs.replay_change import Change
 from tests.short_missions import SMALL
 from tests.store.made_up import ticks_of
 
@@ -206,12 +206,12 @@ def test_a_run_that_goes_on_or_was_killed_is_refused_as_such(run):
     last.rename(partial_path(last))
     with pytest.raises(SessionError, match=r"was not finished .*x\.part004\.mcap\.partial.*recover .*x\.mcap`"):
         SessionReader(run)
-    assert [(row.name, row.outcome, row.parts) for row in list_sessions(run.parent)] == [("x.mcap", "unfinished", 4)]
+    assert [(row.name, row.outcome, row.parts) for row in ls([run.parent])] == [("x.mcap", "unfinished", 4)]
     partial_path(last).unlink()
     with SessionWriter(last, HEADER):
         with pytest.raises(SessionError, match="is being recorded just now"):
             SessionReader(run)
-        assert [row.outcome for row in list_sessions(run.parent)] == ["recording"]
+        assert [row.outcome for row in ls([run.parent])] == ["recording"]
 
 
 @pytest.mark.parametrize("left", ["all but the index", "half", "no message", "nothing", "no file"])
@@ -254,7 +254,7 @@ def test_the_verbs_take_the_run(run, whole, tmp_path, rrd_only_begun):
     )
     assert info(run)["parts"] == 4
     assert "part 2 of the run x, goes on from 1.17 s" in info(part_path(run, 2))["piece"]
-    (row,) = list_sessions(run.parent)
+    (row,) = ls([run.parent])
     assert (row.name, row.outcome, row.parts) == ("x.mcap", "reached", 4)
     assert compare(run, whole.path).identical
     files = SessionReader(run).files
@@ -287,16 +287,17 @@ def test_a_replay_of_the_run_and_of_each_part_alone_is_exact_wherever_it_was_cut
     orders = [i for i in waits if ticks[i - 1].mission is None or ticks[i].mission is not ticks[i - 1].mission]
     files = in_parts(path, {order + 2 for order in orders}, ticks, header)  # in the middle of each order
     for file in (path, *files):
-        done = verb.replay(file, Change(), verify=True)
+        done = verb.replay_session(file, Change(), verify=True)
         same_again, lines = done.same, done.lines()
         assert same_again and done.comparison.identical, lines
         assert (done.worker is not None and done.worker.lines) or file == files[0]
     # What is planned or refined anew from a part alone goes out from what the part knows.
-    done = verb.replay(files[-1], Change(refine="assimilate"), out=tmp_path / "again.mcap")
+    done = verb.replay_session(files[-1], Change(refine="assimilate"), out=tmp_path / "again.mcap")
     assert done.replayed.refined is not None
     assert SessionReader(tmp_path / "again.mcap").header.parent["sha256"] == session_sha256([files[-1]])
 
 
+@pytest.mark.slow("flies a survey by information")
 def test_a_stretch_of_a_survey_that_was_ordered_before_a_part_begins_is_taken_as_recorded(tmp_path):
     sets = [*SMALL, "survey.method=information", "survey.worth=0.03", "mission.phases=survey"]
     with SessionReader(record(load_config(None, sets), tmp_path / "survey.mcap").path) as reader:
@@ -309,7 +310,7 @@ def test_a_stretch_of_a_survey_that_was_ordered_before_a_part_begins_is_taken_as
         and tick.mission.stamp_ns == tick.stamp_ns
     ][-1:]
     _, part = in_parts(tmp_path / "x.mcap", {cut}, ticks, header)
-    done = verb.replay(part, Change(), verify=True)
+    done = verb.replay_session(part, Change(), verify=True)
     assert done.comparison.identical, done.lines()
     assert "/plan/route: ordered in the part before, taken as recorded" in done.lines()
 

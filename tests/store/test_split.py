@@ -18,8 +18,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from flowrec.errors import SessionError
-from flowrec.messages import OperatorEvent
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import OperatorEvent
+from flowrec.core.topics import Tick
+from flowrec.core.units import NS_PER_S, seconds
 from flowrec.store.channels import SLOTS
 from flowrec.store.mcap_reader import McapReader
 from flowrec.store.mcap_writer import McapWriter
@@ -32,8 +34,6 @@ from flowrec.store.split import Parts
 from flowrec.store.viewer_topics import ViewerTopics
 from flowrec.store.write_queue import Entry
 from flowrec.store.writer import SessionWriter
-from flowrec.topics import Tick
-from flowrec.units import NS_PER_S, seconds
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 from tests.store.test_damage import names_in
 from tests.store.test_durability import GatedDisk, slow_disk
@@ -139,6 +139,21 @@ def test_parts_by_time_begin_where_they_would_without_gaps_and_parts_by_size_hav
 def test_a_part_whose_beginning_is_larger_than_a_part_still_gets_as_much_again(tmp_path):
     files = record(tmp_path / "x.mcap", Split(megabytes=0.001), block=True).files
     assert 2 < len(files) < len(TICKS) / 2
+
+
+def test_a_part_counts_the_images_that_still_wait_for_it_until_they_have_come(tmp_path):
+    split = Split(megabytes=0.2)
+    parts = Parts(tmp_path / "x.mcap", HEADER, WriterOptions(files=split, frames="raw"), split, "run")
+    first = parts._router.open[0]
+    ticks = list(ticks_of(12, shape=(200, 200)))
+    image = {tick.stamp_ns: Entry(tick.stamp_ns, {"frame": tick.frame}, 40_000, late=True) for tick in ticks}
+    for tick in ticks[:4]:
+        parts.add(Entry(tick.stamp_ns, {"track": tick.track}, 500, ticks=1, image_bytes=40_000))
+    assert (first.awaited, first.awaited_bytes) == (4, 160_000)
+    for number, tick in enumerate(ticks[:4]):
+        parts.add(image[tick.stamp_ns])
+        assert first.awaited_bytes == 40_000 * (3 - number)
+    parts.close()
 
 
 def test_an_end_in_a_hurry_counts_what_it_drops_in_the_part_that_lacks_it(tmp_path, monkeypatch):

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from flowrec.chip.registration import Calibration, on_chip
-from flowrec.declarations import as_read
-from flowrec.flow import sample
-from flowrec.messages import Estimate, Mission, Observations, Route, Track
-from flowrec.session import Session
+from flowrec.core.declarations import as_read
+from flowrec.core.messages import Estimate, Mission, Observations, Route, Track
+from flowrec.physics.chip.registration import Calibration, on_chip
+from flowrec.physics.flow.sampling import sample
 from flowrec.store.roi import nonzero_window, region_from
 from flowrec.store.schema import foxglove_schema
+from flowrec.store.session import Session
 from flowrec.store.session_file import Split, WriterOptions
 from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.store.viewer_topics import VIEWER_TOPICS, ViewerTopics
@@ -58,7 +58,7 @@ def point(place):
 @pytest.mark.parametrize("mirror", [False, True])
 @pytest.mark.parametrize("angle_deg", [0.0, 33.0, 180.0, -118.0])
 def test_robot_route_and_goal_lie_on_the_image_where_the_tracker_saw_them(angle_deg, mirror):
-    stated = Calibration.centred(3.2, (1500.0, 900.0), (640, 512), angle_deg, mirror)
+    stated = Calibration.centre_on(3.2, (1500.0, 900.0), (640, 512), angle_deg, mirror)
     views = ViewerTopics(ViewerScene(ChipCamera(stated, (640, 512), 70.0), START_NS))
     robot_px, goal_px, way_px = (
         np.array([123.25, 400.75]),

@@ -19,18 +19,18 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader, make_reader
 
-from flowrec.diagnostics import Clocks
-from flowrec.errors import SessionError
-from flowrec.messages import Frame
+from flowrec.core.diagnostics import Clocks
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import Frame
+from flowrec.core.system.processes import Priority
+from flowrec.core.topics import Tick
 from flowrec.store.audit import digest_faults
 from flowrec.store.reader import SessionReader
 from flowrec.store.schema import foxglove_schema
 from flowrec.store.session_file import Snapshot, Split, WriterOptions
 from flowrec.store.viewer_topics import VIEWER_TOPICS
 from flowrec.store.writer import SessionWriter
-from flowrec.system.processes import Priority
-from flowrec.topics import Tick
-from tests.conftest import until
+from tests.conftest import HANG_S, until
 from tests.store.made_up import HEADER, PERIOD_NS, START_UNIX_NS, ticks_of
 
 TICKS = list(ticks_of(150))
@@ -289,7 +289,7 @@ def test_rerun_accepts_the_bare_file(path, tmp_path):
     if rerun is None:
         pytest.skip("the rerun command is not installed")
     home = os.environ | {"HOME": str(tmp_path)}  # where Rerun notes that it was started
-    run = partial(subprocess.run, capture_output=True, text=True, check=False, timeout=60, env=home)
+    run = partial(subprocess.run, capture_output=True, text=True, check=False, timeout=HANG_S, env=home)
     checked = run([rerun, "mcap", "check", path])
     assert checked.returncode == 0, checked.stdout + checked.stderr
     done = run([rerun, "mcap", "convert", path, "-o", tmp_path / "s.rrd"])
@@ -368,3 +368,23 @@ def test_the_thread_of_a_live_run_is_never_behind_other_programs_and_in_real_tim
             assert 1 <= os.sched_getparam(thread.native_id).sched_priority < Priority.LOOP < Priority.DEVICE
         writer.write(TICKS[1])
     assert len(list(SessionReader(tmp_path / "live.mcap").ticks())) == 2
+
+
+def test_a_chunk_is_sealed_before_it_outgrows_what_a_reader_takes_and_no_message_may(tmp_path, monkeypatch):
+    monkeypatch.setattr("flowrec.store.chunk._MESSAGE_LIMIT_BYTES", 100_000)
+    path, options = tmp_path / "x.mcap", WriterOptions(block=True, frames="raw", flush_s=100.0)
+    with SessionWriter(path, HEADER, options) as writer:
+        for tick in ticks_of(12, shape=(200, 200)):  # images of 40 kB
+            writer.write(tick)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    frames = next(number for number, each in summary.channels.items() if each.topic == "/camera/frame")
+    chunks = [chunk for chunk in summary.chunk_indexes if frames in chunk.message_index_offsets]
+    assert len(chunks) == 6 and all(80_000 < chunk.uncompressed_size < 101_000 for chunk in chunks)
+
+    def one(shape):
+        with SessionWriter(tmp_path / "y.mcap", HEADER, options) as other:
+            other.write(next(ticks_of(1, shape=shape)))
+
+    with pytest.raises(SessionError, match=r"a message of /camera/frame has \d+ bytes, more than a chunk may hold"):
+        one((400, 300))

@@ -32,8 +32,8 @@ class Device:
     def sets(self) -> tuple[str, ...]:
         """Settings with which a recorder finds it."""
         if self.kind == "serial":
-            return (f'lab.port="{self.address}"',)
-        return ("lab.amplifier=ni", f'lab.ni_server="{self.address}"', f'lab.channels="{CHANNELS}"')
+            return (f'lab.serial.port="{self.address}"',)
+        return ("lab.amplifier=ni", f'lab.ni.server="{self.address}"', f'lab.ni.channels="{CHANNELS}"')
 
     @property
     def a_per_unit(self) -> float:

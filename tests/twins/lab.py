@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
-from flowrec.chip import load_chip
-from flowrec.config import load_config
-from flowrec.pipeline import assemble
-from flowrec.resolve import resolve
+from flowrec.physics.chip.io import load_chip
 from flowrec.rigs.simulated.rig import SimulatedRig
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import assemble
+from flowrec.stages.resolve import resolve
 from tests.twins.coils import environment
 from tests.twins.emulator import showing
 

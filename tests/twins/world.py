@@ -16,14 +16,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flowrec.config import ResolvedConfig
-from flowrec.declarations import Image
-from flowrec.messages import FlowField, Truth
-from flowrec.pipeline import Pipeline
+from flowrec.core.declarations import Image
+from flowrec.core.messages import FlowField, Truth
+from flowrec.core.system.processes import Priority, realtime_priority
+from flowrec.core.units import NS_PER_S, seconds
 from flowrec.rigs.simulated.bodies import Swimmer
 from flowrec.rigs.simulated.rig import SimulatedRig
-from flowrec.system.processes import Priority, realtime_priority
-from flowrec.units import NS_PER_S, seconds
+from flowrec.stages.config import ResolvedConfig
+from flowrec.stages.pipeline import Pipeline
 from tests.twins.coils import Device
 from tests.twins.firmware import SAMPLE
 

@@ -10,12 +10,12 @@ import numpy as np
 import psutil
 import pytest
 
-from flowrec import messages as m
-from flowrec.chip.chip import Chip
-from flowrec.chip.registration import Calibration
-from flowrec.diagnostics import Timing
-from flowrec.robot import Robot
-from flowrec.topics import Tick
+from flowrec.core import messages as m
+from flowrec.core.diagnostics import Timing
+from flowrec.core.topics import Tick
+from flowrec.physics.chip.chip import Chip
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.robot import Robot
 from flowrec.view.scene import Scene
 
 H, W, UM_PER_PX = 256, 320, 4.0

@@ -18,11 +18,11 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from flowrec.core.messages import Frame
+from flowrec.core.topics import Tick
 from flowrec.exports.rrd import scene_of
-from flowrec.messages import Frame
-from flowrec.pipeline import assemble
-from flowrec.session import Session
-from flowrec.topics import Tick
+from flowrec.stages.pipeline import assemble
+from flowrec.store.session import Session
 from flowrec.view import live_server, viewer
 from flowrec.view.live import LiveView
 from flowrec.view.scene import Scene

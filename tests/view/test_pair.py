@@ -9,8 +9,8 @@ import pytest
 from rerun.chunk import RrdReader
 
 import flowrec
-from flowrec.errors import SessionError, UsageError
-from flowrec.session import Session
+from flowrec.core.errors import SessionError, UsageError
+from flowrec.store.session import Session
 
 GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
 

@@ -10,16 +10,20 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from flowrec.chip.registration import Calibration
-from flowrec.flow import sample
-from flowrec.messages import FlowField
-from flowrec.topics import Tick
+from flowrec.console.page_state import PageState
+from flowrec.core.enums import Outcome
+from flowrec.core.messages import FlowField, Shift
+from flowrec.core.topics import Tick
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.flow.sampling import sample
+from flowrec.store.viewer_scene import ChipCamera, ViewerScene
 from flowrec.view import colours, flow_values, maps
-from flowrec.view.colours import Scale
+from flowrec.view.colours import ColourScale
+from flowrec.view.feed import Batch
 from flowrec.view.flow_values import arrow_grid, flow_arrows
 from flowrec.view.logger import TickLogger
 from flowrec.view.scene import Scene
-from flowrec.view.summary_text import registration_remark
+from flowrec.view.summary_text import LiveSummary, registration_remark
 from flowrec.view.window_images import WindowCompleter
 
 
@@ -103,7 +107,7 @@ def test_a_map_of_the_time_to_go_tells_far_from_unreachable(scene: Scene, ticks:
 @pytest.mark.parametrize("largest", [3e-7, 0.9, 1.0, 7.3, 42.0, 100.0, 456.0, 1e6])
 def test_a_scale_holds_its_largest_value_on_few_round_ticks(largest: float) -> None:
     for shown in ("speed", "change"):
-        scale = Scale.up_to(largest, shown)  # type: ignore[arg-type]
+        scale = ColourScale.up_to(largest, shown)  # type: ignore[arg-type]
         assert largest <= scale.high * (1 + 1e-9) < 2.6 * largest
         assert 3 <= len(scale.ticks) <= 8
         assert scale.high - 0.51 * scale.step < scale.ticks[-1] <= scale.high * (1 + 1e-9)
@@ -111,7 +115,7 @@ def test_a_scale_holds_its_largest_value_on_few_round_ticks(largest: float) -> N
 
 
 def test_the_ticks_of_the_colour_bar_stand_where_their_colour_is(scene: Scene) -> None:
-    scale, bar = Scale.up_to(500.0, "speed"), maps.ColourBar.beside(scene)
+    scale, bar = ColourScale.up_to(500.0, "speed"), maps.ColourBar.beside(scene)
     image, _ = bar.strip(scale)
     marks, numbers = bar.ticks(scale)
     words = numbers.labels.as_arrow_array().to_pylist()  # type: ignore[union-attr]
@@ -201,9 +205,9 @@ def test_a_window_is_shown_in_the_last_whole_image_dimmed() -> None:
     whole = np.full((40, 60), 200, np.uint8)
     window = np.zeros_like(whole)
     window[10:20, 30:45] = 90
-    assert np.array_equal(windows.completed(window), window)  # nothing is known of the rest
-    assert np.array_equal(windows.completed(whole), whole)
-    shown = windows.completed(window)
+    assert np.array_equal(windows.complete(window), window)  # nothing is known of the rest
+    assert np.array_equal(windows.complete(whole), whole)
+    shown = windows.complete(window)
     assert np.all(shown[10:20, 30:45] == 90)
     shown[10:20, 30:45] = 120
     assert np.all(shown == 120)
@@ -229,6 +233,59 @@ def test_image_and_robot_lie_on_the_chip_once_the_refinement_found_the_registrat
     shift = np.array(moved.translation.as_arrow_array().to_pylist()[0])[:2]
     seen = turned.to_plane(tick.estimate.position_um)  # where the robot is in the image
     assert np.allclose(matrix @ seen + shift, turned.to_plane(on_chip), atol=1e-3)
+
+
+def test_a_shaken_image_is_moved_back_to_where_route_and_robot_lie_in_every_view(
+    scene: Scene, ticks: list[Tick]
+) -> None:
+    turned, off_px = replace(scene, calibration=Calibration(2.0, (5.0, 9.0), 25.0, True)), np.array([3.0, -1.5])
+    tick = replace(ticks[-1], shift=Shift(ticks[-1].stamp_ns, off_px, found=True, alike=1.0))
+    assert tick.estimate is not None
+    record = Record()
+    logger = TickLogger(record, turned)  # type: ignore[arg-type]
+    logger.log(tick)
+    at = turned.to_plane(tick.estimate.position_um)
+    ring = np.array(record.logged["/camera/robot"].strips.as_arrow_array().to_pylist()[0])
+    assert np.allclose(ring[:-1].mean(axis=0), at, atol=1e-3)  # on the chip, which rests
+    moved = np.array(record.logged["/camera/measured"].translation.as_arrow_array().to_pylist()[0])[:2]
+    assert np.allclose(at + off_px + moved, at, atol=1e-3)  # where the image shows it
+    page = PageState(turned)
+    page.take(Batch(1, [{"estimate": tick.estimate, "shift": tick.shift}], {}))
+    assert np.allclose(page.state()["robot"], at + off_px, atol=0.06)
+    assert np.allclose(page.chip_um(*(at + off_px)), tick.estimate.position_um, atol=0.01)
+    viewer = ViewerScene(ChipCamera(turned.calibration, (640, 512), 50.0))
+    viewer.update({"shift": tick.shift})
+    assert viewer.picture is not None
+    assert np.allclose(viewer.picture.to_px(tick.estimate.position_um[None])[0], at + off_px)
+
+
+class States(Record):
+    """Keeps the colours of the lanes."""
+
+    def log(self, path: str, what: Any, *_: Any, static: bool = False) -> None:
+        if isinstance(what, rr.StateConfiguration):
+            self.logged[path] = what
+
+
+def test_the_outcome_of_a_run_is_amber_if_its_track_is_doubtful_and_else_green(scene: Scene, ticks: list[Tick]) -> None:
+    mission, track = ticks[-1].mission, ticks[-1].track
+    assert mission is not None
+    assert track is not None
+    middle_px, border_px = (100.0, 100.0), (0.5, 100.0)
+    found = []
+    for place_px in (middle_px, border_px):
+        at = replace(track, seen=True, position_um=scene.calibration.to_um(place_px))
+        record, summary = States(), LiveSummary(replace(scene, camera_shape=(512, 640)))
+        logger = TickLogger(record, scene)  # type: ignore[arg-type]
+        done = replace(mission, finished=True, outcome=Outcome.REACHED)
+        for tick in (Tick(0, track=at, mission=replace(mission, finished=False)), Tick(1, track=at, mission=done)):
+            summary.add(tick)
+            logger.doubtful = summary.doubtful
+            logger.log(tick)
+        shades = np.asarray(record.logged["/Mission"].colors.as_arrow_array().to_pylist()[-1]).ravel()
+        found.append(int(shades[-1]) >> 8)
+    green, amber = ((r << 16) + (g << 8) + b for r, g, b in (colours.GREEN, colours.YELLOW))
+    assert found == [green, amber]
 
 
 def test_the_summary_says_by_how_much_the_picture_is_moved_in_the_middle_of_the_chip(ticks: list[Tick]) -> None:

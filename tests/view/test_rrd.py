@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from rerun import RecordingStream
 from rerun.chunk import RrdReader
 
-from flowrec.diagnostics import Drops
-from flowrec.errors import SessionError
-from flowrec.messages import Health, OperatorEvent
-from flowrec.system.outputs import RRD, Output
-from flowrec.topics import Tick
+from flowrec.core.diagnostics import Drops
+from flowrec.core.errors import SessionError
+from flowrec.core.messages import Health, OperatorEvent
+from flowrec.core.system.outputs import RRD, Output
+from flowrec.core.topics import Tick
 from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene
 from flowrec.view.summary_text import summary_document
@@ -212,3 +213,21 @@ def test_text_of_a_session_is_no_markdown_in_the_summary(tmp_path: Path, scene: 
     assert "\\<script\\>" in text
     assert "\x1b" not in text
     assert "\\*remark\\*" in text
+
+
+def test_rerun_is_waited_for_only_as_long_as_the_file_grows(
+    tmp_path: Path, scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where its thread could not write, its own wait may never end; a slow disk is no error."""
+    waited: list[float] = []
+
+    def flush(stream: RecordingStream, *, timeout_sec: float = 1e38) -> None:
+        waited.append(timeout_sec)
+        if len(waited) < 3:
+            with (tmp_path / next(tmp_path.iterdir()).name).open("ab") as file:
+                file.write(b"more")
+        raise RuntimeError("timed out")
+
+    monkeypatch.setattr(RecordingStream, "flush", flush)
+    write_rrd(Output(tmp_path / "slow.rrd", RRD), scene, ticks[:2])
+    assert len(waited) == 3 and max(waited) <= 60.0

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from flowrec.errors import FlowrecError
-from flowrec.system.outputs import RRD, Output
-from flowrec.topics import Tick
+from flowrec.core.errors import FlowrecError
+from flowrec.core.system.outputs import RRD, Output
+from flowrec.core.topics import Tick
 from flowrec.view import viewer
 from flowrec.view.rrd_file import write_rrd
 from flowrec.view.scene import Scene
@@ -64,6 +64,7 @@ def test_the_viewer_is_started_without_its_analytics_and_without_a_way_to_other_
     assert environment["NO_PROXY"] == ""
 
 
+@pytest.mark.slow("draws in the real viewer")
 def test_a_screenshot_shows_all_views_without_complaint_and_rerun_takes_no_notes_of_its_use(
     tmp_path: Path, scene: Scene, ticks: list[Tick], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,7 +2,7 @@
 
     with Drive.of(config) as drive:        # device found, limits checked, guardian started; nothing is energised
         for frame in ...:                  # while it waits for a frame, the loop calls drive.beat() every BEAT_S
-            applied = drive.applied(stamp_ns, previous_stamp_ns)
+            applied = drive.applied_at(stamp_ns, previous_stamp_ns)
             drive.apply(currents)
 
 Times are those of the host's monotonic clock.
@@ -19,17 +19,14 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from flowrec.control.field_log import FieldLog
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import RigError, UsageError
-from flowrec.messages import Applied, Currents
-from flowrec.rig_settings import AMPLIFIERS
+from flowrec.core import Applied, Currents, RigError, UsageError
 from flowrec.rigs.lab.amplifiers.amplifier import Amplifier, AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.guardian import ONLY_HARDWARE, Guardian
+from flowrec.stages import AMPLIFIERS, FieldCommand, FieldLog
 
 if TYPE_CHECKING:
-    from flowrec.config import ResolvedConfig  # with every stage: this module starts without them
+    from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 BEAT_S = 0.02  # between beats, at most, while the loop waits for a frame
 _REST = FieldCommand()
@@ -57,7 +54,7 @@ class Drive:
     @classmethod
     def of(cls, config: ResolvedConfig, tell: Callable[[str], None] = lambda _text: None) -> Self:
         """The coils of a configuration; `tell` is called with one line when a command is changed."""
-        limits = Limits(config.coils, config.robot, config.lab.output, tell)
+        limits = CommandLimits(config.coils, config.robot, config.lab.output, tell)
         silence_s, patience_s = config.lab.guardian_s, config.safety.guard_timeout_s + config.lab.guardian_s
         return cls(AMPLIFIERS[config.lab.amplifier].load().of(config), limits, silence_s, patience_s)
 
@@ -66,7 +63,7 @@ class Drive:
     def __init__(
         self,
         amplifier: Amplifier,
-        limits: Limits,
+        limits: CommandLimits,
         silence_s: float,
         patience_s: float,
         guardian: Callable[..., Guardian] = Guardian,
@@ -138,10 +135,10 @@ class Drive:
         if now_s - self._commanded_s <= self._patience_s or self._command.amplitude_mt == 0.0:
             self._send(self._command, now_s)
 
-    def applied(self, stamp_ns: int, before_ns: int | None) -> Applied:
-        """What the coils did between two frames. What has become known of the time before is made good in the turns."""
+    def applied_at(self, stamp_ns: int, before_ns: int | None) -> Applied:
+        """Field between two frames. Late reports on the time before correct the number of turns."""
         log = self.put_out(stamp_ns)
-        result = log.applied(stamp_ns, before_ns)
+        result = log.applied_at(stamp_ns, before_ns)
         late = np.zeros(2)
         if self._accounted is not None and self._accounted[1] == before_ns:
             late = log.turns(*self._accounted[:2]) - self._accounted[2]
@@ -150,7 +147,7 @@ class Drive:
         return replace(result, turns=result.turns + late)
 
     def put_out(self, until_ns: int) -> FieldLog:
-        """What was put out up to a time of the host's monotonic clock."""
+        """Log of the field that was put out up to a time of the host's monotonic clock."""
         return self._amplifier.put_out(until_ns)
 
     def zero(self) -> None:
@@ -199,8 +196,8 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
-    """What `flowrec doctor` states of the coils; nothing was energised for it.
+class CoilProbe:
+    """Result of the check of the coils by `flowrec doctor`; nothing was energised for it.
 
     Attributes
     ----------
@@ -221,7 +218,7 @@ class Probe:
     only_hardware: str = ONLY_HARDWARE
 
 
-def probe(config: ResolvedConfig) -> Probe:
+def probe_amplifier(config: ResolvedConfig) -> CoilProbe:
     """Open the amplifier, check the limits, start the guardian and let it take the output, which is at zero, to zero.
 
     Raises
@@ -246,4 +243,4 @@ def probe(config: ResolvedConfig) -> Probe:
         warnings.append(
             f"the coils make {limits.amplitude_mt:.3g} of coils.amplitude_mt = {config.coils.amplitude_mt:g}"
         )
-    return Probe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, config.lab.guardian_s, tuple(warnings))
+    return CoilProbe(info, limits.amplitude_mt, limits.rotation_hz, trip_s, config.lab.guardian_s, tuple(warnings))

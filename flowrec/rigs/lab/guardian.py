@@ -12,6 +12,8 @@ raises an error, and the recorder takes the output to zero itself.
 The child is `python -m flowrec.rigs.lab.guardian SILENCE_S BEATS STATUS KIND ...`, with one of
     serial FD                 newline and Z on a descriptor of the open port
     ni SERVER CHANNELS        reset of the devices, by the local driver ('') or the gRPC server at host:port
+    call MODULE:NAME WORD...  what the function of another package makes of the words: called without arguments, it
+                              takes the output to zero and returns how that went; an exception: it did not
 
 What it can not do: it is a process of the same computer. It can not help when the kernel, the computer's power or the
 cable fails. A serial amplifier then has its own timer; an NI device holds its last voltage. Only an interlock in
@@ -22,6 +24,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
 import select
 import signal
@@ -32,8 +35,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Self
 
-from flowrec.errors import RigError
-from flowrec.system.processes import Priority, child_command, child_environment, prioritise_process
+from flowrec.core import Priority, RigError, child_command, child_environment, prioritise_process
 
 SILENCE_S = 0.1
 ONLY_HARDWARE = (
@@ -138,7 +140,7 @@ class Guardian:
 
     @property
     def tripped(self) -> str:
-        """What the guardian has done and why, as a sentence; '' if it has not acted."""
+        """Sentence on the guardian's intervention and its reason; '' if it has not acted."""
         line = _line(self._heard, b"tripped")
         return f"the guardian has switched the coils off: {line}" if line else ""
 
@@ -230,7 +232,8 @@ def main(arguments: Sequence[str]) -> int:
         signal.signal(number, signal.SIG_IGN)
     silence_s, beats, status = float(arguments[0]), int(arguments[1]), int(arguments[2])
     kind, words = arguments[3], arguments[4:]
-    zero = _serial_zero(int(words[0])) if kind == "serial" else _ni_zero(words[0], words[1])
+    kinds: dict[str, Callable[..., Callable[[], str]]] = {"serial": _serial_zero, "ni": _ni_zero, "call": _others_zero}
+    zero = kinds[kind](*words)
     rehearsal = _try(zero)  # the output is at zero; whatever loads late, or does not work, does so now
     if "failed" in rehearsal:
         sys.stderr.write(rehearsal)
@@ -242,7 +245,7 @@ def main(arguments: Sequence[str]) -> int:
     os.set_blocking(status, False)
     _say(status, "ready")
     cause = watch(
-        partial(_heard, beats),
+        partial(_read_beats, beats),
         silence_s,
         lambda: _say(status, ".", end=""),
         lambda: _say(status, f"probed {_try(zero)}"),
@@ -255,8 +258,8 @@ def main(arguments: Sequence[str]) -> int:
     return 3
 
 
-def _heard(beats: int, timeout_s: float | None) -> bytes | None:
-    """What the recorder says; b'' at the end of its pipe; None: nothing in that time."""
+def _read_beats(beats: int, timeout_s: float | None) -> bytes | None:
+    """Read from the recorder; b'' at the end of its pipe; None: nothing in that time."""
     return os.read(beats, 4096) if select.select([beats], [], [], timeout_s)[0] else None
 
 
@@ -307,8 +310,16 @@ def _try(zero: Callable[[], str]) -> str:
         time.sleep(0.01)
 
 
-def _serial_zero(port: int) -> Callable[[], str]:
+def _others_zero(target: str, *words: str) -> Callable[[], str]:
+    """The function of another package that takes its own amplifier to zero."""
+    module, _, name = target.partition(":")
+    zero: Callable[[], str] = getattr(importlib.import_module(module), name)(*words)
+    return zero
+
+
+def _serial_zero(descriptor: str) -> Callable[[], str]:
     """Newline and Z. The newline ends a line that the recorder may have left half written."""
+    port = int(descriptor)
 
     def zero() -> str:
         with contextlib.suppress(termios.error):

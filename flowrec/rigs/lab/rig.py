@@ -1,6 +1,6 @@
 """The rig of a lab: a camera behind its queue, and coils behind their limits and their guardian.
 
-See cameras/grabber.py and drive.py. Stamps are on the session clock, which is the host's monotonic clock
+See rigs/lab/cameras/grabber.py and drive.py. Stamps are on the session clock, which is the host's monotonic clock
 less the stamp of the first frame: the middle of the exposure, by the fit of the camera's own clock. `Applied` is made
 of what the amplifier put out, not of what it was told.
 
@@ -20,18 +20,11 @@ from functools import partial
 
 import numpy as np
 
-from flowrec.clocks import Fit
-from flowrec.config import ResolvedConfig
-from flowrec.declarations import Image
-from flowrec.diagnostics import CameraLosses
-from flowrec.errors import RigError, UsageError
-from flowrec.messages import Applied, Currents, Frame
-from flowrec.pipeline import Inputs, Pipeline
-from flowrec.rig_settings import CAMERAS
+from flowrec.core import Applied, CameraLosses, Currents, Fit, Frame, Image, RigError, UsageError, nanoseconds
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
 from flowrec.rigs.lab.drive import BEAT_S, Drive
-from flowrec.units import nanoseconds
+from flowrec.stages import CAMERAS, Inputs, Pipeline, ResolvedConfig
 
 _ABSENT_S = 0.1  # between ticks without an image
 _FIRST_S = 10.0  # for the first frame of a run
@@ -94,7 +87,7 @@ class LabRig:
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera says of itself; inside of `connected`."""
+        """Properties that the camera reports; inside of `connected`."""
         assert self._grabber is not None, "the devices are open"
         return self._grabber.info
 
@@ -166,7 +159,7 @@ class LabRig:
                 stamp_ns = absent_until_ns = max(self._absent_ns(session), last_ns + 1)
             if self._duration_ns is not None and stamp_ns > self._duration_ns:
                 return
-            applied = self._applied(session, stamp_ns, before_ns)
+            applied = self._field_between(session, stamp_ns, before_ns)
             applied = replace(applied, absent_until_ns=absent_until_ns)
             if frame is None:
                 yield Inputs(stamp_ns, None, applied)
@@ -266,11 +259,11 @@ class LabRig:
         if self.drive is not None:
             self.drive.beat()
 
-    def _applied(self, session: _Session, stamp_ns: int, before_ns: int | None) -> Applied:
+    def _field_between(self, session: _Session, stamp_ns: int, before_ns: int | None) -> Applied:
         if self.drive is None:
             return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2))
         begin_ns = None if before_ns is None else session.monotonic_ns(before_ns)
-        return replace(self.drive.applied(session.monotonic_ns(stamp_ns), begin_ns), stamp_ns=stamp_ns)
+        return replace(self.drive.applied_at(session.monotonic_ns(stamp_ns), begin_ns), stamp_ns=stamp_ns)
 
 
 class _Session:

@@ -1,4 +1,4 @@
-"""What an export of a session tells of the run, so that `flowrec import` need not be given it.
+"""Facts on a run in an export of its session, so that `flowrec import` need not be given them.
 
 It is in what flowrec writes into a movie (movies/notes.py), and in config.toml and chip.png of a folder of tables.
 """
@@ -9,13 +9,10 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from flowrec.config import Config, config_from_tree
-from flowrec.control.coil_log import is_of_session
-from flowrec.errors import MovieError
+from flowrec.core import MovieError, marker_of, parse_toml, read_toml
 from flowrec.movies import MovieFacts
-from flowrec.rigs.movie.source import opened
-from flowrec.system.output_folder import marker_of
-from flowrec.system.toml_file import parse_toml, read_toml
+from flowrec.rigs.movie.source import open_source
+from flowrec.stages import Config, config_from_tree, is_of_session
 
 # Settings that state facts about the run. What analyses it, such as the observer, is left to the import.
 _OF_CAMERA = ("um_per_px", "angle_deg", "mirror", "centre_um", "exposure_s")
@@ -58,7 +55,7 @@ def with_exported(asked: Config) -> tuple[Config, list[str]]:
     ------
     MovieError : the movie can not be read, or what flowrec wrote is damaged.
     """
-    with opened(asked.movie) as movie:
+    with open_source(asked.movie) as movie:
         facts = movie.facts
     found = _of_movie(facts, asked.movie.path) or _of_folder(asked.movie.coils, facts)
     if found is None:
@@ -88,7 +85,7 @@ def _of_movie(facts: MovieFacts, path: str) -> Exported | None:
     if notes is None:
         return None
     try:
-        settings = _chosen(parse_toml(notes.settings))
+        settings = _run_facts(parse_toml(notes.settings))
     except (ValueError, RecursionError) as error:
         raise MovieError(f"{path}: the settings in it are damaged ({error}); export the session again") from error
     settings["camera"] = {**settings.get("camera", {}), "um_per_px": notes.um_per_px}
@@ -96,20 +93,20 @@ def _of_movie(facts: MovieFacts, path: str) -> Exported | None:
 
 
 def _of_folder(log: str, facts: MovieFacts) -> Exported | None:
-    """What the folder of tables states in which a log is."""
+    """Facts from the folder of tables in which a log is."""
     folder, key = Path(log).parent, session_of_log(Path(log)) if log else ""
     settings, chip = folder / _SETTINGS, folder / _CHIP
     if not key or not settings.is_file() or not chip.is_file():
         return None
     tree = read_toml(settings)
-    found = _chosen(tree)
+    found = _run_facts(tree)
     camera = tree.get("camera", {})
     if (camera.get("width_px"), camera.get("height_px")) != (facts.width_px, facts.height_px):
         found.pop("camera", None)  # the movie was cut or scaled
     return Exported(key, found, str(chip))
 
 
-def _chosen(tree: dict[str, Any]) -> dict[str, Any]:
+def _run_facts(tree: dict[str, Any]) -> dict[str, Any]:
     """The settings of a run that state facts about it."""
     found = {section: tree[section] for section in _SECTIONS if section in tree}
     if isinstance(found.get("camera"), dict):

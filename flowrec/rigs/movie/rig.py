@@ -11,15 +11,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
-from flowrec.config import Config, ResolvedConfig
-from flowrec.control.field_log import FieldLog
-from flowrec.control.mission import PHASES
-from flowrec.enums import Phase
-from flowrec.errors import UsageError
-from flowrec.messages import Currents
-from flowrec.pipeline import Inputs, Pipeline
+from flowrec.core import Currents, Phase, UsageError, nanoseconds, seconds
 from flowrec.rigs.movie.source import MovieSource
-from flowrec.units import nanoseconds, seconds
+from flowrec.stages import PHASES, Config, FieldLog, Inputs, Pipeline, ResolvedConfig
 
 _MARGIN = 1.2  # of the robot's top speed over the fastest rotation in the log
 _ASKED = {
@@ -57,7 +51,7 @@ class MovieRig:
         self, source: MovieSource, delay_s: float, duration_s: float | None = None, realtime: bool = False
     ) -> None:
         self._source = source
-        self._log = (source.log if source.log is not None else FieldLog()).shifted(nanoseconds(delay_s))
+        self._log = (source.log if source.log is not None else FieldLog()).shift_clock(nanoseconds(delay_s))
         self._end_ns = None if duration_s is None else nanoseconds(duration_s)
         self._realtime = realtime
         self._known = len(source.remarks)
@@ -67,7 +61,7 @@ class MovieRig:
 
     @property
     def noticed(self) -> list[str]:
-        """What was noticed while the images were read, such as an early end."""
+        """Remarks made while the images were read, such as an early end."""
         return self._source.remarks[self._known :]
 
     def __enter__(self) -> MovieRig:
@@ -86,7 +80,7 @@ class MovieRig:
             if self._realtime:
                 time.sleep(max(0.0, began_s + seconds(frame.stamp_ns) - time.monotonic()))
             self.taken += 1
-            yield Inputs(frame.stamp_ns, frame, self._log.applied(frame.stamp_ns, before_ns))
+            yield Inputs(frame.stamp_ns, frame, self._log.applied_at(frame.stamp_ns, before_ns))
             before_ns = frame.stamp_ns
 
     def apply(self, currents: Currents) -> None:
@@ -109,7 +103,7 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
     MovieError : the movie or its log can not be used.
     """
     with MovieSource(config.movie, config.coils) as source:
-        config = _stated(config, source)
+        config = _with_notes(config, source)
         _refuse_missing(config, source)
         facts, log, robot = source.facts, source.log, config.robot
         camera: dict[str, Any] = {"width_px": facts.width_px, "height_px": facts.height_px, "bits": facts.bits}
@@ -145,7 +139,7 @@ def fitted_to_movie(config: Config) -> tuple[Config, Mapping[str, str], list[str
         return changed, source.provenance(), remarks
 
 
-def _stated(config: Config, source: MovieSource) -> Config:
+def _with_notes(config: Config, source: MovieSource) -> Config:
     """The configuration with what flowrec wrote into the movie of a session, where nothing else is given."""
     notes = source.facts.notes
     if notes is None:

@@ -10,22 +10,15 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control import Coils
-from flowrec.control.coil_log import is_of_session, read_coil_log
-from flowrec.control.field_log import FieldLog
-from flowrec.errors import MovieError, UsageError
-from flowrec.messages import Frame
-from flowrec.movies import Movie as OpenMovie
-from flowrec.movies import MovieFacts, ReadOptions, open_movie
-from flowrec.movies.frame_times import frame_times
-from flowrec.rig_settings import Movie
-from flowrec.units import NS_PER_S, nanoseconds, seconds
+from flowrec.core import NS_PER_S, Frame, MovieError, UsageError, nanoseconds, seconds
+from flowrec.movies import Movie, MovieFacts, ReadOptions, frame_times, open_movie
+from flowrec.stages import Coils, FieldLog, MovieSettings, is_of_session, read_coil_log
 
 _PAUSE = 1.5  # median intervals; some formats round times to ms, so the mean says more than the median
 _LEAST_OVERLAP = 0.98  # of the movie; with less a remark says so
 
 
-def opened(settings: Movie) -> OpenMovie:
+def open_source(settings: MovieSettings) -> Movie:
     """The movie of settings, open."""
     options = ReadOptions(settings.channel, settings.bits, settings.partial)
     return open_movie(Path(settings.path), settings.reader, options)
@@ -57,14 +50,14 @@ class MovieSource:
     MovieError, UsageError : in one line: what can not be read, and what does not fit together.
     """
 
-    def __init__(self, settings: Movie, coils: Coils) -> None:
+    def __init__(self, settings: MovieSettings, coils: Coils) -> None:
         if not settings.path:
             raise UsageError(
                 "movie.path not given: name the movie that the rig plays, as in --set movie.path=MOVIE.avi"
             )
         self.path = Path(settings.path)
         self._settings = settings
-        self._movie = opened(settings)
+        self._movie = open_source(settings)
         try:
             self.facts: MovieFacts = self._movie.facts
             self._times = frame_times(self.path, self.facts, settings.times, settings.rate_hz)
@@ -73,7 +66,7 @@ class MovieSource:
                 0, None if self.facts.times_ns is None else int(self.facts.times_ns[0]), self.path
             )
             self.first_ns = first_ns
-            self.stamps_ns = self._expected()
+            self.stamps_ns = self._stamps_ns()
             self._log_remarks: list[str] = []
             self.log_delayed = bool(settings.coils) and is_of_session(Path(settings.coils))
             self.log = self._read_log(coils)
@@ -83,7 +76,7 @@ class MovieSource:
 
     @property
     def remarks(self) -> list[str]:
-        """What was assumed, and what is unusual; more may come while images are read."""
+        """Assumptions and unusual findings; more may come while images are read."""
         return [*self._movie.remarks, *self._log_remarks]
 
     @property
@@ -164,7 +157,7 @@ class MovieSource:
         since_ns, rate = time_ns - self.first_ns, self._settings.clock_rate
         return since_ns if rate == 1.0 else round(since_ns * rate)
 
-    def _expected(self) -> NDArray[np.int64]:
+    def _stamps_ns(self) -> NDArray[np.int64]:
         times = self._times.times_ns
         if times is None:
             times = np.array([self._times.of(n, None, self.path)[0] for n in range(self.facts.frames)], np.int64)
@@ -187,7 +180,8 @@ class MovieSource:
             )
         name = Path(settings.coils)
         log = read_coil_log(name, settings.columns, coils, settings.heading_offset_deg, settings.heading_mirrored)
-        log = log.shifted(-self.first_ns - nanoseconds(settings.clock_offset_s))
+        log = log.interpolate() if settings.between_rows == "linear" else log
+        log = log.shift_clock(-self.first_ns - nanoseconds(settings.clock_offset_s))
         begin_s, end_s, movie_s = (seconds(int(ns)) for ns in (log.times_ns[0], log.times_ns[-1], self.stamps_ns[-1]))
         if end_s < 0.0 or begin_s > movie_s:
             raise MovieError(

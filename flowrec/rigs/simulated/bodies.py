@@ -1,4 +1,4 @@
-"""What moves in the simulated flow: the robot, and particles that a tracker must not follow.
+"""Moving bodies in the simulated flow: the robot, and particles that a tracker must not follow.
 
 The robot moves by xdot = u(f) (cos phi, sin phi) + v(x), the paper's kinematics, with the true flow at its centre;
 where walls hinder it, as hindrance.py describes. Added is what the controller can not know: a rolling direction and a
@@ -14,18 +14,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.chip.chip import Chip
-from flowrec.flow.sampling import sample, walls_of
-from flowrec.flow.velocity_stencil import velocity_at
-from flowrec.interpolation import bilinear
-from flowrec.messages import FlowField
-from flowrec.rigs.simulated.hindrance import FAXEN, Hindrance, hindered
+from flowrec.core import UM_PER_M, FlowField, bilinear, compiled
+from flowrec.physics import Chip, Robot, sample, velocity_at, walls_of
+from flowrec.rigs.simulated.hindrance import FAXEN, Hindrance, hindered_velocity
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.world import true_pump
-from flowrec.robot import Robot
-from flowrec.simulated_settings import Simulated
-from flowrec.system.numba_setup import compiled
-from flowrec.units import UM_PER_M
+from flowrec.stages import Simulated
 
 _SUBSTEP_S = 1.0 / 240.0  # at least eight to a frame at 30 per second, at most 4 um at 1000 um/s
 _CORRELATION_S = 1.0  # of the wander
@@ -58,7 +52,7 @@ def _moves(
         vx, vy = velocity_at(velocity, wall_px, (x + dx) / um_per_px, (y + dy) / um_per_px)
         flow[n, 0] = strength * vx
         flow[n, 1] = strength * vy
-    return hindered(x, y, own_x, own_y, flow, hindrance, clearance, walls, um_per_px, radius)
+    return hindered_velocity(x, y, own_x, own_y, flow, hindrance, clearance, walls, um_per_px, radius)
 
 
 @compiled

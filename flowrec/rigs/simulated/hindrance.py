@@ -40,8 +40,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.interpolation import bilinear
-from flowrec.system.numba_setup import compiled
+from flowrec.core import bilinear, compiled
 
 FLOOR_DRAG = 2.9  # of the roller over its floor, relative to Stokes' drag
 FAXEN = math.sqrt(2.0 / 3.0)  # radii from the centre to the four points
@@ -74,7 +73,7 @@ def drag_towards(gap: float) -> float:
 
 
 @compiled
-def carried(gap: float) -> float:
+def shear_mobility(gap: float) -> float:
     """Speed of a sphere that a shear flow carries along a wall over that of the flow at its centre, at a gap in radii.
 
     Beyond the table 1 - 5/16 (a / l)^3, of the method of reflections.
@@ -90,14 +89,14 @@ def carried(gap: float) -> float:
 
 
 @compiled
-def pressed(gap: float) -> float:
+def approach_mobility(gap: float) -> float:
     """Speed of a sphere that a flow carries towards a wall over that of the flow, at a gap in radii."""
     gap = max(gap, _LEAST_GAP)
     return gap / (gap + 1.0 / _STAGNATION)
 
 
 @compiled
-def hindered(
+def hindered_velocity(
     x: float,
     y: float,
     own_x: float,
@@ -128,9 +127,9 @@ def hindered(
     along, across = 1.0 - share * (1.0 - along), 1.0 - share * (1.0 - across)
     to_wall = (across - along) * (own_x * nx + own_y * ny)
     apart = 2.0 * FAXEN * radius
-    lag = share * ((1.0 - carried(near_gap)) * near - (1.0 - carried(far_gap)) * far)
+    lag = share * ((1.0 - shear_mobility(near_gap)) * near - (1.0 - shear_mobility(far_gap)) * far)
     mean_x, mean_y = flow[:, 0].mean(), flow[:, 1].mean()
-    squeezed = share * (1.0 - pressed(near_gap)) * (mean_x * nx + mean_y * ny)
+    squeezed = share * (1.0 - approach_mobility(near_gap)) * (mean_x * nx + mean_y * ny)
     shear_x = (nx * (flow[0, 0] - flow[1, 0]) + ny * (flow[2, 0] - flow[3, 0])) / apart
     shear_y = (nx * (flow[0, 1] - flow[1, 1]) + ny * (flow[2, 1] - flow[3, 1])) / apart
     return (
@@ -141,7 +140,7 @@ def hindered(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hindrance:
-    """What the side walls do to the robot: how much of the physics, and where the walls are (`walls_around`)."""
+    """Effect of the side walls on the robot: its strength, 0 to 1, and the walls (`walls_around`)."""
 
     share: float
     walls: Rasters

@@ -1,4 +1,4 @@
-"""What a bright-field microscope shows of the chip: walls as dark refracting lines, particles as defocused discs.
+"""Simulated bright-field images of the chip: walls as dark refracting lines, particles as defocused discs.
 
 The optics `disc` draw a particle with the profile that the tracker fits. `oblique` is another one: light from one side,
 so that the rim is bright there and dark on the other side, a softer outline, and a bright spot in the middle where the
@@ -20,13 +20,9 @@ import numpy as np
 import scipy  # its special loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.chip.clearance import clearance_um
-from flowrec.chip.registration import Calibration
-from flowrec.declarations import Image
-from flowrec.messages import pixel_type
-from flowrec.rig_settings import CameraSettings
-from flowrec.simulated_settings import Optics
-from flowrec.system.numba_setup import compiled
+from flowrec.core import Image, compiled, pixel_type
+from flowrec.physics import Calibration, clearance_um
+from flowrec.stages import CameraSettings, Optics, SimulatedImage
 
 _POOL = 1 << 20
 _NOISE_STEPS = 32.0  # of the pool's int8, to one sigma
@@ -122,6 +118,7 @@ class Microscope:
         um_per_px: float,
         calibration: Calibration,
         camera: CameraSettings,
+        image: SimulatedImage,
         seed: int,
         optics: Optics = "disc",
         mask_origin_um: float = 0.0,
@@ -129,11 +126,13 @@ class Microscope:
         rng = np.random.default_rng([seed, 3])
         lit_rad = float(np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * math.pi))
         self._lit = (0.0, 0.0) if optics == "disc" else (math.cos(lit_rad), math.sin(lit_rad))
-        self._camera = camera
+        self._camera, self._image = camera, image
         self._calibration = calibration
         self._noise = np.random.default_rng([seed, 4])
         self._pool = np.clip(np.rint(self._noise.standard_normal(_POOL) * _NOISE_STEPS), -127, 127).astype(np.int8)
-        self._empty = _empty_scene(mask, um_per_px, calibration, camera, rng, mask_origin_um)
+        self._empty = _empty_scene(
+            mask, um_per_px, calibration, (camera.height_px, camera.width_px), image, rng, mask_origin_um
+        )
         self._scene = self._empty.copy()
 
     def add_still(self, point_um: NDArray[np.float64], radius_um: float, darkness: float) -> None:
@@ -179,8 +178,8 @@ class Microscope:
         camera = self._camera
         image = np.empty((height, width), pixel_type(camera.bits))
         offsets = self._noise.integers(0, _POOL - width, height)
-        shot, top = 1.0 / camera.photons_per_level, 2**camera.bits - 1
-        _expose(self._scene, self._pool, offsets, shot, camera.read_noise, top, image)
+        shot, top = 1.0 / self._image.photons_per_level, 2**camera.bits - 1
+        _expose(self._scene, self._pool, offsets, shot, self._image.read_noise, top, image)
         for x0, y0, x1, y1 in windows:
             self._scene[y0:y1, x0:x1] = self._empty[y0:y1, x0:x1]
         return image
@@ -194,7 +193,7 @@ class Microscope:
         smear_px: Sequence[float] = (0.0, 0.0),
     ) -> tuple[int, int, int, int]:
         radius = radius_um / self._calibration.um_per_px
-        edge = math.hypot(max(self._camera.blur_px, 0.3), 0.05 * radius)
+        edge = math.hypot(max(self._image.blur_px, 0.3), 0.05 * radius)
         (column, row), (smear_x, smear_y) = place_px, smear_px
         return _draw(scene, column, row, radius, edge, darkness, 0.35 * darkness, smear_x, smear_y, *self._lit)
 
@@ -203,12 +202,13 @@ def _empty_scene(
     mask: NDArray[np.bool_],
     um_per_px: float,
     calibration: Calibration,
-    camera: CameraSettings,
+    shape: tuple[int, int],
+    settings: SimulatedImage,
     rng: np.random.Generator,
     mask_origin_um: float,
 ) -> NDArray[np.float32]:
-    """Grey levels (h, w) of the chip without particles."""
-    height, width = camera.height_px, camera.width_px
+    """Grey levels (h, w) = `shape` of the chip without particles."""
+    height, width = shape
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
     places = (calibration.to_um(pixels) - mask_origin_um) / um_per_px
     map_x, map_y = np.moveaxis(places.astype(np.float32), -1, 0)
@@ -236,11 +236,12 @@ def _empty_scene(
     x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None]
     y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
     cx, cy, tilt = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(0, 2 * math.pi)
-    lamp = 1.0 - 0.5 * camera.illumination * ((x - cx) ** 2 + (y - cy) ** 2)
-    lamp += 0.25 * camera.illumination * (x * math.cos(tilt) + y * math.sin(tilt))
-    scene = np.asarray(camera.background * light * lamp, np.float32)
-    if camera.blur_px > 0:
-        scene = np.asarray(cv2.GaussianBlur(scene, (0, 0), camera.blur_px, borderType=cv2.BORDER_REPLICATE), np.float32)
+    lamp = 1.0 - 0.5 * settings.illumination * ((x - cx) ** 2 + (y - cy) ** 2)
+    lamp += 0.25 * settings.illumination * (x * math.cos(tilt) + y * math.sin(tilt))
+    scene = np.asarray(settings.background * light * lamp, np.float32)
+    if settings.blur_px > 0:
+        blurred = cv2.GaussianBlur(scene, (0, 0), settings.blur_px, borderType=cv2.BORDER_REPLICATE)
+        scene = np.asarray(blurred, np.float32)
     return np.ascontiguousarray(np.clip(scene, 0.0, 255.0), np.float32)
 
 

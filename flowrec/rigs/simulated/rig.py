@@ -16,26 +16,37 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.clearance import check_point
-from flowrec.chip.registration import Calibration
-from flowrec.clocks import DeviceClock
-from flowrec.config import ResolvedConfig, registration_of
-from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
-from flowrec.declarations import Image
-from flowrec.errors import RigError
-from flowrec.messages import Applied, Currents, FlowField, Frame, Truth
-from flowrec.pipeline import Inputs, Pipeline
-from flowrec.ranges import check_ranges
-from flowrec.rig_settings import Camera
+from flowrec.core import (
+    NS_PER_S,
+    Applied,
+    Currents,
+    DeviceClock,
+    FlowField,
+    Frame,
+    Image,
+    RigError,
+    Truth,
+    check_ranges,
+    nanoseconds,
+    seconds,
+)
+from flowrec.physics import Calibration, Chip, Robot, check_point
 from flowrec.rigs.simulated.bodies import Debris, Swimmer
 from flowrec.rigs.simulated.microscope import Microscope
 from flowrec.rigs.simulated.true_coils import TrueCoils
-from flowrec.rigs.simulated.world import Shake, World, misregistered, true_pump, true_robot, world_of
-from flowrec.robot import Robot
-from flowrec.simulated_settings import Simulated
-from flowrec.units import NS_PER_S, nanoseconds, seconds
+from flowrec.rigs.simulated.world import Shake, World, misregister, true_pump, true_robot, world_of
+from flowrec.stages import (
+    Coils,
+    FieldCommand,
+    FieldState,
+    Inputs,
+    Pipeline,
+    ResolvedCamera,
+    ResolvedConfig,
+    Simulated,
+    field_motion,
+    registration_of,
+)
 
 _COILS = 3
 _SKEW_PPM = 50.0  # of a crystal, at most
@@ -69,7 +80,7 @@ def true_view(config: ResolvedConfig, chip: Chip) -> Calibration:
     keys, camera = ("um_per_px", "angle_deg", "mirror", "centre_um"), config.camera
     true = {key: value for key in keys if (value := getattr(config.simulated, key)) is not None}
     stated = registration_of(replace(camera, **true), chip)
-    return misregistered(stated, config.simulated, (camera.width_px, camera.height_px))
+    return misregister(stated, config.simulated, (camera.width_px, camera.height_px))
 
 
 class SimulatedRig:
@@ -119,7 +130,7 @@ class SimulatedRig:
         chip: Chip,
         robot: Robot,
         calibration: Calibration,
-        camera: Camera,
+        camera: ResolvedCamera,
         simulated: Simulated,
         start_um: ArrayLike,
         duration_s: float | None = None,
@@ -186,6 +197,7 @@ class SimulatedRig:
             world.mask_um_per_px,
             self._calibration,
             self._camera,
+            simulated.image,
             simulated.seed,
             simulated.value("optics"),
             world.mask_origin_um,
@@ -204,7 +216,7 @@ class SimulatedRig:
         swimmer = Swimmer(
             self._start_um, self._true_robot, self._simulated, field, walls, px, self.pump, world.hindrance
         )
-        debris = Debris(self._chip, self._camera.debris, radius, field, walls, seed)
+        debris = Debris(self._chip, self._simulated.image.debris, radius, field, walls, seed)
         microscope = self._microscope()
         moving = slice(0, len(debris.points_um) - debris.still)
         for n in range(moving.stop, len(debris.points_um)):
@@ -242,7 +254,7 @@ class SimulatedRig:
             yield Inputs(
                 stamp_ns=stamped,
                 frame=Frame(stamped, index, image, self._camera.bits),
-                applied=self._applied(stamped, turns),
+                applied=self._field_message(stamped, turns),
                 truth=Truth(stamped, swimmer.position_um, swimmer.flow_um_s, swimmer.clearance_um, swimmer.contacts),
                 true_field=field if index == 0 else None,
                 clock=fit,
@@ -250,7 +262,7 @@ class SimulatedRig:
             index += 1
 
     def tried(self) -> Generator[Inputs]:
-        """The same world and camera; what a run does later does not depend on it."""
+        """Run on a copy of this rig with the same world and camera; a later run does not depend on it."""
         self.true_world()  # once for both
         yield from copy(self).inputs()
 
@@ -318,7 +330,7 @@ class SimulatedRig:
         left_s = max(left_s, _STEADY_S) if rises else left_s - duration_s
         self._hold = (left_s, strength) if left_s > 0.0 else None
 
-    def _applied(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
+    def _field_message(self, stamp_ns: int, turns: NDArray[np.float64]) -> Applied:
         command, now = self._acting, self._rotation
         if command is None:
             return Applied(stamp_ns, 0.0, 0.0, 0.0, np.zeros(_COILS), turns)
@@ -331,6 +343,6 @@ class SimulatedRig:
 
 
 def _order(command: Currents) -> FieldCommand:
-    """What a command asks of the field; its amplitude, already on a ramp, at once."""
+    """Field of a command; its amplitude, already on a ramp, at once."""
     c = command
     return FieldCommand(c.frequency_hz, c.heading_rad, c.amplitude_mt, c.limit_hz)

@@ -1,4 +1,4 @@
-"""The field that the coils truly make: where their calibration is wrong it turns on an ellipse in a tilted plane.
+"""True field of coils whose calibration is wrong: its vector moves on an ellipse in a tilted plane.
 
 The commanded field B(theta) = B0 (h sin theta + z cos theta) is made with the currents A^-1 B; with the true matrix A'
 it is M B, M = A' A^-1. It turns about the normal of the plane of M h and M z, so the robot travels at an angle to the
@@ -14,15 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.coils import Coils
+from flowrec.core import wrap_rad
 from flowrec.rigs.simulated.world import drawn_from
-from flowrec.simulated_settings import Simulated
-from flowrec.units import wrap_rad
+from flowrec.stages import Coils, Simulated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueCoils:
-    """Coils as they are calibrated, and what becomes of a field that they are asked for."""
+    """Coils as they are calibrated, and the matrix from a commanded field to the true one."""
 
     coils: Coils
     made: NDArray[np.float64]  # (3, 3) M

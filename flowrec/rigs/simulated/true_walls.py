@@ -15,11 +15,8 @@ import numpy as np
 import scipy  # its ndimage loads at first use, not at start-up
 from numpy.typing import NDArray
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.clearance import clearance_um, median_width_um
-from flowrec.errors import RigError
-from flowrec.flow.sampling import sample
-from flowrec.messages import FlowField
+from flowrec.core import FlowField, RigError
+from flowrec.physics import Chip, clearance_um, median_width_um, sample
 from flowrec.rigs.simulated.microscope import blotches, outline_px
 
 _REFINED, _LARGEST_PX = 2, 40_000  # cells of the true mask per pixel side; fluid pixels of a larger chip are not cut
@@ -100,7 +97,7 @@ def _core(inside: Mask) -> Mask:
 
 
 def _without_specks(fluid: Mask, before: Mask) -> Mask:
-    """The same without pieces of a few pixels that were part of larger ones before, such as a corner that is cut off.
+    """Remove pieces of a few pixels that were part of larger ones before, such as a corner that is cut off.
 
     A piece of a wall becomes fluid, a piece of fluid a wall; a post that was small before stays.
     """
@@ -167,7 +164,7 @@ def cut_up(mask: Mask, cut: int) -> Mask:
 
 
 def origin_um(true: Chip, chip: Chip) -> float:
-    """Where the centre of the first pixel of the true mask lies, on either axis of the chip frame."""
+    """Position of the centre of the first pixel of the true mask, on either axis of the chip frame."""
     return 0.5 * (true.um_per_px - chip.um_per_px)
 
 

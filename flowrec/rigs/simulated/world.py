@@ -1,4 +1,4 @@
-"""What the simulated world truly is: flow, walls, robot and registration, drawn from the seed for the rig.
+"""The simulated world: true flow, walls, robot and registration, drawn from the seed for the rig.
 
 Each quantity has random numbers of its own, so that a setting which states one leaves the others as they are. What was
 drawn is the note of the true field, for evaluation; no stage reads it.
@@ -12,18 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.chip.chip import Chip
-from flowrec.chip.clearance import clearance_um, median_width_um
-from flowrec.chip.fluid import with_settings
-from flowrec.chip.registration import Calibration
-from flowrec.errors import FlowError
-from flowrec.flow import FlowSolver
-from flowrec.messages import FlowField
+from flowrec.core import FlowError, FlowField
+from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, median_width_um, with_settings
 from flowrec.rigs.simulated.hindrance import Hindrance, walls_around
 from flowrec.rigs.simulated.pump import Pump
 from flowrec.rigs.simulated.true_walls import at_centres, on_pixels, origin_um, true_walls
-from flowrec.robot import Robot
-from flowrec.simulated_settings import Simulated
+from flowrec.stages import Simulated
 
 _STREAM = 7  # of the seed; bodies, microscope, chip and clock have 1 to 6 and 8
 # In the order of their random numbers; new ones at the end.
@@ -116,7 +110,7 @@ def true_pump(simulated: Simulated) -> Pump:
     return Pump(*pulse, *drift, drawn_from(seed, "drift"))
 
 
-def misregistered(stated: Calibration, simulated: Simulated, size_px: tuple[int, int]) -> Calibration:
+def misregister(stated: Calibration, simulated: Simulated, size_px: tuple[int, int]) -> Calibration:
     """The true registration of images of `size_px` (width, height) whose stated one is this; about the middle.
 
     What [simulated] states of it is in `stated` already, and is not drawn.
@@ -134,7 +128,9 @@ def misregistered(stated: Calibration, simulated: Simulated, size_px: tuple[int,
     if not shift_px.any() and turned_deg == 0.0 and scaled == 1.0:
         return stated
     middle = stated.to_um(0.5 * (np.array(size_px) - 1.0) + shift_px)
-    return Calibration.centred(stated.um_per_px * scaled, middle, size_px, stated.angle_deg + turned_deg, stated.mirror)
+    return Calibration.centre_on(
+        stated.um_per_px * scaled, middle, size_px, stated.angle_deg + turned_deg, stated.mirror
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,7 +193,7 @@ def world_of(
         if wall_error_px > 0.0 or blocked_share > 0.0:
             rng = drawn_from(simulated.seed, "walls")
             fine, words = true_walls(truth, wall_error_px, blocked_share, clear_um, rng)
-            field = on_pixels(_solved(fine, solver), fine, chip)
+            field = on_pixels(_solve(fine, solver), fine, chip)
             mask, um_per_px, mask_origin_um = fine.mask, fine.um_per_px, origin_um(fine, chip)
             walls_um = at_centres(clearance_um(fine.mask, fine.um_per_px), chip)
         else:
@@ -211,7 +207,7 @@ def world_of(
     return World(field, walls_um, mask, um_per_px, mask_origin_um, hindrance)
 
 
-def _solved(fine: Chip, solver: FlowSolver) -> FlowField:
+def _solve(fine: Chip, solver: FlowSolver) -> FlowField:
     """The flow between smooth walls; along the pixels where the smooth ones would cut an opening."""
     try:
         return solver.solve(fine)
@@ -220,7 +216,7 @@ def _solved(fine: Chip, solver: FlowSolver) -> FlowField:
 
 
 def drawn_note(chip: Chip, truth: Chip, robot: Robot, simulated: Simulated, walls: str) -> str:
-    """What a world has drawn, in words."""
+    """Description of the random deviations of a world, in words."""
     real = true_robot(robot, simulated)
     parts = ["drawn from the seed of the simulated rig"]
     if simulated.world != "kind":

@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.control.coils import field_limits
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import FlowrecError, RigError
-from flowrec.rig_settings import OutputLimits
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.core.errors import FlowrecError, RigError
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import Drive
 from flowrec.rigs.lab.guardian import Guardian
+from flowrec.stages.control.coils import field_limits
+from flowrec.stages.control.field_rotation import FieldCommand
+from flowrec.stages.rig_settings import OutputLimits
 from tests.conftest import needs_quiet, until
+from tests.extras import why
 from tests.perf.guardian import sleeper, trial
 from tests.perf.guardian_trial import COILS, OUTPUT, ROBOT, amplifier, currents
 from tests.twins.coils import CHANNELS, Device, device
@@ -43,7 +44,7 @@ def serial(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
 
 @pytest.fixture(scope="module")
 def ni(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Device]:
-    pytest.importorskip("nidaqmx")
+    pytest.importorskip("nidaqmx", reason=why("nidaqmx"))
     with device("ni", tmp_path_factory.mktemp("ni")) as on:
         yield on
 
@@ -57,7 +58,7 @@ def on(request: pytest.FixtureRequest) -> Device:
 @contextlib.contextmanager
 def driven(on: Device, seconds: float = 0.0) -> Iterator[tuple[Drive, int, int]]:
     """A drive after so many seconds of commands, and the times of its first and last command."""
-    with Drive(amplifier(on.kind, on.address, 5.0), Limits(COILS, ROBOT, OUTPUT), 1.0, 5.0) as drive:
+    with Drive(amplifier(on.kind, on.address, 5.0), CommandLimits(COILS, ROBOT, OUTPUT), 1.0, 5.0) as drive:
         begin_ns, number = time.monotonic_ns(), 0
         while time.monotonic_ns() < begin_ns + seconds * 1e9:
             drive.apply(currents(8.0 + 6.0 * math.sin(0.05 * number), 0.03 * number))
@@ -117,7 +118,7 @@ def test_a_recorder_whose_guardian_is_killed_takes_the_field_away_itself(on: Dev
 
 def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
     begin = serial.end()
-    limits = Limits(COILS, ROBOT, OUTPUT)
+    limits = CommandLimits(COILS, ROBOT, OUTPUT)
     with Drive(amplifier("serial", serial.address), limits, 0.1, 0.3) as drive:
         drive.apply(currents(5.0, 0.0))
         begin_s = time.monotonic()
@@ -132,7 +133,7 @@ def test_a_loop_that_only_waits_stops_to_beat(serial: Device) -> None:
 def test_a_board_that_has_gone_to_zero_by_itself_ends_the_run(tmp_path: Path) -> None:
     with (
         device("serial+timer", tmp_path) as on,
-        Drive(amplifier("serial", on.address), Limits(COILS, ROBOT, OUTPUT), 5.0, 5.0) as drive,
+        Drive(amplifier("serial", on.address), CommandLimits(COILS, ROBOT, OUTPUT), 5.0, 5.0) as drive,
     ):
         drive.apply(currents(5.0, 0.0))
         until(on.energised)
@@ -187,7 +188,7 @@ def obeying(on: Device, monkeypatch: pytest.MonkeyPatch, silence_s: float) -> It
     thread.start()
     begin = on.end()
     try:
-        ours.send(("open", ni_process.Settings(CHANNELS, on.address, COILS, ROBOT, OUTPUT, silence_s)))
+        ours.send(("open", ni_process.NiSettings(CHANNELS, on.address, COILS, ROBOT, OUTPUT, silence_s)))
         assert ours.recv()[0] == "info"
         ours.send(("arm",))
         assert ours.recv()[0] == "armed"
@@ -233,13 +234,16 @@ def test_what_is_wrong_with_an_amplifier_is_one_line_and_nothing_is_energised(
     master, slave = os.openpty()
     strong = replace(COILS, max_current_a=7.0)
     cases = [
-        (amplifier("serial", ""), COILS, "lab.port: which serial port"),
+        (amplifier("serial", ""), COILS, "lab.serial.port: which serial port"),
         (amplifier("serial", str(tmp_path / "ttyNone")), COILS, "ports here"),
         (amplifier("serial", serial.address), strong, "coils.max_current_a = 7 A: flowrec-coils makes at most 5 A"),
         (amplifier("ni", "127.0.0.1:1"), COILS, "no NI gRPC Device Server"),
     ]
     for given, coils, words in cases:
-        with pytest.raises(FlowrecError) as refused, Drive(given, Limits(coils, ROBOT, OutputLimits()), 0.1, 1.0):
+        with (
+            pytest.raises(FlowrecError) as refused,
+            Drive(given, CommandLimits(coils, ROBOT, OutputLimits()), 0.1, 1.0),
+        ):
             pytest.fail("it opened")
         assert words in str(refused.value) and "\n" not in str(refused.value)
     with driven(serial), pytest.raises(RigError, match="another program uses this port"), driven(serial):

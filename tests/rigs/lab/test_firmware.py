@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import FieldCommand, FieldState, field_motion
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
     ZERO,
     Reply,
@@ -22,6 +20,8 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
     telemetry,
 )
 from flowrec.rigs.lab.guardian import SERIAL_ZERO
+from flowrec.stages.control.coils import Coils
+from flowrec.stages.control.field_rotation import FieldCommand, FieldState, field_motion
 from tests.twins.firmware import FULL_A, compiled, read_samples
 
 COILS = Coils(

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import RigError, UsageError
-from flowrec.messages import Currents
-from flowrec.rig_settings import OutputLimits
+from flowrec.core.errors import RigError, UsageError
+from flowrec.core.messages import Currents
+from flowrec.physics.robot import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.drive import BEAT_S, Drive
 from flowrec.rigs.lab.guardian import Guardian, watch
-from flowrec.robot import Robot
+from flowrec.stages.control.coils import Coils
+from flowrec.stages.control.field_rotation import FieldCommand
+from flowrec.stages.rig_settings import OutputLimits
 
 ON, OFF, TRIP, QUIT, PROBE = b"1", b"0", b"T", b"Q", b"P"
 
@@ -141,7 +141,7 @@ class Told:
 
 # Currents that may change so slowly only take a field away in a while.
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=500.0, step_out_hz=30.0)
-LIMITS = Limits(Coils(), ROBOT, OutputLimits(slew_a_s=600.0))
+LIMITS = CommandLimits(Coils(), ROBOT, OutputLimits(slew_a_s=600.0))
 
 
 def driven(told: Told, clock: Callable[[], float]) -> Drive:

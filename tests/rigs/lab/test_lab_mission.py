@@ -18,16 +18,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.chip import load_chip
-from flowrec.cli import main
-from flowrec.commands.check import check
-from flowrec.commands.replay import replay
-from flowrec.config import load_config
-from flowrec.flow.sampling import relative_rmse
-from flowrec.pipeline import assemble
-from flowrec.resolve import resolve
-from flowrec.session import Session
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.flow.sampling import relative_rmse
+from flowrec.stages.config import load_config
+from flowrec.stages.pipeline import assemble
+from flowrec.stages.resolve import resolve
+from flowrec.store.session import Session
+from flowrec.verbs.check import check
+from flowrec.verbs.cli import main
+from flowrec.verbs.session_replay import replay_session
 from tests.conftest import needs_quiet
+from tests.extras import why
 from tests.perf.camera_killed import trial
 from tests.twins.coils import Device, device
 from tests.twins.emulator import emulated
@@ -41,7 +42,7 @@ GOAL_UM = (2480.0, 3343.0)
 
 def test_a_mission_whose_camera_is_killed_on_the_way_has_no_field_meanwhile_and_arrives(tmp_path: Path) -> None:
     """By the GigE Vision protocol and the serial firmware."""
-    pytest.importorskip("viva_genicam")
+    pytest.importorskip("viva_genicam", reason=why("viva_genicam"))
     if not installed:
         pytest.skip("needs aravis-tools")
     killed = trial(tmp_path)
@@ -56,14 +57,14 @@ def test_a_mission_whose_camera_is_killed_on_the_way_has_no_field_meanwhile_and_
     assert losses.reconnections == 1
     assert losses.ids == losses.frames + losses.link + losses.incomplete + losses.driver + losses.backlog
     assert any(tick.applied is not None and tick.applied.without_image for tick in ticks)
-    assert replay(killed.session, verify=True).same
+    assert replay_session(killed.session, verify=True).same
     assert check(killed.session).exit_status in (0, 3)
 
 
 def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path: Path) -> None:
     """By pylon's emulator and the twin of NI's server."""
-    pytest.importorskip("pypylon")
-    pytest.importorskip("nidaqmx")
+    pytest.importorskip("pypylon", reason=why("pypylon"))
+    pytest.importorskip("nidaqmx", reason=why("nidaqmx"))
     mission = ("mission.phases=survey,refine,plan,navigate", f"mission.goal={list(GOAL_UM)}", "robot.delay_s=0.19")
     # The inlet of this world is 32 % slower or faster than assumed: a busy computer costs the survey some percent.
     kind = ("simulated.world=kind", "simulated.seed=7")
@@ -91,7 +92,7 @@ def test_a_mission_that_surveys_and_refines_arrives_and_replays_exactly(tmp_path
     assert 25.0 * float(np.hypot(*turns.T).sum()) > 300.0, "the coils did the work, to and fro"
     errors_v = {name: float(relative_rmse(field, truth, chip.mask).v) for name, field in fields.items()}
     assert errors_v["refined"] < errors_v["assumed"], errors_v
-    assert replay(session, verify=True).same
+    assert replay_session(session, verify=True).same
     assert check(session).exit_status in (0, 3)
 
 
@@ -115,7 +116,7 @@ def other_words(_on: Device) -> Iterator[tuple[str, ...]]:
 
     thread = threading.Thread(target=answer)
     thread.start()
-    yield (f'lab.port="{os.ttyname(theirs)}"',)
+    yield (f'lab.serial.port="{os.ttyname(theirs)}"',)
     over.set()
     thread.join()
     os.close(ours)
@@ -134,7 +135,7 @@ def port_in_use(on: Device) -> Iterator[tuple[str, ...]]:
 @contextmanager
 def outputs_in_use(on: Device) -> Iterator[tuple[str, ...]]:
     """Another program puts out zeros at one of the outputs; they stay its own."""
-    nidaqmx = pytest.importorskip("nidaqmx")
+    nidaqmx = pytest.importorskip("nidaqmx", reason=why("nidaqmx"))
     from flowrec.rigs.lab.amplifiers.ni_device import grpc_options
 
     with nidaqmx.Task(grpc_options=grpc_options(on.address)) as other:
@@ -155,7 +156,7 @@ def outputs_in_use(on: Device) -> Iterator[tuple[str, ...]]:
         ("serial", 1, other_words, (), "another device than flowrec-coils answers"),
         ("serial", 1, port_in_use, (), "another program uses this port"),
         ("ni", 1, outputs_in_use, (), "another program uses the outputs"),
-        ("ni", 1, nothing_else, ('lab.channels="cDAQ1Mod1/ao7:9"',), "the device has no such output"),
+        ("ni", 1, nothing_else, ('lab.ni.channels="cDAQ1Mod1/ao7:9"',), "the device has no such output"),
     ],
 )
 def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_file_and_no_field(
@@ -169,7 +170,7 @@ def test_devices_that_are_not_there_or_can_not_do_it_are_one_line_and_leave_no_f
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The verb itself, in this process."""
-    pytest.importorskip("pypylon")
+    pytest.importorskip("pypylon", reason=why("pypylon"))
     out = tmp_path / "out"
     out.mkdir()
     with emulated(cameras), device(kind, tmp_path) as on, meanwhile(on) as more:

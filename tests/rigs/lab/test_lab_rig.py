@@ -6,23 +6,29 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 import pytest
 
-from flowrec.chip import load_chip
-from flowrec.commands.record import record
-from flowrec.config import ResolvedConfig, load_config
-from flowrec.errors import FlowrecError, RigError, UsageError
-from flowrec.messages import Applied, Currents
-from flowrec.resolve import resolve
+from flowrec.core.errors import FlowrecError, RigError, UsageError
+from flowrec.core.messages import Applied, Currents
+from flowrec.physics.chip.io import chip_files, load_chip
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.rig import LabRig
 from flowrec.rigs.rig import checked_images
+from flowrec.stages.config import ResolvedConfig, load_config
+from flowrec.stages.pipeline import Sight, assemble, look
+from flowrec.stages.resolve import resolve
+from flowrec.verbs.record import record
 from tests.conftest import until
+from tests.extras import why
+from tests.stages.vision import shaky
+from tests.twins.emulator import emulated, showing
 
 SHAPE = (48, 64)
 MEASURED = (
@@ -103,7 +109,7 @@ class Noted:
     def zero(self) -> None:
         self.calls.append("zero")
 
-    def applied(self, stamp_ns: int, before_ns: int | None) -> Applied:
+    def applied_at(self, stamp_ns: int, before_ns: int | None) -> Applied:
         self.looked_at += 1
         lasted_s = 0.0 if before_ns is None else (stamp_ns - before_ns) / 1e9
         return Applied(stamp_ns, 2.0, 0.0, 4.0, np.zeros(3), [2.0 * lasted_s, 0.0])
@@ -158,6 +164,43 @@ def test_while_a_camera_is_absent_the_field_is_off_and_ticks_without_an_image_go
     assert "the field is off until" in off and "back after" in back
 
 
+class Shaken(Paced):
+    """A camera over the drawn chip on a stage that shakes; the robot goes along the channel."""
+
+    def grab(self, timeout_s: float) -> Grabbed | None:
+        grabbed = super().grab(timeout_s)
+        assert grabbed is not None
+        n = self.number
+        picture = shaky.image(shaky.chip(), [(40.0 + 1.5 * n, 80.0)], shake_px(n), seed=n)
+        return replace(grabbed, image=picture)
+
+
+def shake_px(number: int) -> tuple[float, float]:
+    return 2.0 * float(np.sin(0.63 * number)), 1.4 * float(np.cos(0.63 * number))
+
+
+def test_the_images_of_a_labs_camera_are_stabilised_unless_somebody_turns_it_off(tmp_path: Path) -> None:
+    png, toml = chip_files(shaky.chip())
+    (tmp_path / "chip.png").write_bytes(png)
+    (tmp_path / "chip.toml").write_text(toml, encoding="utf-8")
+    size = f"camera.width_px={shaky.WIDTH}", f"camera.height_px={shaky.HEIGHT}"
+    config = config_of(
+        *size, f"camera.um_per_px={shaky.UM_PER_PX}", "robot.radius_um=20", f"chip.path={tmp_path / 'chip.toml'}"
+    )
+    info = CameraInfo("Shaken", "1", shaky.WIDTH, shaky.HEIGHT, 8, 50.0, id_bits=64)
+    wanted, pipeline = Wanted(shaky.WIDTH, shaky.HEIGHT, rate_hz=50.0), assemble(config, load_chip(config.chip))
+    rig = LabRig(lambda: Grabber(lambda: Shaken((60.0, 61.0), info), wanted), Noted(), config, None)  # type: ignore[arg-type, return-value]
+    sight, shifts, numbers = Sight(), [], []
+    with rig.connected(), rig:
+        for inputs in islice((each for each in rig.inputs() if each.frame is not None), 12):
+            sight = look(pipeline, sight, inputs.frame)
+            assert sight.shift is not None
+            shifts.append(sight.shift.shift_px)
+            numbers.append(inputs.frame.index + 1)
+    true_px = np.array([shake_px(number) for number in numbers])
+    assert np.abs(np.array(shifts) - (true_px - true_px[0])).max() < 0.15
+
+
 def test_images_are_tried_before_a_run_without_a_word_to_the_coils_and_the_run_counts_from_its_own_first() -> None:
     rig, coils = rig_of(config_of(), gone=(60.0, 61.0), duration_s=0.3)
     with rig.connected():
@@ -167,6 +210,23 @@ def test_images_are_tried_before_a_run_without_a_word_to_the_coils_and_the_run_c
         with rig:
             first = next(rig.inputs())
     assert first.stamp_ns == 0 and first.frame is not None and first.frame.index == 0
+
+
+def test_a_picture_before_a_run_is_an_image_of_the_camera_and_tells_the_coils_nothing(tmp_path: Path) -> None:
+    """Against pylon's emulator, which shows it in a circle with other images."""
+    pytest.importorskip("pypylon", reason=why("pypylon"))
+    shown = [np.random.default_rng(n).integers(0, 256, SHAPE).astype(np.uint8) for n in range(3)]
+    sets = ("lab.camera=pylon", f'lab.device_config="{showing(tmp_path, shown)}"', "mission.phases=observe")
+    config = config_of(*sets)
+    chip = load_chip(config.chip)
+    with emulated():
+        rig = LabRig.of(assemble(config, chip), config, None, realtime=True)
+        with rig.connected():
+            picture = rig.picture()
+            with rig:
+                first = next(rig.inputs())
+    assert any(np.array_equal(picture, image) for image in shown)
+    assert first.stamp_ns == 0 and first.frame is not None and first.frame.index == 0, "it belongs to no run"
 
 
 def test_images_that_were_dropped_before_the_run_are_no_losses_of_it() -> None:

@@ -10,18 +10,18 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from flowrec.control.amplifier import Amplifier
-from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.declarations import as_read
-from flowrec.errors import RigError, UsageError
-from flowrec.messages import Currents
-from flowrec.rig_settings import OutputLimits
+from flowrec.core.declarations import as_read
+from flowrec.core.errors import RigError, UsageError
+from flowrec.core.messages import Currents
+from flowrec.physics.robot import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.amplifiers.serial_protocol import field_line
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
-from flowrec.robot import Robot
+from flowrec.stages.control.amplifier import AmplifierSettings
+from flowrec.stages.control.coils import Coils
+from flowrec.stages.control.field_rotation import FieldCommand
+from flowrec.stages.rig_settings import OutputLimits
 
 RATE_HZ = 2500.0
 ROBOT = Robot(radius_um=50.0, max_speed_um_s=500.0, step_out_hz=30.0)
@@ -29,9 +29,11 @@ COUPLED = ((2.1, 0.2, 0.1), (-0.3, 1.9, 0.2), (0.1, 0.2, 1.5))
 VOLTAGE = Coils(
     mt_per_a=COUPLED,
     bias_mt=(0.3, -0.2, 0.1),
-    amplifier=Amplifier(kind="voltage", max_voltage_v=6.0, output_hz=RATE_HZ, inductance_mh=(8.0, 5.0, 12.0)),
+    amplifier=AmplifierSettings(kind="voltage", max_voltage_v=6.0, output_hz=RATE_HZ, inductance_mh=(8.0, 5.0, 12.0)),
 )
-CURRENT = Coils(mt_per_a=COUPLED, bias_mt=(0.3, -0.2, 0.1), max_current_a=2.5, amplifier=Amplifier(output_hz=RATE_HZ))
+CURRENT = Coils(
+    mt_per_a=COUPLED, bias_mt=(0.3, -0.2, 0.1), max_current_a=2.5, amplifier=AmplifierSettings(output_hz=RATE_HZ)
+)
 SUDDEN = replace(CURRENT, ramp_s=0.0)
 SLEWED = OutputLimits(slew_a_s=420.0, longest_on_s=0.2, rest_s=2.0)
 
@@ -50,7 +52,7 @@ commands = st.lists(
 )
 
 
-class JudgedHere(Limits):
+class JudgedHere(CommandLimits):
     """Limits that let all samples pass, so that the test sees them."""
 
     def check_samples(self, *_samples: object) -> None:
@@ -92,7 +94,7 @@ def test_no_sequence_of_commands_gets_a_sample_beyond_a_limit(
 
 
 def test_samples_beyond_a_limit_or_that_are_no_numbers_are_refused_whoever_made_them() -> None:
-    limits = Limits(CURRENT, ROBOT, SLEWED)
+    limits = CommandLimits(CURRENT, ROBOT, SLEWED)
     rest, none = np.zeros((3, 3)), np.zeros((2, 3))
     limits.check_samples(rest, none)
     for spoil in (2.6, math.nan, -math.inf):
@@ -106,15 +108,17 @@ def test_samples_beyond_a_limit_or_that_are_no_numbers_are_refused_whoever_made_
 
 def test_impossible_numbers_become_zero_field_and_are_told_once() -> None:
     told: list[str] = []
-    limits = Limits(CURRENT, ROBOT, OutputLimits(), told.append)
+    limits = CommandLimits(CURRENT, ROBOT, OutputLimits(), told.append)
     for spoiled in ((math.nan, 0.0, 4.0, 9.0), (5.0, math.inf, 4.0, 9.0), (5.0, 0.0, -4.0, 9.0), (-5.0, 0.0, 4.0, 9.0)):
         admitted = limits.admit(command(*spoiled), 0)
         assert (admitted.amplitude_mt, admitted.frequency_hz) == (0.0, 0.0)
     assert len(told) == 1 and "impossible" in told[0]
+    assert limits.admit(command(5.0, 0.0, 9.0 * CURRENT.amplitude_mt, 9.0), 0).amplitude_mt == limits.amplitude_mt
+    assert len(told) == 2 and "held to the limits" in told[1]
 
 
 def test_commands_of_the_coil_stage_pass_unchanged() -> None:
-    limits = Limits(VOLTAGE, ROBOT, OutputLimits(), pytest.fail)
+    limits = CommandLimits(VOLTAGE, ROBOT, OutputLimits(), pytest.fail)
     full = VOLTAGE.full_mt(ROBOT)
     admitted = limits.admit(command(limits.rotation_hz, 1.0, full, limits.rotation_hz), 0)
     assert (admitted.frequency_hz, admitted.amplitude_mt) == (limits.rotation_hz, full)
@@ -122,7 +126,7 @@ def test_commands_of_the_coil_stage_pass_unchanged() -> None:
 
 def test_coils_that_were_on_for_the_longest_time_rest_before_they_are_on_again() -> None:
     told: list[str] = []
-    limits = Limits(CURRENT, ROBOT, OutputLimits(longest_on_s=10.0, rest_s=5.0), told.append)
+    limits = CommandLimits(CURRENT, ROBOT, OutputLimits(longest_on_s=10.0, rest_s=5.0), told.append)
     at_s = np.arange(0.0, 40.0, 0.1)
     on = np.array([limits.admit(command(5.0, 0.0, 2.0, 9.0), round(s * 1e9)).amplitude_mt > 0.0 for s in at_s])
     edges = at_s[1:][np.diff(on.astype(int)) != 0]
@@ -134,23 +138,23 @@ def test_limits_beyond_the_amplifier_are_refused_in_one_line() -> None:
     info = AmplifierInfo(
         "NI 9263", "", max_current_a=2.0, max_voltage_v=10.0, max_output_hz=1e5, latency_s=0, timer_s=0
     )
-    wide = replace(CURRENT, amplifier=Amplifier(max_voltage_v=12.0))
+    wide = replace(CURRENT, amplifier=AmplifierSettings(max_voltage_v=12.0))
     for coils, words in (
         (CURRENT, "coils.max_current_a = 2.5 A: NI 9263 makes at most 2 A"),
         (replace(wide, max_current_a=2.0), "coils.amplifier.max_voltage_v = 12 V: NI 9263 makes at most 10 V"),
     ):
         with pytest.raises(UsageError) as refused:
-            Limits(coils, ROBOT, OutputLimits()).check(info)
+            CommandLimits(coils, ROBOT, OutputLimits()).check(info)
         assert words in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_a_slew_limit_that_the_field_exceeds_is_refused_in_one_line() -> None:
     with pytest.raises(UsageError, match=r"lab\.output\.slew_a_s = 100: .* need \d+ A/s"):
-        Limits(CURRENT, ROBOT, OutputLimits(slew_a_s=100.0))
+        CommandLimits(CURRENT, ROBOT, OutputLimits(slew_a_s=100.0))
 
 
 def test_the_phase_is_continuous_from_block_to_block_whatever_the_commands() -> None:
-    limits = Limits(CURRENT, ROBOT, OutputLimits())
+    limits = CommandLimits(CURRENT, ROBOT, OutputLimits())
     waveform, rng = Waveform(limits, RATE_HZ), np.random.default_rng(1)
     samples = []
     for _ in range(200):

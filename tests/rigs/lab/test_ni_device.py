@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.errors import RigError, UsageError
-from flowrec.rig_settings import OutputLimits
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.core.errors import RigError, UsageError
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.stages.rig_settings import OutputLimits
+from tests.extras import why
 from tests.perf.guardian_trial import COILS, ROBOT
 
-nidaqmx = pytest.importorskip("nidaqmx")
+nidaqmx = pytest.importorskip("nidaqmx", reason=why("nidaqmx"))
 from nidaqmx.constants import AcquisitionType  # noqa: E402
 
 from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, grpc_options  # noqa: E402
@@ -32,7 +33,7 @@ def server(tmp_path: Path) -> Iterator[tuple[str, NiTwin]]:
 @pytest.mark.parametrize(
     ("channels", "told"),
     [
-        ("", "lab.channels: which outputs"),
+        ("", "lab.ni.channels: which outputs"),
         ("cDAQ1Mod1/ao2:4", "the device has no such output"),
         ("Dev9/ao0:2", "NI knows no such device"),
         ("cDAQ1Mod1/ao0:1", "2 outputs, where three coils need 3"),
@@ -53,7 +54,7 @@ def test_a_voltage_beyond_the_range_of_the_device_is_refused_by_the_name_of_its_
     strong = replace(COILS, amplifier=replace(COILS.amplifier, max_voltage_v=20.0))
     info = NiDevice("cDAQ1Mod1/ao0:2", server[0], strong.amplifier, 0.1).info
     with pytest.raises(UsageError, match=r"coils\.amplifier\.max_voltage_v = 20 V: NI 9263 makes at most 10 V"):
-        Limits(strong, ROBOT, OutputLimits()).check(info)
+        CommandLimits(strong, ROBOT, OutputLimits()).check(info)
 
 
 def test_outputs_that_another_program_uses_are_not_taken_from_it(server: tuple[str, NiTwin]) -> None:
@@ -64,6 +65,6 @@ def test_outputs_that_another_program_uses_are_not_taken_from_it(server: tuple[s
         other.write(np.full(1000, 2.0))
         other.start()
         device = NiDevice("cDAQ1Mod1/ao0:2", address, COILS.amplifier, 0.1)
-        with pytest.raises(RigError, match=r"lab\.channels = .*: another program uses the outputs"):
+        with pytest.raises(RigError, match=r"lab\.ni\.channels = .*: another program uses the outputs"):
             device.take()
         assert not other.is_task_done() and twin.outputs[1] == 2.0, "the other program goes on"

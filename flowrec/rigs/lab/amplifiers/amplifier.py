@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from flowrec.control.field_log import FieldLog
-from flowrec.control.field_rotation import FieldCommand
+from flowrec.stages import FieldCommand, FieldLog
 
 
 @dataclass(frozen=True, slots=True)
 class AmplifierInfo:
-    """What an amplifier says of itself when it is opened.
+    """Properties that an amplifier reports when it is opened.
 
     Attributes
     ----------
@@ -48,7 +47,10 @@ class Amplifier(Protocol):
         """
 
     def guard(self) -> tuple[tuple[str, ...], tuple[int, ...]]:
-        """Arguments and open file descriptors with which the guardian process takes this output to zero."""
+        """Arguments and open file descriptors with which the guardian process takes this output to zero.
+
+        An amplifier of another package returns ("call", "module:function", *words): see lab/guardian.py.
+        """
 
     def arm(self) -> None:
         """Let commands make a field from now on; until `zero`, or until the guardian or the device takes it away.
@@ -59,7 +61,7 @@ class Amplifier(Protocol):
         """
 
     def apply(self, command: FieldCommand) -> None:
-        """What the field does from the next output sample on; a command that is repeated keeps the device awake.
+        """Put out a field from the next output sample on; a command that is repeated keeps the device awake.
 
         Raises
         ------
@@ -67,7 +69,7 @@ class Amplifier(Protocol):
         """
 
     def put_out(self, until_ns: int) -> FieldLog:
-        """What was put out up to a time of the host's monotonic clock, with the latency in it."""
+        """Log of the field that was put out up to a time of the host's monotonic clock, with the latency in it."""
 
     def zero(self) -> None:
         """Take the output to zero now and disarm. Any thread, at any time, also during `apply`; repeats are harmless.

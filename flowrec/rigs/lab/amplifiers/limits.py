@@ -15,21 +15,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.coils import Coils, field_limits
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import RigError, UsageError
-from flowrec.messages import Currents
-from flowrec.rig_settings import OutputLimits
+from flowrec.core import Currents, RigError, UsageError, seconds, wrap_rad
+from flowrec.physics import Robot
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.robot import Robot
-from flowrec.units import seconds, wrap_rad
+from flowrec.stages import Coils, FieldCommand, OutputLimits, field_limits
 
 _TURN_RAD = 2.0 * math.pi
 _ROUNDING = 1e-9  # relative
 
 
 @dataclass(slots=True)
-class Limits:
+class CommandLimits:
     """Limits of one rig. It remembers for how long the coils were energised.
 
     Parameters
@@ -166,7 +162,7 @@ class Limits:
         return turning
 
     def _permits(self, now_ns: int, wanted: bool) -> bool:
-        """Whether the coils may be energised from now on; counts for how long they were."""
+        """True if the coils may be energised from now on; counts for how long they were."""
         longest_s, rest_s = self.output.longest_on_s, self.output.rest_s
         if self._last is not None:
             elapsed_s = max(seconds(now_ns - self._last[0]), 0.0)

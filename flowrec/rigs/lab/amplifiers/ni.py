@@ -13,16 +13,13 @@ from typing import TYPE_CHECKING, Any, Self
 import nidaqmx  # noqa: F401  here, so that a missing package is stated before a process is started
 import numpy as np
 
-from flowrec.control.field_log import FieldLog
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import RigError
+from flowrec.core import NS_PER_S, RigError, child_command, child_environment
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
-from flowrec.rigs.lab.amplifiers.ni_orders import Played, Settings
-from flowrec.system.processes import child_command, child_environment
-from flowrec.units import NS_PER_S
+from flowrec.rigs.lab.amplifiers.ni_orders import NiSettings, Played
+from flowrec.stages import FieldCommand, FieldLog
 
 if TYPE_CHECKING:
-    from flowrec.config import ResolvedConfig  # with every stage: this module starts without them
+    from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 _START_S = 60.0  # the package of NI takes seconds to load on a busy computer, and so does a device
 _ZERO_S = 0.5
@@ -43,9 +40,9 @@ class NiAmplifier:
     def of(cls, config: ResolvedConfig) -> Self:
         """The amplifier of a configuration."""
         lab = config.lab
-        return cls(Settings(lab.channels, lab.ni_server, config.coils, config.robot, lab.output, lab.guardian_s))
+        return cls(NiSettings(lab.ni.channels, lab.ni.server, config.coils, config.robot, lab.output, lab.guardian_s))
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: NiSettings) -> None:
         self.underruns = 0
         self._settings = settings
         self._process: subprocess.Popen[bytes] | None = None
@@ -61,7 +58,7 @@ class NiAmplifier:
     def open(self) -> AmplifierInfo:
         self._fault = ""
         if os.name == "nt":
-            raise RigError("lab.amplifier = 'ni' needs Linux or macOS; run flowrec there and set lab.ni_server")
+            raise RigError("lab.amplifier = 'ni' needs Linux or macOS; run flowrec there and set lab.ni.server")
         here, there = os.pipe(), os.pipe()
         ours, theirs = Pipe()
         descriptors = (theirs.fileno(), here[0], there[1])

@@ -14,9 +14,9 @@ from nidaqmx.errors import DaqError, DaqNotFoundError, DaqNotSupportedError, Rpc
 from nidaqmx.system import Device
 from numpy.typing import NDArray
 
-from flowrec.control.amplifier import Amplifier
-from flowrec.errors import RigError
+from flowrec.core import RigError
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
+from flowrec.stages import AmplifierSettings
 
 _COILS = 3
 _CONNECT_S = 10.0
@@ -39,20 +39,20 @@ class NiDevice:
     RigError : no driver, server or device, or not three outputs; one line.
     """
 
-    def __init__(self, channels: str, server: str, amplifier: Amplifier, latency_s: float) -> None:
+    def __init__(self, channels: str, server: str, amplifier: AmplifierSettings, latency_s: float) -> None:
         self._channels, self._amplifier = channels, amplifier
         if not channels:
-            raise RigError("lab.channels: which outputs drive the coils x, y, z? For instance 'cDAQ1Mod1/ao0:2'")
+            raise RigError("lab.ni.channels: which outputs drive the coils x, y, z? For instance 'cDAQ1Mod1/ao0:2'")
         self._options = grpc_options(server) if server else None
         self._task: nidaqmx.Task | None = None
         try:
-            self.info = self._described(latency_s)
+            self.info = self._describe(latency_s)
         except (DaqNotFoundError, DaqNotSupportedError) as error:
             raise RigError(
-                "NI-DAQmx is not installed on this computer; install National Instruments' driver, or set lab.ni_server"
+                "NI-DAQmx is not installed on this computer; install National Instruments' driver, or set lab.ni.server"
             ) from error
         except DaqError as error:
-            raise RigError(f"lab.channels = {channels!r}: {reason(error)}") from error
+            raise RigError(f"lab.ni.channels = {channels!r}: {reason(error)}") from error
 
     def take(self) -> None:
         """Take the outputs to zero before the first use. Nothing is taken away from another program that uses them.
@@ -65,7 +65,7 @@ class NiDevice:
             write_zeros(self._channels, self._options)
         except DaqError as error:
             if int(error.error_code) in _RESERVED:
-                raise RigError(f"lab.channels = {self._channels!r}: {reason(error)}") from error
+                raise RigError(f"lab.ni.channels = {self._channels!r}: {reason(error)}") from error
             reset(self._channels, self._options)
 
     def start(self, block_s: float) -> float:
@@ -90,7 +90,7 @@ class NiDevice:
         assert self._task is not None
         self._task.write(np.ascontiguousarray(voltages_v.T), auto_start=False)
 
-    def generated(self) -> tuple[int, int]:
+    def samples_generated(self) -> tuple[int, int]:
         """Number of samples put out so far, and when that was, in ns of the host's monotonic clock.
 
         Raises
@@ -117,7 +117,7 @@ class NiDevice:
         except Exception:  # noqa: BLE001  whatever it was, a reset is the next thing to try
             reset(self._channels, self._options)
 
-    def _described(self, latency_s: float) -> AmplifierInfo:
+    def _describe(self, latency_s: float) -> AmplifierInfo:
         device = Device(devices(self._channels)[0], grpc_options=self._options)
         edges = device.ao_voltage_rngs  # lowest and highest of each range
         offered_v = max((min(-low, high) for low, high in zip(edges[::2], edges[1::2], strict=True)), default=0.0)
@@ -125,10 +125,12 @@ class NiDevice:
         with self._new_task(min(self._amplifier.max_voltage_v, offered_v)) as task:
             names = task.ao_channels.channel_names
         if len(names) != _COILS:
-            raise RigError(f"lab.channels = {self._channels!r}: {len(names)} outputs, where three coils need {_COILS}")
+            raise RigError(
+                f"lab.ni.channels = {self._channels!r}: {len(names)} outputs, where three coils need {_COILS}"
+            )
         if len(set(names)) != _COILS:
             raise RigError(
-                f"lab.channels = {self._channels!r}: an output is named twice; each coil needs one of its own"
+                f"lab.ni.channels = {self._channels!r}: an output is named twice; each coil needs one of its own"
             )
         return AmplifierInfo(
             model=device.product_type,
@@ -168,7 +170,7 @@ def grpc_options(server: str) -> Any:
     try:
         grpc.channel_ready_future(channel).result(timeout=_CONNECT_S)
     except grpc.FutureTimeoutError as error:
-        raise RigError(f"lab.ni_server = {server!r}: no NI gRPC Device Server answers there") from error
+        raise RigError(f"lab.ni.server = {server!r}: no NI gRPC Device Server answers there") from error
     return nidaqmx.GrpcSessionOptions(channel, "")
 
 

@@ -1,4 +1,4 @@
-"""What the recorder and the process of an NI output send each other, besides commands."""
+"""Messages between the recorder and the process of an NI output, besides commands."""
 
 from __future__ import annotations
 
@@ -7,15 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.coils import Coils
-from flowrec.control.field_rotation import MotionSegment
-from flowrec.rig_settings import OutputLimits
-from flowrec.robot import Robot
+from flowrec.physics import Robot
+from flowrec.stages import Coils, MotionSegment, OutputLimits
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """What the process needs to know."""
+class NiSettings:
+    """Settings of the process."""
 
     channels: str
     server: str

@@ -2,7 +2,7 @@
 
 It is `python -m flowrec.rigs.lab.amplifiers.ni_process CONNECTION ZERO DONE`, with open descriptors: a connection of
 multiprocessing for orders and reports, a pipe whose bytes ask for zero, and one whose bytes confirm it. The orders are
-("open", Settings), ("arm",) and ("command", FieldCommand); the reports ("info", AmplifierInfo), ("armed",),
+("open", NiSettings), ("arm",) and ("command", FieldCommand); the reports ("info", AmplifierInfo), ("armed",),
 ("block", Played) and ("fault", text).
 
 Blocks of 50 ms are written two ahead and are not generated again. An output that runs dry, a device that was reset, a
@@ -21,16 +21,12 @@ from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import Any
 
-from flowrec.clocks import DeviceClock
-from flowrec.clocks.device_clock import Fit
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import FlowrecError, RigError
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.core import NS_PER_S, DeviceClock, Fit, FlowrecError, Priority, RigError, prioritise_process, seconds
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
 from flowrec.rigs.lab.amplifiers.ni_device import NiDevice, reason
-from flowrec.rigs.lab.amplifiers.ni_orders import Played, Settings
+from flowrec.rigs.lab.amplifiers.ni_orders import NiSettings, Played
 from flowrec.rigs.lab.amplifiers.waveform import Waveform
-from flowrec.system.processes import Priority, prioritise_process
-from flowrec.units import NS_PER_S, seconds
+from flowrec.stages import FieldCommand
 
 BLOCK_S = 0.05
 BLOCKS_AHEAD = 2
@@ -41,7 +37,7 @@ _REST = FieldCommand()
 class Stream:
     """The output of blocks, from the start to zero."""
 
-    def __init__(self, device: NiDevice, limits: Limits) -> None:
+    def __init__(self, device: NiDevice, limits: CommandLimits) -> None:
         self._device = device
         self._rate_hz = device.start(BLOCK_S)
         self._count = round(BLOCK_S * self._rate_hz)
@@ -55,7 +51,7 @@ class Stream:
 
     @property
     def amplitude_mt(self) -> float:
-        """Of the field at the end of what is written."""
+        """Amplitude of the field at the end of what is written."""
         return self._waveform.amplitude_mt
 
     def due_s(self) -> float:
@@ -75,7 +71,7 @@ class Stream:
             from_ns = self._stamp_ns(self._written)
             block = self._write(command)
             played.append(Played(from_ns, block.segments, block.amplitude_mt, block.currents_a[0]))
-        generated, arrival_ns = self._device.generated()
+        generated, arrival_ns = self._device.samples_generated()
         self._fit = self._clock.take(self._fit, generated, arrival_ns)
         if self._written - generated > 2 * BLOCKS_AHEAD * self._count:
             raise RigError(f"the output stands still at sample {generated}: was the device reset?")
@@ -88,7 +84,7 @@ class Stream:
         return block
 
     def _stamp_ns(self, sample: int) -> int:
-        """When a sample is put out."""
+        """Time at which a sample is put out."""
         if self._fit is None:
             return self._began_ns + round(sample * NS_PER_S / self._rate_hz)
         return self._fit.stamp_ns + round((sample - self._fit.last[0]) * self._fit.rate)
@@ -99,7 +95,7 @@ class Server:
 
     def __init__(self, connection: Connection, zero: int, done: int) -> None:
         self._connection, self._zero, self._done = connection, zero, done
-        self._settings: Settings | None = None
+        self._settings: NiSettings | None = None
         self._device: NiDevice | None = None
         self._stream: Stream | None = None
         self._command = _REST
@@ -139,7 +135,7 @@ class Server:
             except Exception as error:  # noqa: BLE001  whatever a driver raises: the recorder states it
                 self._fault(error)
 
-    def _open(self, settings: Settings) -> None:
+    def _open(self, settings: NiSettings) -> None:
         self._settings = settings
         device = NiDevice(settings.channels, settings.server, settings.coils.amplifier, LATENCY_S)
         device.take()
@@ -151,7 +147,7 @@ class Server:
         assert self._settings is not None and self._device is not None
         s = self._settings
         self._command = _REST
-        self._stream = Stream(self._device, Limits(s.coils, s.robot, s.output))
+        self._stream = Stream(self._device, CommandLimits(s.coils, s.robot, s.output))
         self._connection.send(("armed",))
 
     def _play(self) -> None:

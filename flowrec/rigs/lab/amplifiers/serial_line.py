@@ -20,12 +20,7 @@ from typing import TYPE_CHECKING, Self
 import serial
 from serial.tools import list_ports
 
-from flowrec.clocks import DeviceClock
-from flowrec.clocks.device_clock import Fit
-from flowrec.control.coils import Coils
-from flowrec.control.field_log import FieldLog
-from flowrec.control.field_rotation import FieldCommand
-from flowrec.errors import RigError, UsageError
+from flowrec.core import NS_PER_S, DeviceClock, Fit, Priority, RigError, UsageError, realtime_priority, seconds
 from flowrec.rigs.lab.amplifiers.amplifier import AmplifierInfo
 from flowrec.rigs.lab.amplifiers.serial_protocol import (
     VERSION,
@@ -38,11 +33,10 @@ from flowrec.rigs.lab.amplifiers.serial_protocol import (
     reply,
     telemetry,
 )
-from flowrec.system.processes import Priority, realtime_priority
-from flowrec.units import NS_PER_S, seconds
+from flowrec.stages import Coils, FieldCommand, FieldLog
 
 if TYPE_CHECKING:
-    from flowrec.config import ResolvedConfig  # with every stage: this module starts without them
+    from flowrec.stages import ResolvedConfig  # with every stage: this module starts without them
 
 _BOOT_S = 4.0  # many boards start anew when their port is opened
 _ASK_S = 0.25
@@ -67,7 +61,7 @@ class SerialAmplifier:
     @classmethod
     def of(cls, config: ResolvedConfig) -> Self:
         """The amplifier of a configuration."""
-        return cls(config.lab.port, config.lab.baud, config.coils)
+        return cls(config.lab.serial.port, config.lab.serial.baud, config.coils)
 
     def __init__(self, port: str, baud: int, coils: Coils) -> None:
         self._name, self._baud, self._coils = port, baud, coils
@@ -97,12 +91,12 @@ class SerialAmplifier:
     # ---- for the rig
 
     def open(self) -> AmplifierInfo:
-        self._port = self._opened()
+        self._port = self._open_port()
         self._closing, self._fault = False, ""
         self._reader = threading.Thread(target=self._read, name="amplifier", daemon=True)
         self._reader.start()
         try:
-            return self._identified()
+            return self._identify()
         except BaseException:
             self.close()
             raise
@@ -115,7 +109,7 @@ class SerialAmplifier:
 
     def arm(self) -> None:
         for verb, numbers in configuration(self._coils):
-            answer = self._asked(verb, *numbers, timeout_s=_CONFIGURE_S)
+            answer = self._ask(verb, *numbers, timeout_s=_CONFIGURE_S)
             if answer is None or answer.verb != verb:
                 raise RigError(f"{self._name}: the amplifier refuses its configuration ({_words(answer)})")
         self._permitted = True
@@ -143,7 +137,7 @@ class SerialAmplifier:
             self._sent.pop(next(iter(self._sent)))
 
     def put_out(self, until_ns: int) -> FieldLog:
-        """What was put out. The last row lasts on; the next answer replaces its frequency and heading by the means."""
+        """Log of the output. The last row lasts on; the next answer replaces its frequency and heading by the means."""
         while self._measured:
             self._take(*self._measured.popleft())
         self._log.forget(until_ns - round(_KEEP_S * NS_PER_S))
@@ -177,10 +171,10 @@ class SerialAmplifier:
 
     # ---- opening
 
-    def _opened(self) -> serial.Serial:
+    def _open_port(self) -> serial.Serial:
         there = ", ".join(sorted(port.device for port in list_ports.comports())) or "none"
         if not self._name:
-            raise UsageError(f"lab.port: which serial port is the amplifier's? There are: {there}")
+            raise UsageError(f"lab.serial.port: which serial port is the amplifier's? There are: {there}")
         try:
             # Another recorder is kept out; the guardian has the same descriptor, and so keeps others out as well.
             return serial.Serial(self._name, self._baud, timeout=0, write_timeout=0, exclusive=True)
@@ -193,26 +187,29 @@ class SerialAmplifier:
                 raise RigError(f"{self._name}: no right to use this port; sudo adduser $USER dialout") from error
             gone = isinstance(error, OSError) and error.errno == errno.ENOENT
             why = "there is no such port" if gone else f"it can not be used as a serial port ({_first_line(error)})"
-            raise RigError(f"lab.port = {self._name!r}: {why}; ports here: {there}") from error
+            raise RigError(f"lab.serial.port = {self._name!r}: {why}; ports here: {there}") from error
 
-    def _identified(self) -> AmplifierInfo:
+    def _identify(self) -> AmplifierInfo:
         end_s = time.monotonic() + _BOOT_S
         answer: Reply | None = None
         while answer is None and time.monotonic() < end_s:
             self._write(ZERO)
-            answer = self._asked("I", timeout_s=_ASK_S)
+            answer = self._ask("I", timeout_s=_ASK_S)
             if self._fault:
                 raise RigError(self._fault)
         if answer is None and self._heard_s:
-            raise RigError(f"{self._name}: another device than flowrec-coils answers; is lab.port right?")
+            raise RigError(f"{self._name}: another device than flowrec-coils answers; is lab.serial.port right?")
         if answer is None:
-            raise RigError(f"{self._name}: no answer in {_BOOT_S:g} s; is the firmware on the board, lab.baud right?")
+            raise RigError(
+                f"{self._name}: no answer in {_BOOT_S:g} s; is the firmware on the board, lab.serial.baud right?"
+            )
         try:
             model, version, most_ua, timer_ms, update_hz = answer.words
             found = int(version), int(most_ua), int(timer_ms), int(update_hz)
         except ValueError as error:
             raise RigError(
-                f"{self._name}: another device than flowrec-coils answers (by {_words(answer)!r}); is lab.port right?"
+                f"{self._name}: another device than flowrec-coils answers (by {_words(answer)!r}); is lab.serial.port "
+                "right?"
             ) from error
         if found[0] != VERSION:
             raise RigError(f"{self._name}: protocol {found[0]}, where {VERSION} is needed; put the new firmware on it")
@@ -226,18 +223,18 @@ class SerialAmplifier:
             timer_s=1e-3 * found[2],
         )
 
-    def _asked(self, verb: str, *numbers: int, timeout_s: float = _CONFIRM_S) -> Reply | None:
+    def _ask(self, verb: str, *numbers: int, timeout_s: float = _CONFIRM_S) -> Reply | None:
         """The answer to a line; None: there is none."""
         number = self._next()
         self._write(line(verb, number, *numbers))
         found: list[Reply] = []
 
-        def answered() -> bool:
+        def has_reply() -> bool:
             found.extend(one for one in self._replies if one.number == number)
             return bool(found)
 
         with self._answered:
-            self._answered.wait_for(answered, timeout_s)
+            self._answered.wait_for(has_reply, timeout_s)
         return found[0] if found else None
 
     # ---- writing
@@ -324,7 +321,7 @@ class SerialAmplifier:
         if self._before is not None:
             since_ns, before = self._before
             stamp_ns = max(stamp_ns, since_ns + 1)
-            x, y = (_TURNS * _signed(a - b) for a, b in zip(now.turns, before.turns, strict=True))
+            x, y = (_TURNS * _signed_difference(a - b) for a, b in zip(now.turns, before.turns, strict=True))
             per_s = math.hypot(x, y) / seconds(stamp_ns - since_ns)
             heading = math.atan2(y, x) if per_s > 0.0 else before.heading_rad
             amplitude = before.amplitude_mt if before.amplitude_mt > 0.0 or per_s == 0.0 else now.amplitude_mt
@@ -341,7 +338,7 @@ class SerialAmplifier:
 _NO_FIELD = Telemetry(0, 0.0, 0.0, 0.0, (0, 0), FieldLog().at(0).currents_a)
 
 
-def _signed(difference: int) -> int:
+def _signed_difference(difference: int) -> int:
     """A difference of two counters that wrap at 2^32."""
     return (difference + _WRAP // 2) % _WRAP - _WRAP // 2
 

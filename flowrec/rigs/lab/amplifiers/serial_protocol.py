@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.coils import Coils, field_limits
-from flowrec.control.field_rotation import FieldCommand
+from flowrec.stages import Coils, FieldCommand, field_limits
 
 ZERO = b"\nZ\n"  # the newline ends a line that its writer may have left half written
 VERSION = 1
@@ -35,7 +34,7 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """What the firmware puts out at a time of its clock."""
+    """Output that the firmware reports for a time of its clock."""
 
     clock_us: int  # wraps at 2^32
     frequency_hz: float
@@ -52,7 +51,7 @@ def line(verb: str, number: int, *numbers: int) -> bytes:
 
 
 def reply(received: bytes) -> Reply | None:
-    """What a received line says; None: it is damaged, or of no flowrec-coils firmware."""
+    """Parse a received line; None: it is damaged, or of no flowrec-coils firmware."""
     body, star, crc = received.strip().rpartition(b"*")
     if not star or not body.strip() or crc != b"%04X" % _crc(body):
         return None

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.control.field_rotation import FieldCommand, FieldState, MotionSegment, field_motion
-from flowrec.rigs.lab.amplifiers.limits import Limits
+from flowrec.rigs.lab.amplifiers.limits import CommandLimits
+from flowrec.stages import FieldCommand, FieldState, MotionSegment, field_motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Waveform:
     output_hz : sample rate as the device has it, which may differ from the one asked for.
     """
 
-    def __init__(self, limits: Limits, output_hz: float) -> None:
+    def __init__(self, limits: CommandLimits, output_hz: float) -> None:
         coils = limits.coils
         self._coils = replace(coils, amplifier=replace(coils.amplifier, output_hz=output_hz))
         self._limits = limits

@@ -7,7 +7,7 @@ because an incomplete one is given up late.
 
 from __future__ import annotations
 
-from flowrec.units import seconds
+from flowrec.core import seconds
 
 _BEHIND = 256  # blocks; an id that lies further back means that the device has begun to count anew
 _HASTE = 4.0  # a gap of more than so many times the blocks that fit into the time passed means the same
@@ -26,9 +26,9 @@ class BlockIds:
     def __init__(self) -> None:
         self.index = -1
         self.restarts = 0
-        self.connected(0)
+        self.reset(0)
 
-    def connected(self, bits: int, rate_hz: float = 0.0) -> None:
+    def reset(self, bits: int, rate_hz: float = 0.0) -> None:
         """Begin with a new connection: whatever id comes next, it is the next index.
 
         Parameters
@@ -44,7 +44,7 @@ class BlockIds:
         self._first = (0, 0)  # index and arrival of the first block of this connection
 
     def step(self, block_id: int | None, arrival_ns: int) -> int:
-        """How far a block lies ahead of the newest one: 1 for the next one, 0 for the same, negative for older ones.
+        """Distance of a block from the newest one: 1 for the next one, 0 for the same, negative for older ones.
 
         A positive step makes it the newest one, and is added to `index`.
         """

@@ -1,4 +1,4 @@
-"""What a camera driver does, and what it tells: the protocol of the rows of CAMERAS.
+"""Camera drivers: the protocol of the rows of CAMERAS, and the messages between driver and grabber.
 
 A driver opens one device with the settings that are wanted, and hands on what the device delivers. It neither queues,
 nor counts, nor reconnects: `grabber.Grabber` does that, in a thread, for every driver alike. The rig uses the grabber
@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flowrec.errors import RigError
-from flowrec.rig_settings import CameraSettings, Lab
+from flowrec.core import RigError
+from flowrec.stages import CAMERAS, CameraSettings, Lab
 
 SOFTWARE = "software"  # value of Wanted.trigger
 _NOTABLE = 0.01  # relative difference between what was asked and what is
@@ -25,7 +25,7 @@ Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What is asked of a camera.
+    """Settings requested from a camera.
 
     Attributes
     ----------
@@ -39,6 +39,7 @@ class Wanted:
     trigger : '': the camera runs freely; 'software': a frame per call of `trigger`; else the name of the line, for
         instance 'Line1'.
     config : configuration file of Micro-Manager (mmcore), or "adapter:device", for instance DemoCamera:DCam.
+    settings : of a camera of another package: its `Settings`, section [lab.NAME] of the configuration.
     """
 
     device: str = ""
@@ -51,11 +52,12 @@ class Wanted:
     pixel_format: str = "Mono8"
     trigger: str = ""
     config: str = ""
+    settings: Any = None
 
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """What the device says of itself after it has been set, and opened.
+    """Properties that the device reports after it has been set, and opened.
 
     Attributes
     ----------
@@ -85,7 +87,7 @@ class CameraInfo:
 
 @dataclass(frozen=True, slots=True)
 class Grabbed:
-    """What one call of `grab` delivers.
+    """Result of one call of `grab`.
 
     Attributes
     ----------
@@ -132,7 +134,7 @@ class Camera(Protocol):
         """
 
     def alive(self) -> bool:
-        """Whether the device still answers. It is asked when no image comes; it may take up to half a second."""
+        """True if the device still answers. It is asked when no image comes; it may take up to half a second."""
 
     def discarded(self) -> int:
         """Whole images that the driver has thrown away since `open`, because `grab` was not called soon enough."""
@@ -150,7 +152,7 @@ class Camera(Protocol):
 
 
 def wanted_of(camera: CameraSettings, lab: Lab) -> Wanted:
-    """What the sections [camera] and [lab] of a configuration ask for; the rate must be resolved.
+    """Camera settings from the sections [camera] and [lab] of a configuration; the rate must be resolved.
 
     Raises
     ------
@@ -170,6 +172,7 @@ def wanted_of(camera: CameraSettings, lab: Lab) -> Wanted:
         pixel_format=lab.pixel_format or f"Mono{camera.bits}",
         trigger=lab.trigger,
         config=lab.device_config,
+        settings=getattr(lab, lab.camera, None) if not CAMERAS.own(lab.camera) else None,
     )
 
 
@@ -201,7 +204,7 @@ def difference(key: str, asked: float | None, got: float | None, unit: str) -> t
     return (f"{key} = {asked:g}{unit} asked, {got:.4g}{unit} reached",)
 
 
-def found(devices: dict[str, Any], wanted: str, where: str) -> Any:
+def find_device(devices: dict[str, Any], wanted: str, where: str) -> Any:
     """The device that is wanted among those that were found, by name, or by a unique part of its description.
 
     Raises

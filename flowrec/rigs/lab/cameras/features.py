@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from flowrec.errors import RigError
+from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import SOFTWARE, CameraInfo, Wanted, bits_of, difference
 
 _US = 1e-6

@@ -13,8 +13,8 @@ from typing import Any
 
 import viva_genicam as vg
 
-from flowrec.errors import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, found
+from flowrec.core import RigError
+from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
 from flowrec.rigs.lab.cameras.features import Feature, Value, configure
 
 _DISCOVER_MS = 500
@@ -56,7 +56,7 @@ class GenicamCamera:
         self._camera = camera
         self._stack.callback(_quietly, camera.close)
         try:
-            nodes = _Nodes(camera)
+            nodes = _GenicamNodes(camera)
             settled = configure(nodes, self._wanted)
             self._bits = settled.bits
             stream = camera.stream(deliver_incomplete=True, auto_packet_size=camera.transport == _GIGE)
@@ -125,7 +125,7 @@ class GenicamCamera:
             for usb in vg.discover_u3v():
                 name = " ".join(filter(None, (usb.manufacturer, usb.model, usb.serial, f"USB {usb.bus}")))
                 devices[name] = (name, usb, False)
-        name, device, controlled = found(devices, wanted, "genicam")
+        name, device, controlled = find_device(devices, wanted, "genicam")
         if controlled:
             raise RigError(
                 f"camera {name} is busy: another program controls it; end that one (a program that was killed lets go "
@@ -134,7 +134,7 @@ class GenicamCamera:
         return name, device
 
 
-class _Nodes:
+class _GenicamNodes:
     """The settings of a camera; see features.Features."""
 
     def __init__(self, camera: vg.Camera) -> None:
@@ -178,7 +178,7 @@ def _look(device: vg.GigeDeviceInfo) -> tuple[str, bool]:
         _quietly(camera.close)
 
 
-def _ticks_per_s(camera: vg.Camera, nodes: _Nodes) -> float:
+def _ticks_per_s(camera: vg.Camera, nodes: _GenicamNodes) -> float:
     """Frequency of the camera's clock, as it states it."""
     if camera.transport != _GIGE:
         return _NS

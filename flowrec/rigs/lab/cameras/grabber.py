@@ -18,13 +18,19 @@ from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self, TypeVar
 
-from flowrec.clocks import DeviceClock, Fit
-from flowrec.diagnostics import CameraLosses
-from flowrec.errors import RigError
+from flowrec.core import (
+    NS_PER_S,
+    CameraLosses,
+    DeviceClock,
+    Fit,
+    Priority,
+    RigError,
+    nanoseconds,
+    realtime_priority,
+    seconds,
+)
 from flowrec.rigs.lab.cameras.block_ids import BlockIds
 from flowrec.rigs.lab.cameras.camera import SOFTWARE, Camera, CameraInfo, Grabbed, Image, Wanted
-from flowrec.system.processes import Priority, realtime_priority
-from flowrec.units import NS_PER_S, nanoseconds, seconds
 
 _SLICE_S = 0.1  # longest wait in the driver, so that the thread ends promptly
 _SILENT_S = 0.7  # without a frame, at least, before a camera is taken for absent
@@ -120,13 +126,13 @@ class Grabber:
 
     @property
     def info(self) -> CameraInfo:
-        """What the camera says of itself."""
+        """Properties that the camera reports."""
         assert self._info is not None, "the context has been entered"
         return self._info
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What people should know of the camera, a line each; more may come with the first frames."""
+        """Remarks on the camera for people, a line each; more may come with the first frames."""
         notes = self.info.notes
         if not self.info.ticks_per_s:
             notes += ("the camera has no clock: frames are stamped by their arrival",)
@@ -193,7 +199,11 @@ class Grabber:
             # All that the queue has dropped lies before the frame, which was behind it.
             exact = self._exact = replace(frame.losses, frames=self.frames, backlog=self.backlog)
         last = self._reported
-        if last is None or exact.stamp_ns >= last.stamp_ns + nanoseconds(_REPORT_S) or _lost(last) != _lost(exact):
+        if (
+            last is None
+            or exact.stamp_ns >= last.stamp_ns + nanoseconds(_REPORT_S)
+            or _loss_counts(last) != _loss_counts(exact)
+        ):
             self._reported = last = exact
         return replace(frame, losses=last)
 
@@ -204,7 +214,7 @@ class Grabber:
         with realtime_priority(Priority.DEVICE):
             camera = self._make()
             try:
-                self._connected(camera.open())
+                self._note_connection(camera.open())
             except Exception as error:  # noqa: BLE001  raised in the thread that waits for the camera
                 self._failure = error
                 _within(_CLOSE_S, camera.close)
@@ -225,11 +235,11 @@ class Grabber:
                     self._filled.notify_all()
                 _within(_CLOSE_S, camera.close)
 
-    def _connected(self, info: CameraInfo) -> None:
+    def _note_connection(self, info: CameraInfo) -> None:
         self._info = info
         rate_hz = info.rate_hz or self._wanted.rate_hz
-        self._ids.connected(info.id_bits, rate_hz)
-        self._stamper.connected(info, self._wanted.exposure_s)
+        self._ids.reset(info.id_bits, rate_hz)
+        self._stamper.reset(info, self._wanted.exposure_s)
         self._attributed = 0
         self._span = (0, 0), (0, 0)
         self._silent_s = max(_SILENT_S, _SILENT_PERIODS / rate_hz) + (info.exposure_s or self._wanted.exposure_s)
@@ -251,7 +261,7 @@ class Grabber:
             now_s = time.monotonic()
             if grabbed is not None:
                 self.absent = ""
-                pace.answered()
+                pace.note_frame()
                 self._take(camera, grabbed)
                 heard_s, silent_s = now_s, self._silent_s
             elif now_s - heard_s > silent_s:
@@ -313,7 +323,7 @@ class Grabber:
             except RigError:
                 info = None  # still absent; `absent` says since when, and this says nothing else
             if info is not None and _same(known, info):
-                self._connected(info)
+                self._note_connection(info)
                 self._counts = replace(self._counts, reconnections=self._counts.reconnections + 1)
                 return camera
             if info is not None:
@@ -326,7 +336,7 @@ class Grabber:
 
 
 class _Pace:
-    """How long to wait in the driver, and when to trigger it by software: a frame at a time, at the rate wanted."""
+    """Timing of the driver: time to wait in it, and times of software triggers, one per frame at the wanted rate."""
 
     def __init__(self, wanted: Wanted, patience_s: float) -> None:
         self._software = wanted.trigger == SOFTWARE
@@ -354,12 +364,12 @@ class _Pace:
             camera.trigger()
         return missed
 
-    def answered(self) -> None:
+    def note_frame(self) -> None:
         """A frame has come."""
         self._sent_s = None
 
     def wait_s(self) -> float:
-        """How long to wait for a frame at most."""
+        """Longest time to wait for a frame."""
         if not self._software or self._sent_s is not None:
             return _SLICE_S
         return min(max(self._due_s - time.monotonic(), 1e-3), _SLICE_S)
@@ -376,7 +386,7 @@ class _Stamper:
         self._clock = DeviceClock()
         self._half_ns = 0
 
-    def connected(self, info: CameraInfo, exposure_s: float) -> None:
+    def reset(self, info: CameraInfo, exposure_s: float) -> None:
         """Begin with a connection."""
         if info.ticks_per_s:
             self._clock = DeviceClock(unit=NS_PER_S / info.ticks_per_s)
@@ -401,7 +411,7 @@ class _Stamper:
         return stamp_ns, fit, before_ns
 
 
-def _lost(of: CameraLosses) -> tuple[int, ...]:
+def _loss_counts(of: CameraLosses) -> tuple[int, ...]:
     return (of.link, of.incomplete, of.driver, of.backlog, of.triggers, of.reconnections)
 
 

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from pymmcore_plus import CMMCorePlus
 
-from flowrec.errors import RigError
+from flowrec.core import RigError, nanoseconds
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, bits_of, difference
-from flowrec.units import nanoseconds
 
 _RATES = ("FrameRate", "Frame Rate", "AcquisitionFrameRate", "FramesPerSecond")  # names of one property
 _LABEL = "Camera"
@@ -44,7 +43,7 @@ class MmcoreCamera:
             raise RigError(f"lab.trigger = {wanted.trigger!r}: with mmcore, set the trigger in the configuration file")
         try:
             self._core = core = CMMCorePlus()
-            label = self._loaded(core)
+            label = self._load(core)
             notes = self._set(core, label)
             self._bits = core.getImageBitDepth()
             if self._bits not in (8, 10, 12, 14, 16) or core.getNumberOfComponents() != 1:
@@ -72,7 +71,7 @@ class MmcoreCamera:
         except (RuntimeError, ValueError, OSError) as error:
             raise RigError(f"camera of Micro-Manager: {' '.join(str(error).split())}") from error
 
-    def _loaded(self, core: CMMCorePlus) -> str:
+    def _load(self, core: CMMCorePlus) -> str:
         """Load the devices; the label of the camera."""
         config, device = self._wanted.config, self._wanted.device
         adapter, colon, name = config.partition(":")
@@ -189,7 +188,7 @@ def _number(text: str | None) -> float | None:
 
 
 def _arrival_ns(received: str | None) -> int:
-    """When Micro-Manager received an image, on the monotonic clock; it states the local time, without a zone."""
+    """Arrival time of an image in Micro-Manager, on the monotonic clock; it states the local time, without a zone."""
     now_ns = time.monotonic_ns()
     if not received:
         return now_ns

@@ -13,7 +13,7 @@ from typing import cast
 import cv2
 import numpy as np
 
-from flowrec.errors import RigError
+from flowrec.core import RigError
 from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Image, Wanted, bits_of, difference
 
 _TIMEOUT_MS = 1000
@@ -142,5 +142,5 @@ class OpencvCamera:
 
 
 def _is_grey(image: Image) -> bool:
-    """Whether the three channels of a colour image are the same."""
+    """True if the three channels of a colour image are the same."""
     return bool(np.array_equal(image[:, :, 0], image[:, :, 1]) and np.array_equal(image[:, :, 0], image[:, :, 2]))

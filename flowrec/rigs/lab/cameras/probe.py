@@ -7,19 +7,15 @@ import time
 from dataclasses import dataclass
 from functools import partial
 
-from flowrec.clocks.device_clock import envelope
-from flowrec.declarations import Image
-from flowrec.diagnostics import CameraLosses
-from flowrec.errors import RigError
-from flowrec.rig_settings import CAMERAS, CameraSettings, Lab
+from flowrec.core import NS_PER_S, CameraLosses, Image, RigError, envelope, seconds
 from flowrec.rigs.lab.cameras.camera import CameraInfo, wanted_of
 from flowrec.rigs.lab.cameras.grabber import Captured, Grabber
-from flowrec.units import NS_PER_S, seconds
+from flowrec.stages import CAMERAS, CameraSettings, Lab
 
 
 @dataclass(frozen=True, slots=True)
-class Probe:
-    """What was seen.
+class CameraProbe:
+    """Result of a trial of the camera.
 
     Attributes
     ----------
@@ -45,7 +41,7 @@ class Probe:
     image: Image | None = None
 
 
-def probe(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> Probe:
+def probe_camera(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> CameraProbe:
     """Open the camera of a configuration, take its frames for some seconds, and close it.
 
     Raises
@@ -68,11 +64,11 @@ def probe(camera: CameraSettings, lab: Lab, duration_s: float = 2.5) -> Probe:
     if not frames and not wanted.trigger:
         raise RigError(f"camera {info.model} {info.serial}: it delivers no frame; see its trigger, cable and bandwidth")
     if not frames:
-        return Probe(info, 0.0, 0.0, losses, 0.0, 0.0, 0, (*notes, f"no trigger has come at {wanted.trigger}"))
+        return CameraProbe(info, 0.0, 0.0, losses, 0.0, 0.0, 0, (*notes, f"no trigger has come at {wanted.trigger}"))
     first, last = frames[0], frames[-1]
     span_s = max(seconds(last.stamp_ns - first.stamp_ns), 1e-9)
     arrivals = [frame.arrival_ns for frame in frames]
-    return Probe(
+    return CameraProbe(
         info,
         rate_hz=(last.index - first.index) / span_s,
         delivered_hz=(len(frames) - 1) / span_s,

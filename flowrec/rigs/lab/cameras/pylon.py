@@ -14,8 +14,8 @@ with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "builtin type .* has no __module__ attribute", DeprecationWarning)
     from pypylon import genicam, pylon
 
-from flowrec.errors import RigError
-from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, found
+from flowrec.core import RigError
+from flowrec.rigs.lab.cameras.camera import CameraInfo, Grabbed, Wanted, find_device
 from flowrec.rigs.lab.cameras.features import Feature, Value, configure
 
 _BUFFERS = 32
@@ -47,7 +47,7 @@ class PylonCamera:
     def open(self) -> CameraInfo:
         factory = pylon.TlFactory.GetInstance()
         devices = {_name(each): each for each in factory.EnumerateDevices()}
-        about = found(devices, self._wanted.device, "pylon")
+        about = find_device(devices, self._wanted.device, "pylon")
         name = _name(about)
         self._emulated = about.GetDeviceClass() == _EMULATOR
         try:
@@ -57,11 +57,11 @@ class PylonCamera:
             busy = "it is busy, end the other program" if not factory.IsDeviceAccessible(about) else "no connection"
             raise RigError(f"camera {name}: {busy} ({_line(error)})") from error
         try:
-            return self._started(name, about)
+            return self._start(name, about)
         except genicam.GenericException as error:
             raise RigError(f"camera {name}: {_line(error)}") from error
 
-    def _started(self, name: str, about: Any) -> CameraInfo:
+    def _start(self, name: str, about: Any) -> CameraInfo:
         nodes = self.device.GetNodeMap()
         if self._wanted.config:
             if not Path(self._wanted.config).is_file():
@@ -69,7 +69,7 @@ class PylonCamera:
                     f"lab.device_config = {self._wanted.config}: no such file; save one with the pylon Viewer"
                 )
             pylon.FeaturePersistence.Load(self._wanted.config, nodes, True)
-        features = _Nodes(nodes)
+        features = _PylonNodes(nodes)
         settled = configure(features, self._wanted)
         self._bits = settled.bits
         self.device.MaxNumBuffer.Value = _BUFFERS
@@ -128,7 +128,7 @@ class PylonCamera:
                 self.device.Close()
 
 
-class _Nodes:
+class _PylonNodes:
     """The settings of a camera; see features.Features."""
 
     def __init__(self, nodes: Any) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flowrec.errors import RigError
+from flowrec.core.errors import RigError
 from flowrec.rigs.lab.cameras.camera import Camera, CameraInfo, Grabbed, Wanted
 
 INFO = CameraInfo("Scripted", "1", 4, 3, 8, 100.0, id_bits=16)

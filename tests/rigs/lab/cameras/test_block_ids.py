@@ -11,7 +11,7 @@ from flowrec.rigs.lab.cameras.block_ids import BlockIds
 def unwrapped(ids: Iterable[int], bits: int, rate_hz: float = 0.0, period_ns: int = 10_000_000) -> list[int]:
     """The index after each id, of blocks that arrive one by one."""
     unwrap = BlockIds()
-    unwrap.connected(bits, rate_hz)
+    unwrap.reset(bits, rate_hz)
     found = []
     for n, block_id in enumerate(ids):
         unwrap.step(block_id, n * period_ns)
@@ -48,7 +48,7 @@ def test_a_16_bit_camera_that_does_send_block_0_is_believed() -> None:
 
 def test_blocks_that_come_late_or_twice_do_not_move_the_index() -> None:
     unwrap = BlockIds()
-    unwrap.connected(16)
+    unwrap.reset(16)
     assert [unwrap.step(block, 0) for block in (65_534, 2, 65_535, 1, 2, 3)] == [1, 3, -2, -1, 0, 1]
     assert unwrap.index == 4
 
@@ -57,16 +57,16 @@ def test_a_device_that_counts_anew_goes_on_with_the_next_index() -> None:
     assert unwrapped([70_000, 70_001, 1, 2], 64) == [0, 1, 2, 3]
     assert unwrapped([40_000, 40_001, 1, 2], 16, rate_hz=100.0) == [0, 1, 2, 3]
     unwrap = BlockIds()
-    unwrap.connected(64)
+    unwrap.reset(64)
     unwrap.step(5, 0)
-    unwrap.connected(16)
+    unwrap.reset(16)
     assert unwrap.step(9, 0) == 1 and unwrap.index == 1
 
 
 def test_a_long_gap_after_a_stall_of_the_host_is_a_gap() -> None:
     # 100 Hz; the host stands still for 5 s, then takes 8 blocks that the driver had kept, and the newest one.
     unwrap = BlockIds()
-    unwrap.connected(16, 100.0)
+    unwrap.reset(16, 100.0)
     for n in range(10):
         unwrap.step(n + 1, n * 10_000_000)
     late_ns = 5_100_000_000

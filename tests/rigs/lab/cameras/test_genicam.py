@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowrec.errors import RigError
+from flowrec.core.errors import RigError
 from flowrec.rigs.lab.cameras.camera import Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from tests.conftest import until
+from tests.extras import why
 from tests.rigs.lab.cameras.watching import absent, adds_up, frames_of, frames_until, rest_of
 from tests.twins.gige import (
     EXPOSURE_US,
@@ -32,7 +33,7 @@ from tests.twins.gige import (
     register,
 )
 
-vg = pytest.importorskip("viva_genicam")
+vg = pytest.importorskip("viva_genicam", reason=why("viva_genicam"))
 from viva_genicam.testing import FakeGigeCamera, FakeU3vCamera  # noqa: E402
 
 from flowrec.rigs.lab.cameras.genicam import GenicamCamera  # noqa: E402

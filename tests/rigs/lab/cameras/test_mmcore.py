@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.errors import RigError
+from flowrec.core.errors import RigError
 from flowrec.rigs.lab.cameras.camera import Grabbed, Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
+from tests.extras import why
 from tests.rigs.lab.cameras.watching import adds_up, frames_of
 
-pytest.importorskip("pymmcore_plus")
-adapters = pytest.importorskip("mm_test_adapters")
+pytest.importorskip("pymmcore_plus", reason=why("pymmcore_plus"))
+adapters = pytest.importorskip("mm_test_adapters", reason=why("mm_test_adapters"))
 from flowrec.rigs.lab.cameras.mmcore import MmcoreCamera  # noqa: E402
 
 WANTED = Wanted(width_px=64, height_px=48, rate_hz=100.0, exposure_s=0.01, config="DemoCamera:DCam")

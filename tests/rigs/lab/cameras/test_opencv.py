@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flowrec.errors import RigError
+from flowrec.core.errors import RigError
 from flowrec.rigs.lab.cameras.camera import Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
 from flowrec.rigs.lab.cameras.opencv import OpencvCamera

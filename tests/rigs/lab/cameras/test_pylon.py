@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowrec.errors import RigError
+from flowrec.core.errors import RigError
 from flowrec.rigs.lab.cameras.camera import Wanted
 from flowrec.rigs.lab.cameras.grabber import Grabber
+from tests.extras import why
 from tests.rigs.lab.cameras.watching import adds_up, frames_of
 from tests.twins.emulator import emulated, showing
 
-pytest.importorskip("pypylon")
+pytest.importorskip("pypylon", reason=why("pypylon"))
 from flowrec.rigs.lab.cameras.pylon import PylonCamera
 
 WANTED = Wanted(width_px=64, height_px=48, rate_hz=100.0, exposure_s=0.002)

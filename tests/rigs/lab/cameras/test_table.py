@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from flowrec.config import load_config
-from flowrec.errors import RigError, UsageError
-from flowrec.rig_settings import CAMERAS, Camera, Lab
-from flowrec.rigs.lab.cameras.camera import Wanted, difference, found, wanted_of
+from flowrec.core.errors import RigError, UsageError
+from flowrec.rigs.lab.cameras.camera import Wanted, difference, find_device, wanted_of
+from flowrec.stages.config import load_config
+from flowrec.stages.rig_settings import CAMERAS, Lab, ResolvedCamera
 
 PACKAGES = {"genicam": "viva_genicam", "pylon": "pypylon", "mmcore": "pymmcore_plus"}
 PROJECT = Path(__file__).parents[4] / "pyproject.toml"
@@ -35,12 +35,12 @@ def test_what_a_configuration_asks_of_a_camera() -> None:
         offset_px=(4, 8), rate_hz=90.0, exposure_s=0.004, pixel_format="Mono12", trigger="Line1"
     )
     with pytest.raises(RigError, match="set both"):
-        wanted_of(Camera(rate_hz=60.0, um_per_px=1.0), Lab(offset_x_px=4))
+        wanted_of(ResolvedCamera(rate_hz=60.0, um_per_px=1.0), Lab(offset_x_px=4))
 
 
 def test_one_camera_needs_no_name_and_two_do() -> None:
     two = {"Basler a 1": 1, "Basler b 2": 2}
-    assert found({"Basler a 1": 1}, "", "here") == 1 and found(two, "basler B", "here") == 2
+    assert find_device({"Basler a 1": 1}, "", "here") == 1 and find_device(two, "basler B", "here") == 2
     for devices, wanted, complaint in (
         ({}, "", "here: no camera found"),
         (two, "", "2 cameras found; set lab.device to part of one of: Basler a 1; Basler b 2"),
@@ -48,7 +48,7 @@ def test_one_camera_needs_no_name_and_two_do() -> None:
         (two, "c", "no camera matches lab.device = 'c'; found: Basler a 1; Basler b 2"),
     ):
         with pytest.raises(RigError, match=complaint):
-            found(devices, wanted, "here")
+            find_device(devices, wanted, "here")
 
 
 def test_a_difference_from_what_was_asked_is_one_line() -> None:

@@ -91,7 +91,7 @@ static void zero(char why) {
   put_out(none);
 }
 
-// The field moves as flowrec/control/field_rotation.py describes.
+// The field moves as flowrec/stages/control/field_rotation.py describes.
 static void advance(float dt_s) {
   int32_t turn = (int32_t)(heading - plane);
   direction = 1;

@@ -1,0 +1,89 @@
+"""Name and metadata of a catalog's Parquet file. It imports no pyarrow, so that `flowrec find` starts quickly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from flowrec.core import UsageError
+from flowrec.store import UrlPath, session_path
+
+NAME = "flowrec-catalog.parquet"  # in the folder that is catalogued
+PARQUET = (".parquet",)
+KEY = "flowrec_catalog"  # of the file's metadata: About, as JSON
+FORMAT = 2  # of the columns and what they mean
+# Lists of structures: an expression of `find` that names a member has a row for each.
+EVENTS, SWEEP = "events", "sweep"
+RELATIONS = {EVENTS: "no event states", SWEEP: "no replay states"}
+SIGNATURE = "signature"  # column of what tells whether a session has changed
+PLACE = "path_bytes"  # column by which a session is known: its name may be no text, and hold any byte
+
+
+@dataclass(frozen=True, slots=True)
+class About:
+    """Metadata of a catalog.
+
+    Attributes
+    ----------
+    places : what is catalogued; folders and files relative to the folder of the catalog, where they are below it.
+    sessions : how many.
+    made : time in UTC, ISO 8601.
+    flowrec : version that made it.
+    left : sessions that were not read before it was interrupted.
+    """
+
+    places: Sequence[str]
+    sessions: int
+    made: str
+    flowrec: str
+    left: int = 0
+    format: int = FORMAT
+
+    def to_json(self) -> str:
+        """As text for the file."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def of(cls, text: str) -> About | None:
+        """From the text of a file; None if it is of another format."""
+        try:
+            found: Any = json.loads(text)
+            return cls(**found) if found["format"] == FORMAT else None
+        except (ValueError, TypeError, KeyError, RecursionError):
+            return None
+
+
+def path_text(path: Path, base: Path) -> str:
+    """A path as the catalog in the folder `base` states it: relative below that folder, so that both can be moved."""
+    if isinstance(path, UrlPath):
+        return str(path)
+    text, above = path.absolute().as_posix(), base.as_posix().rstrip("/") + "/"
+    return text.removeprefix(above) if path != base else "."
+
+
+def path_of(text: str, base: Path) -> Path:
+    """The path that the catalog in the folder `base` states so."""
+    path = session_path(text)
+    return path if isinstance(path, UrlPath) else base / path
+
+
+def catalog_above(named: Path | None) -> Path:
+    """The catalog that is named, or in the folder that is; None: the one in this folder, or the next one above.
+
+    Raises
+    ------
+    UsageError : there is none.
+    """
+    if named is not None:
+        path = named / NAME if named.is_dir() else named
+        if not path.is_file():
+            raise UsageError(f"{path}: no such catalog; flowrec catalog DIR makes one")
+        return path
+    here = Path().absolute()
+    for folder in (here, *here.parents):
+        if (folder / NAME).is_file():
+            return folder / NAME
+    raise UsageError(f"no {NAME} is here or above; flowrec catalog makes one of this folder, --catalog names another")

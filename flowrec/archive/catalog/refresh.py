@@ -1,0 +1,174 @@
+"""`flowrec catalog`: one file about all sessions of some places, in which only what has changed is read again."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flowrec.archive.catalog import catalog_file  # first: it says which extra is missing
+from flowrec.archive.catalog.format import NAME, PLACE, SIGNATURE, About, path_of, path_text
+from flowrec.archive.catalog.places import Contents, Found, contents_of
+from flowrec.archive.catalog.session_rows import row_of
+from flowrec.archive.catalog.sweeps import lists_of, sweep_rows
+from flowrec.core import Ended, SessionError, UsageError, __version__, printable
+from flowrec.store import UrlPath, session_path
+from flowrec.verbs import read_each
+
+_BROKEN = ("unreadable", "unfinished", "recording")
+
+
+@dataclass(frozen=True, slots=True)
+class Refreshed:
+    """Result of a refresh.
+
+    Attributes
+    ----------
+    sessions : in the catalog, of which `new`, `changed` and `broken`, that is unreadable, unfinished or recording.
+    gone : sessions that were in the catalog and are no longer there.
+    replays : of sweeps.
+    left : sessions that were not read before an interruption.
+    stop_status : exit status of that interruption.
+    remarks : lines about what could not be used.
+    """
+
+    path: Path
+    sessions: int
+    new: int
+    changed: int
+    gone: int
+    broken: int
+    replays: int
+    left: int = 0
+    stop_status: int = 0
+    remarks: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it."""
+        return asdict(self) | {"path": str(self.path), "remarks": list(self.remarks)}
+
+    def lines(self) -> list[str]:
+        """For people."""
+        same = self.sessions - self.new - self.changed
+        counts = {
+            f"{self.new} new": self.new,
+            f"{self.changed} changed": self.changed,
+            f"{same} as before": same,
+            f"{self.gone} gone": self.gone,
+        }
+        parts = [", ".join(text for text, count in counts.items() if count)]
+        if self.broken:
+            parts.append(f"{self.broken} unreadable, unfinished or being recorded")
+        if self.replays:
+            parts.append(f"{self.replays} replays of sweeps")
+        told = "; ".join(part for part in parts if part)
+        lines = [*self.remarks, f"{self.path}: {_count_text(self.sessions)}{': ' if told else ''}{told}"]
+        if self.left:
+            lines.append(f"interrupted before {_count_text(self.left)} were read; the same command goes on")
+        return lines
+
+
+def refresh(
+    places: Sequence[Path | str], out: Path | None = None, progress: Callable[[float], None] = lambda _: None
+) -> Refreshed:
+    """Write or refresh the catalog of some places.
+
+    Parameters
+    ----------
+    places : folders, with all below them, sessions and URLs of either; none: those of the catalog as it is, or this
+        folder.
+    out : the catalog; by default in the folder, if one is named, or in this one.
+    progress : takes the share of the work that is done.
+
+    Raises
+    ------
+    SessionError : a place is not there, or holds none of the sessions that it held.
+    OutputError : the catalog may not be written.
+    UsageError : no session is there.
+    """
+    given = [session_path(place) for place in places]
+    path = (out if out is not None else _default(given)).absolute()
+    if path.is_dir():
+        path /= NAME
+    base = path.parent
+    with catalog_file.lock_catalog(path):
+        known, remark = catalog_file.read(path)
+        remarks = [remark] if remark else []
+        if not given and known.about is not None:
+            given = [path_of(text, base) for text in known.about.places]
+        given = given or [base if out is None else Path()]
+        contents = contents_of(given, path)
+        _refuse_if_emptied(given, contents, known, base)
+        named = {path_text(found.path, base): found for found in contents.sessions}
+        places_before = map(os.fsdecode, known.sessions[PLACE].to_pylist())
+        before = dict(zip(places_before, known.sessions[SIGNATURE].to_pylist(), strict=True))
+        due = {text: found for text, found in named.items() if before.get(text) != found.signature}
+        rows, stop_status = _read(due, progress)
+        left = len(due) - len(rows)
+        read = {os.fsdecode(row[PLACE]) for row in rows}
+        # A changed session that was not read before an interruption is left out: what is known of it is out of date.
+        kept = [text in named and text not in due for text in before]
+        sessions = catalog_file.join_rows(known.sessions, kept, rows)
+        replays = sweep_rows(contents.tables, lambda table: printable(path_text(table, base)), remarks.append)
+        lists, verdicts = lists_of(sessions["content"].to_pylist(), replays)
+        made = datetime.now(UTC).isoformat(timespec="seconds")
+        stated = [path_text(place, base) for place in given]
+        about = About(stated, len(sessions), made, __version__, left)
+        catalog_file.write(path, sessions, lists, verdicts, about)
+    outcomes = Counter(sessions["outcome"].to_pylist())
+    return Refreshed(
+        path,
+        len(sessions),
+        new=sum(text not in before for text in read),
+        changed=sum(text in before for text in read),
+        gone=len(before.keys() - named.keys()),
+        broken=sum(outcomes[word] for word in _BROKEN),
+        replays=len(lists.flatten()),
+        left=left,
+        stop_status=stop_status,
+        remarks=tuple(remarks),
+    )
+
+
+def _default(places: Sequence[Path]) -> Path:
+    """Default path of the catalog of these places: in the folder, if it is one folder."""
+    first = places[0] if len(places) == 1 else None
+    return first / NAME if first is not None and not isinstance(first, UrlPath) and first.is_dir() else Path(NAME)
+
+
+def _refuse_if_emptied(places: Sequence[Path], contents: Contents, known: catalog_file.Known, base: Path) -> None:
+    """Refuse places without a session: a disk that is not mounted must not empty the catalog."""
+    if contents.sessions:
+        return
+    where = ", ".join(map(str, places))
+    if len(known.sessions):
+        raise SessionError(
+            f"{where}: holds no session any more, {len(known.sessions)} were there; is the disk mounted? The catalog "
+            "stays as it is; remove it if they are gone for good"
+        )
+    raise UsageError(f"{where}: no session (.mcap) is there, nor in a folder below; name directories and sessions")
+
+
+def _read(due: dict[str, Found], progress: Callable[[float], None]) -> tuple[list[dict[str, Any]], int]:
+    """The rows of sessions, and the exit status of an interruption before all were read; 0 without one."""
+    rows: list[dict[str, Any]] = []
+    stop_status = 0
+    try:
+        far = any(isinstance(found.path, UrlPath) for found in due.values())
+        with read_each(lambda text: row_of(due[text], text), due, far) as read:
+            for row in read:
+                rows.append(row)
+                progress(len(rows) / len(due))
+    except KeyboardInterrupt as error:
+        if not rows:
+            raise
+        stop_status = Ended.of(error).status
+    return rows, stop_status
+
+
+def _count_text(number: int) -> str:
+    return f"{number} session{'s' * (number != 1)}"

@@ -1,0 +1,73 @@
+"""`flowrec catalog --serve`: the sessions that a condition finds, for Rerun, by its own catalog server.
+
+The server takes .rrd files only. They are made when they are asked for, kept beside the catalog in a hidden folder, and
+removed when a later call serves others: the folder holds what was served last.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from flowrec.archive.catalog.find import find
+from flowrec.archive.catalog.format import PLACE, path_of
+from flowrec.core import RRD, FlowrecError, Output, SessionError, UsageError
+from flowrec.exports import RrdExport
+from flowrec.store import Session, input_blamed
+from flowrec.view import is_made_from
+
+FOLDER = ".flowrec-rrd"
+SERVED_LIMIT = 50  # sessions; each takes seconds to convert, and twice its size
+
+
+def recordings_of(catalog: Path, where: str, say: Callable[[str], None]) -> list[Path]:
+    """The .rrd files of the sessions that a condition finds, made where they are not there yet.
+
+    Parameters
+    ----------
+    say : takes lines about sessions that can not be shown.
+
+    Raises
+    ------
+    UsageError : no session is found, or too many; as of `find`.
+    SessionError : the folder can not be made.
+    """
+    found = {os.fsdecode(row[PLACE]): row for row in find(where, catalog).rows if row["duration_s"] is not None}
+    if not 0 < len(found) <= SERVED_LIMIT:
+        raise UsageError(
+            f"--serve: {len(found)} whole sessions are found, and 1 to {SERVED_LIMIT} are served at a time; choose "
+            "them, as in --where \"outcome = 'reached' and refined_flow_error < 0.05\""
+        )
+    folder = catalog.parent / FOLDER
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"{folder}: can not be made ({error.strerror}); choose another place with --out") from error
+    made: list[Path] = []
+    for path in found:
+        try:
+            made.append(_rrd_of(Session(path_of(path, catalog.parent)), folder, say))
+        except FlowrecError as error:
+            say(f"{error}; it is not served")
+    if not made:
+        raise SessionError(f"none of {len(found)} sessions can be shown by Rerun")
+    _remove_others(folder, made)
+    return made
+
+
+def _rrd_of(session: Session, folder: Path, say: Callable[[str], None]) -> Path:
+    """The .rrd of a session: an earlier one of the same session, or a new one."""
+    path = folder / f"{session.path.stem}-{session.key[:8]}{RRD[0]}"
+    if not is_made_from(path, session.key):
+        say(f"{session.path.name}: making {path}")
+        with input_blamed(session, None, "exported"), Output(path, RRD, overwrite=True).new_file() as part:
+            RrdExport().write(session, part, lambda _: None)
+    session.close()
+    return path
+
+
+def _remove_others(folder: Path, kept: Sequence[Path]) -> None:
+    for path in folder.glob(f"*{RRD[0]}"):
+        if path not in kept:
+            path.unlink(missing_ok=True)

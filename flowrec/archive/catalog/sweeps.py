@@ -1,0 +1,123 @@
+"""The tables of `flowrec sweep` in a catalog: the replays of each session as a list of structures.
+
+A member of the structure is a column of the sweep's table, and three more: `settings` as one text, `place` among the
+replays of the same session, 1 for the best, and `table`, the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flowrec.archive.sweep.ranking import RANKED_BY, settings_text
+from flowrec.archive.sweep.results import COLUMNS, is_sweep, rows_of
+from flowrec.core import FlowrecError, SessionError
+from flowrec.store import open_bytes
+
+_LIMIT_BYTES = 1 << 30
+
+
+def sweep_rows(tables: Iterable[Path], named: Callable[[Path], str], remark: Callable[[str], None]) -> pa.Table:
+    """The replays of all tables of sweeps, each once; a table of another program is passed over.
+
+    Parameters
+    ----------
+    named : how the catalog states a path.
+    remark : takes lines about what can not be read.
+    """
+    rows: dict[str, dict[str, Any]] = {}
+    for path in tables:
+        try:
+            table = _read(path)
+            found = rows_of(table) if is_sweep(table.schema) else []
+        except (FlowrecError, pa.ArrowException, OSError, ValueError, KeyError) as error:
+            remark(f"{path}: can not be read as Parquet, and is passed over ({_first_line(error)})")
+            continue
+        for row in found:
+            rows[row["key"]] = _flat(row) | {"table": named(path)}
+    _rank(rows.values())
+    names = dict.fromkeys(("settings", "place", "table", *COLUMNS, *(name for row in rows.values() for name in row)))
+    columns = {name: _array(name, [row.get(name) for row in rows.values()]) for name in names}
+    return pa.table(columns)
+
+
+def lists_of(contents: Sequence[str | None], rows: pa.Table) -> tuple[pa.ListArray, list[str | None]]:
+    """The replays of each session, by the hash of its content, and the verdict on it where a row has one."""
+    by_content: dict[str, list[int]] = {}
+    verdicts: dict[str, str] = {}
+    for number, (content, verdict) in enumerate(
+        zip(rows["content"].to_pylist(), rows["verdict"].to_pylist(), strict=True)
+    ):
+        by_content.setdefault(content, []).append(number)
+        if verdict:
+            verdicts[content] = verdict
+    order: list[int] = []
+    offsets = [0]
+    for content in contents:
+        order += by_content.get(content or "", ())
+        offsets.append(len(order))
+    taken = rows.take(pa.array(order, pa.int64())).combine_chunks()
+    arrays = [_one(taken[name]) for name in taken.column_names]
+    structures = pa.StructArray.from_arrays(arrays, names=taken.column_names)
+    lists = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), structures)
+    return lists, [verdicts.get(content or "") for content in contents]
+
+
+def _read(path: Path) -> pa.Table:
+    source = open_bytes(path)
+    with contextlib.closing(source):
+        if source.size > _LIMIT_BYTES:
+            raise SessionError(f"{path}: is larger than the table of a sweep")
+        file = pq.ParquetFile(io.BytesIO(source.read(0, source.size)))
+        return file.read() if is_sweep(file.schema_arrow) else file.schema_arrow.empty_table()
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of a sweep with a member a setting and two a figure, as the columns of its table."""
+    flat = {name: row[name] for name in COLUMNS} | dict(row["settings"])
+    for name, (recorded, replayed) in row["figures"].items():
+        flat |= {f"recorded_{name}": recorded, f"replayed_{name}": replayed}
+    return flat | {"settings": settings_text(row["settings"], refly=bool(row.get("refly")))}
+
+
+def _rank(rows: Iterable[dict[str, Any]]) -> None:
+    """Number the replays of each session by the first figure of RANKED_BY that one of them has."""
+    by_content: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_content.setdefault(row["content"], []).append(row)
+    for own in by_content.values():
+        for figure in RANKED_BY:
+            ranked = [row for row in own if isinstance(row.get(f"replayed_{figure}"), int | float)]
+            if ranked:
+                ranked.sort(key=lambda row: row[f"replayed_{figure}"])
+                for place, row in enumerate(ranked, 1):
+                    row["place"] = place
+                break
+
+
+def _array(name: str, values: Sequence[Any]) -> pa.Array:
+    """Values of one kind; of several tables, a column may be numbers in one and text in another."""
+    kinds = {type(value) for value in values if value is not None}
+    if name in ("place", "ticks") or kinds == {int}:
+        return pa.array(values, pa.int64())
+    if kinds == {list} or name in ("refinement", "findings"):
+        return pa.array([None if value is None else list(map(str, value)) for value in values], pa.list_(pa.string()))
+    if kinds <= {int, float} and kinds:
+        return pa.array(values, pa.float64())
+    if kinds == {bool}:
+        return pa.array(values, pa.bool_())
+    return pa.array([None if value is None else str(value) for value in values], pa.string())
+
+
+def _one(column: pa.ChunkedArray) -> pa.Array:
+    return pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0]

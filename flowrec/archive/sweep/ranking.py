@@ -1,0 +1,185 @@
+"""Ranking of settings: means over the same sessions, and paired differences with their intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flowrec.archive.sweep.replay_process import Row
+from flowrec.core import UsageError, name_of, shown
+
+# The figures by which settings are ranked, in order of preference; the smallest is the best.
+RANKED_BY = ("refined_flow_error", "residual_um_s", "travel_time_on_replayed_map_s")
+RECORDED, ASSUMED = "as recorded", "assumed flow (null model)"
+INTERVAL = "Student's t over sessions, 95 % each; not corrected for the number of settings"
+
+
+@dataclass(frozen=True, slots=True)
+class Ranked:
+    """Settings, or a reference that every session has.
+
+    Attributes
+    ----------
+    settings : as text.
+    mean : of the figure over the common sessions; None without any.
+    difference : mean of its difference from the first of the ranking, paired by session; None for the first itself.
+    interval : of the difference, 95 %; None for fewer than two sessions.
+    values : of the common sessions, in the same order for every setting.
+    failed : tasks that ended with an error.
+    cpu_s : mean of a task; None of a reference.
+    """
+
+    settings: str
+    mean: float | None
+    difference: float | None
+    interval: tuple[float, float] | None
+    values: tuple[float, ...]
+    failed: int = 0
+    cpu_s: float | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it but the values."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__ if name != "values"}
+
+
+@dataclass(frozen=True, slots=True)
+class Ranking:
+    """The settings of a sweep, the best first.
+
+    Attributes
+    ----------
+    figure : by which they are ranked; '' where no task has one.
+    sessions : the number of sessions with that figure in every setting: the common sessions.
+    of_sessions : of how many.
+    """
+
+    figure: str
+    sessions: int
+    of_sessions: int
+    rows: tuple[Ranked, ...]
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], figure: str | None = None) -> Ranking:
+        """Rank the settings of some rows.
+
+        Of a session that was replayed by several versions with the same settings, the last row counts. A setting that
+        has the figure in no session is last and does not narrow the common sessions.
+
+        Parameters
+        ----------
+        figure : by which they are ranked; None: the first of RANKED_BY that a row has.
+
+        Raises
+        ------
+        UsageError : no row has that figure as a number.
+        """
+        by_settings: dict[str, dict[str, Row]] = {}
+        for row in rows:
+            by_settings.setdefault(settings_text(row["settings"], refly=bool(row.get("refly"))), {})[row["content"]] = (
+                row
+            )
+        contents = {row["content"] for row in rows}
+        figure = figure if figure is not None else _first_figure(rows)
+        values = {
+            text: {content: each for content, row in own.items() if (each := _number(row, figure, 1)) is not None}
+            for text, own in by_settings.items()
+        }
+        if figure and not any(values.values()):
+            named = sorted({name for row in rows for name in row.get("figures") or {}})
+            raise UsageError(f"--by {figure}: no replay states it as a number; known are {', '.join(named)}")
+        common = sorted(set.intersection(*(set(own) for own in values.values() if own))) if figure else []
+        found = [(text, [own[content] for content in common] if own else []) for text, own in values.items()]
+        found += _references(by_settings, figure, common).items()
+        found.sort(key=lambda each: np.mean(each[1]) if each[1] else math.inf)
+        best = found[0][1] if found else []
+        ranked = []
+        for number, (text, of_sessions) in enumerate(found):
+            own = by_settings.get(text, {}).values()
+            cpu_s = [row["cpu_s"] for row in own if row.get("cpu_s") is not None and not row.get("error")]
+            mean = float(np.mean(of_sessions)) if of_sessions else None
+            difference, interval = _paired_difference(of_sessions, best) if number and of_sessions else (None, None)
+            failed = sum(bool(row.get("error")) for row in own)
+            of_tasks = float(np.mean(cpu_s)) if cpu_s else None
+            ranked.append(Ranked(text, mean, difference, interval, tuple(of_sessions), failed, of_tasks))
+        return cls(figure, len(common), len(contents), tuple(ranked))
+
+    def cells(self) -> tuple[list[str], list[list[str]]]:
+        """Names of the columns and the rows, as text for people."""
+        columns = ["settings", name_of(self.figure) or "figure", "more than the first", "95 %", "failed", "CPU"]
+        return columns, [
+            [
+                each.settings,
+                shown(self.figure, each.mean),
+                shown(self.figure, each.difference),
+                " to ".join(shown(self.figure, end) for end in each.interval) if each.interval is not None else "-",
+                str(each.failed or "-"),
+                shown("cpu_s", each.cpu_s),
+            ]
+            for each in self.rows
+        ]
+
+    @property
+    def note(self) -> str:
+        """One sentence on the content of the table."""
+        if not self.figure:
+            return "No task has a figure to rank by."
+        return (
+            f"Means of the {name_of(self.figure)} over the {self.sessions} of {self.of_sessions} sessions that have it "
+            f"in every setting; differences paired by session; intervals: {INTERVAL}."
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """The ranking in numbers."""
+        return {
+            "figure": self.figure,
+            "sessions": self.sessions,
+            "of_sessions": self.of_sessions,
+            "interval": INTERVAL,
+            "settings": [each.as_json() for each in self.rows],
+        }
+
+
+def settings_text(settings: Mapping[str, str], *, refly: bool) -> str:
+    """The settings of a replay in a line."""
+    return ", ".join(f"{key}={value}" for key, value in settings.items()) + (" (reflown)" if refly else "") or "none"
+
+
+def _first_figure(rows: Sequence[Row]) -> str:
+    return next((name for name in RANKED_BY if any(_number(row, name, 1) is not None for row in rows)), "")
+
+
+def _number(row: Row, figure: str, side: int) -> float | None:
+    """A recorded (0) or replayed (1) figure, if it is a number."""
+    value = (row.get("figures") or {}).get(figure, (None, None))[side]
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _references(by_settings: dict[str, dict[str, Row]], figure: str, common: Sequence[str]) -> dict[str, list[float]]:
+    """Values of a figure that the recorded sessions state, where all of the common ones do.
+
+    The recorded figure may depend on the replay (the residual is on its observations): it is that of the first setting.
+    """
+    own = next((rows for rows in by_settings.values() if all(content in rows for content in common)), {})
+    asked = {RECORDED: figure, ASSUMED: "assumed_flow_error" if figure == "refined_flow_error" else ""}
+    found = {}
+    for text, name in asked.items():
+        values = [value for each in common if name and (value := _number(own[each], name, 0)) is not None]
+        if values and len(values) == len(common):
+            found[text] = values
+    return found
+
+
+def _paired_difference(values: Sequence[float], best: Sequence[float]) -> tuple[float, tuple[float, float] | None]:
+    """Mean difference and its 95 % interval."""
+    from scipy.stats import t
+
+    differences = np.subtract(values, best)
+    mean, count = float(differences.mean()), len(differences)
+    if count < 2:
+        return mean, None
+    half = float(t.ppf(0.975, count - 1) * differences.std(ddof=1) / math.sqrt(count))
+    return mean, (mean - half, mean + half)

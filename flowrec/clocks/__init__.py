@@ -1,6 +1,0 @@
-"""The session clock, and the other clocks of a run relative to it."""
-
-from flowrec.clocks.clock_monitor import ClockMonitor, read_clocks
-from flowrec.clocks.device_clock import DeviceClock, Fit
-
-__all__ = ["ClockMonitor", "DeviceClock", "Fit", "read_clocks"]

@@ -1,0 +1,39 @@
+"""The records that rigs, stages and the operator make: frozen, read-only, with units in the field names.
+
+What a stage carries from one frame to the next is one of these, and each of them is recorded, so a session can be
+replayed from any tick. Annotations (declarations.py) state the shape of each array and the topic of each field of
+`Tick`; the wire format, the checks of what is read and the table of topics derive from them.
+
+Chip frame: origin at the centre of the mask's pixel (0, 0), x right, y down; headings from +x towards +y.
+Points are (x, y); arrays are [row, column] = [y, x]. Stamps are nanoseconds on the session clock.
+"""
+
+from flowrec.core.messages.control import AxesCheck, Currents, Demand, Event, Mission
+from flowrec.core.messages.estimation import Estimate, Health, Observations
+from flowrec.core.messages.rig import PIXEL_BITS, Applied, Frame, OperatorEvent, Truth, pixel_type
+from flowrec.core.messages.slow_stages import FlowField, Route
+from flowrec.core.messages.vision import Appearance, Background, Shift, Track, shift_px
+
+__all__ = [
+    "PIXEL_BITS",
+    "Appearance",
+    "Applied",
+    "AxesCheck",
+    "Background",
+    "Currents",
+    "Demand",
+    "Estimate",
+    "Event",
+    "FlowField",
+    "Frame",
+    "Health",
+    "Mission",
+    "Observations",
+    "OperatorEvent",
+    "Route",
+    "Shift",
+    "Track",
+    "Truth",
+    "pixel_type",
+    "shift_px",
+]

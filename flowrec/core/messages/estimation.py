@@ -1,0 +1,126 @@
+"""The estimate of the observer, its consistency, and the observations of the flow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core.declarations import Matrix, Message, NanFloat, Shape, Vector, Vector2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate(Message):
+    """The observer's estimate of the robot and of the flow that carries it."""
+
+    stamp_ns: int
+    position_um: Vector2
+    flow_um_s: Annotated[Vector2, "the disturbance: flow velocity at the robot"]
+    covariance: Annotated[
+        Matrix,
+        Shape("k", "k"),
+        "Of [x, y, vx, vy], then the slopes (without a map) and um_per_rev if estimated: um2, um2/s, um2/s2, ...",
+    ]
+    nis: Annotated[NanFloat, "normalised innovation squared; NaN on a frame without measurement"]
+    measured_um: Annotated[Vector, Shape(2, finite=False), "last measured position that was used"]
+    seen: bool
+    slopes_per_s: Annotated[
+        Vector,
+        Shape("n"),
+        "(3,) gradient of the flow at the robot: dvx/dx, dvx/dy, dvy/dx; dvy/dy = -dvx/dx. (0,): not known",
+    ] = field(default_factory=lambda: np.zeros(0))
+    surprise: Annotated[
+        Vector, Shape("m"), "(2,) sliding mean of the innovations, in standard deviations; (0,): not known"
+    ] = field(default_factory=lambda: np.zeros(0))
+    um_per_rev: Annotated[float | None, "of the robot; None: the nominal one is used"] = None
+    rolled_um_s: Annotated[
+        Vector,
+        Shape("o"),
+        "(2,) the robot's own motion through the fluid, averaged over time as `flow_um_s` is; (0,): not known",
+    ] = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Health(Message):
+    """Consistency of the observer. All means are exponential averages; the message holds their state."""
+
+    stamp_ns: int
+    alarm: Annotated[str, "words of enums.Alarm, separated by \"; \"; '' without an alarm"]
+    nis: Annotated[NanFloat, "mean normalised innovation squared; 2 if the noise settings are right"]
+    lost_share: Annotated[float, "fraction of the frames without the robot, 0 to 1"]
+    heard_s: Annotated[float, "duration for which the flow estimate was accurate enough for the spectral monitor"]
+    pulsation_hz: Annotated[float, "frequency of the strongest spectral line of the flow"]
+    pulsation_share: Annotated[float, "amplitude of that line divided by the mean flow"]
+    line_share: Annotated[float, "fraction of the flow's variance in that line, 0 to 1"]
+    bank_re: Annotated[Vector, Shape("n"), "state of the resonators, relative to the mean flow; real part"]
+    bank_im: Annotated[Vector, Shape("n"), "imaginary part"]
+    bank_power: Annotated[Vector, Shape("n"), "mean square of the input of each resonator"]
+    mean_um_s: Annotated[Vector2, "mean flow"]
+    offset_share: Annotated[float, "mean of the resonators' input, which is subtracted from it"]
+    rolled_sums: Annotated[
+        Vector,
+        Shape("m"),
+        "Motion per revolution, see estimation/step_out.py. (4,) exponential sums: um rolled along the heading, um "
+        "expected from the revolutions, um by which the map's flow carried the robot, s. (0,): none yet, or not "
+        "recorded.",
+    ] = field(default_factory=lambda: np.zeros(0))
+    limit_hz: Annotated[float | None, "limit of the field's frequency because of step-out; None: the robot's own"] = (
+        None
+    )
+    limited_ns: Annotated[int | None, "stamp of the last change of the limit"] = None
+    rolled_before_um_s: Annotated[
+        Vector,
+        Shape("o"),
+        "(2,) um/s rolled and um/s expected from the revolutions, just before the limit was lowered; (0,): no limit to "
+        "test",
+    ] = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations(Message):
+    """Local flow measured along the robot's way: the data of a refinement.
+
+    The measured flow is the robot's velocity over ground less its own motion as assumed, `rolled_um_s`. So a wrong um
+    per revolution, slip and hindered motion near walls appear as a part of the flow along `rolled_um_s`.
+    """
+
+    stamp_ns: int
+    position_um: Annotated[Matrix, Shape("n", 2)]
+    flow_um_s: Annotated[Matrix, Shape("n", 2)]
+    std_um_s: Annotated[Vector, Shape("n"), "one standard deviation per component"]
+    rolled_um_s: Annotated[
+        Matrix | None,
+        Shape("n", 2),
+        "um_per_rev times revolutions per second along the heading, a mean over the time that the flow is a mean of; "
+        "None: not stated",
+    ] = None
+    time_s: Annotated[Vector | None, Shape("n"), "middle of that time on the session clock; None: not stated"] = None
+    radius_um: Annotated[float | None, "of the robot, which the flow carries as a sphere; None: not stated"] = None
+
+    def only(self, which: slice | NDArray[np.bool_] | NDArray[np.intp]) -> Observations:
+        """Some of the observations, chosen by an index of arrays."""
+        return Observations(
+            self.stamp_ns,
+            self.position_um[which],
+            self.flow_um_s[which],
+            self.std_um_s[which],
+            None if self.rolled_um_s is None else self.rolled_um_s[which],
+            None if self.time_s is None else self.time_s[which],
+            self.radius_um,
+        )
+
+    def followed_by(self, more: Observations) -> Observations:
+        """These observations, then more; the stamp is that of the later ones. What one does not state, both do not."""
+        rolled = (self.rolled_um_s, more.rolled_um_s)
+        time = (self.time_s, more.time_s)
+        return Observations(
+            more.stamp_ns,
+            np.concatenate((self.position_um, more.position_um)),
+            np.concatenate((self.flow_um_s, more.flow_um_s)),
+            np.concatenate((self.std_um_s, more.std_um_s)),
+            None if rolled[0] is None or rolled[1] is None else np.concatenate((rolled[0], rolled[1])),
+            None if time[0] is None or time[1] is None else np.concatenate((time[0], time[1])),
+            more.radius_um if self.radius_um == more.radius_um else None,
+        )

@@ -1,0 +1,85 @@
+"""Messages of the stages that read the image: the track, the look of the robot, the shift of the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+
+from flowrec.core.declarations import Matrix, Message, Raster, Shape, Vector, Vector2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track(Message):
+    """Position of the robot in one image; the last known one if it was not seen."""
+
+    stamp_ns: int
+    seen: bool
+    position_um: Vector2
+    score: Annotated[float, "0 to 1, similarity to the robot's appearance"]
+    lost_frames: Annotated[int, "in a row"]
+    radius_px: Annotated[float, "of the robot's image, low-pass filtered"]
+    roi_px: Annotated[Vector, Shape(4), "x0, y0, x1, y1 of the searched region"]
+    seen_ns: Annotated[int | None, "stamp of the latest frame in which it was seen; None: never, or not recorded"] = (
+        None
+    )
+    velocity_px_s: Annotated[
+        Vector,
+        Shape("n"),
+        "Motion of a robot that is tracked by its learned appearance, and the objects around it. (2,) mean; (0,): none",
+    ] = field(default_factory=lambda: np.zeros(0))
+    spread_px: Annotated[float, "mean distance from where it was expected"] = 0.0
+    energy: Annotated[float, "mean of its squared foreground, in units of the noise's variance"] = 0.0
+    neighbours_px: Annotated[Vector, Shape("m"), "x, y and energy of each object nearby, (3 k,)"] = field(
+        default_factory=lambda: np.zeros(0)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Appearance(Message):
+    """Appearance of the robot, as far as the tracker has found out."""
+
+    stamp_ns: int
+    polarity: Annotated[str, "dark, bright or mixed, relative to the background"]
+    noise: Annotated[float, "of a pixel, one standard deviation in grey levels"]
+    foreground_noise: Annotated[float, "of the foreground (stages/vision/foreground.py), likewise"]
+    radius_px: Annotated[float, "of the object in `views`, in camera px"]
+    centre_px: Annotated[Vector2, "where it was when it was learned"]
+    views: Annotated[
+        Raster,
+        Shape("n", "p", "p"),
+        "Foreground around the centre, in blocks of whole camera pixels: the first look, a slow mean, other looks. n = "
+        "0: nothing was learned, the robot is a disc.",
+    ]
+    note: Annotated[str, "why nothing was found at the given place"] = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Background(Message):
+    """Image of the solid of the chip, to which later images are registered."""
+
+    stamp_ns: int
+    pixels: Annotated[
+        Matrix,
+        Shape("n", 5),
+        "Column, row, grey level, and the change of the grey level per pixel along columns and rows. n = 0: the image "
+        "shows no structure of the solid, so no shift can be measured.",
+    ]
+    noise: Annotated[float, "of a pixel, one standard deviation in grey levels"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shift(Message):
+    """Displacement of the image from the registration of the chip, because the stage or the camera shakes."""
+
+    stamp_ns: int
+    shift_px: Annotated[Vector2, "columns, rows: what the registration puts at p is seen at p + shift"]
+    found: Annotated[bool, "False: the image is not like the background, and the shift is the one before"]
+    alike: Annotated[float, "share of the background that agrees, 0 to 1"]
+    rests: Annotated[bool, "the image rests: it did not move for a second, and small shifts are noise"] = False
+
+
+def shift_px(shift: Shift | None) -> tuple[float, float]:
+    """The shift of an image (columns, rows); (0, 0) where none is measured."""
+    return (0.0, 0.0) if shift is None else (float(shift.shift_px[0]), float(shift.shift_px[1]))

@@ -1,0 +1,128 @@
+"""Figures of a run, a replay or a file: numbers whose keys carry the unit, and their conversion to text and back."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+
+Value = str | int | float | bool | None
+Figures = dict[str, Value]
+Row = tuple[str, Value, Value]  # key, recorded, replayed
+
+# Numbers without a unit; every other number ends with one of _UNITS.
+_COUNTS = frozenset(
+    {"ticks", "contacts", "observations", "frames_dropped", "dropped_frames", "frames_missing_from_camera", "seed"}
+)
+_UNITS = {"_um_s": "um/s", "_um": "um", "_s": "s", "_bytes": "bytes", "_ns": "ns", "_error": "", "_rad": "rad"}
+_WHOLE = ("_bytes", "_ns")
+_LONGEST = 25  # characters of a number in a file; flowrec writes shorter ones
+_OLD_FLOW_ERROR = re.compile(r"(\d{1,6}\.\d) % of the true flow \(\w{1,20}\)")  # flow errors in older files
+_HIDDEN = frozenset({"note", "wall_ns", "monotonic_ns"})
+DOUBTS = "doubts"  # key of the outcome of a session: why its result is doubtful; absent: it is not
+# Names of keys that would be misread as words.
+_NAMES = {
+    "wall_s": "computed in",
+    "contacts": "wall contacts",
+    "planned_s": "planned time",
+    "navigation_s": "navigation time",
+    "observations": "flow observations",
+    "assumed_method": "assumed flow",
+    "refined_method": "refined flow",
+}
+
+
+def as_text(figures: Mapping[str, Value]) -> dict[str, str]:
+    """Figures as the metadata of a file, which is text only."""
+    return {
+        key: value if isinstance(value, str) else repr(value) for key, value in figures.items() if value is not None
+    }
+
+
+def of_text(text: Mapping[str, str]) -> Figures:
+    """Figures from the metadata of a file; sentences of older files stay text.
+
+    `frames_dropped` is the count of the writer, which older files hold under two names; the larger one is complete.
+    """
+    figures = {key: _number(value) if is_numeric(key) else value for key, value in text.items()}
+    counts = [figures.pop("dropped_frames", None), figures.get("frames_dropped")]
+    numbers = [count for count in counts if isinstance(count, int)]
+    return figures | ({"frames_dropped": max(numbers)} if numbers else {})
+
+
+def doubts_text(doubts: Iterable[str]) -> str:
+    """Doubts as a session states them in its outcome, each once; '' for none."""
+    return "; ".join(dict.fromkeys(doubts))
+
+
+def doubts_of(outcome: Mapping[str, object]) -> list[str]:
+    """The doubts that the outcome of a session states."""
+    return [each for each in str(outcome.get(DOUBTS) or "").split("; ") if each]
+
+
+def finite(value: float) -> float | None:
+    """The value, None if it is NaN or infinite, which JSON can not hold."""
+    return value if math.isfinite(value) else None
+
+
+def rows_for_people(figures: Mapping[str, Value]) -> list[tuple[str, str]]:
+    """Names and values as text; the outcome together with its note."""
+    rows = [(name_of(key), shown(key, value)) for key, value in figures.items() if key not in _HIDDEN]
+    note = figures.get("note")
+    return [(name, f"{value} ({note})" if name == "outcome" and note else value) for name, value in rows]
+
+
+def comparison_for_people(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
+    """Rows of name, recorded value and replayed value of figures, as text with units."""
+    return [(name_of(key), shown(key, was), shown(key, now)) for key, was, now in rows]
+
+
+def name_of(key: str) -> str:
+    """The name of a figure: its key without the unit, as words."""
+    if key in _NAMES:
+        return _NAMES[key]
+    unit = next((unit for unit in _UNITS if key.endswith(unit) and unit != "_error"), "")
+    return key.removesuffix(unit).replace("_", " ")
+
+
+def shown(key: str, value: Value) -> str:
+    """A value with its unit; `-` if it is None."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    suffix = next((suffix for suffix in _UNITS if key.endswith(suffix)), None)
+    if isinstance(value, str) or suffix is None:
+        return f"{value:g}" if isinstance(value, float) else str(value)
+    if suffix == "_error":
+        return f"{100 * value:.1f} %"
+    if suffix == "_bytes":
+        return f"{value / 1e6:.1f} MB"
+    if suffix == "_um" and abs(value) >= 1000:
+        return f"{value / 1000:.2f} mm"
+    return f"{value:.1f} {_UNITS[suffix]}"
+
+
+def is_numeric(key: str) -> bool:
+    """True if the value of a key is a number, by its name."""
+    return key in _COUNTS or key.endswith(tuple(_UNITS))
+
+
+def is_count(key: str) -> bool:
+    """True if that number is whole."""
+    return key in _COUNTS or key.endswith(_WHOLE)
+
+
+def _number(text: str) -> Value:
+    percent = _OLD_FLOW_ERROR.fullmatch(text)
+    if percent is not None:
+        return float(percent[1]) / 100
+    if len(text) > _LONGEST:
+        return text
+    for kind in (int, float):
+        try:
+            number = kind(text)
+        except ValueError:
+            continue
+        return number if math.isfinite(number) else text
+    return text

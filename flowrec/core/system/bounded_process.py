@@ -1,0 +1,186 @@
+"""A child process that parses what another program wrote, within limits of time and memory.
+
+A file of a kilobyte can ask for gigabytes: a sheet that names row 2,000,000,000, a chunk that unpacks a million times.
+What the child can not do within its limits is refused in one line, and the caller's process is as it was. The child
+protects against cost, not against malice: what it answers is trusted. Of an ordinary file the limits are never felt.
+
+Linux limits both CPU time and memory, macOS CPU time; elsewhere the time is that of the clock.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from flowrec.core.errors import FlowrecError, UsageError
+from flowrec.core.system.processes import child_command, child_environment
+
+Answer = TypeVar("Answer")
+
+MEMORY_BYTES = 3 << 30  # for one file, beyond what the libraries take
+_JOIN_S = 5.0
+
+
+class BoundedProcess:
+    """The child process; it is started by the first call, and ends with `close` or with this process.
+
+    Parameters
+    ----------
+    where : the file, for errors.
+    cpu_s : CPU time of each call.
+    memory_bytes : of the child, beyond what it takes before it reads anything.
+    error : what is raised when the file can not be read within the limits, or at all.
+    """
+
+    def __init__(
+        self, where: str, cpu_s: float, memory_bytes: int = MEMORY_BYTES, error: type[FlowrecError] = UsageError
+    ) -> None:
+        self._where, self._cpu_s, self._memory_bytes, self._error = where, cpu_s, memory_bytes, error
+        self._process: subprocess.Popen[bytes] | None = None
+        self._late = False  # ended by the clock, where the system limits no CPU time
+        self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
+
+    def call(self, function: Callable[..., Answer], *given: Any) -> Answer:
+        """The result of a function of a module, called in the child.
+
+        Raises
+        ------
+        FlowrecError : that of the function; or `error`, where it raised another, or went beyond a limit.
+        """
+        process = self._process = self._process or self._start_child()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        timer = threading.Timer(self._cpu_s, self._end_late) if sys.platform == "win32" else None
+        try:
+            if timer is not None:
+                timer.start()
+            pickle.dump((self._cpu_s, self._memory_bytes, function, given), process.stdin)
+            process.stdin.flush()
+            answer, failure = pickle.load(process.stdout)  # noqa: S301 - from our own process
+        except (OSError, EOFError, pickle.UnpicklingError) as error:
+            raise self._error(f"{self._where}: {self._cause(process)}") from error
+        finally:
+            if timer is not None:
+                timer.cancel()
+        if isinstance(failure, FlowrecError):
+            raise failure
+        if failure:
+            raise self._error(f"{self._where}: {self._words(failure)}")
+        result: Answer = answer
+        return result
+
+    def close(self) -> None:
+        """End the child at once."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            for pipe in (self._process.stdin, self._process.stdout):
+                with suppress(OSError):  # the unread part of a call
+                    pipe.close()  # type: ignore[union-attr]
+        self._printed.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def _start_child(self) -> subprocess.Popen[bytes]:
+        try:
+            return subprocess.Popen(  # noqa: S603 - our own module
+                child_command("flowrec.core.system.bounded_process"),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._printed,
+                start_new_session=True,  # Ctrl-C ends the caller, and then the caller ends this
+                env=child_environment() | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+            )
+        except OSError as error:
+            raise self._error(f"{self._where}: no process starts to read it ({error.strerror or error})") from error
+
+    def _end_late(self) -> None:
+        self._late = True
+        if self._process is not None:
+            self._process.kill()
+
+    def _cause(self, process: subprocess.Popen[bytes]) -> str:
+        """Reason that the child has ended without an answer."""
+        status = process.wait(_JOIN_S)
+        how = signal.Signals(-status).name if status < 0 else f"status {status}"
+        if self._late or how == "SIGXCPU":
+            return self._words("time")
+        if how == "SIGKILL":
+            return self._words("memory")
+        self._printed.seek(0)
+        last = self._printed.read().decode(errors="replace").strip().rpartition("\n")[2]
+        return f"its reader has ended ({how}{': ' + last[:300] if last else ''}); the file is damaged"
+
+    def _words(self, failure: str) -> str:
+        if failure == "time":
+            return f"takes more than {self._cpu_s:g} s to read, far more than a file of its size should; is it damaged?"
+        if failure == "memory":
+            return f"needs more than {self._memory_bytes / 1e9:.2g} GB of memory to be read; is it damaged?"
+        return f"can not be read ({failure}); it is damaged, or not what its name says"
+
+
+def _limit_time(cpu_s: float) -> None:
+    """Limit the CPU time that is spent from now on."""
+    if sys.platform != "win32":
+        import resource
+
+        usage = resource.getrusage(resource.RUSAGE_SELF)
+        until_s = math.ceil(usage.ru_utime + usage.ru_stime + cpu_s)
+        resource.setrlimit(resource.RLIMIT_CPU, (until_s, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+
+
+def _limit_memory(memory_bytes: int) -> None:
+    """Limit the memory that is taken from now on."""
+    if sys.platform == "linux":
+        import resource
+
+        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()
+        used_bytes = int(pages[5]) * resource.getpagesize()  # data and stack
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        resource.setrlimit(resource.RLIMIT_DATA, (used_bytes + memory_bytes, hard))
+
+
+def _serve() -> None:
+    """Answer calls until the caller has ended."""
+    calls, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints must not get between the answers
+    limited = False
+    while True:
+        try:
+            cpu_s, memory_bytes, function, given = pickle.load(calls)  # noqa: S301 - from our own caller
+        except EOFError:
+            return
+        _limit_time(cpu_s)
+        if not limited:  # once, so that what one call leaves behind counts in the next
+            _limit_memory(memory_bytes)
+            limited = True
+        answer: tuple[Any, Any] = None, None
+        try:
+            answer = function(*given), None
+        except FlowrecError as error:  # a reader may have taken the lack of memory for damage
+            answer = None, "memory" if isinstance(error.__cause__, MemoryError) else error
+        except MemoryError:
+            answer = None, "memory"
+        except Exception as error:  # noqa: BLE001  of as many kinds as there are libraries
+            answer = None, f"{type(error).__name__}: {error}"[:500]
+        pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
+
+
+if __name__ == "__main__":
+    _serve()

@@ -1,0 +1,109 @@
+"""Compilation of kernels by numba with a cache on disk; the type checker sees their Python types.
+
+numba keys a cached kernel by the file that it is in, and not by the kernels of other files that it calls: after a
+change of one of those it would keep using the old code. So the cache is a folder whose name holds a hash of all files
+with kernels. It lies outside the installation, which may be read-only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import shutil
+import stat
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+from numba import njit
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_config: Any = numba.config  # it makes its attributes as it is imported
+_PACKAGE = Path(__file__).parents[2]
+_DECORATED = "\n@compiled\n"  # in a file with kernels
+_OWN = Path("core", "system", "numba_setup.py")
+_PREFIX = "numba-"
+_UNUSED_DAYS = 30.0  # then a cache of other sources is removed
+
+
+def compiled(function: Function) -> Function:
+    """The function in machine code; the first call of a new installation takes seconds, later ones load the cache.
+
+    What a kernel takes from other files of flowrec, it must take from files with kernels: the cache is keyed by those.
+    A kernel assigns element by element: an array assigned to a slice, `np.where` and `np.interp` take two seconds more
+    to compile, most of it for messages that are never shown.
+    """
+    folder = _cache_folder()
+    before, _config.CACHE_DIR = _config.CACHE_DIR, folder  # for this kernel only, not for those of other packages
+    try:
+        return cast(Function, njit(cache=bool(folder))(function))
+    finally:
+        _config.CACHE_DIR = before
+
+
+def kernels_cached() -> bool:
+    """True if kernels of this installation have been compiled."""
+    folder = _cache_folder()
+    return bool(folder) and any(Path(folder).rglob("*.nbi"))
+
+
+def kernel_files(package: Path = _PACKAGE) -> list[Path]:
+    """The files of flowrec with kernels, and the one that compiles them."""
+    found = (path for path in package.rglob("*.py") if _DECORATED in path.read_text(encoding="utf-8"))
+    return sorted({package / _OWN, *found})
+
+
+@functools.cache
+def _cache_folder() -> str:
+    """Folder in which kernels are cached; '' where nothing can be written, then they are compiled in every process."""
+    state = hashlib.sha256(f"{sys.version} {numba.__version__}".encode())
+    for path in kernel_files():
+        state.update(path.read_bytes())
+    for place in _places():
+        folder = place / f"{_PREFIX}{state.hexdigest()[:16]}"
+        with contextlib.suppress(OSError):
+            if not folder.exists():
+                _remove_unused(place)
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            found = folder.lstat()
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != _user_id() or found.st_mode & 0o022:
+                continue  # another user could write code there that this process runs
+            tempfile.TemporaryFile(dir=folder).close()
+            os.utime(folder)
+            return str(folder)
+    return ""
+
+
+def _places() -> Iterator[Path]:
+    """Candidates for the cache: numba's own setting, the user's caches, the folder of temporary files."""
+    if _config.CACHE_DIR:
+        yield Path(_config.CACHE_DIR).absolute()
+    home = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(home):  # noqa: PTH117 - unset, or to be ignored by the XDG specification
+        home = os.path.expanduser("~/.cache")  # noqa: PTH111 - which raises nothing where there is no home
+    if os.path.isabs(home):  # noqa: PTH117
+        yield Path(home, "flowrec")
+    yield Path(tempfile.gettempdir(), f"flowrec-{_user_id()}")
+
+
+def _user_id() -> int:
+    """Number of the user; 0 on Windows, where files have none."""
+    number = 0
+    if sys.platform != "win32":
+        number = os.getuid()
+    return number
+
+
+def _remove_unused(place: Path) -> None:
+    """Remove the caches of other sources that have not been used for a while."""
+    for other in place.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
+                shutil.rmtree(other)

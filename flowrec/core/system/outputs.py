@@ -1,0 +1,141 @@
+"""Output files of every verb: an existing file is replaced only with --overwrite, and an input file never.
+
+A file gets its name when it is complete and on the disk. Sessions are written by store/, with the same rules.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from flowrec.core.errors import SessionError
+from flowrec.core.system.durable import replacing
+from flowrec.core.system.leftovers import PREFIX
+from flowrec.core.system.locks import is_growing
+from flowrec.core.system.written import sha256_of
+
+MCAP = (".mcap",)
+RRD = (".rrd",)
+RBL = (".rbl",)
+PICTURE = (".png",)
+FIGURE = (".png", ".pdf", ".svg")
+JSON = (".json",)
+TOML = (".toml",)
+WEIGHTS = (".safetensors",)
+
+
+class OutputError(SessionError):
+    """A file that may not be written: it exists, is an input of the command, or is named like another format."""
+
+    exit_status = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """An output file of a verb, and what it may replace.
+
+    Attributes
+    ----------
+    path : of the file.
+    suffixes : those of its format, the usual one first.
+    inputs : files that the command reads; the output must be none of them, even with `overwrite`.
+    overwrite : an existing file may be replaced.
+    replaces : SHA-256 of what flowrec wrote there before; a file that still holds it may be replaced, too.
+    """
+
+    path: Path
+    suffixes: tuple[str, ...]
+    inputs: tuple[Path, ...] = ()
+    overwrite: bool = False
+    replaces: str = ""
+
+    def check(self, also: Iterable[Path] = ()) -> None:
+        """Check the output before any work is done for it.
+
+        Parameters
+        ----------
+        also : other files that this output replaces or adds to: the parts of a session, and its unfinished files.
+
+        Raises
+        ------
+        OutputError : it may not be written; the text says why, and what to do.
+        """
+        path, suffixes, files = self.path, self.suffixes, (self.path, *also)
+        if path.is_dir():
+            raise OutputError(f"{path}: is a directory; name a file, as in {path / ('NAME' + suffixes[0])}")
+        for file in files:
+            if any(_same(file, other) for other in self.inputs):
+                raise OutputError(
+                    f"{file}: is read by this command and stays as it is; choose another name for the output"
+                )
+        if path.suffix not in suffixes:
+            formats = " or ".join(suffixes)
+            raise OutputError(
+                f"{path}: the name must end in {formats}, its format; name it {path.with_suffix(suffixes[0])}"
+            )
+        if not path.parent.is_dir():
+            raise OutputError(f"{path.parent}: no such directory; make it, or choose another place for {path.name}")
+        for file in files:
+            if file.is_file() and is_growing(file):
+                raise OutputError(
+                    f"{file}: is being written by another process just now; let it end or stop it with Ctrl-C, or "
+                    "choose another name"
+                )
+        self._check_existing()
+        if not os.access(path.parent, os.W_OK | os.X_OK):
+            raise OutputError(f"{path.parent}: can not be written to; choose another place for {path.name}")
+
+    @contextlib.contextmanager
+    def new_file(self) -> Iterator[Path]:
+        """Yield a temporary file in the same folder; it gets the name `path` when the block ends without an exception.
+
+        If the block ends with an exception, nothing is left.
+
+        Raises
+        ------
+        OutputError : the output is refused, see `check`.
+        SessionError : it can not be written, in one line.
+        """
+        self.check()
+        path = self.path
+        try:
+            with replacing(path, overwrite=self.overwrite or bool(self.replaces)) as part:
+                yield part
+                self._check_existing()  # again: somebody may have used the time
+        except FileExistsError as error:
+            raise taken(path) from error
+        except OSError as error:
+            named = Path(str(error.filename)) if error.filename is not None else path
+            if named != path and not named.name.startswith(PREFIX):
+                raise
+            raise SessionError(
+                f"{path}: can not be written ({error.strerror or error}); choose another place"
+            ) from error
+
+    def _check_existing(self) -> None:
+        """Refuse a file that is there and may not be replaced."""
+        path = self.path
+        if self.overwrite or not os.path.lexists(path):
+            return
+        if not self.replaces:
+            raise taken(path)
+        if path.is_symlink() or sha256_of(path) != self.replaces:
+            raise taken(path, ", and was changed since flowrec wrote it")
+
+
+def taken(path: Path, kept: str = "") -> OutputError:
+    """The error for a name that another file has."""
+    return OutputError(f"{path}: exists already{kept}; choose another name, or replace it with --overwrite")
+
+
+def _same(output: Path, other: Path) -> bool:
+    """True if two paths name the same file."""
+    if "\0" in str(other):  # only a file can have given such a name, and none can have it
+        return False
+    try:
+        return output.samefile(other)
+    except OSError:  # one of them is not there
+        return output.resolve() == other.resolve()

@@ -1,0 +1,90 @@
+"""Conversion factors between units. The unit is part of every name (`_um`, `_um_s`, `_pa`).
+
+Only the flow solver works in SI; everything else uses um, um/s, s, rad, Hz, mT, Pa, mPa*s, kg/m3, A.
+"""
+
+import math
+import re
+
+NS_PER_S = 1_000_000_000
+M_PER_UM = 1e-6
+UM_PER_M = 1e6
+PA_S_PER_MPA_S = 1e-3
+# Units on the command line.
+_S_PER = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+_MB_PER = {"kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6}
+_AMOUNT = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)\s*", re.IGNORECASE)
+
+
+def seconds(stamp_ns: int) -> float:
+    """A stamp or a difference of stamps in s."""
+    return stamp_ns / NS_PER_S
+
+
+def nanoseconds(time_s: float) -> int:
+    """The nearest integer stamp to a time in s."""
+    return round(time_s * NS_PER_S)
+
+
+def wrap_rad(angle_rad: float) -> float:
+    """Angle wrapped to (-pi, pi]."""
+    return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)
+
+
+def amounts(text: str) -> dict[str, list[float]]:
+    """Times (key `s`, in s) and sizes (key `mb`, in MB) in a text such as `10min`, `2GB` or `30s,10s`.
+
+    Raises
+    ------
+    ValueError : a part of the text is neither.
+    """
+    found: dict[str, list[float]] = {"s": [], "mb": []}
+    for part in text.split(","):
+        match = _AMOUNT.fullmatch(part)
+        unit = match[2].lower() if match is not None else ""
+        if match is not None and unit in _S_PER:
+            found["s"].append(float(match[1]) * _S_PER[unit])
+        elif match is not None and unit in _MB_PER:
+            found["mb"].append(float(match[1]) * _MB_PER[unit])
+        else:
+            raise ValueError(f"{part.strip()!r} is neither a time (ms, s, min, h) nor a size (kB, MB, GB, TB)")
+    return found
+
+
+# What the ends of names mean, the longer ones first; a name with none of them is of a pure number or of a text.
+_SYMBOLS = {
+    "_um_per_px": "um/px",
+    "_um_per_rev": "um/rev",
+    "_kg_m3": "kg/m3",
+    "_mpa_s": "mPa*s",
+    "_per_s": "1/s",
+    "_um_s": "um/s",
+    "_px_s": "px/s",
+    "_rad": "rad",
+    "_share": "1",
+    "_um": "um",
+    "_px": "px",
+    "_pa": "Pa",
+    "_hz": "Hz",
+    "_mt": "mT",
+    "_ns": "ns",
+    "_ms": "ms",
+    "_mb": "MB",
+    "_s": "s",
+    "_a": "A",
+    "_v": "V",
+}
+
+
+def unit_suffix(name: str) -> str:
+    """The end of a name that tells its unit, such as "_um_s"; "" if it has none."""
+    return next((suffix for suffix in _SYMBOLS if f"_{name}".endswith(suffix)), "")
+
+
+def unit_of(name: str) -> str:
+    """The unit that a name ends in, such as "um/s"; "" if it has none.
+
+    >>> unit_of("flow_um_s"), unit_of("nis")
+    ('um/s', '')
+    """
+    return _SYMBOLS.get(unit_suffix(name), "")

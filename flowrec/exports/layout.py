@@ -1,0 +1,77 @@
+"""`flowrec view --layout`: layouts with which Foxglove and Rerun show a session file as it is."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+
+from flowrec.core import JSON, M_PER_UM, RBL, Output, Topic
+from flowrec.store import Session, SessionMetadata, files_behind
+from flowrec.view import APPLICATION, Plot, bare_blueprint, foxglove_layout, plot_of
+
+_CAMERA = "/view/camera"
+_LACKS = (
+    "was recorded without the topics that place things on its image (by an older flowrec, or recording.leave_out);"
+    " flowrec view shows all of it in Rerun"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Layouts:
+    """The files written for a session, and what it lacks for them ('' for nothing)."""
+
+    session: Path
+    foxglove: Path
+    rerun: Path
+    lacks: str
+
+    @property
+    def advice(self) -> list[str]:
+        """Instructions to open the session with these files, a line each."""
+        bare = self.rerun.with_name(f"{self.session.stem}_bare.rrd")
+        mcap, rrd, rbl = (shlex.quote(str(path)) for path in (self.session, bare, self.rerun))
+        convert = f"rerun mcap convert {mcap} --application-id {APPLICATION} -o {rrd}"
+        return [
+            f"{self.foxglove}: for Foxglove and Lichtblick; open {self.session} there, then Layouts > Import from file",
+            f"{self.rerun}: for Rerun, which takes a layout with an .rrd only: {convert} && rerun {rrd} {rbl}",
+            *([self.lacks] if self.lacks else []),
+        ]
+
+
+def write_layouts(session: Session | Path | str, folder: Path | str, overwrite: bool = False) -> Layouts:
+    """Write a layout for Foxglove and Lichtblick (.json) and one for Rerun (.rbl) into a folder.
+
+    Raises
+    ------
+    SessionError : the session can not be read; OutputError if a file may not be written.
+    """
+    session, folder = Session.of(session), Path(folder)
+    files = tuple(files_behind(session.path))
+    foxglove, rerun = (
+        Output(folder / f"{session.path.stem}_{name}", suffixes, files, overwrite)
+        for name, suffixes in (("foxglove.json", JSON), ("rerun.rbl", RBL))
+    )
+    foxglove.check()
+    rerun.check()
+    (width_m, height_m), px_m = (M_PER_UM * um for um in session.chip.size_um), M_PER_UM * session.chip.um_per_px
+    plots = {topic.path: plot for topic in session.reader.topics.extra if (plot := _plot_of(session, topic))}
+    centre_m = 0.5 * (width_m - px_m), 0.5 * (height_m - px_m)
+    layout = foxglove_layout(centre_m, max(width_m, height_m), list(plots.values()))
+    with SessionMetadata(session.run.files[0].path) as head:
+        counts, began_ns = head.statistics.channel_message_counts, head.source.start_unix_ns
+        present = {head.channels[number].topic for number, count in counts.items() if count}
+        schemas = {channel.topic: head.schemas[channel.schema_id].name for channel in head.channels.values()}
+    extra = [(schemas[path], plot) for path, plot in plots.items() if path in present]
+    blueprint = bare_blueprint(present, began_ns + session.run.first_ns, began_ns + session.run.last_ns, extra)
+    with foxglove.new_file() as part:
+        part.write_text(json.dumps(layout, indent=1) + "\n", encoding="utf-8")
+    with rerun.new_file() as part:
+        blueprint.save(APPLICATION, str(part))
+    lacks = "" if _CAMERA in present else f"{session.path}: {_LACKS}"
+    return Layouts(session.path, foxglove.path, rerun.path, lacks)
+
+
+def _plot_of(session: Session, topic: Topic) -> Plot | None:
+    return plot_of(topic, next(session.messages(topic.path), None))

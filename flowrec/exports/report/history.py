@@ -1,0 +1,257 @@
+"""Time series and events that a report shows of a session, read in one pass over its ticks, without images."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import (
+    CameraLosses,
+    Clocks,
+    Demand,
+    Drops,
+    Estimate,
+    Event,
+    FlowField,
+    Health,
+    Mission,
+    OperatorEvent,
+    Tick,
+    Timing,
+    Track,
+    Truth,
+    printable,
+    seconds,
+)
+from flowrec.exports.report.curves import Curve, CurveBuilder, SpanBuilder
+from flowrec.physics import sample
+from flowrec.store import Session
+
+_MOST_REMARKS = 300  # events and actions of the operator; of more, the first
+_SPEED_OVER_S = 0.25  # the speed over ground is a mean over at least this time
+_MOST_ALARMS = 8  # different ones; flowrec has three
+_LONGEST_NAME = 24  # letters of a phase or an alarm
+_REPORT_EVERY = 200  # ticks
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """An event of the run, or an action of the operator.
+
+    Attributes
+    ----------
+    level : enums.Level of an event, '' of an action.
+    action : enums.Action of an action, '' of an event.
+    """
+
+    time_s: float
+    text: str
+    level: str = ""
+    action: str = ""
+
+
+class History:
+    """One session, thinned to what figures and tables can show; memory does not grow with the session.
+
+    Curves by name, all at the stamps of their messages:
+
+    - x_um, y_um: the robot's estimated position; speed_um_s: over ground; demand_um_s: demanded of it through the fluid
+    - error_um: distance to where it should be; estimate_error_um: of the estimate to the true position
+    - flow_x_um_s, flow_y_um_s: flow at the robot by the observer; flow_std_um_s: one standard deviation per component
+    - map_x_um_s, map_y_um_s: the best map of that time at the robot; map_std_um_s: its standard deviation
+    - true_x_um_s, true_y_um_s: true flow at the robot
+    - nis: mean normalised innovation squared
+    - tick_ms, queue_mb, dropped: time per tick, data that waits for the disk, images dropped so far
+    - lost: images that the camera has lost so far; late_ms, latest_ms: mean and largest delay of images
+
+    Attributes
+    ----------
+    first_ns, last_ns : stamps of the first and the last tick.
+    ticks : their number.
+    found : the robot was ever seen; before, its position is only where the tracker begins to search.
+    last : the last tick.
+    remarks : events and actions in order; `remarks_left_out` more are not listed.
+    losses, clocks : the last message of each; drops : likewise, by topic.
+    phases, unseen, held, alarms : spans of time; alarms by name.
+    """
+
+    def __init__(self, first_ns: int, last_ns: int) -> None:
+        self.first_ns, self.last_ns = first_ns, last_ns
+        self.ticks = 0
+        self.last = Tick()
+        self.remarks: list[Remark] = []
+        self.remarks_left_out = 0
+        self.losses: CameraLosses | None = None
+        self.clocks: Clocks | None = None
+        self.drops: dict[str, Drops] = {}
+        self.phases, self.unseen, self.held = SpanBuilder(), SpanBuilder(), SpanBuilder()
+        self.alarms: dict[str, SpanBuilder] = {}
+        self._builders: dict[str, CurveBuilder] = {}
+        self.found = False
+        self._position: tuple[int, NDArray[np.float64]] | None = None
+        self._by_field: dict[str, Callable[[Any], None]] = {
+            "event": self._event,
+            "operator": self._operator,
+            "mission": self._mission,
+            "track": self._track,
+            "estimate": self._estimate,
+            "demand": self._demand,
+            "health": self._health,
+            "truth": self._truth,
+            "timing": self._timing,
+            "drops": self._drops,
+            "clocks": self._clocks,
+            "losses": self._losses,
+        }
+
+    @classmethod
+    def of(cls, session: Session, progress: Callable[[float], None] = lambda _: None) -> History:
+        """Read a session; `progress` takes the session time in s since the first tick.
+
+        Raises
+        ------
+        SessionError : a message is damaged.
+        """
+        history = cls(session.run.first_ns, session.run.last_ns)
+        for tick in session.ticks(with_frames=False):
+            history.add(tick)
+            if history.ticks % _REPORT_EVERY == 0:
+                progress(seconds(tick.stamp_ns - history.first_ns))
+        for spans in (history.phases, history.unseen, history.held, *history.alarms.values()):
+            spans.end(history.last_s)
+        return history
+
+    @property
+    def first_s(self) -> float:
+        """Session time of the first tick."""
+        return seconds(self.first_ns)
+
+    @property
+    def last_s(self) -> float:
+        """Session time of the last tick; of a session of one tick a moment later."""
+        return seconds(max(self.last_ns, self.first_ns + 1_000_000))
+
+    def curve(self, name: str) -> Curve:
+        """A curve of those above; empty if nothing was recorded for it."""
+        builder = self._builders.get(name)
+        return (builder or CurveBuilder(self.first_ns, self.last_ns, 1)).curve()
+
+    def add(self, tick: Tick) -> None:
+        """Take the next tick."""
+        before, self.last = self.last, tick
+        self.ticks += 1
+        for name, take in self._by_field.items():
+            message = getattr(tick, name)
+            if message is not None and message is not getattr(before, name):
+                take(message)
+
+    def _put(self, stamp_ns: int, **values: float) -> None:
+        """Values that belong together: all of them, or none where one is not finite."""
+        if not all(map(math.isfinite, values.values())):
+            return
+        for name, value in values.items():
+            if name not in self._builders:
+                self._builders[name] = CurveBuilder(self.first_ns, self.last_ns)
+            self._builders[name].add(stamp_ns, float(value))
+
+    def _event(self, event: Event) -> None:
+        self._remark(Remark(seconds(event.stamp_ns), event.text, level=event.level))
+
+    def _operator(self, event: OperatorEvent) -> None:
+        self._remark(Remark(seconds(event.stamp_ns), event.text, action=event.action))
+
+    def _remark(self, remark: Remark) -> None:
+        if len(self.remarks) < _MOST_REMARKS:
+            self.remarks.append(remark)
+        else:
+            self.remarks_left_out += 1
+
+    def _mission(self, mission: Mission) -> None:
+        now_s = seconds(mission.stamp_ns)
+        self.phases.add(now_s, _name(mission.phase))
+        self.held.add(now_s, "held" if mission.held_since_ns is not None and not mission.finished else "")
+
+    def _track(self, track: Track) -> None:
+        self.found |= track.seen
+        self.unseen.add(seconds(track.stamp_ns), "" if track.seen else "not seen")
+
+    def _estimate(self, estimate: Estimate) -> None:
+        if not self.found and self.last.track is not None:
+            return
+        stamp_ns, position_um, tick = estimate.stamp_ns, estimate.position_um, self.last
+        if not np.isfinite(position_um).all():
+            return
+        self._put(stamp_ns, x_um=position_um[0], y_um=position_um[1])
+        before_ns, before_um = self._position or (stamp_ns, position_um)
+        moved_s = seconds(stamp_ns - before_ns)
+        if moved_s >= _SPEED_OVER_S:
+            self._put((stamp_ns + before_ns) // 2, speed_um_s=math.dist(position_um, before_um) / moved_s)
+        if moved_s >= _SPEED_OVER_S or self._position is None:
+            self._position = (stamp_ns, position_um)
+        variance = np.diagonal(estimate.covariance)[2:4]
+        flow_std = math.sqrt(max(float(variance.mean()), 0.0)) if variance.size else math.nan
+        self._put(stamp_ns, flow_x_um_s=estimate.flow_um_s[0], flow_y_um_s=estimate.flow_um_s[1])
+        self._put(stamp_ns, flow_std_um_s=flow_std)
+        if tick.field is not None:
+            on_map = sample(tick.field, position_um)
+            self._put(stamp_ns, map_x_um_s=on_map[0], map_y_um_s=on_map[1])
+            self._put(stamp_ns, map_std_um_s=float(std_at(tick.field, position_um)))
+        if tick.truth is not None and tick.truth.stamp_ns == stamp_ns:
+            self._put(stamp_ns, estimate_error_um=math.dist(position_um, tick.truth.position_um))
+
+    def _demand(self, demand: Demand) -> None:
+        self._put(demand.stamp_ns, demand_um_s=math.hypot(*demand.velocity_um_s))
+        self._put(demand.stamp_ns, error_um=demand.error_um)
+
+    def _health(self, health: Health) -> None:
+        self._put(health.stamp_ns, nis=health.nis)
+        now = set(map(_name, health.alarm.split("; ")[:_MOST_ALARMS])) - {""}
+        for name in now | self.alarms.keys():
+            if name not in self.alarms and len(self.alarms) >= _MOST_ALARMS:
+                continue
+            spans = self.alarms.setdefault(name, SpanBuilder())
+            spans.add(seconds(health.stamp_ns), name if name in now else "")
+
+    def _truth(self, truth: Truth) -> None:
+        self._put(truth.stamp_ns, true_x_um_s=truth.flow_um_s[0], true_y_um_s=truth.flow_um_s[1])
+
+    def _timing(self, timing: Timing) -> None:
+        self._put(timing.stamp_ns, tick_ms=timing.total_ms, queue_mb=timing.queue_mb, dropped=timing.dropped_frames)
+
+    def _drops(self, drops: Drops) -> None:
+        self.drops[drops.topic] = drops
+
+    def _clocks(self, clocks: Clocks) -> None:
+        self.clocks = clocks
+        if clocks.rate:
+            self._put(clocks.stamp_ns, late_ms=1e3 * clocks.late_s, latest_ms=1e3 * clocks.latest_s)
+
+    def _losses(self, losses: CameraLosses) -> None:
+        self.losses = losses
+        self._put(losses.stamp_ns, lost=losses.link + losses.incomplete + losses.driver + losses.backlog)
+
+
+def _name(text: str) -> str:
+    """A word of a file for a figure, whatever it holds."""
+    return printable(text)[:_LONGEST_NAME]
+
+
+def std_at(field: FlowField, points_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """One standard deviation of the velocity vector of a map at points (..., 2), um/s: of the nearest pixel.
+
+    NaN where the map states none, and outside of the mask's image.
+    """
+    points = np.asarray(points_um, np.float64)
+    if field.std_um_s is None:
+        return np.full(points.shape[:-1], np.nan)
+    height, width = field.std_um_s.shape[:2]
+    column, row = np.moveaxis(np.rint(points / field.um_per_px), -1, 0)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    at = np.where(inside, row, 0).astype(np.intp), np.where(inside, column, 0).astype(np.intp)
+    std = np.hypot(field.std_um_s[..., 0][at], field.std_um_s[..., 1][at])
+    return np.where(inside, std, np.nan)

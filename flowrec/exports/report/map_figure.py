@@ -1,0 +1,208 @@
+"""Figure: maps of the flow before and after, their standard deviation, and where the flow is not known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import FlowField
+from flowrec.exports.report import style
+from flowrec.exports.report.path_figure import scale_bar
+from flowrec.exports.report.report_data import ReportData
+from flowrec.view import ColourScale, change, scale_of, speed, uncertainty
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+Floats = NDArray[np.float64]
+NOT_KNOWN = 0.25  # standard deviation over the typical speed, above which the flow counts as not known
+_MARGIN_PX = 3
+_BAR_MM = 15.0  # for a colour bar with its numbers
+_TITLE_MM = 7.0
+_TALLEST_MM = 75.0  # of a panel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One map: a title, values (h, w) and their scale; `hatched` (h, w) where the flow is not known."""
+
+    title: str
+    values: Floats
+    scale: ColourScale
+    hatched: NDArray[np.bool_] | None = None
+
+
+def typical_speed(field: FlowField, mask: NDArray[np.bool_]) -> float:
+    """Root mean square of the speed over the fluid, um/s."""
+    found = speed(field, mask)[mask]
+    return float(np.sqrt((found**2).mean())) if found.size else 0.0
+
+
+def not_known(field: FlowField, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) fluid where one standard deviation exceeds NOT_KNOWN of the typical speed; all where none is stated."""
+    if field.std_um_s is None:
+        return mask
+    return mask & (uncertainty(field, mask) > NOT_KNOWN * typical_speed(field, mask))
+
+
+def known_text(field: FlowField, mask: NDArray[np.bool_], name: str) -> str:
+    """Description of the standard deviation of a map, in one or two sentences."""
+    if field.std_um_s is None:
+        return f"The method of the {name} map ({field.method}) states no standard deviation."
+    share = float(not_known(field, mask).sum() / max(int(mask.sum()), 1))
+    text = f"Deviation: one standard deviation of the velocity that the {name} map states for itself."
+    if share < 0.001:
+        return f"{text} It is nowhere more than {NOT_KNOWN:.0%} of the typical speed."
+    return f"{text} Hatched: where it is more than {NOT_KNOWN:.0%} of the typical speed ({share:.0%} of the fluid)."
+
+
+class MapFigure:
+    """The flow that was assumed, the flow after the refinement, and how well it is known."""
+
+    name = "maps"
+    title = "Maps of the flow"
+
+    def why_not(self, data: ReportData) -> str:
+        return data.no_map
+
+    def caption(self, data: ReportData) -> str:
+        mask, refined, assumed = data.scene.chip.mask, data.refined, data.assumed
+        parts = []
+        if assumed is not None:
+            parts.append(f"Assumed: computed from the chip and its stated inflow alone (method {assumed.method}).")
+        if refined is not None:
+            parts.append(f"Refined: corrected by what the robot experienced (method {refined.method}).")
+            if assumed is not None:
+                parts.append("Change: refined minus assumed speed.")
+        else:
+            parts.append("The flow was not refined in this session: there is no map after a refinement.")
+        best = refined if refined is not None else assumed
+        assert best is not None
+        parts.append(known_text(best, mask, "refined" if refined is not None else "assumed"))
+        if data.truth is not None:
+            parts.append("True: the flow of the simulated world, which no stage of the run knew.")
+        return " ".join(parts)
+
+    def alt(self, data: ReportData) -> str:
+        return f"Maps of the flow on the chip {data.scene.chip.name}: {', '.join(p.title for p in _panels(data))}."
+
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        return draw_panels(_panels(data), data, width_mm)
+
+
+class ChangeFigure:
+    """The maps of a session and of a replay of it."""
+
+    name = "replay"
+    title = "Flow map as recorded and as replayed"
+
+    def __init__(self, before: FlowField | None, after: FlowField | None, number: int) -> None:
+        self._before, self._after = before, after
+        self.name = f"replay_{number}"
+
+    def why_not(self, _story: ReportData) -> str:
+        if self._before is None or self._after is None:
+            return "one of the two holds no map of the flow"
+        if self._before.same_as(self._after):
+            return "the replay has the map of the recording, unchanged"
+        if self._before.velocity_um_s.shape != self._after.velocity_um_s.shape:
+            return "the two maps have different sizes"
+        return ""
+
+    def caption(self, data: ReportData) -> str:
+        assert self._before is not None and self._after is not None
+        return (
+            f"Recorded: the best map of the session (method {self._before.method}). Replayed: that of the replay "
+            f"(method {self._after.method}). Change: replayed minus recorded speed. "
+            + known_text(self._after, data.scene.chip.mask, "replayed")
+        )
+
+    def alt(self, data: ReportData) -> str:
+        return f"Maps of the flow on the chip {data.scene.chip.name}: recorded, replayed, and their difference."
+
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        assert self._before is not None and self._after is not None
+        mask = data.scene.chip.mask
+        values = [speed(field, mask) for field in (self._before, self._after)]
+        scale = ColourScale.up_to(float(np.nanmax(values)), "speed")
+        panels = [Panel("recorded", values[0], scale), Panel("replayed", values[1], scale)]
+        panels += [_change(self._after, self._before, mask), *_deviation(self._after, mask)]
+        return draw_panels(panels, data, width_mm)
+
+
+def _panels(data: ReportData) -> list[Panel]:
+    mask, scale = data.scene.chip.mask, data.speed_scale()
+    named = {"assumed": data.assumed, "refined": data.refined}
+    panels = [Panel(name, speed(field, mask), scale) for name, field in named.items() if field is not None]
+    if data.refined is not None and data.assumed is not None:
+        panels.append(_change(data.refined, data.assumed, mask))
+    best = data.refined if data.refined is not None else data.assumed
+    panels += _deviation(best, mask) if best is not None else []
+    return [*panels, Panel("true", speed(data.truth, mask), scale)] if data.truth is not None else panels
+
+
+def _change(now: FlowField, was: FlowField, mask: NDArray[np.bool_]) -> Panel:
+    values = change(now, was, mask)
+    return Panel("change", values, scale_of(values, "change"))
+
+
+def _deviation(field: FlowField, mask: NDArray[np.bool_]) -> list[Panel]:
+    if field.std_um_s is None:
+        return []
+    values = uncertainty(field, mask)
+    return [Panel("deviation", values, scale_of(values, "uncertainty"), not_known(field, mask))]
+
+
+def draw_panels(panels: list[Panel], data: ReportData, width_mm: float) -> Figure:
+    """Maps side by side, each kind of value with its colour bar; several rows where they do not fit in one."""
+    mask, um_per_px = data.scene.chip.mask, data.scene.chip.um_per_px
+    rows_px, columns_px = np.nonzero(mask)
+    box = (
+        slice(max(rows_px.min() - _MARGIN_PX, 0), rows_px.max() + _MARGIN_PX + 1),
+        slice(max(columns_px.min() - _MARGIN_PX, 0), columns_px.max() + _MARGIN_PX + 1),
+    )
+    height_px, width_px = mask[box].shape
+    columns = min(len(panels), 2 if width_mm > style.NARROW_MM else 1)
+    rows = -(-len(panels) // columns)
+    panel_mm = min((width_mm / columns - _BAR_MM) * height_px / width_px, _TALLEST_MM)
+    figure = style.new_figure(width_mm, rows * (panel_mm + _TITLE_MM) + 4.0)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[len(panels) :]:
+        ax.remove()
+    for ax, panel in zip(axes, panels, strict=False):
+        shown = _show(ax, panel, box)
+        sign = "+" if panel.scale.table == "change" else ""
+        bar = figure.colorbar(shown, ax=ax, shrink=0.9, aspect=16, pad=0.02, ticks=panel.scale.ticks)
+        bar.ax.set_yticklabels([f"{tick:{sign}g}" if tick else "0" for tick in np.round(panel.scale.ticks, 9)])
+        bar.outline.set_visible(False)
+    scale_bar(axes[0], style_px_per_mm(um_per_px))
+    return figure
+
+
+def style_px_per_mm(um_per_px: float) -> float:
+    """Pixels of the mask in a millimetre."""
+    return 1.0 / (um_per_px * style.MM_PER_UM)
+
+
+def _show(ax: Axes, panel: Panel, box: tuple[slice, slice]) -> AxesImage:
+    style.bare(ax)
+    ax.set_facecolor(style.SOLID)
+    colours: dict[str, Any] = {"speed": style.SPEEDS, "uncertainty": style.DEVIATIONS, "change": style.CHANGES}
+    shown = ax.imshow(
+        panel.values[box],
+        cmap=colours[panel.scale.table],
+        vmin=panel.scale.low,
+        vmax=panel.scale.high,
+        interpolation="nearest",
+    )
+    if panel.hatched is not None and panel.hatched.any():
+        area = panel.hatched[box].astype(np.float64)
+        ax.contourf(area, levels=[0.5, 1.5], colors="none", hatches=["//////"])
+        ax.contour(area, levels=[0.5], colors=style.INK, linewidths=0.4)
+    ax.set_title(f"{panel.title} (µm/s)")
+    return shown

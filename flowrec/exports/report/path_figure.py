@@ -1,0 +1,245 @@
+"""Figure: the way of the robot over the flow, on the camera's picture or the mask of the chip."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.exports.report import style
+from flowrec.exports.report.report_data import ReportData
+from flowrec.view import arrow_grid, flow_arrows, speed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+_MARGIN = 0.06  # around the fluid, of its width
+_OVER_PICTURE = 0.72  # opacity of the flow over the camera's picture
+_TALLEST_MM = 200.0
+_BAR_MM, _BELOW_MM = 17.0, 6.0  # beside the picture: the colour bar; below it: the scale bar
+_SAME_PLACE = 4.0  # radii of the robot: an end this near to the goal has no name of its own
+_NEAR_EDGE = 0.08  # of the width: a name beside the edge begins or ends at its place
+_HEAD_SHARE = 0.004  # of the path, half of what an arrow head points along
+_HEADS = 7  # arrow heads on the path
+_PT_PER_INCH = 72.0
+_BAR_SHARE = 0.25  # longest scale bar, of the width
+
+
+class PathFigure:
+    """Path of the robot over the map of the flow."""
+
+    name = "path"
+    title = "Path of the robot over the flow"
+
+    def why_not(self, data: ReportData) -> str:
+        return data.no_position
+
+    def caption(self, data: ReportData) -> str:
+        parts = ["Line: the way of the robot (estimated position)."]
+        if data.route is not None:
+            parts.append("Dashes: the route that was planned last.")
+        field = data.history.last.field
+        if field is not None:
+            kind = "refined" if data.refined is not None else "assumed"
+            parts.append(f"Colours and arrows: speed and direction of the flow by the {kind} map.")
+        if data.picture is None:
+            parts.append("The session holds no camera image: the mask of the chip is shown, walls in grey.")
+        elif data.picture.images > 1:
+            parts.append(
+                f"Beneath: the camera's picture, median of {data.picture.images} images, in which what moves is not "
+                "visible."
+            )
+        else:
+            parts.append("Beneath: the one image of the camera that was found whole.")
+        return " ".join(parts)
+
+    def alt(self, data: ReportData) -> str:
+        path = data.path_um
+        length_mm = float(np.nansum(np.hypot(*np.diff(path, axis=0).T))) * style.MM_PER_UM
+        return f"Map of the chip {data.scene.chip.name} with the robot's path of {length_mm:.1f} mm."
+
+    def draw(self, data: ReportData, width_mm: float) -> Figure:
+        left, top, right, bottom = _bounds(data)
+        aspect = (bottom - top) / (right - left)
+        picture_mm = width_mm - (_BAR_MM if data.history.last.field is not None else 2.0)
+        figure = style.new_figure(width_mm, min(picture_mm * aspect + _BELOW_MM, _TALLEST_MM))
+        ax = figure.subplots()
+        style.bare(ax)
+        _background(ax, data)
+        _flow(figure, ax, data)
+        _outline(ax, data)
+        ax.set_xlim(left, right)
+        ax.set_ylim(bottom, top)
+        ax.set_aspect("equal")
+        ax.autoscale(False)
+        _paths(ax, data)
+        scale_bar(ax, data.scene.length_px(1e3))
+        return figure
+
+
+def scale_bar(ax: Axes, per_mm: float) -> None:
+    """A bar of a round length below the lower left corner; `per_mm` units of the axis are a millimetre."""
+    from matplotlib.transforms import ScaledTranslation
+
+    left, right = ax.get_xlim()
+    longest_mm = _BAR_SHARE * abs(right - left) / per_mm
+    power = 10.0 ** np.floor(np.log10(longest_mm))
+    length_mm = max(m * power for m in (1.0, 2.0, 5.0) if m * power <= longest_mm)
+    share = length_mm * per_mm / abs(right - left)
+    figure = ax.get_figure()
+    assert figure is not None
+    below = ax.transAxes + ScaledTranslation(0.0, -5.0 / _PT_PER_INCH, figure.dpi_scale_trans)
+    ax.plot([0.0, share], [0.0, 0.0], transform=below, color=style.INK, lw=1.6, clip_on=False)
+    text = f"{length_mm:g} mm" if length_mm >= 1.0 else f"{1e3 * length_mm:g} µm"
+    ax.text(share + 0.01, 0.0, text, transform=below, va="center", ha="left")
+
+
+def _bounds(data: ReportData) -> tuple[float, float, float, float]:
+    """Left, top, right, bottom of the fluid with a margin, within the chip, in the picture plane."""
+    chip = data.scene.chip
+    rows, columns = np.nonzero(chip.mask)
+    corners = np.array([(x, y) for x in (columns.min(), columns.max()) for y in (rows.min(), rows.max())], np.float64)
+    places = data.scene.to_plane(corners * chip.um_per_px)
+    margin = _MARGIN * float(np.ptp(places[:, 0]))
+    chip_left, chip_top, chip_right, chip_bottom = data.scene.chip_bounds()
+    left, top = places.min(axis=0) - margin
+    right, bottom = places.max(axis=0) + margin
+    return max(left, chip_left), max(top, chip_top), min(right, chip_right), min(bottom, chip_bottom)
+
+
+def _background(ax: Axes, data: ReportData) -> None:
+    """The camera's picture, else the mask: walls grey, fluid white."""
+    scene, picture = data.scene, data.picture
+    if picture is not None:
+        height, width = (size * picture.step for size in picture.image.shape)
+        # Brightened: the path and the arrows are dark.
+        ax.imshow(picture.image, cmap="gray", vmin=-90, vmax=255, extent=(0.0, width, height, 0.0), zorder=0)
+    else:
+        _on_mask(ax, data, np.where(scene.chip.mask, 255.0, 200.0), cmap="gray", vmin=0, vmax=255, zorder=0)
+
+
+def _on_mask(ax: Axes, data: ReportData, values: NDArray[np.float64], **how: Any) -> AxesImage:
+    """Values (h, w) of the mask's pixels, where the camera sees them."""
+    from matplotlib.transforms import Affine2D
+
+    placement = data.scene.mask_placement()
+    (a, b), (c, d) = placement.scale * placement.axes
+    x, y = placement.offset
+    height, width = values.shape
+    shown = ax.imshow(values, extent=(0.0, width, height, 0.0), interpolation="nearest", **how)
+    shown.set_transform(Affine2D(np.array([[a, b, x], [c, d, y], [0.0, 0.0, 1.0]])) + ax.transData)
+    return shown
+
+
+def _flow(figure: Figure, ax: Axes, data: ReportData) -> None:
+    """The speed of the best map in colours, its direction as arrows."""
+    field, scene = data.history.last.field, data.scene
+    if field is None:
+        return
+    scale = data.speed_scale()
+    opacity = _OVER_PICTURE if data.picture is not None else 1.0
+    values = speed(field, scene.chip.mask)
+    how = {"cmap": style.SPEEDS, "vmin": 0.0, "vmax": scale.high, "alpha": opacity, "zorder": 1}
+    speeds = _on_mask(ax, data, values, **how)
+    bar = figure.colorbar(speeds, ax=ax, shrink=0.85, aspect=22, pad=0.01, ticks=scale.ticks)
+    bar.set_label("speed of the flow (µm/s)")
+    bar.outline.set_visible(False)
+    origins, vectors, _ = flow_arrows(scene, field, arrow_grid(scene))
+    ends = origins + vectors
+    if len(origins):
+        ax.quiver(
+            *origins.T,
+            *(ends - origins).T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0,
+            color=style.INK,
+            width=0.0018,
+            headwidth=4.5,
+            headlength=5.0,
+            headaxislength=4.0,
+            alpha=0.75,
+            zorder=3,
+        )
+
+
+def _outline(ax: Axes, data: ReportData) -> None:
+    """The walls of the mask."""
+    chip = data.scene.chip
+    contours, _ = cv2.findContours(chip.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    for contour in contours:
+        around = np.concatenate([contour, contour[:1]])[:, 0] * chip.um_per_px
+        ax.plot(*data.scene.to_plane(around).T, color=style.QUIET, lw=0.5, zorder=2)
+
+
+def _paths(ax: Axes, data: ReportData) -> None:
+    """The route, the way of the robot, and where both begin and end."""
+    scene = data.scene
+    white: dict[str, Any] = {"color": "white", "solid_capstyle": "round"}
+    if data.route is not None:
+        route = scene.to_plane(data.route.waypoints_um)
+        ax.plot(*route.T, lw=1.8, zorder=4, **white)
+        ax.plot(*route.T, color=style.INK, lw=0.9, ls=(0, (4, 2)), zorder=5)
+    path = scene.to_plane(data.path_um)
+    ax.plot(*path.T, lw=2.4, zorder=6, **white)
+    ax.plot(*path.T, color=style.VERMILLION, lw=1.3, zorder=7)
+    _directions(ax, path)
+    known = path[np.isfinite(path[:, 0])]
+    radius_px = scene.length_px(scene.robot.radius_um)
+    goal = scene.to_plane(data.goal_um) if data.goal_um is not None else None
+    at_goal = goal is not None and float(np.hypot(*(known[-1] - goal))) < _SAME_PLACE * radius_px
+    _place(ax, known[0], radius_px, "start", style.INK, below=goal is not None)
+    if goal is not None:
+        _place(ax, goal, 1.6 * radius_px, "goal", style.GREEN)
+    _place(ax, known[-1], radius_px, "" if at_goal else "end", style.VERMILLION)
+
+
+def _directions(ax: Axes, path: NDArray[np.float64]) -> None:
+    """Arrow heads on the path, evenly spread over its length."""
+    way = path[np.isfinite(path[:, 0])]
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(way, axis=0).T))])
+    if along[-1] <= 0.0:
+        return
+    for share in (np.arange(_HEADS) + 0.5) / _HEADS:
+        middle = share * along[-1]
+        ends = [
+            (
+                np.interp(middle + shift * along[-1], along, way[:, 0]),
+                np.interp(middle + shift * along[-1], along, way[:, 1]),
+            )
+            for shift in (-_HEAD_SHARE, _HEAD_SHARE)
+        ]
+        arrow = {
+            "arrowstyle": "-|>,head_length=0.35,head_width=0.22",
+            "color": style.VERMILLION,
+            "lw": 0.0,
+            "shrinkA": 0.0,
+            "shrinkB": 0.0,
+            "mutation_scale": 11.0,
+        }
+        ax.annotate("", ends[1], ends[0], arrowprops=arrow, zorder=8)
+
+
+def _place(ax: Axes, at: NDArray[np.float64], radius: float, name: str, colour: str, *, below: bool = False) -> None:
+    """A circle with a name, which stays within the axis."""
+    from matplotlib.patches import Circle
+
+    ax.add_patch(Circle((at[0], at[1]), radius, facecolor="white", edgecolor=colour, lw=1.2, zorder=9))
+    if name:
+        share = (at[0] - ax.get_xlim()[0]) / np.ptp(ax.get_xlim())
+        ax.annotate(
+            name,
+            (at[0], at[1] + (radius if below else -radius)),
+            (0, -4 if below else 4),
+            textcoords="offset points",
+            ha="left" if share < _NEAR_EDGE else "right" if share > 1.0 - _NEAR_EDGE else "center",
+            va="top" if below else "bottom",
+            color=colour,
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
+            zorder=10,
+        )

@@ -1,0 +1,144 @@
+"""`flowrec calibrate coils`: the settings of the coils and their uncertainty, from a table of currents and fields."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowrec.core import TOML, Coverage, Output, __version__, say, table
+from flowrec.measure.coil_calibration import CoilFit, advice, fit_coils, read_excitations
+from flowrec.stages import Coils
+
+_AXES = ("x", "y", "z")
+_EXACT_DIGITS = 9
+
+
+def calibrate_coils(path: Path, out: Path | None = None, overwrite: bool = False) -> CoilFit:
+    """Fit the settings of the coils to a table, and write them to `out` if it is given.
+
+    Raises
+    ------
+    UsageError : the table can not be read or has too few rows, or no run could use such coils.
+    OutputError : `out` may not be written, see `Output.check`.
+    """
+    output = Output(out, TOML, (path,), overwrite) if out is not None else None
+    if output is not None:
+        output.check()
+    fit = fit_coils(read_excitations(path))
+    Coils(mt_per_a=_matrix(fit), bias_mt=_bias(fit)).check(path.name)
+    if output is not None:
+        with output.new_file() as part:
+            part.write_text(fragment(fit, path), encoding="utf-8")
+    return fit
+
+
+def fragment(fit: CoilFit, path: Path) -> str:
+    """The settings as TOML, with a comment on their source."""
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    noise = ", ".join(f"{value:.2g}" for value in fit.noise_mt)
+    suspects = f"; {len(fit.suspects)} of them suspicious" if fit.suspects else ""
+    rows = "".join(f"    {list(row)},\n" for row in _matrix(fit))
+    return (
+        f"# By flowrec {__version__} calibrate coils from {path.name} (sha256 {digest}...): "
+        f"{len(fit.residual_mt)} excitations{suspects}.\n"
+        f"# Residual rms {noise} mT in x, y, z; a field of 4 mT is known to {fit.uncertainty_mt:.2g} mT.\n"
+        f"[coils]\nmt_per_a = [\n{rows}]\nbias_mt = {list(_bias(fit))}\n"
+    )
+
+
+def as_sets(fit: CoilFit) -> list[str]:
+    """The calibration as values of --set, to go with any configuration."""
+    matrix = [list(row) for row in _matrix(fit)]
+    return [f"coils.mt_per_a={matrix}", f"coils.bias_mt={list(_bias(fit))}"]
+
+
+def figures(fit: CoilFit) -> dict[str, Any]:
+    """The fit as plain numbers; None where the rows do not determine one."""
+    direction, strength = fit.weakest
+    lines = fit.excitations.lines
+    return {
+        "rows": len(lines),
+        "degrees_of_freedom": fit.freedom,
+        "mt_per_a": fit.mt_per_a.tolist(),
+        "mt_per_a_standard_error": fit.mt_per_a_std.tolist(),
+        "bias_mt": fit.bias_mt.tolist(),
+        "bias_standard_error_mt": fit.bias_std_mt.tolist(),
+        "residual_rms_mt": fit.noise_mt.tolist(),
+        "worst_line": [lines[row] for row in np.abs(fit.residual_mt).argmax(0)],
+        "worst_residual_mt": [_largest(column) for column in fit.residual_mt.T],
+        "left_out_mt": [[None if math.isnan(v) else v for v in row] for row in fit.left_out_mt.tolist()],
+        "suspicious_lines": [lines[row] for row in fit.suspects],
+        "unchecked_lines": [lines[row] for row in fit.unchecked],
+        "condition": fit.condition,
+        "weakest_direction": direction,
+        "weakest_mt_per_a": strength,
+        "standard_error_of_4_mt": fit.uncertainty_mt,
+        "advice": advice(fit),
+        "set": as_sets(fit),
+        "covered": Coverage(len(lines), len(lines), "rows").as_json(),
+    }
+
+
+def show(fit: CoilFit, out: Path | None) -> None:
+    """Print the fit as a table."""
+    lines = fit.excitations.lines
+    rows = []
+    for axis, name in enumerate(_AXES):
+        worst = int(np.abs(fit.residual_mt[:, axis]).argmax())
+        rows.append(
+            (
+                f"b_{name}",
+                *(_with_doubt(fit.mt_per_a[axis, coil], fit.mt_per_a_std[axis, coil]) for coil in range(3)),
+                _with_doubt(fit.bias_mt[axis], fit.bias_std_mt[axis]),
+                f"{fit.noise_mt[axis]:.2g}",
+                f"{fit.residual_mt[worst, axis]:+.2g} (line {lines[worst]})",
+            )
+        )
+    table(
+        f"{fit.excitations.name}: {len(lines)} excitations; mT per A of each coil, bias and residuals in mT",
+        ("", "coil x", "coil y", "coil z", "bias", "residual", "worst"),
+        rows,
+    )
+    direction, strength = fit.weakest
+    say(
+        f"A field of 4 mT is known to {fit.uncertainty_mt:.2g} mT (one standard error, {fit.freedom} degrees of "
+        f"freedom). Weakest direction: {direction}, {strength:.3g} mT/A; the strongest direction has "
+        f"{fit.condition:.2g} times as much."
+    )
+    for sentence in advice(fit):
+        say(f"- {sentence}")
+    if out is not None:
+        say(f"{out} written: flowrec record {out}")
+    say("With any configuration: " + " ".join(f"--set '{text}'" for text in as_sets(fit)))
+
+
+def _matrix(fit: CoilFit) -> Any:
+    return tuple(_round_to_error(row, std) for row, std in zip(fit.mt_per_a, fit.mt_per_a_std, strict=True))
+
+
+def _bias(fit: CoilFit) -> Any:
+    return _round_to_error(fit.bias_mt, fit.bias_std_mt)
+
+
+def _round_to_error(values: Any, stds: Any) -> Any:
+    """To some hundredths of the standard error."""
+    return tuple(round(float(v), _digits(s) + 2) + 0.0 for v, s in zip(values, stds, strict=True))
+
+
+def _with_doubt(value: float, std: float) -> str:
+    """A value with its standard error, to the first digit of that."""
+    digits = _digits(std)
+    return f"{value:.{digits}f} ± {std:.{digits}f}" if digits < _EXACT_DIGITS else f"{value:.4g}"
+
+
+def _digits(std: float) -> int:
+    """Number of decimals that show the first digit of a standard error."""
+    return min(max(-math.floor(math.log10(std)), 0), _EXACT_DIGITS) if std > 0.0 else _EXACT_DIGITS
+
+
+def _largest(values: Any) -> float:
+    return float(values[np.abs(values).argmax()])

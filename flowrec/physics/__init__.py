@@ -1,0 +1,5 @@
+"""Model of the world: a mask and numbers in, a flow field out; how a robot moves. No time, no session."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

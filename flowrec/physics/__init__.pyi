@@ -1,0 +1,53 @@
+from .chip.chip import (
+    Chip as Chip, ChipSettings as ChipSettings, Opening as Opening, WATER_KG_M3 as WATER_KG_M3,
+    WATER_MPA_S as WATER_MPA_S, Walls as Walls,
+)
+from .chip.clearance import (
+    check_point as check_point, clearance_um as clearance_um, median_width_um as median_width_um,
+    opening_point_um as opening_point_um,
+)
+from .chip.fluid import (
+    CarreauYasuda as CarreauYasuda, PowerLaw as PowerLaw, ViscosityLaw as ViscosityLaw,
+    ViscositySettings as ViscositySettings, blood as blood, law_text as law_text, with_settings as with_settings,
+)
+from .chip.io import (
+    CHIP_KEYS as CHIP_KEYS, MAX_PIXELS as MAX_PIXELS, chip_files as chip_files, chip_from_files as chip_from_files,
+    load_chip as load_chip, without_pockets as without_pockets,
+)
+from .chip.openings import (
+    border as border, check_chip as check_chip, distance_px as distance_px, distance_um as distance_um,
+    find_openings as find_openings, guess_inlets as guess_inlets, name_inlets as name_inlets,
+    named_opening as named_opening, opening_names as opening_names, run_around as run_around,
+    set_inlet_speed as set_inlet_speed,
+)
+from .chip.orientation import (
+    AS_STATED as AS_STATED, ORIENTATIONS as ORIENTATIONS, Orientation as Orientation,
+    camera_settings as camera_settings, likeness as likeness, nearest as nearest,
+)
+from .chip.registration import Calibration as Calibration, on_chip as on_chip
+from .chip.synthetic import (
+    bifurcation as bifurcation, draw_channel as draw_channel, smooth_curve as smooth_curve, straight as straight,
+    vessels as vessels,
+)
+from .chip.vessel_case import (
+    NOISES as NOISES, SHARES as SHARES, read_observations as read_observations,
+    read_true_velocity as read_true_velocity, read_vessel_case as read_vessel_case,
+)
+from .flow.generalised import generalised_equations as generalised_equations
+from .flow.level_set import from_distance as from_distance
+from .flow.linear_solver import chip_key as chip_key, clear_cache as clear_cache, compute_cached as compute_cached
+from .flow.map_error import (
+    CONTROL as CONTROL, COURSE as COURSE, OBSERVER as OBSERVER, RESERVE as RESERVE, STEP_OUT as STEP_OUT,
+)
+from .flow.newton_solver import (
+    NotConvergedError as NotConvergedError, Scales as Scales, System as System, local_friction as local_friction,
+    newton_equations as newton_equations, system as system, with_friction as with_friction,
+)
+from .flow.sampling import (
+    fluid_image as fluid_image, relative_rmse as relative_rmse, sample as sample, walls_of as walls_of,
+)
+from .flow.sensitivities import Remainder as Remainder, Sensitivities as Sensitivities, sensitivities as sensitivities
+from .flow.solver import FlowSolver as FlowSolver
+from .flow.uncertainty import Doubts as Doubts, FlowUncertainty as FlowUncertainty, Registration as Registration
+from .flow.velocity_stencil import pixel_weights as pixel_weights, velocity_at as velocity_at
+from .robot import Robot as Robot, RobotSettings as RobotSettings, USUAL_DELAY_S as USUAL_DELAY_S

@@ -1,0 +1,96 @@
+"""The chip: fluid pixels, their size, the openings and the assumed fluid; and the settings that choose one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flowrec.core import Range, Seed
+from flowrec.physics.chip.fluid import ViscosityLaw, ViscositySettings
+
+Side = Literal["left", "right", "top", "bottom"]
+Kind = Literal["inlet", "outlet"]
+Walls = Literal["smooth", "pixel"]
+WATER_MPA_S, WATER_KG_M3 = 1.0, 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ChipSettings:
+    """Section [chip] of a configuration: a built-in chip by name, or a file; None keeps the value of that chip."""
+
+    name: str = "bifurcation"  # bifurcation, straight, vessels
+    path: str = ""  # instead of the name: *.png (*.toml beside it), *.toml (*.png beside it) or *.npz vessel case
+    seed: Seed = 0  # of the vessels
+    um_per_px: Annotated[float, Range(1e-3, 1e3)] | None = None  # needed for a PNG that has no TOML
+    walls: Walls | None = None
+    # channel depth, for the depth-averaged friction; 0: two-dimensional
+    depth_um: Annotated[float, Range(0.0, 1e5)] | None = None
+    viscosity_mpa_s: Annotated[float, Range(1e-3, 1e5)] | None = None
+    density_kg_m3: Annotated[float, Range(1.0, 3e4)] | None = None
+    # mean speed of the fastest inlet; the others keep their ratio to it
+    inlet_speed_um_s: Annotated[float, Range(0.0, 1e7)] | None = None
+    # Openings that are inlets, all others outlets at 0 Pa: "left:0" is the first on the left from the top,
+    # "top:1" the second on the top from the left, "left" every one on the left.
+    inlets: tuple[str, ...] = ()
+    viscosity: ViscositySettings = field(default_factory=ViscositySettings)  # how it depends on the shear rate
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A run of fluid pixels on the border of the mask, first to last inclusive along the side."""
+
+    side: Side
+    first: int
+    last: int
+    kind: Kind
+    value: float  # inlet: mean inward speed, um/s; outlet: pressure, Pa
+
+    @property
+    def width_px(self) -> int:
+        """Number of fluid pixels on the border."""
+        return self.last - self.first + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chip:
+    """Mask and assumed boundary values, from which flow, planning and simulation start."""
+
+    name: str
+    mask: NDArray[np.bool_]  # (h, w) True in fluid
+    um_per_px: float
+    openings: tuple[Opening, ...]
+    viscosity_mpa_s: float
+    density_kg_m3: float
+    depth_um: float | None = None  # None: two-dimensional; else depth-averaged friction -12 mu v / depth^2
+    walls: Walls = "smooth"
+    # (h, w) friction of each pixel beside that of the depth, as 12 / depth^2: the force is -mu times this times v
+    friction_per_um2: NDArray[np.float64] | None = None
+    law: ViscosityLaw | None = None  # viscosity over viscosity_mpa_s as a function of shear rate; None: Newtonian
+
+    @property
+    def size_um(self) -> tuple[float, float]:
+        """Width and height of the mask in um."""
+        return self.mask.shape[1] * self.um_per_px, self.mask.shape[0] * self.um_per_px
+
+    @property
+    def boundary_values(self) -> NDArray[np.float64]:
+        """(openings,) inlets: mean inward speed, um/s; outlets: pressure, Pa."""
+        return np.array([opening.value for opening in self.openings], np.float64)
+
+    def with_boundary(
+        self, values: ArrayLike, viscosity_mpa_s: float | None = None, density_kg_m3: float | None = None
+    ) -> Chip:
+        """A copy with other boundary values (openings,) and fluid."""
+        openings = tuple(
+            replace(opening, value=float(value))
+            for opening, value in zip(self.openings, np.asarray(values, np.float64), strict=True)
+        )
+        return replace(
+            self,
+            openings=openings,
+            viscosity_mpa_s=self.viscosity_mpa_s if viscosity_mpa_s is None else viscosity_mpa_s,
+            density_kg_m3=self.density_kg_m3 if density_kg_m3 is None else density_kg_m3,
+        )

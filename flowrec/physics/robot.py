@@ -1,0 +1,64 @@
+"""The robot: its kinematics, its size and its limits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+from flowrec.core import PositiveShare, Range
+
+USUAL_DELAY_S = 0.04  # two buffered blocks of coil samples and a frame of exposure and transfer
+
+_Radius = Annotated[float, Range(0.05, 1e4)]
+_Speed = Annotated[float, Range(0.01, 1e6)]
+_Frequency = Annotated[float, Range(0.01, 1e5)]
+_Delay = Annotated[float, Range(0.0, 10.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSettings:
+    """Section [robot] of a configuration. None: chosen to fit the chip when the configuration is resolved."""
+
+    radius_um: _Radius | None = None
+    um_per_rev: Annotated[float, Range(0.01, 1e5)] = 25.0  # k: distance rolled per revolution of the field
+    max_speed_um_s: _Speed | None = None  # v_max, relative to the fluid
+    step_out_hz: _Frequency | None = None  # above it the robot no longer follows the field
+    step_out_margin: PositiveShare = 0.9  # fraction of the step-out frequency that is commanded at most
+    delay_s: _Delay | None = None  # from command to motion
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Robot(RobotSettings):
+    """The robot of a resolved configuration: kinematics xdot = u (cos phi, sin phi) + v(x), u = k f.
+
+    This is eq. kinematic of the paper; k is `um_per_rev`, f the frequency of the field, phi its heading.
+    """
+
+    radius_um: _Radius
+    max_speed_um_s: _Speed
+    step_out_hz: _Frequency
+    delay_s: _Delay = USUAL_DELAY_S  # sessions recorded before the setting existed do not hold it
+
+    @property
+    def speed_limit_um_s(self) -> float:
+        """The fastest speed through the fluid that may be commanded, um/s."""
+        return min(self.max_speed_um_s, self.step_out_margin * self.step_out_hz * self.um_per_rev)
+
+    def limited_to(self, frequency_hz: float | None) -> Robot:
+        """A copy that is never driven at more than a frequency; None: without that limit."""
+        return self if frequency_hz is None else replace(self, step_out_hz=frequency_hz / self.step_out_margin)
+
+    def slowed_to(self, speed_um_s: float | None) -> Robot:
+        """A copy that is never commanded to swim faster than a speed; None: without that limit."""
+        return self if speed_um_s is None else replace(self, max_speed_um_s=min(speed_um_s, self.max_speed_um_s))
+
+    def speed_limit_at(self, strength: float) -> float:
+        """Speed limit in a field of this fraction of the full amplitude, um/s: step-out falls with the torque."""
+        return min(self.speed_limit_um_s, strength * self.step_out_margin * self.step_out_hz * self.um_per_rev)
+
+    def rolled_speed_um_s(self, frequency_hz: float) -> float:
+        """Speed at a field frequency: proportional up to step-out, then the mean of Adler's equation, um/s."""
+        if frequency_hz <= self.step_out_hz:
+            return self.um_per_rev * frequency_hz
+        return self.um_per_rev * (frequency_hz - math.sqrt(frequency_hz**2 - self.step_out_hz**2))

@@ -1,0 +1,14 @@
+from .lab.amplifiers.limits import CommandLimits as CommandLimits
+from .lab.cameras.camera import CameraInfo as CameraInfo, Grabbed as Grabbed, Wanted as Wanted, bits_of as bits_of
+from .lab.cameras.probe import probe_camera as probe_camera
+from .lab.drive import probe_amplifier as probe_amplifier
+from .lab.guardian import Guardian as Guardian, ONLY_HARDWARE as ONLY_HARDWARE
+from .movie.exported import session_of_log as session_of_log, with_exported as with_exported
+from .movie.rig import MovieRig as MovieRig, fitted_to_movie as fitted_to_movie
+from .movie.source import MovieSource as MovieSource, open_source as open_source, sha256_of as sha256_of
+from .rig import (
+    Connecting as Connecting, Picturing as Picturing, Rig as Rig, Tried as Tried, checked_images as checked_images,
+    increasing_stamps as increasing_stamps,
+)
+from .simulated.rig import SimulatedRig as SimulatedRig, true_view as true_view
+from .simulated.world import true_depth_um as true_depth_um, true_robot as true_robot

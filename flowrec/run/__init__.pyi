@@ -1,0 +1,22 @@
+import sys
+
+from .control import RunControl as RunControl
+from .disk_monitor import DiskMonitor as DiskMonitor, refuse_below as refuse_below
+from .loop import RunReport as RunReport, Sink as Sink, run as run
+from .operator_commands import COMMANDS as COMMANDS, HELP as HELP, LONGEST_NOTE as LONGEST_NOTE, NOTE as NOTE
+from .recorded import RecordedRig as RecordedRig
+from .replay_figures import (
+    CommandDifference as CommandDifference, ReplayFiles as ReplayFiles, ReplayPair as ReplayPair,
+    before_after as before_after,
+)
+from .streams import Streams as Streams
+from .watchdog import Watchdog as Watchdog
+from .worker_process import ProcessWorker as ProcessWorker
+from .workers import (
+    LockstepWorker as LockstepWorker, Preloaded as Preloaded, ReplayWorker as ReplayWorker, Worker as Worker,
+    work as work,
+)
+
+if sys.platform != "win32":
+    from .keyboard import keyboard_of as keyboard_of
+    from .signals import Signals as Signals

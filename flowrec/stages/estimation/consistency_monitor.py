@@ -1,0 +1,150 @@
+"""Health: whether the observer's estimate is consistent with the measurements, with an alarm when it is not.
+
+There are three alarms. All means are exponential, so that the message holds their state.
+
+- `nis`: the normalised innovation squared is far above 2, its mean when all noise is stated correctly: the robot is
+  moved by something that the model does not include. A value far below 2 is no alarm: the noise is stated too large.
+- `pulsation`: a spectral line in the flow, such as that of a pump. A bank of resonators z_f, exponential means of
+  r exp(-i 2 pi f t), analyses the relative deviation r of the flow's strength from the map (or from its own mean), less
+  the mean of r. The alarm needs a strong line that is also most of the variance of r: when the robot turns into another
+  branch, r changes a lot, but not in one line.
+- `tracking`: the fraction of frames without the robot.
+
+Step-out is detected as well, see step_out.py.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import Alarm, Applied, Estimate, FlowField, Health, Range, Share, seconds
+from flowrec.physics import Robot, sample
+from flowrec.stages.estimation.step_out import StepOut
+
+Floats = NDArray[np.float64]
+Resonators = NDArray[np.complex128]
+
+_BANK_HZ, _STEP, _ABOVE = 0.3, 1.125, 24  # of the bank: a frequency, the ratio of neighbours, how many from there on
+_EXPECTED_NIS = 2.0
+_LARGEST_NIS = 50.0  # a single lost step must not cause a minute of alarm
+_SLOW_FRACTION = 0.1  # of v_max: a deviation relative to a slower flow is not meaningful
+
+
+@dataclass(frozen=True, slots=True)
+class HealthMonitor:
+    """Settings of the alarms."""
+
+    window_s: Annotated[float, Range(0.05, 3600.0)] = 3.0  # of the means of NIS and of lost frames
+    # lowest frequency of a line that is looked for: that of the slowest syringe pumps. Its resonator needs the periods
+    # below to swing up, so a line of 0.1 Hz and 30 % is an alarm after half a minute, not in a short survey.
+    slowest_hz: Annotated[float, Range(0.01, 1.0)] = 0.05
+    # alarm if the mean NIS exceeds 2 by this many standard deviations of the mean of white innovations
+    nis_sigma: Annotated[float, Range(0.1, 1e6)] = 8.0
+    lost_share: Share = 0.3  # alarm above this fraction of frames without the robot
+    # memory of a resonator in periods of its frequency; one second at least
+    periods: Annotated[float, Range(0.5, 1e3)] = 2.0
+    pulsation_share: Annotated[float, Range(1e-3, 1e3)] = 0.15  # alarm above this amplitude relative to the flow
+    line_share: Share = 0.5  # if the line is at least this fraction of the variance
+    settle_s: Annotated[float, Range(0.0, 3600.0)] = 2.0  # the flow must have been accurate for this long
+    # the spectrum is not updated while the flow's sigma exceeds this fraction of v_max
+    settled_share: Annotated[float, Range(0.0, 10.0)] = 0.1
+    ends_at: Share = 0.8  # an alarm ends below this fraction of its thresholds
+    step_out: StepOut = field(default_factory=StepOut)
+
+    def watch(
+        self,
+        previous: Health | None,
+        before: Estimate | None,
+        estimate: Estimate,
+        field: FlowField | None,
+        robot: Robot,
+        applied: Applied | None = None,
+        wall_um: float = math.inf,
+    ) -> Health:
+        """Health after this frame.
+
+        Parameters
+        ----------
+        before : the estimate that `previous` was made with.
+        applied : None switches the detection of step-out off.
+        wall_um : from the robot's centre to the nearest wall.
+        """
+        bank_hz = _bank_hz(self.slowest_hz)
+        if previous is None or before is None:
+            bank = np.zeros(len(bank_hz))
+            return Health(
+                estimate.stamp_ns, "", _EXPECTED_NIS, 0.0, 0.0, 0.0, 0.0, 0.0, bank, bank, bank, np.zeros(2), 0.0
+            )
+        dt = max(seconds(estimate.stamp_ns - before.stamp_ns), 0.0)
+        weight = min(dt / self.window_s, 1.0)
+        lost = previous.lost_share + weight * (float(not estimate.seen) - previous.lost_share)
+        nis = previous.nis
+        if math.isfinite(estimate.nis):
+            nis += weight * (min(estimate.nis, _LARGEST_NIS) - nis)
+        settled_s, mean, offset = previous.heard_s, previous.mean_um_s, previous.offset_share
+        z, power = previous.bank_re + 1j * previous.bank_im, previous.bank_power
+        variance = 0.5 * float(estimate.covariance[2, 2] + estimate.covariance[3, 3])
+        if estimate.seen and dt > 0.0 and variance < (self.settled_share * robot.max_speed_um_s) ** 2:
+            settled_s += dt
+            mean = mean + weight * (estimate.flow_um_s - mean)
+            deviation = _flow_deviation(estimate, mean if field is None else sample(field, estimate.position_um), robot)
+            offset += weight * (deviation - offset)
+            z, power = self._resonate(z, power, deviation - offset, dt, seconds(estimate.stamp_ns))
+        strongest = int(np.argmax(np.abs(z)))
+        amplitude = 2.0 * float(np.abs(z[strongest]))
+        line = min(0.5 * amplitude**2 / float(power[strongest]), 1.0) if power[strongest] > 0.0 else 0.0
+        nis_std = self.nis_sigma * math.sqrt(2.0 * weight)
+        levels = {  # relative to the thresholds
+            Alarm.NIS: (nis - _EXPECTED_NIS) / nis_std if weight > 0.0 else 0.0,
+            Alarm.PULSATION: min(amplitude / self.pulsation_share, line / self.line_share, settled_s / self.settle_s),
+            Alarm.TRACKING: lost / self.lost_share,
+        }
+        active = previous.alarm.split("; ")
+        alarms = [name for name, level in levels.items() if level > (self.ends_at if name in active else 1.0)]
+        now = Health(
+            stamp_ns=estimate.stamp_ns,
+            alarm="; ".join(alarms),
+            nis=nis,
+            lost_share=lost,
+            heard_s=settled_s,
+            pulsation_hz=float(bank_hz[strongest]),
+            pulsation_share=amplitude,
+            line_share=line,
+            bank_re=z.real,
+            bank_im=z.imag,
+            bank_power=power,
+            mean_um_s=mean,
+            offset_share=offset,
+        )
+        if applied is None:
+            return now
+        return self.step_out.watch(previous, now, before, estimate, applied, field, robot, wall_um)
+
+    def _resonate(
+        self, z: Resonators, power: Floats, deviation: float, dt: float, time_s: float
+    ) -> tuple[Resonators, Floats]:
+        """State (n,) and mean square input (n,) of the resonators after `dt` seconds with an input."""
+        bank_hz = _bank_hz(self.slowest_hz)
+        weights = 1.0 - np.exp(-dt / np.maximum(self.periods / bank_hz, 1.0))
+        phase = np.exp(-2j * math.pi * bank_hz * time_s)
+        return z + weights * (deviation * phase - z), power + weights * (deviation**2 - power)
+
+
+def _flow_deviation(estimate: Estimate, expected_um_s: Floats, robot: Robot) -> float:
+    """Deviation of the flow's strength from an expected flow (2,), relative to it; -1 to 1."""
+    speed = max(math.hypot(expected_um_s[0], expected_um_s[1]), _SLOW_FRACTION * robot.max_speed_um_s)
+    deviation = float((estimate.flow_um_s - expected_um_s) @ expected_um_s) / speed**2
+    return min(max(deviation, -1.0), 1.0)
+
+
+@lru_cache(maxsize=16)
+def _bank_hz(slowest_hz: float) -> Floats:
+    """(n,) frequencies of the resonators."""
+    below = math.floor(math.log(_BANK_HZ / slowest_hz) / math.log(_STEP) + 1e-9)
+    return np.asarray(_BANK_HZ * _STEP ** np.arange(-below, _ABOVE))

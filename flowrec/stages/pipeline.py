@@ -1,0 +1,377 @@
+"""One tick: a frame comes in, currents go out. One call per stage, in order.
+
+The previous Tick is all the state between ticks, so the pipeline can resume at any tick.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import (
+    BY_FIELD,
+    FIXED,
+    NO_EXTRA,
+    TOPICS,
+    Action,
+    Appearance,
+    Applied,
+    AxesCheck,
+    Background,
+    CameraLosses,
+    Estimate,
+    Extra,
+    Fit,
+    FlowField,
+    Frame,
+    Message,
+    Observations,
+    OperatorEvent,
+    Phase,
+    RigError,
+    Role,
+    Route,
+    Shift,
+    Source,
+    Tick,
+    TopicTable,
+    Track,
+    Truth,
+    UsageError,
+    nearest_pixel,
+    seconds,
+    shift_px,
+)
+from flowrec.physics import Calibration, Chip, FlowSolver, Robot, clearance_um, on_chip, sample
+from flowrec.stages.config import ResolvedConfig, calibration_of
+from flowrec.stages.control import Coils, Controller
+from flowrec.stages.control.axes_check import leg_velocity, steady_velocity, watch
+from flowrec.stages.control.events import event_of
+from flowrec.stages.control.mission import MissionStateMachine
+from flowrec.stages.estimation import HealthMonitor, Observer, Sampler
+from flowrec.stages.extra_topics import ExtraStage, extra_rows, topics_of
+from flowrec.stages.planning import Planner, SurveyPlanner
+from flowrec.stages.refine import Refiner
+from flowrec.stages.vision import Stabiliser, Tracker, move_neighbours, unseen
+
+_RELEASE_S = 0.2  # from the moment at which a held robot may be let go until it is taken to be free
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Inputs of one tick: from the rig, the operator and the worker. None: nothing new."""
+
+    stamp_ns: int
+    frame: Frame | None  # None only in a replay of a recording that had to drop the image
+    applied: Applied
+    operator: OperatorEvent | None = None
+    assumed: FlowField | None = None  # adopted on this tick
+    refined: FlowField | None = None
+    route: Route | None = None
+    truth: Truth | None = None  # for the record only, no stage reads it
+    true_field: FlowField | None = None  # likewise
+    track: Track | None = None  # the recorded one, if `frame` was dropped
+    appearance: Appearance | None = None  # likewise, if it changed then
+    background: Background | None = None  # likewise
+    shift: Shift | None = None  # likewise
+    clock: Fit | None = None  # of the camera's clock, with which the stamp was made
+    losses: CameraLosses | None = None  # of the camera so far, for the record only
+    extra: Mapping[str, Message] = NO_EXTRA  # new messages of the extra topics of rig and simulator, by path
+
+
+# Fields of a Tick that arrive from outside, and those of them that stay known until the next message.
+ARRIVING = tuple(topic.field for topic in TOPICS if topic.role in (Role.INPUT, Role.TRUTH))
+HELD = tuple(name for name in ARRIVING if BY_FIELD[name].source in (Source.RIG, Source.OPERATOR, Source.WORKER))
+# The results of the stages that read the image: where it was not recorded, a replay takes these.
+FROM_IMAGE = ("track", "appearance", "background", "shift")
+if {each.name for each in fields(Inputs)} != {"stamp_ns", *FROM_IMAGE, "clock", "losses", "extra", *ARRIVING}:
+    raise TypeError(f"pipeline.Inputs needs a field for each input of Tick: {', '.join(ARRIVING)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pipeline:
+    """All stages of a run with the chip, the camera's calibration and the robot they work on."""
+
+    chip: Chip
+    calibration: Calibration
+    robot: Robot
+    clearance_um: NDArray[np.float32]  # (h, w) from each pixel centre to the nearest wall, negative in solid
+    image_shape: tuple[int, int]  # (height, width) in pixels of the camera's images
+    image_bits: int  # depth of their pixels
+    stabiliser: Stabiliser
+    tracker: Tracker
+    observer: Observer
+    health: HealthMonitor
+    sampler: Sampler
+    mission: MissionStateMachine
+    controller: Controller
+    coils: Coils
+    # Slow stages: run/workers.py runs them when the mission orders it.
+    solver: FlowSolver
+    refiner: Refiner
+    survey: SurveyPlanner
+    planner: Planner
+    # In a replay with smoothing: the observations up to a stamp, instead of the sampler's.
+    hindsight: Callable[[int], Observations] | None = None
+    topics: TopicTable = FIXED
+    extra_stages: Mapping[str, ExtraStage] = field(default_factory=dict)  # by path of the topic
+
+
+def assemble(config: ResolvedConfig, chip: Chip) -> Pipeline:
+    """The stages of a resolved configuration on its chip."""
+    return Pipeline(
+        chip=chip,
+        calibration=calibration_of(config, chip),
+        robot=config.robot,
+        clearance_um=clearance_um(chip.mask, chip.um_per_px),
+        image_shape=(config.camera.height_px, config.camera.width_px),
+        image_bits=config.camera.bits,
+        stabiliser=config.stabilise,
+        tracker=config.tracker,
+        observer=config.observer,
+        health=config.health,
+        sampler=config.sampler,
+        mission=config.mission,
+        controller=config.control,
+        coils=config.coils,
+        solver=config.flow,
+        refiner=config.refine,
+        survey=config.survey,
+        planner=config.plan,
+        topics=topics_of(config),
+        extra_stages={row.topic.path: row.settings for row in extra_rows(config) if row.topic.source is Source.STAGE},
+    )
+
+
+def _wall_um(p: Pipeline, point_um: NDArray[np.float64]) -> float:
+    """Distance from a point (2,) to the nearest wall, at the nearest pixel; 0 if the point is not finite."""
+    if not np.isfinite(point_um).all():
+        return 0.0
+    x, y = (point_um / p.chip.um_per_px).tolist()
+    return float(p.clearance_um[nearest_pixel(x, y, p.clearance_um.shape)])
+
+
+def _goal_fault(p: Pipeline, inputs: Inputs) -> str:
+    """Reason that the goal of the operator's event of this tick can be none; '' if a route may lead to it."""
+    event = inputs.operator
+    if event is None or event.stamp_ns != inputs.stamp_ns or event.goal_um.shape != (2,):
+        return ""
+    width_um, height_um = p.chip.size_um
+    x_um, y_um = event.goal_um + 0.5 * p.chip.um_per_px  # from the edge; the centre of the first pixel is 0, 0
+    if not (0.0 <= x_um <= width_um and 0.0 <= y_um <= height_um):
+        return "it is outside the chip"
+    return "" if _wall_um(p, event.goal_um) > 0.0 else "it is in a wall"
+
+
+def _place_on_chip(estimate: Estimate, refined: FlowField | None) -> Estimate:
+    """The estimate with its position on the chip, by the registration that the refinement found."""
+    if refined is None or refined.registration is None:
+        return estimate
+    return replace(estimate, position_um=on_chip(refined.registration, estimate.position_um))
+
+
+def _strength(coils: Coils, last: Tick) -> float:
+    """Amplitude of the field in the tick before, relative to the full one; 1 before the first."""
+    full_mt = coils.amplitude_mt
+    return min(last.currents.amplitude_mt / full_mt, 1.0) if last.currents is not None and full_mt > 0.0 else 1.0
+
+
+class Sight(NamedTuple):
+    """Results of an image: the robot, how it looks, and how far the image lies off."""
+
+    track: Track | None = None
+    appearance: Appearance | None = None
+    background: Background | None = None
+    shift: Shift | None = None
+
+
+def look(p: Pipeline, last: Sight, frame: Frame) -> Sight:
+    """Register the next image and find the robot in it."""
+    shift, background = p.stabiliser.register(
+        last.shift, last.background, last.track, frame, p.chip, p.calibration, p.robot
+    )
+    previous = last.track
+    if shift is not None and previous is not None and last.shift is not None:
+        previous = move_neighbours(previous, shift.shift_px - last.shift.shift_px)
+    found = p.tracker.follow(previous, last.appearance, frame, p.chip, p.calibration, p.robot, shift_px(shift))
+    return Sight(*found, background, shift)
+
+
+def _find_robot(p: Pipeline, last: Tick, inputs: Inputs) -> Sight:
+    """Position of the robot, when it was last seen, and how it looks. A repeated image counts as not seen."""
+    previous, before = last.track, Sight(last.track, last.appearance, last.background, last.shift)
+    if inputs.applied.repeats_image and previous is not None:
+        return before._replace(track=unseen(previous, inputs.stamp_ns))
+    if inputs.frame is None:
+        assert inputs.track is not None, "a tick has a frame or, where that was dropped, the recorded track"
+        new = {name: message for name in FROM_IMAGE if (message := getattr(inputs, name)) is not None}
+        return before._replace(**new)
+    sight = look(p, before, inputs.frame)
+    track = sight.track
+    if inputs.applied.image_since_ns is None or track is None:
+        return sight
+    before_ns = previous.seen_ns if previous is not None else None
+    return sight._replace(track=replace(track, seen_ns=track.stamp_ns if track.seen else before_ns))
+
+
+def _axes(p: Pipeline, last: Tick, tick: Tick, track: Track) -> tuple[AxesCheck | None, NDArray[np.float64] | None]:
+    """The check of the axes, and the velocity (2,) that it drives the robot with; None: the robot is controlled."""
+    mission = last.mission
+    checks = p.mission.check_axes and not p.mission.observes
+    if not checks or (mission is not None and mission.phase != Phase.START) or tick.applied is None:
+        return last.axes, None
+    if last.axes is not None and last.axes.verdict:
+        return last.axes, None
+    start_um = np.asarray(p.mission.start, np.float64)
+    hold_s = p.mission.hold_start_s or 0.0
+    # A robot that is let go beside an outlet would be carried out. Elsewhere the flow carries it along its channel, and
+    # to act against the flow of the map would drive it into a wall if the axes of the coils were exchanged.
+    map_um_s = sample(tick.assumed, start_um) if hold_s and tick.assumed is not None else np.zeros(2)
+    free_s = hold_s + p.coils.ramp_s + _RELEASE_S if hold_s else 0.0
+    since_s = 0.0 if mission is None else seconds(track.stamp_ns - mission.since_ns)
+    waits = mission is None or mission.held_since_ns is not None or mission.blind_since_ns is not None
+    axes = last.axes
+    if not waits and since_s >= free_s:
+        wall_um = _wall_um(p, start_um)
+        frame_s = p.planner.swift.frame_s or 0.0
+        axes = watch(axes, track, tick.applied, p.robot, map_um_s, wall_um, frame_s, p.calibration, p.coils)
+    if axes is not None and axes.verdict:
+        return axes, None
+    return axes, steady_velocity(axes, map_um_s) + (np.zeros(2) if waits else leg_velocity(axes))
+
+
+def _no_lap(_stage: str) -> None:
+    """Ignore the end of a stage."""
+
+
+def with_inputs(last: Tick, inputs: Inputs, topics: TopicTable = FIXED) -> Tick:
+    """The tick after `last` before any stage has run: the state of `last` with the new inputs.
+
+    Raises
+    ------
+    RigError : a message of a topic that the run does not declare.
+    """
+    new: dict[str, Any] = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
+    if inputs.extra:
+        new["extra"] = last.extra.updated(_of_source(inputs.extra, topics, Source.RIG))
+    return replace(last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, **new)
+
+
+def recorded_extra(tick: Tick, inputs: Inputs, topics: TopicTable) -> Extra:
+    """The messages of the extra topics that are recorded with a tick: those of a simulator, too."""
+    return tick.extra.updated(_of_source(inputs.extra, topics, Source.SIMULATOR)) if inputs.extra else tick.extra
+
+
+def _of_source(extra: Mapping[str, Message], topics: TopicTable, source: Source) -> dict[str, Message]:
+    for path in extra:
+        if path not in topics.by_field:
+            raise RigError(f"{path}: the rig has a message of this topic, which no row of `topics` declares; add it")
+    return {path: message for path, message in extra.items() if topics.by_field[path].source is source}
+
+
+def _with_extra_stages(p: Pipeline, last: Tick, tick: Tick) -> Tick:
+    """The tick with the messages of the stages of other packages, each of which sees those before it."""
+    for path, stage in p.extra_stages.items():
+        message = stage.step(last, tick)
+        if message is None or message is tick.extra.get(path):
+            continue
+        kind = p.topics.by_field[path].type
+        if type(message) is not kind:
+            raise UsageError(f"{path}: its stage returned a {type(message).__name__}, where a {kind.__name__} belongs")
+        tick = replace(tick, extra=tick.extra.updated({path: message}))
+    return tick
+
+
+def step(pipeline: Pipeline, last: Tick, inputs: Inputs, lap: Callable[[str], None] = _no_lap) -> Tick:
+    """The tick after `last`, given its inputs. `lap(stage)` is called as each stage ends, for timing only.
+
+    Long because it is the list of all stages with the messages that each one reads; parts of it would have to hand on
+    nearly all of these messages.
+    """
+    p = pipeline
+    tick = with_inputs(last, inputs, p.topics)
+    flow, route = tick.field, tick.route
+    sight = _find_robot(p, last, inputs)
+    track, appearance = sight.track, sight.appearance
+    assert track is not None, "the tracker says of every image whether it shows the robot"
+    lap("track")
+    estimate = p.observer.estimate(last.estimate, track, inputs.applied, p.robot, flow, last.health)
+    # The robot with the estimated um_per_rev, if the observer estimates it.
+    robot = p.robot if estimate.um_per_rev is None else replace(p.robot, um_per_rev=estimate.um_per_rev)
+    # Sessions recorded before step-out was monitored replay without it.
+    looked = inputs.applied if inputs.applied.image_since_ns is not None else None
+    # Observations, their predictions and the pictures keep to the registration as stated.
+    placed = _place_on_chip(estimate, tick.refined)
+    wall_um = _wall_um(p, placed.position_um)
+    health = last.health
+    if health is None or not (inputs.applied.repeats_image and last.mission is not None and last.mission.input_ended):
+        health = p.health.watch(health, last.estimate, estimate, flow, p.robot, looked, wall_um)
+    robot = robot.limited_to(health.limit_hz)
+    mapless, measured = last.mapless, estimate
+    if p.sampler.without_map:
+        mapless = p.observer.without_map(last.mapless, last.estimate, estimate, track, inputs.applied, p.robot)
+        measured = p.observer.measured_estimate(mapless, estimate)
+    before = None if last.estimate is None else p.observer.measured_estimate(last.mapless, last.estimate)
+    observations = p.sampler.collect(last.observations, before, measured, p.robot)
+    lap("observe")
+    axes, driven_um_s = _axes(p, last, tick, track)
+    mission = p.mission.update(
+        last.mission,
+        track,
+        placed,
+        tick.assumed,
+        tick.refined,
+        route,
+        inputs.operator,
+        last.demand,
+        robot,
+        inputs.applied,
+        p.tracker.not_found_note(appearance),
+        appearance is not None and bool(appearance.note),
+        observations,
+        _goal_fault(p, inputs),
+        axes,
+        driven_um_s is not None,
+    )
+    robot = robot.slowed_to(mission.speed_limit_um_s)
+    demand = p.controller.control(
+        last.demand,
+        mission,
+        route,
+        placed,
+        flow,
+        robot,
+        p.clearance_um,
+        p.chip.um_per_px,
+        _strength(p.coils, last),
+        p.observer.uses_map(estimate),
+        driven_um_s,
+    )
+    asked = inputs.operator
+    cut = asked is not None and asked.stamp_ns == inputs.stamp_ns and asked.action == Action.ZERO
+    cut = cut or mission.field_off
+    currents = p.coils.drive(last.currents, demand, robot, mission.finished, cut)
+    lap("control")
+    tick = replace(
+        tick,
+        track=track,
+        appearance=appearance,
+        background=sight.background,
+        shift=sight.shift,
+        estimate=estimate,
+        health=health,
+        observations=observations,
+        mapless=mapless,
+        mission=mission,
+        demand=demand,
+        currents=currents,
+        axes=axes,
+    )
+    if p.extra_stages:
+        tick = _with_extra_stages(p, last, tick)
+    event = event_of(last, tick, "time_to_go" in p.controller.needs)
+    return replace(tick, event=event) if event is not None else tick

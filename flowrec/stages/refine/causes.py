@@ -1,0 +1,278 @@
+"""Effects, with their sizes, that make observations differ from the assumed flow besides boundary values and fluid.
+
+With the measured flow y_i at x_i, the robot's own motion r_i as it is assumed, and the flow v:
+
+    y_i = v(x_i) + dv/dx (offset - scale (x_i - c) - angle J (x_i - c)) + (scale + angle J) v + scale r_i
+          + (gain - hindrance (b_i - b)) r_i + heading J r_i + rolling(t_i) r_i
+          + sphere(v) + walls(x_i) + v p(t_i) + local(x_i) + noise
+
+J turns from +x to +y, c is the mean of the places. b_i is the drag of the side walls on a sphere of the robot's radius,
+relative to the largest one, and b its mean: the gain is that of the robot where it was observed, and hindrance what
+differs nearer to or farther from a wall. sphere(v) is how a sphere lags behind the flow, sphere_between_walls.py. Where
+the radius is not stated (older sessions), b_i = exp(-(d_i - d) / (d / 2)) falls with the distance d_i to the wall, d is
+the least one that was observed, and the lag is carry b_i v - curved d^2 / 6 lap v. p is a change of the whole flow in
+time: slow wander, and a spectral line. `local` is the error of the grid. Each effect is linear in its unknowns around
+the flow and the registration in use, so the assimilation repeats with those that it found.
+
+Walls that are off by w pixels (one standard deviation, each wall on its own) change the width of a cell of the channels
+by the fraction e = sqrt(2) w / width. In a channel at the same flow rate the mean speed changes by -e, the resistance
+by -3 e (lubrication; Poiseuille between plates); beside a wall the whole profile moves with it, by w times the gradient
+of the velocity. One size w belongs to all three, so the speeds that were observed in the middle of the channels tell
+how far to trust the flow beside their walls, where no robot has been.
+
+The median of a size is what is usual in a laboratory, the ln_std says how far that may be off: by a factor of 3 to 5,
+so that the observations decide (evidence.py), and an effect that nothing asks for stays small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowrec.core import cells_at
+from flowrec.physics import clearance_um
+from flowrec.stages.refine.channel_cells import curvature
+from flowrec.stages.refine.evidence import Effect
+from flowrec.stages.refine.flow_model import FlowModel
+from flowrec.stages.refine.observation_operator import Floats, ObservationOperator
+from flowrec.stages.refine.sphere_between_walls import SphereBetweenWalls
+
+# Median and ln_std of the size of each effect.
+BOUNDARY = (1.0, 0.3)  # in the prior standard deviations of the settings
+FLUID = (1.0, 0.02)  # viscosity, density, depth, shapes of the inlets, fraction of the grid's error: as stated
+RESISTANCE = (0.05, 1.0)  # of a cell: a channel 3 % narrower than drawn has 9 % more
+WALLS = (0.29, 0.8)  # px by which a wall is off: a wall somewhere in its pixel, 1 / sqrt(12)
+WALLS_LONG = np.sqrt(0.5)  # of it, what extends over a cell: half of the variance; the rest over a channel's width
+LOCAL = (1.0, 0.8)  # of the error of the grid that the model states
+GAIN = (0.08, 1.3)  # um per revolution is known to a few per cent where it was calibrated, else to 15 %
+HEADING = (0.01, 0.8)  # rad: coils and camera are aligned to half a degree
+CURVED = (0.12, 0.8)  # of the part of Faxen's law that a sphere as large as the least distance to a wall would show
+HINDRANCE = (0.05, 1.0)  # of the own motion, between the least distance to a wall and far from one
+CARRY = (0.02, 0.4)  # of the flow, likewise: a sphere lags by few per cent until it nearly touches the wall
+# Of the lag of a sphere of the stated radius (sphere_between_walls.py): a robot that the floor holds lags otherwise. In
+# two simulated surveys on each of four chips the size 0.5 around no lag had smaller errors than 0.5 or 1 +- 0.5 of it.
+SPHERE = (0.5, 0.3)
+# Of the own motion, per unit of the drag of the side walls: a roller's floor has 2.2 to 3.4 times Stokes' drag at gaps
+# of a tenth to a hundredth of its radius (Goldman, Cox and Brenner 1967), which the walls' drag adds to.
+HELD = (0.3, 1.0)
+OFFSET_PX = (0.3, 1.0)  # registration to a fraction of a pixel of the mask
+SCALE = (0.006, 1.0)  # um per pixel of a camera
+ANGLE = (0.004, 0.8)  # rad
+WANDER = (0.02, 1.2)  # of the flow, over `WANDER_S`: a pump on a bench
+WANDER_S = (2.0, 20.0)  # correlation times: one effect each
+ROLLING = (0.02, 0.7)  # of the own motion: a roller's course and speed vary by that much, over `ROLLING_S`
+ROLLING_S = 1.0  # correlation time: as long as a roller needs for some ten revolutions
+LINE = (0.04, 1.3)  # amplitude of a spectral line
+AS_STATED = 0.1  # of these sizes, for a chip that is as drawn and a robot and a camera that are as calibrated
+_STATED = (
+    *("resistance", "walls", "offset", "scale", "angle"),
+    *("gain", "heading", "hindrance", "carry", "curved", "sphere"),
+)
+DISTURBED = (3.0, 1.0)  # of a disturbance that was noticed, in typical stated standard deviations of an observation
+NEIGHBOURHOOD_PX = 6.0  # over which the correlation of the model's local error falls to 1 / e
+SLOWEST_HZ = 0.05  # of a line
+LINE_STEP = 0.2  # of the frequencies that are tried, over the time that was observed: finer than its resolution
+MOST_LINES = 400  # of them, for the time that it takes
+LEAST_PERIODS = 0.5  # of a line in the time that was observed: less is a wander
+FEWEST_FOR_LINE = 12  # observations: amplitude, phase and frequency on top of the flow
+LINE_NAME = "line"
+NEAR_SHARE = 0.5  # of the least distance: over which hindrance falls to 1 / e
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed:
+    """The usable observations in the walls of one model, and what the effects need of each."""
+
+    model: FlowModel
+    operator: ObservationOperator  # on the fluid pixels of the model
+    shifted: tuple[ObservationOperator, ...]  # half a pixel to the right, left, down, up
+    cells: Floats  # (cells, n) weights of the cells there
+    near: Floats  # (n,) b_i: 1 where walls hold the robot back most
+    least_px: float  # least distance to a wall
+    sphere: SphereBetweenWalls | None  # None: the robot's radius is not stated
+    um_per_px: float
+    stated: ObservationOperator  # where the registration puts the observations
+    moved: Floats  # (n, 2) px from there to where the flow is read, by the registration in use
+    usual: float = 1.0  # sizes of the effects in _STATED, over what is usual
+
+    @classmethod
+    def of(cls, model: FlowModel, operator: ObservationOperator, moved: Floats | None = None) -> Observed:
+        """The observations of an operator, moved by (n, 2) px. Those in solid are predicted to be at rest."""
+        mask, wall_px = model.chip.mask, model.expansion.wall_px
+        stated, moved = operator, np.zeros_like(operator.points) if moved is None else moved
+        operator = replace(operator, points=np.clip(operator.points + moved, 0.0, np.array(mask.shape[::-1]) - 1.0))
+        here = operator.with_walls(wall_px)
+        steps = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        last = np.array(mask.shape[::-1]) - 1.0
+        shifted = tuple(
+            replace(operator, points=np.clip(operator.points + step, 0.0, last)).with_walls(wall_px).on_fluid(mask)
+            for step in steps
+        )
+        here = here.on_fluid(mask)
+        clearance = np.minimum(clearance_um(mask, 1.0), np.float32(max(mask.shape)))
+        distance = np.maximum(cells_at(operator.points, mask.shape).interpolate(clearance), 0.0)
+        least = max(float(distance.min()), 0.5)
+        sphere = None
+        if operator.radius_px is None:
+            near = np.exp(-np.maximum(distance - least, 0.0) / (NEAR_SHARE * least))
+        else:
+            sphere = SphereBetweenWalls.of(operator.radius_px, mask, clearance, operator.points, distance)
+            near = sphere.drag / float(sphere.drag.max())
+        cells = model.cells[:, here.pixels[:, 0]].toarray()
+        return cls(model, here, shifted, cells, near, least, sphere, model.chip.um_per_px, stated, moved)
+
+    def at(self, registration: Floats) -> Observed:
+        """The observations moved by a registration (4,): offset x and y in px, scale, angle in rad."""
+        away = self.away
+        moved = np.asarray(registration[:2] - registration[2] * away - registration[3] * _quarter_turn(away))
+        return replace(Observed.of(self.model, self.stated, moved), usual=self.usual)
+
+    @property
+    def away(self) -> Floats:
+        """(n, 2) px from the mean of the places."""
+        return np.asarray(self.stated.points - self.stated.points.mean(axis=0))
+
+    def misfit(self, flow: Floats, in_use: Floats) -> Floats:
+        """(n, 2) measured minus predicted from a flow (n, 2), for a registration without error.
+
+        The flow is read where the registration in use has the observations; what this adds is taken off to first order,
+        because the effects count from the stated registration.
+        """
+        added = np.einsum("an,anc->nc", self.moved.T, self._gradient(in_use)) if self.moved.any() else 0.0
+        return np.asarray(self.operator.flow_um_s - self.operator.predict(flow) + added)
+
+    def beyond_first_order(self, flow: Floats) -> Floats:
+        """(n, 2) what the registration in use adds to the observations of a flow, but for its first order."""
+        if not self.moved.any():
+            return np.zeros_like(self.moved)
+        first = np.einsum("an,anc->nc", self.moved.T, self._gradient(flow))
+        return np.asarray(self.operator.predict(flow) - self.predict_stated(flow) - first)
+
+    def predict_stated(self, flow: Floats) -> Floats:
+        """(n, 2) a flow (n, 2) where the stated registration has the observations."""
+        stated = self.stated.with_walls(self.model.expansion.wall_px).on_fluid(self.model.chip.mask)
+        return stated.predict(flow)
+
+    def _gradient(self, flow: Floats) -> Floats:
+        """(2, n, 2) derivatives of a flow along x and y, um/s per px."""
+        right, left, down, up = (one.predict(flow) for one in self.shifted)
+        return np.stack([right - left, down - up])
+
+    def effects(self, flow: Floats, line_hz: float | None) -> list[Effect]:
+        """All effects around a flow (n, 2) of the model's pixels, with columns for the observations, x and y of each.
+
+        The first four have unknowns that belong to the field: boundary values, fluid, resistances, walls.
+        """
+        here, model = self.operator, self.model
+        v = here.predict(flow)
+        gradient = self._gradient(flow)
+        rolled, time_s = here.rolled_um_s, here.time_s
+        own = np.zeros_like(v) if rolled is None else rolled
+        away = self.away
+        turned = _quarter_turn(away)
+        stretch = v + own - np.einsum("an,anc->nc", away.T, gradient)
+        turn = _quarter_turn(v) - np.einsum("an,anc->nc", turned.T, gradient)
+        known, openings = here.predict(model.known), len(model.chip.openings)
+        found = [
+            _effect("boundary", BOUNDARY, known[:openings]),
+            _effect("fluid", FLUID, known[openings:]),
+            _effect("resistance", RESISTANCE, here.predict(model.resistance)),
+            replace(_effect("walls", WALLS, self._widening_flow(v)), kernel=self._beside_walls(v, gradient)),
+            _effect("offset", OFFSET_PX, gradient),
+            _effect("scale", SCALE, stretch[None]),
+            _effect("angle", ANGLE, turn[None]),
+            *self._transport_effects(v, flow),
+            Effect("local", *LOCAL, np.zeros((0, v.size)), self.local_error()),
+        ]
+        if rolled is not None:
+            found += [
+                _effect("gain", GAIN, own[None]),
+                _effect("heading", HEADING, _quarter_turn(own)[None]),
+                _effect("hindrance", self._hindrance_size(), -((self.near - self.near.mean())[:, None] * own)[None]),
+            ]
+        if time_s is not None:
+            along = v.ravel()[:, None] * v.ravel()
+            apart = np.abs(np.repeat(time_s, 2)[:, None] - np.repeat(time_s, 2))
+            none = np.zeros((0, v.size))
+            found += [
+                Effect(f"wander {length:g} s", *WANDER, none, along * np.exp(-apart / length)) for length in WANDER_S
+            ]
+            if rolled is not None:
+                pushed = [(vectors.ravel()[:, None] * vectors.ravel()) for vectors in (own, _quarter_turn(own))]
+                found.append(Effect("rolling", *ROLLING, none, sum(pushed) * np.exp(-apart / ROLLING_S)))
+            if line_hz is not None:
+                found.append(_effect(LINE_NAME, LINE, waves(line_hz, time_s)[:, :, None] * v))
+        noise = float(np.median(here.std_um_s))
+        found += [_effect(name, (DISTURBED[0] * noise, DISTURBED[1]), every) for name, every in here.disturbances]
+        return [
+            replace(effect, median=self.usual * effect.median) if effect.name in _STATED else effect for effect in found
+        ]
+
+    def _transport_effects(self, v: Floats, flow: Floats) -> list[Effect]:
+        """Effects of a flow (n, 2), which is v (n, 2) at the observations, on a robot of finite size."""
+        pixels = np.unique(self.operator.pixels)
+        bent = np.zeros_like(flow)
+        bent[pixels] = curvature(self.model.chip.mask, flow, pixels)
+        laplacian = self.operator.predict(bent)
+        if self.sphere is not None:
+            return [_effect("sphere", SPHERE, self.sphere.transport_slip(v, laplacian)[None])]
+        return [
+            _effect("carry", CARRY, -(self.near[:, None] * v)[None]),
+            _effect("curved", CURVED, (self.least_px**2 / 6.0 * laplacian)[None]),
+        ]
+
+    def _hindrance_size(self) -> tuple[float, float]:
+        """Size of the hindrance of the own motion: median and ln_std."""
+        return HINDRANCE if self.sphere is None else (HELD[0] * float(self.sphere.drag.max()), HELD[1])
+
+    def _widening_flow(self, v: Floats) -> Floats:
+        """(cells, n, 2) what walls that are a pixel off in a cell do to the flow v (n, 2), there and elsewhere."""
+        resistance = self.operator.predict(self.model.resistance)
+        both = 3.0 * resistance + self.cells[:, :, None] * v
+        return np.asarray(-WALLS_LONG * self.model.widening[:, None, None] * both)
+
+    def _beside_walls(self, v: Floats, gradient: Floats) -> Floats:
+        """(2 n, 2 n) covariance of a profile that moves by a pixel and of what is shorter than a cell.
+
+        `v` (n, 2) is the flow, `gradient` (2, n, 2) its derivatives, um/s per px.
+        """
+        points = self.operator.points
+        apart = np.linalg.norm(points[:, None] - points, axis=-1)
+        wider = np.sqrt(1.0 - WALLS_LONG**2) * (self.model.widening @ self.cells)[:, None] * v
+        flat = np.concatenate([gradient, wider[None]]).reshape(3, -1)
+        return np.asarray((flat.T @ flat) * np.kron(np.exp(-apart / self.model.channel_px), np.ones((2, 2))))
+
+    def local_error(self) -> Floats:
+        """(2 n, 2 n) covariance of the model's own error: neighbours share it."""
+        here = self.operator
+        std = here.predict(np.repeat(self.model.error_std[:, None], 2, axis=1))[:, 0]
+        apart = np.linalg.norm(here.points[:, None] - here.points, axis=-1)
+        covariance = std[:, None] * std * np.exp(-apart / NEIGHBOURHOOD_PX)
+        return np.kron(covariance, np.eye(2))
+
+
+def waves(hz: float, time_s: Floats) -> Floats:
+    """(2, n) cosine and sine of a line."""
+    phase = 2.0 * np.pi * hz * time_s
+    return np.stack([np.cos(phase), np.sin(phase)])
+
+
+def lines_hz(time_s: Floats | None) -> Floats:
+    """(k,) frequencies that observations at times (n,) could show: enough periods, and two observations in each."""
+    if time_s is None or len(time_s) < FEWEST_FOR_LINE:
+        return np.zeros(0)
+    span = float(np.ptp(time_s))
+    slowest, fastest = max(SLOWEST_HZ, LEAST_PERIODS / max(span, 1e-9)), 0.5 * (len(time_s) - 1) / max(span, 1e-9)
+    if fastest <= slowest:
+        return np.zeros(0)
+    return np.arange(slowest, fastest, LINE_STEP / span)[:MOST_LINES]
+
+
+def _effect(name: str, size: tuple[float, float], columns: Floats) -> Effect:
+    return Effect(name, *size, np.ascontiguousarray(columns.reshape(len(columns), -1)))
+
+
+def _quarter_turn(vectors: Floats) -> Floats:
+    """(n, 2) vectors turned by 90 degrees from +x to +y."""
+    return np.stack([-vectors[:, 1], vectors[:, 0]], axis=1)

@@ -1,0 +1,210 @@
+"""Gaussian evidence: how likely observations are under unknowns of unknown size, and what these unknowns then are.
+
+The observations y (m,) are a sum of effects and noise, y ~ N(0, C) with
+
+    C = R + sum_g s_g^2 G_g
+
+Each effect g (boundary values, the robot's um per revolution, errors of the map along the channels, and others) has a
+size s_g, one standard deviation of its unknowns, and a matrix G_g = D_g' D_g of its columns, or its own kernel. Sizes
+are unknown themselves: ln s_g has a normal hyperprior. The marginal likelihood of the sizes (restricted likelihood for
+the effects that are integrated out) is maximised by a quasi-Newton method; the posterior of the sizes around that mode
+is a normal distribution with the expected information as its precision, corrected by importance weights at fixed
+points (MacKay 1992; Rue, Martino and Chopin 2009 for the idea). The posterior of the unknowns is averaged
+over the points, so an effect that the observations can not tell from another one widens the error bars by what it might
+be: a mean over models, not the choice of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy  # its linalg and optimize load at first use, not at start-up
+
+from flowrec.stages.refine.observation_operator import Floats
+
+POINTS = 32  # at which the posterior of the sizes is integrated; a power of two above the number of sizes
+NEGLIGIBLE = 1e-3  # weight of a point, relative to the largest, that is left out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Effect:
+    """One kind of unknown, or of error, and the hyperprior of its size."""
+
+    name: str
+    median: float  # of the size s
+    ln_std: float  # of ln s
+    columns: Floats  # (unknowns, m) what a unit of each unknown does to the observations; (0, m) for a kernel
+    kernel: Floats | None = None  # (m, m) of what no unknown stands for, in addition
+
+    @property
+    def matrix(self) -> Floats:
+        """(m, m) covariance that it adds at size 1."""
+        return np.asarray(self.columns.T @ self.columns + (0.0 if self.kernel is None else self.kernel))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posterior:
+    """Posterior of the unknowns of all effects with columns, in order, averaged over their sizes."""
+
+    evidence: float  # ln of the marginal likelihood
+    mean: Floats  # (unknowns,)
+    covariance: Floats  # (unknowns, unknowns)
+    sizes: Floats  # (effects,) geometric posterior mean of each size
+    ln_size_std: Floats  # (effects,)
+    square_sizes: Floats  # (effects,) posterior mean of the square of each size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sizes:
+    """The posterior of ln sizes as a normal distribution, and the ln evidence by Laplace's method."""
+
+    mode: Floats  # (effects,)
+    covariance: Floats  # (effects, effects)
+    evidence: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EffectModel:
+    """Observations y (m,) with noise of covariance R (m, m), and the effects that may explain them."""
+
+    y: Floats
+    noise: Floats
+    effects: Sequence[Effect]
+
+    def sizes(self, start: Floats | None = None) -> Sizes:
+        """The most probable sizes and their uncertainty."""
+        matrices = self._matrices()
+        medians = np.log([effect.median for effect in self.effects])
+        stds = np.array([effect.ln_std for effect in self.effects])
+
+        def cost(ln_sizes: Floats) -> tuple[float, Floats]:
+            value, gradient = self._likelihood(matrices, ln_sizes)
+            scaled = (ln_sizes - medians) / stds
+            return -value + 0.5 * float(scaled @ scaled), -gradient + scaled / stds
+
+        bounds = [(median - 6.0 * std, median + 4.0 * std) for median, std in zip(medians, stds, strict=True)]
+        begin = medians if start is None else start
+        found = scipy.optimize.minimize(
+            cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40, "ftol": 1e-5}
+        )
+        mode = np.asarray(found.x, np.float64)
+        inverse = np.linalg.inv(self._covariance(matrices, mode))
+        scaled = 2.0 * np.exp(2.0 * mode)[:, None, None] * (inverse @ matrices)
+        # Half of the traces of the products of each two.
+        products = scaled.reshape(len(mode), -1) @ scaled.transpose(0, 2, 1).reshape(len(mode), -1).T
+        information = np.diag(1.0 / stds**2) + 0.25 * (products + products.T)
+        covariance = np.asarray(np.linalg.inv(information), np.float64)
+        # Laplace: the hyperprior's density is normalised, its constant is in the determinants.
+        evidence = -float(found.fun) + 0.5 * float(np.linalg.slogdet(covariance)[1]) - float(np.log(stds).sum())
+        return Sizes(mode, covariance, evidence)
+
+    def posterior(self, sizes: Sizes) -> Posterior:
+        """The unknowns, averaged over the sizes."""
+        matrices = self._matrices()
+        columns = np.concatenate([effect.columns for effect in self.effects])
+        owner = np.repeat(np.arange(len(self.effects)), [len(effect.columns) for effect in self.effects])
+        medians = np.log([effect.median for effect in self.effects])
+        stds = np.array([effect.ln_std for effect in self.effects])
+        normal = _points(len(medians))
+        root = np.linalg.cholesky(sizes.covariance)
+        points = sizes.mode + normal @ root.T
+        points = np.clip(points, medians - 6.0 * stds, medians + 4.0 * stds)
+        ln_weight = np.empty(len(points))
+        for index, point in enumerate(points):
+            factor, solved = self._factorise(matrices, point)
+            value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
+            value -= 0.5 * len(self.y) * np.log(2.0 * np.pi)
+            ln_prior = -0.5 * float((((point - medians) / stds) ** 2).sum()) - float(np.log(stds).sum())
+            ln_proposal = -0.5 * float(normal[index] @ normal[index]) - float(np.log(np.diag(root)).sum())
+            ln_weight[index] = value + ln_prior - ln_proposal
+        top = float(ln_weight.max())
+        weight = np.exp(ln_weight - top)
+        # One point that outweighs all others is an accident of the sampling: no weight above the mean of the rest.
+        weight = np.minimum(weight, np.sqrt(float(weight.mean()) * float(weight.max())))
+        evidence = top + float(np.log(np.exp(ln_weight - top).mean()))
+        weight /= weight.sum()
+        mean, square = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
+        for share, point in zip(weight, points, strict=True):
+            if share < NEGLIGIBLE * weight.max():
+                continue
+            factor, solved = self._factorise(matrices, point)
+            variance = np.exp(2.0 * point)[owner]
+            effect = variance[:, None] * columns
+            one = effect @ solved
+            half = scipy.linalg.solve_triangular(factor, effect.T, lower=True, check_finite=False)
+            mean += share * one
+            square += share * (np.diag(variance) - half.T @ half + np.outer(one, one))
+        covariance = square - np.outer(mean, mean)
+        centre = weight @ points
+        spread = np.sqrt(np.maximum(weight @ (points - centre) ** 2, 0.0))
+        square_sizes = weight @ np.exp(2.0 * points)
+        return Posterior(evidence, mean, 0.5 * (covariance + covariance.T), np.exp(centre), spread, square_sizes)
+
+    def most_probable(self, sizes: Sizes) -> Floats:
+        """(unknowns,) at the most probable sizes."""
+        _, solved = self._factorise(self._matrices(), sizes.mode)
+        return np.concatenate(
+            [
+                np.exp(2.0 * ln_size) * (effect.columns @ solved)
+                for effect, ln_size in zip(self.effects, sizes.mode, strict=True)
+            ]
+        )
+
+    def covariance(self, ln_sizes: Floats) -> Floats:
+        """(m, m) of the observations at sizes of the effects."""
+        return self._covariance(self._matrices(), ln_sizes)
+
+    def _matrices(self) -> Floats:
+        """(effects, m, m) what each effect adds to the covariance at size 1."""
+        return np.stack([effect.matrix for effect in self.effects])
+
+    def _covariance(self, matrices: Floats, ln_sizes: Floats) -> Floats:
+        sum_of_effects = np.exp(2.0 * ln_sizes) @ matrices.reshape(len(matrices), -1)
+        return np.asarray(self.noise + sum_of_effects.reshape(self.noise.shape))
+
+    def _factorise(self, matrices: Floats, ln_sizes: Floats) -> tuple[Floats, Floats]:
+        """Cholesky factor (m, m) of the covariance, and the covariance's inverse times y."""
+        factor = scipy.linalg.cholesky(self._covariance(matrices, ln_sizes), lower=True, check_finite=False)
+        return factor, scipy.linalg.cho_solve((factor, True), self.y, check_finite=False)
+
+    def _likelihood(self, matrices: Floats, ln_sizes: Floats) -> tuple[float, Floats]:
+        """Ln N(y; 0, C) and its gradient (effects,) by ln size."""
+        factor, solved = self._factorise(matrices, ln_sizes)
+        inverse = scipy.linalg.cho_solve((factor, True), np.eye(len(self.y)), check_finite=False)
+        value = -0.5 * float(self.y @ solved) - float(np.log(np.diag(factor)).sum())
+        # s^2 (u^T G u - trace(C^-1 G)) with u = C^-1 y, of all effects at once.
+        gradient = np.exp(2.0 * ln_sizes) * (
+            matrices.reshape(len(matrices), -1) @ (np.outer(solved, solved) - inverse).ravel()
+        )
+        return value - 0.5 * len(self.y) * np.log(2.0 * np.pi), gradient
+
+
+def gains_of_trials(columns: Floats, covariance: Floats, y: Floats, sizes: Sequence[float]) -> Floats:
+    """(k,) ln evidence gained by each of k effects on top of what else may explain y, of covariance (m, m).
+
+    `columns` (k, unknowns, m); summed over trial sizes.
+    """
+    inverse = np.linalg.inv(covariance)
+    precision = columns @ inverse @ columns.transpose(0, 2, 1)
+    score = columns @ (inverse @ y)
+    gains = []
+    for size in sizes:
+        inner = np.eye(columns.shape[1]) + size**2 * precision
+        explained = (score * np.linalg.solve(inner, score[..., None])[..., 0]).sum(axis=1)
+        gains.append(0.5 * size**2 * explained - 0.5 * np.linalg.slogdet(inner)[1])
+    return np.asarray(np.logaddexp.reduce(gains, axis=0))
+
+
+def _points(dimensions: int) -> Floats:
+    """(POINTS or more, dimensions) corners of a cube, +1 and -1: mean and covariance are those of a standard normal.
+
+    Columns of a Hadamard matrix are orthogonal to each other and to the first, which is constant (the design of
+    Plackett and Burman 1946). The points lie at the distance sqrt(dimensions), where a normal distribution has its
+    mass. (Of a Halton sequence in seventeen dimensions the first 32 points are correlated ramps.)
+    """
+    count = POINTS
+    while count <= dimensions:
+        count *= 2
+    return np.asarray(scipy.linalg.hadamard(count)[:, 1 : dimensions + 1], np.float64)

@@ -1,0 +1,249 @@
+"""Findings of an assimilation besides the boundary values: names, values, standard deviations, and plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowrec.core import FlowField
+from flowrec.physics import Chip
+from flowrec.stages.refine.causes import LINE_NAME, WANDER_S
+from flowrec.stages.refine.disturbances import SHAKE
+from flowrec.stages.refine.hypothesis import HypothesisFit
+from flowrec.stages.refine.observation_operator import Floats
+from flowrec.stages.refine.obstacles import Obstacle
+
+SURE = 2.5  # standard deviations from zero above which a cause is named
+PROBABLE = 0.9  # probability of a depth, or of none, above which it is said
+# Factor for people, least value that is worth a word, and the words for a negative and a positive value. Clockwise is
+# from +x to +y, as the chip is drawn. The values have the signs of causes.py: um_per_px_share is the stated scale over
+# the true one, less 1; an offset is where the robot is, from where it was measured, so the chip lies the other way.
+WORDS = {
+    "um_per_rev_share": (
+        *(100.0, 0.02),
+        "the robot moves {} % less per revolution than stated",
+        "the robot moves {} % more per revolution than stated",
+    ),
+    "heading_deg": (
+        *(1.0, 2.0),
+        "the robot's own course lies {} degrees counterclockwise of its heading",
+        "the robot's own course lies {} degrees clockwise of its heading",
+    ),
+    "hindrance_share": (
+        *(100.0, 0.03),
+        "near walls the robot rolls by {} % faster than elsewhere",
+        "near walls the robot rolls by {} % slower than elsewhere",
+    ),
+    "um_per_px_share": (
+        *(100.0, 0.005),
+        "the image scale is {} % larger than stated",
+        "the image scale is {} % smaller than stated",
+    ),
+    "angle_deg": (
+        *(1.0, 0.3),
+        "the chip is turned by {} degrees counterclockwise from how the registration puts it",
+        "the chip is turned by {} degrees clockwise from how the registration puts it",
+    ),
+}
+UNSURE = 0.04  # of um per revolution: a larger standard deviation is worth a word
+MOVED_PX = 0.25  # least offset of the registration, or of walls, that is worth a word, in pixels of the mask
+WANDERS, PULSATES = 0.06, 0.03  # likewise of the flow in time, and of a line of the pump
+OTHER_SCALE, OTHER_SCALE_STDS = 0.02, 3.0  # of um_per_px_share from which on a session is doubtful
+PERIODS = 1.5  # of a line in the time that was observed; with fewer, a place that was passed once looks like it
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """Named values with their standard deviations, means over the hypotheses; the rest is for the note."""
+
+    names: tuple[str, ...]
+    values: Floats
+    stds: Floats
+    words: tuple[str, ...]
+
+    def of(self, name: str) -> tuple[float, float]:
+        """Value and standard deviation of a name.
+
+        Raises
+        ------
+        ValueError
+            If there is no such name.
+        """
+        index = self.names.index(name)
+        return float(self.values[index]), float(self.stds[index])
+
+
+def scale_doubt(field: FlowField, um_per_px: float) -> str:
+    """Reason to doubt a session's stated scale by its refined field; '' if the field has no other scale."""
+    names = field.parameter_names.split("; ")
+    if "um_per_px_share" not in names:
+        return ""
+    value, std = (float(each[names.index("um_per_px_share")]) for each in (field.parameters, field.parameter_std))
+    if abs(value) <= max(OTHER_SCALE, OTHER_SCALE_STDS * std):
+        return ""
+    way = "large" if value > 0.0 else "small"
+    return (
+        f"camera.um_per_px = {um_per_px:.4g} is {100.0 * abs(value):.1f} +- {100.0 * std:.1f} % too {way} for the "
+        f"motion of the robot: measure it with flowrec calibrate image, or try {um_per_px / (1.0 + value):.4g}"
+    )
+
+
+def findings(found: Sequence[HypothesisFit], weights: Floats) -> Findings:
+    """Combine the hypotheses."""
+    parts = [_values(one) for one in found]
+    names = list(dict.fromkeys(name for part in parts for name in part))
+    values, stds = {}, {}
+    for name in names:
+        # A hypothesis that does not know an effect says that it is zero.
+        pairs = np.array([part.get(name, (0.0, 0.0)) for part in parts])
+        mean = float(weights @ pairs[:, 0])
+        values[name] = mean
+        stds[name] = float(np.sqrt(weights @ (pairs[:, 1] ** 2 + (pairs[:, 0] - mean) ** 2)))
+    depth_words = []
+    shallow = [index for index, one in enumerate(found) if one.observed.model.prior.depth_index is not None]
+    share = float(weights[shallow].sum()) if shallow else 0.0
+    if shallow:
+        depths = np.array([found[index].depth_um for index in shallow])
+        part = weights[shallow] / share
+        ln_mean = float(part @ np.log(depths[:, 0]))
+        ln_std = float(np.sqrt(part @ ((depths[:, 1] / depths[:, 0]) ** 2 + (np.log(depths[:, 0]) - ln_mean) ** 2)))
+        depth, std = float(np.exp(ln_mean)), float(np.exp(ln_mean) * ln_std)
+        if share > PROBABLE:
+            names.append("depth_um")
+            values["depth_um"], stds["depth_um"] = depth, std
+            depth_words.append(f"chip depth {with_error(depth, std)} um")
+        elif share > 1.0 - PROBABLE:
+            depth_words.append(
+                f"whether the chip is shallow they do not tell ({share:.0%}: {depth:.0f} +- {std:.0f} um)"
+            )
+    time_s = found[0].observed.operator.time_s
+    observed_s = 0.0 if time_s is None else float(np.ptp(time_s))
+    words = (*_words(values, stds, found[0].observed.um_per_px, observed_s), *depth_words)
+    return Findings(tuple(names), np.array([values[n] for n in names]), np.array([stds[n] for n in names]), words)
+
+
+def _values(one: HypothesisFit) -> dict[str, tuple[float, float]]:
+    """Value and standard deviation by name, of one hypothesis."""
+    px = one.observed.um_per_px
+    singles = {
+        "um_per_rev_share": ("gain", 1.0),
+        "hindrance_share": ("hindrance", 1.0),
+        "heading_deg": ("heading", 180.0 / np.pi),
+        "um_per_px_share": ("scale", 1.0),
+        "angle_deg": ("angle", 180.0 / np.pi),
+        "carry_share": ("carry", 1.0),
+        "sphere_share": ("sphere", 1.0),
+    }
+    result: dict[str, tuple[float, float]] = dict(one.law)
+    for name, (effect, factor) in singles.items():
+        mean, covariance = one.unknowns(effect)
+        if len(mean):
+            result[name] = (factor * float(mean[0]), factor * float(np.sqrt(covariance[0, 0])))
+    mean, covariance = one.unknowns("offset")
+    for axis, index in (("x", 0), ("y", 1)):
+        result[f"offset_{axis}_um"] = (px * float(mean[index]), px * float(np.sqrt(covariance[index, index])))
+    mean, covariance = one.unknowns(LINE_NAME)
+    if len(mean) and one.line_hz is not None:
+        result[f"pump_{one.line_hz:.2f}_hz_share"] = _amplitude(mean, covariance)
+    names = [effect.name for effect in one.effects]
+    for name in names:
+        if name.startswith(SHAKE):
+            result[f"{name.replace(' ', '_')}_um_s"] = _amplitude(*one.unknowns(name))
+    sizes = {"walls_px": ["walls"], "resistance_share": ["resistance"]}
+    sizes["wander_share"] = [f"wander {length:g} s" for length in WANDER_S]
+    for name, effects in sizes.items():
+        chosen = [names.index(effect) for effect in effects if effect in names]
+        if chosen:
+            size = one.posterior.sizes[chosen]
+            total = float(np.sqrt((size**2).sum()))
+            std = float(np.sqrt(((size**2 * one.posterior.ln_size_std[chosen]) ** 2).sum())) / max(total, 1e-12)
+            result[name] = (total, std)
+    return result
+
+
+def _amplitude(mean: Floats, covariance: Floats) -> tuple[float, float]:
+    """Amplitude of a wave with the unknowns (k,), and its standard deviation."""
+    amplitude = float(np.hypot.reduce(mean))
+    return amplitude, float(np.sqrt(mean @ covariance @ mean)) / max(amplitude, 1e-12)
+
+
+def _words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float, observed_s: float) -> list[str]:
+    """Causes that are certain, and those that the observations could not tell apart."""
+    words = []
+    for name, (factor, least, less, more) in WORDS.items():
+        value, std = values.get(name, 0.0), stds.get(name, 0.0)
+        if abs(value) > max(SURE * std, least):
+            words.append((less if value < 0.0 else more).format(with_error(factor * abs(value), factor * std)))
+    if stds.get("um_per_rev_share", 0.0) > UNSURE:
+        words.append(
+            f"um per revolution they tell to {100.0 * stds['um_per_rev_share']:.0f} % only: a survey with other "
+            "headings tells more"
+        )
+    words += _offset_words(values, stds, um_per_px)
+    for name in values:
+        if name.startswith("viscosity_"):
+            words.append(f"{name.replace('_', ' ')} {values[name]:.3g} +- {stds[name]:.2g}")
+    words += _in_time(values, stds, observed_s)
+    # The size is that of random errors around zero mean; of walls that are off to one side it is the smaller part.
+    if values["walls_px"] > max(SURE * stds["walls_px"], MOVED_PX):
+        words.append(f"the walls seem off by {values['walls_px'] * um_per_px:.0f} um or more in places")
+    return words
+
+
+def with_mask_faults(found: Findings, chip: Chip, wrong_mask: str, obstacle: tuple[Obstacle, float] | None) -> Findings:
+    """Add the error of the mask in words, and the place of an obstacle whose probability exceeds PROBABLE."""
+    wrong = (f"the mask seems wrong: {wrong_mask}",) if wrong_mask else ()
+    if obstacle is None or obstacle[1] <= PROBABLE:
+        return replace(found, words=(*wrong, *found.words))
+    place = obstacle[0]
+    x_um, y_um = place.column * chip.um_per_px, place.row * chip.um_per_px
+    return Findings(
+        (*found.names, "obstacle_x_um", "obstacle_y_um"),
+        np.append(found.values, [x_um, y_um]),
+        np.append(found.stds, 2 * [place.half_width_px * chip.um_per_px]),
+        (*wrong, f"a channel is partly blocked at ({x_um:.0f}, {y_um:.0f}) um", *found.words),
+    )
+
+
+def _in_time(values: Mapping[str, float], stds: Mapping[str, float], observed_s: float) -> list[str]:
+    """Sentences on changes in time: a stage that shakes, a pump, a flow that wanders."""
+    words, shaking_hz = [], [float(name.split("_")[1]) for name in values if name.startswith(SHAKE)]
+    words += [f"the image shakes at {hz:.2f} Hz" for hz in shaking_hz]
+    for name, share in values.items():
+        if not name.startswith("pump_") or share <= max(SURE * stds[name], PULSATES):
+            continue
+        hz = float(name.split("_")[1])
+        if any(abs(hz - other) * observed_s < 1.0 for other in shaking_hz):
+            continue  # what the frequency of the stage leaves of its motion
+        by = f"by {with_error(100.0 * share, 100.0 * stds[name])} % at {hz:.2f} Hz"
+        slow = hz * observed_s < PERIODS
+        words.append(f"the flow changes {by}, with the pump or by place" if slow else f"the pump pulsates {by}")
+    # A robot that passes each place once can not tell a slow change from one along the way.
+    wander, wander_std = (100.0 * of.get("wander_share", 0.0) for of in (values, stds))
+    if wander > 100.0 * WANDERS:
+        words.append(f"the flow wanders in time, or by place along the way, by {with_error(wander, wander_std)} %")
+    return words
+
+
+def _offset_words(values: Mapping[str, float], stds: Mapping[str, float], um_per_px: float) -> list[str]:
+    """That the chip lies elsewhere than the registration puts it, and on which side; nothing where that is not sure."""
+    offset = np.array([values["offset_x_um"], values["offset_y_um"]])  # of the robot on the chip
+    spread = np.array([stds["offset_x_um"], stds["offset_y_um"]])
+    size = float(np.hypot(*offset))
+    along = float(np.hypot(*(offset * spread))) / max(size, 1e-12)
+    if size <= max(SURE * along, MOVED_PX * um_per_px):
+        return []
+    x, y = -offset
+    sides = [
+        f"{abs(x):.0f} um to the {'left' if x < 0.0 else 'right'}",
+        f"{abs(y):.0f} um {'up' if y < 0.0 else 'down'}",
+    ]
+    return [f"the chip lies {with_error(size, along)} um from where the registration puts it ({', '.join(sides)})"]
+
+
+def with_error(value: float, std: float) -> str:
+    """A value and its standard deviation with as many digits as that has a meaning: '15.1 +- 0.2'."""
+    digits = 0 if std >= 0.95 else 1 if std >= 0.095 else 2
+    return f"{value:.{digits}f} +- {std:.{digits}f}"

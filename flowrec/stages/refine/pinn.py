@@ -1,0 +1,184 @@
+"""PINN, a baseline of the paper: velocity and pressure as a network of continuous coordinates (Raissi et al., 2019).
+
+A fully connected tanh network is fitted to one case. Its loss is the weighted sum of mean squares: residuals of
+continuity and momentum at random points of the fluid, velocity on the walls, and deviations from the assumed profiles
+of the inlets, the assumed pressures of the outlets, and the observations. Without dimensions (length L: the median
+channel width, velocity V: root mean square of the observations, pressure mu V / L) the equations are
+
+    div v = 0,   Re (v . grad) v + grad p - lap v + f v = 0,   Re = rho V L / mu,   f = 12 L^2 / H^2,
+
+and momentum is divided by 12, the pressure gradient of Poiseuille flow of mean V in a channel of width L.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+
+from flowrec.core import FlowError, FlowField, NotFiniteError, Range, Seed, Threads, Weight
+from flowrec.stages.refine.collocation import POISEUILLE, PinnCase
+from flowrec.stages.refine.method import RefinementProblem
+from flowrec.stages.refine.network_fit import Device, adam, torch_run
+from flowrec.stages.refine.observation_operator import Floats
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from flowrec.stages.refine.network import CoordinateNet
+
+BLOCK = 100  # iterations over which the noisy loss is averaged before it is compared
+WARM_UP = 50  # iterations of a rising learning rate
+LOWEST_RATE = 0.02  # of the learning rate, at the end
+
+
+@dataclass(frozen=True, slots=True)
+class Pinn:
+    """Settings of the PINN."""
+
+    iterations: Annotated[int, Range(1, 1_000_000)] = 1000
+    # iterations without a loss that is lower by a hundredth before it stops
+    patience: Annotated[int, Range(1, 1_000_000)] = 300
+    # in the fluid, drawn anew for every iteration; half as many on the walls
+    points: Annotated[int, Range(16, 1_000_000)] = 512
+    width: Annotated[int, Range(1, 4_096)] = 64
+    depth: Annotated[int, Range(1, 64)] = 4
+    features: Annotated[int, Range(1, 4_096)] = 64  # sines and cosines of the coordinates that the first layer sees
+    # of those, radians per median channel width, one standard deviation
+    wavenumber: Annotated[float, Range(1e-3, 1e3)] = 0.5
+    learning_rate: Annotated[float, Range(1e-8, 1.0)] = 3e-3
+    momentum_weight: Weight = 0.1  # weights are those of mean squares
+    continuity_weight: Weight = (
+        30.0  # a leak is worse than a wrong force: it changes the flow of every branch behind it
+    )
+    observation_weight: Weight = 10.0
+    wall_weight: Weight = 10.0
+    inlet_weight: Weight = 1.0
+    outlet_weight: Weight = 1.0
+    device: Device = "cpu"
+    threads: Threads = 1
+    seed: Seed = 0
+
+    def fit(self, problem: RefinementProblem) -> FlowField:
+        """The network's values at pixel centres; of the assumed field only stamp and labels are used.
+
+        Raises
+        ------
+        FlowError
+            If the device is not available, or the viscosity depends on the shear rate.
+        NotFiniteError
+            If the fit diverges.
+        """
+        assumed, operator, chip = problem.assumed, problem.operator, problem.chip
+        if chip.law is not None:
+            raise FlowError(
+                "the PINN knows constant viscosities only: use refine.method pi_unet or assimilate, or set "
+                "chip.viscosity.law = newtonian"
+            )
+        speed = operator.rms_um_s
+        if speed == 0.0:
+            return replace(assumed, method="pinn", note="start kept: all observations say that the fluid stands still")
+        case = PinnCase.of(speed, operator, chip)
+        with torch_run(self.device, self.threads, self.seed, "refine.pinn.device"):
+            iterations, values, residual = self._fit_network(case)
+        if not np.isfinite(values).all():
+            raise NotFiniteError("the PINN diverged: lower refine.pinn.learning_rate")
+        velocity, pressure = np.zeros((*chip.mask.shape, 2), np.float32), np.zeros(chip.mask.shape, np.float32)
+        velocity[chip.mask], pressure[chip.mask] = values[:, :2] * speed, values[:, 2] * case.unit_pressure
+        return replace(
+            assumed,
+            method="pinn",
+            velocity_um_s=velocity,
+            pressure_pa=pressure,
+            std_um_s=None,
+            boundary_values=chip.boundary_values,
+            viscosity_mpa_s=chip.viscosity_mpa_s,
+            density_kg_m3=chip.density_kg_m3,
+            note=f"fitted to equations, openings and {operator.count} observations in {iterations} iterations; "
+            f"{residual:.0%} of the observed speed left",
+        )
+
+    def _fit_network(self, case: PinnCase) -> tuple[int, Floats, float]:
+        """Number of iterations, dimensionless (vx, vy, p) (fluid pixels, 3), and residual of the observations."""
+        import torch
+
+        from flowrec.stages.refine.network import CoordinateNet
+
+        rng = np.random.default_rng(self.seed)
+        net = CoordinateNet(self.width, self.depth, self.features, self.wavenumber).to(self.device)
+        loss_of = _Loss(case, self, net)
+        optimiser, schedule = adam(net.parameters(), self.learning_rate, self.iterations, WARM_UP, LOWEST_RATE)
+        lowest, since, done, block = float("inf"), 0, 0, 0.0
+        for _ in range(self.iterations):
+            loss = loss_of(*case.points.draw(rng, self.points))
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+            schedule.step()
+            block, done = block + float(loss.detach()), done + 1
+            if done % BLOCK == 0:
+                lowest, since = (block, 0) if block < 0.99 * lowest else (lowest, since + BLOCK)
+                block = 0.0
+                if since >= self.patience:
+                    break
+        with torch.no_grad():
+            return done, loss_of.pixels(), loss_of.residual_speed()
+
+
+class _Loss:
+    """Residuals of equations, conditions and observations; holds the tensors of one case on the device."""
+
+    def __init__(self, case: PinnCase, settings: Pinn, net: CoordinateNet) -> None:
+        self.case, self.settings, self.net = case, settings, net
+        self.flow, self.inlet, self.outlet = (self._tensor(a) for a in (case.flow, case.inlet, case.outlet))
+        self.scale = self._tensor(np.array([1.0, 1.0, case.largest_pressure]))
+        self.seen, self.inlets, self.outlets = (
+            self._place(points) for points in (case.seen, case.points.inlets, case.points.outlets)
+        )
+
+    def __call__(self, inside: Floats, walls: Floats) -> Tensor:
+        """Weighted sum of mean squares at drawn points (n, 2), (m, 2) in px."""
+        import torch
+
+        case, settings = self.case, self.settings
+        v, by_x, by_y, laplacian = self.net.jet(self._place(inside)) * self.scale
+        loss: Tensor = settings.continuity_weight * (by_x[:, 0] + by_y[:, 1]).square().mean()
+        for axis, slope in enumerate((by_x, by_y)):
+            convection = v[:, 0] * by_x[:, axis] + v[:, 1] * by_y[:, axis]
+            momentum = case.reynolds * convection + slope[:, 2] - laplacian[:, axis] + case.friction * v[:, axis]
+            loss = loss + settings.momentum_weight * (momentum / POISEUILLE).square().mean()
+        # One call for all points where only the value counts.
+        places = [self._place(walls), self.seen, self.inlets, self.outlets]
+        wall, seen, inlet, outlet = torch.split(self._values(torch.cat(places)), [len(place) for place in places])
+        for weight, residual in (
+            (settings.wall_weight, wall[:, :2]),
+            (settings.observation_weight, seen[:, :2] - self.flow),
+            (settings.inlet_weight, inlet[:, :2] - self.inlet),
+            (settings.outlet_weight, (outlet[:, 2:] - self.outlet[:, None]) / case.largest_pressure),
+        ):
+            if len(residual):
+                loss = loss + weight * residual.square().sum(dim=1).mean()
+        return loss
+
+    def pixels(self) -> Floats:
+        """(fluid pixels, 3) dimensionless vx, vy, p at the centre of each pixel."""
+        return np.asarray(self._values(self._place(self.case.points.fluid)).cpu().numpy(), np.float64)
+
+    def residual_speed(self) -> float:
+        """Root mean square residual of the observations, in units of their speed."""
+        residual = self._values(self.seen)[:, :2] - self.flow
+        return float(residual.square().sum(dim=1).mean().sqrt())
+
+    def _values(self, places: Tensor) -> Tensor:
+        values: Tensor = self.net(places) * self.scale
+        return values
+
+    def _place(self, points: Floats) -> Tensor:
+        """Coordinates of the network of points in px."""
+        return self._tensor((points - self.case.centre) / self.case.length_px)
+
+    def _tensor(self, array: Floats) -> Tensor:
+        import torch
+
+        return torch.as_tensor(array, dtype=torch.float32, device=self.settings.device)

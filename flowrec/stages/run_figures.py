@@ -1,0 +1,95 @@
+"""The figures of a run, from its ticks: those that its session states at the end, and a live view meanwhile."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flowrec.core import FLOW_FIELDS, Demand, Figures, FlowField, Outcome, Phase, Route, Tick, finite, seconds
+from flowrec.physics import Chip, relative_rmse
+
+
+class RunStatistics:
+    """A sink that collects of all ticks what the figures need.
+
+    Attributes
+    ----------
+    true_field : the true flow; None where it is not known.
+    contacts : with walls so far, where the truth is known.
+    navigating_ns : stamp at which the way to the goal began; None: not yet.
+    """
+
+    def __init__(self) -> None:
+        self.true_field: FlowField | None = None
+        self.contacts = 0
+        self.navigating_ns: int | None = None
+        self._square_um2 = 0.0
+        self._count = 0
+        self._last: Demand | None = None
+
+    def write(self, tick: Tick) -> None:
+        """Take one tick."""
+        self.true_field = tick.true_field or self.true_field
+        if tick.truth is not None:
+            self.contacts = tick.truth.contacts
+        demand = tick.demand
+        if tick.mission is None or tick.mission.phase != Phase.NAVIGATE:
+            return
+        if self.navigating_ns is None:
+            self.navigating_ns = tick.stamp_ns
+        if demand is None or demand is self._last:
+            return
+        self._last = demand
+        if math.isfinite(demand.error_um):
+            self._square_um2 += demand.error_um**2
+            self._count += 1
+
+    @property
+    def tracking_error_um(self) -> float | None:
+        """Root mean square distance to the reference; None if nothing was navigated along one."""
+        return finite(math.sqrt(self._square_um2 / self._count)) if self._count else None
+
+
+def figures_of(
+    chip: Chip, last: Tick, true_field: FlowField | None, contacts: int, navigating_ns: int | None
+) -> Figures:
+    """Figures of route, contacts and maps at a tick, in the order of the table. Errors are relative to the true flow.
+
+    `contacts` and `navigating_ns` are those of RunStatistics.
+    """
+    figures: Figures = {"axes_check": last.axes.verdict} if last.axes is not None and last.axes.verdict else {}
+    mission, route = last.mission, last.route
+    flies = mission is not None and mission.phase in (Phase.NAVIGATE, Phase.DONE)
+    if mission is not None and route is not None and route.reachable and flies:
+        figures["planner"] = route.method
+        figures["route_length_um"] = length_um(route)
+        figures["planned_s"] = float(route.arrival_s[-1])
+        if mission.outcome == Outcome.REACHED and navigating_ns is not None:
+            figures["navigation_s"] = seconds(mission.since_ns - navigating_ns)
+    if mission is not None and mission.goal_set_ns is not None:
+        figures["latest_goal"] = f"{mission.goal_um[0]:.0f}, {mission.goal_um[1]:.0f} um"
+    if mission is not None and mission.speed_limit_um_s is not None:
+        figures["speed_limit_um_s"] = mission.speed_limit_um_s
+    if true_field is not None:
+        figures["contacts"] = contacts
+        for name in FLOW_FIELDS:
+            flow: FlowField | None = getattr(last, name)
+            if flow is not None:
+                figures[f"{name}_method"] = f"{flow.method}, another refused" if flow.refused else flow.method
+                figures[f"{name}_flow_error"] = flow_error(chip, flow, true_field)
+    if last.observations is not None:
+        figures["observations"] = len(last.observations.position_um)
+    return figures
+
+
+def length_um(route: Route) -> float:
+    """Length of a route in um."""
+    return float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
+
+
+def flow_error(chip: Chip, flow: FlowField | None, true_field: FlowField | None) -> float | None:
+    """Relative RMSE of a flow over the fluid pixels; None where one is not known, or not comparable."""
+    if flow is None or true_field is None or (flow.wall_px is None) != (true_field.wall_px is None):
+        return None  # means over pixels, of numerics 1, are not compared with values at their centres
+    return finite(float(relative_rmse(flow, true_field, chip.mask).v))

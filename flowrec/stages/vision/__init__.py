@@ -1,0 +1,6 @@
+"""Frame to Track."""
+
+from flowrec.stages.vision.stabiliser import Stabiliser
+from flowrec.stages.vision.tracker import Footprint, Tracker, move_neighbours, unseen
+
+__all__ = ["Footprint", "Stabiliser", "Tracker", "move_neighbours", "unseen"]

@@ -1,0 +1,426 @@
+"""Frame to Track: where is the robot?
+
+The previous messages alone decide where to search: near the last position, or, after the robot has been missing for a
+while, in the whole channel. There are two ways to find it.
+
+Disc: positions that correlate with the template of a disc are candidates, and a disc is fitted to each with sub-pixel
+precision. Near the last position the disc of the right size that fits best is the robot; in the whole channel it is the
+darkest of those, because debris is paler. It needs no help from the user.
+
+Learned appearance (learned.py): for a robot that a user has pointed at, and for bright ones.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import Appearance, Frame, Range, Share, Track, seconds
+from flowrec.physics import Calibration, Chip, Robot
+from flowrec.stages.vision.disc_search import (
+    LARGEST,
+    Disc,
+    DiscLimits,
+    DiscSearch,
+    best_disc,
+    best_disc_normalised,
+    disc_pad_px,
+)
+from flowrec.stages.vision.learned import (
+    Candidates,
+    ExpectedMotion,
+    ReducedScale,
+    alone,
+    assign_objects,
+    candidates,
+    expected_motion,
+    find_merged,
+    hidden_neighbours,
+    is_isolated,
+    locate_robot,
+    neighbours_of,
+    region_of,
+    scale_of,
+    similar,
+    updated_views,
+    with_motion,
+)
+from flowrec.stages.vision.learning import box_of, brightest_spot, energy_of, learn, pixel_noise
+from flowrec.stages.vision.trackers import TRACKERS, TrackingMethod
+from flowrec.stages.vision.walls import Box, Walls, walls_in_view
+
+Polarity = Literal["dark", "bright", "auto"]
+_Pixel = Annotated[float, Range(-1e5, 1e5)]
+_SMALLEST = 0.75  # least expected radius relative to the robot's own
+_RADIUS_WEIGHT = 0.05  # of the newest radius in the tracked one: focus drifts, single frames are unreliable
+_LENIENT_SCORE, _LENIENT_LIKENESS = 0.85, 0.9  # of a disc that may be pale or beside a wall: debris has less
+_ENERGY_SHARE = 0.05  # least energy of a candidate relative to the robot's
+_UPDATE_NS = 100_000_000  # least time between two updates of a known look
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """The pixels that a tracker reads: those of Track.roi_px and no farther than `pad_px` around it."""
+
+    pad_px: int
+    everywhere_px: Box  # roi_px of a search in the whole channel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scene:
+    """An image and what is known about it."""
+
+    frame: Frame
+    walls: Walls
+    calibration: Calibration
+    robot: Robot
+
+
+@dataclass(frozen=True, slots=True)
+class Tracker:
+    """Finds the robot; its memory is the previous Track, and the Appearance."""
+
+    # None: disc_or_look. A method of another package reads none of the settings below.
+    method: Annotated[str, TRACKERS] | None = None
+
+    least_score: Share = 0.55  # likeness times agreement of size, 0 to 1, for the robot while it is tracked
+    acquire_score: Share = 0.65  # the same if it was not seen on the frame before: more objects can be mistaken for it
+    acquire_likeness: Share = 0.82  # and the likeness alone: debris in contact may have its size, but not its shape
+    least_contrast: Annotated[float, Range(0.0, 255.0)] = 6.0  # darkness of the robot in grey levels
+    size_tolerance: Annotated[float, Range(0.01, 10.0)] = 0.25  # one sigma of ln(measured radius / expected radius)
+    # search range around the last position in robot radii, besides what v_max permits
+    search_radii: Annotated[float, Range(0.0, 1e3)] = 2.0
+    search_px: Annotated[float, Range(1.0, 1e4)] = 8.0  # least search range
+    # largest displacement since the last frame, by itself and by the flow, in units of v_max dt
+    reach_speed: Annotated[float, Range(0.0, 1e3)] = 3.0
+    # frames without the robot after which the whole channel is searched
+    reacquire_after: Annotated[int, Range(0, 1_000_000)] = 10
+    # width of the band along walls whose own image disturbs that of the robot
+    wall_margin_um: Annotated[float, Range(0.0, 1e4)] = 18.0
+    candidates: Annotated[int, Range(1, 1_000)] = 6  # largest number of fitted discs per image
+    # Brightness of the robot relative to the background; auto: found out on the first image that shows it. None: auto
+    # in a new run; a session recorded before this setting existed is replayed as it was, dark and with exact walls.
+    polarity: Polarity | None = None
+    # a point (column, row) on the robot, whose look is learned there; robot.radius_um should reach its border
+    click_px: tuple[_Pixel, _Pixel] | None = None
+    box_px: tuple[_Pixel, _Pixel, _Pixel, _Pixel] | None = None  # the same by a box around it: x0, y0, x1, y1
+    click_frame: Annotated[int, Range(0, 2**62)] | None = None  # index of the image of click_px; None: the first one
+    # the walls of the mask may be off by this many robot radii; ignored where polarity is None
+    wall_error_radii: Annotated[float, Range(0.0, 2.0)] = 0.5
+
+    @property
+    def _other(self) -> TrackingMethod | None:
+        """The method of another package, if one is chosen."""
+        if self.method is None or TRACKERS.own(self.method):
+            return None
+        method: TrackingMethod = TRACKERS[self.method].made(self)
+        return method
+
+    def not_found_note(self, appearance: Appearance | None) -> str:
+        """Advice for a robot that is not found; '' in a session that had no such note."""
+        if self._other is not None:
+            return f"tracker.method = {self.method!r} does not find it; see its settings"
+        if self.polarity is None:
+            return ""
+        if appearance is not None and appearance.note:
+            return appearance.note
+        return (
+            f"it is searched as a disc, tracker.polarity = {self.polarity!r}; for any other look name a point on it in "
+            "the first image, as in tracker.click_px = [320, 256]"
+        )
+
+    def follow(
+        self,
+        previous: Track | None,
+        appearance: Appearance | None,
+        frame: Frame,
+        chip: Chip,
+        calibration: Calibration,
+        robot: Robot,
+        shift_px: tuple[float, float] = (0.0, 0.0),
+    ) -> tuple[Track, Appearance | None]:
+        """The robot in this frame, and how it looks; the given appearance itself if nothing new is known of it.
+
+        `shift_px` (columns, rows): how far the image lies from where the calibration holds.
+        """
+        if self._other is not None:
+            moved = calibration.for_shift(shift_px) if any(shift_px) else calibration
+            return self._other.track(previous, frame, chip, moved, robot), None
+        if self.polarity is None:
+            return self.track(previous, frame, chip, calibration, robot), None
+        walls = walls_in_view(chip, calibration, (frame.image.shape[0], frame.image.shape[1]))
+        if any(shift_px):
+            walls, calibration = walls.for_shift(shift_px), calibration.for_shift(shift_px)
+        scene = _Scene(frame, walls, calibration, robot)
+        if appearance is None:
+            return self._first_look(previous, scene)
+        if appearance.note:
+            return _not_seen(previous, scene, self._everywhere(previous, scene)), appearance
+        if len(appearance.views):
+            assert previous is not None, "the robot was seen when its look was learned"
+            return self._follow_learned(previous, appearance, scene)
+        search = self._plan(previous, frame, walls, calibration, robot)
+        found = self._dark_disc(scene, search, appearance.noise)
+        return (_not_seen(previous, scene, search) if found is None else _seen_track(scene, search, found)), appearance
+
+    def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
+        """The dark disc in this frame; `seen` False keeps the last position (the image's centre before the first)."""
+        walls = walls_in_view(chip, calibration, (frame.image.shape[0], frame.image.shape[1]))
+        scene = _Scene(frame, walls, calibration, robot)
+        search = self._plan(previous, frame, walls, calibration, robot)
+        found = best_disc(frame.image, walls, search)
+        return _not_seen(previous, scene, search) if found is None else _seen_track(scene, search, found)
+
+    def footprint(self, chip: Chip, calibration: Calibration, robot: Robot, shape: tuple[int, int]) -> Footprint:
+        """The pixels of an image of `shape` that can influence a track, whatever the image shows."""
+        if self._other is not None:
+            return Footprint(max(shape), (0, 0, shape[1], shape[0]))
+        pad_px = disc_pad_px(robot.radius_um / calibration.um_per_px)
+        if self.polarity is not None:
+            pad_px = max(pad_px, scale_of(self._radius_px(calibration, robot)).pad_px)
+        return Footprint(pad_px, walls_in_view(chip, calibration, shape).box)
+
+    def _radius_px(self, calibration: Calibration, robot: Robot) -> float:
+        """Radius of what is learned: that of the user's box, or the robot's."""
+        return robot.radius_um / calibration.um_per_px if self.box_px is None else max(box_of(self.box_px)[1], 1.0)
+
+    def _first_look(self, previous: Track | None, scene: _Scene) -> tuple[Track, Appearance | None]:
+        """Find a robot of unknown look; its appearance is None until it is seen."""
+        frame, assumed = scene.frame, self.polarity or "dark"
+        search = self._everywhere(previous, scene)
+        if self.click_px is not None or self.box_px is not None:
+            if self.click_frame is not None and frame.index < self.click_frame:
+                return _not_seen(previous, scene, search), None
+            at_px, what = self.click_px, f"tracker.click_px = {list(self.click_px or ())}"
+            if self.box_px is not None:
+                at_px, what = box_of(self.box_px)[0], f"tracker.box_px = {list(self.box_px)}"
+            assert at_px is not None
+            return self._learn_look(previous, scene, at_px, assumed, f"{what} of image {frame.index}")
+        noise = pixel_noise(frame.image)
+        dark = self._dark_disc(scene, search, noise) if assumed != "bright" else None
+        if assumed != "dark":
+            radius_px = self._radius_px(scene.calibration, scene.robot)
+            clear_px = (1.0 + self.wall_error_radii) * radius_px
+            distance_px, outstanding = scene.walls.distance_px, assumed == "auto"
+            spot = brightest_spot(frame.image, distance_px, radius_px, clear_px, outstanding=outstanding)
+            if spot is not None and (dark is None or spot[1] > dark.darkness):
+                return self._learn_look(previous, scene, spot[0], "bright", "the brightest spot")
+        if dark is None:
+            return _not_seen(previous, scene, search), None
+        nothing = np.zeros((0, 1, 1), np.float32)
+        appearance = Appearance(
+            frame.stamp_ns, "dark", noise, 0.0, search.nominal_px, np.array([dark.x, dark.y]), nothing
+        )
+        return _seen_track(scene, search, dark), appearance
+
+    def _learn_look(
+        self, previous: Track | None, scene: _Scene, at_px: tuple[float, float], polarity: str, what: str
+    ) -> tuple[Track, Appearance]:
+        """The track and the appearance after learning the robot's look at a point."""
+        frame, walls = scene.frame, scene.walls
+        radius_px = self._radius_px(scene.calibration, scene.robot)
+        solid_px = self._solid_px(radius_px)
+        appearance = learn(frame.image, walls.distance_px, frame.stamp_ns, at_px, radius_px, polarity, solid_px, what)
+        search = self._everywhere(previous, scene)
+        if appearance.note:
+            return _not_seen(previous, scene, search), appearance
+        x, y = appearance.centre_px.tolist()
+        scale = ReducedScale(appearance.radius_px)
+        box = _clip_box((x, y), 4.0 * radius_px, walls.box)
+        region = region_of(frame.image, walls.distance_px, _pad_box(box, scale.margin_px), scale, solid_px)
+        found = candidates(region, appearance, box, walls.distance_px, 0.0, appearance.centre_px)
+        near = np.hypot(*(found.px - appearance.centre_px).T) < 0.7 * appearance.radius_px
+        track = _seen_track(scene, search, Disc(x, y, search.expected_px, 0.0, 1.0, 1.0))
+        return replace(
+            track,
+            velocity_px_s=np.zeros(2),
+            spread_px=0.3 * appearance.radius_px,
+            energy=energy_of(appearance),
+            neighbours_px=neighbours_of(found, int(near.argmax()) if near.any() else None),
+        ), appearance
+
+    def _follow_learned(
+        self, previous: Track, appearance: Appearance, scene: _Scene
+    ) -> tuple[Track, Appearance | None]:
+        """The robot by its learned look: near where it is expected, then as far as it can be, or in the whole image."""
+        frame, walls, calibration = scene.frame, scene.walls, scene.calibration
+        scale, solid_px = ReducedScale(appearance.radius_px), self._solid_px(appearance.radius_px)
+        place_px = calibration.to_px(previous.position_um)
+        dt, frames = seconds(frame.stamp_ns - previous.stamp_ns), 1 + previous.lost_frames
+        motion = expected_motion(previous, place_px, scale.radius_px, dt)
+        expected = (float(motion.expected_px[0]), float(motion.expected_px[1]))
+        everywhere = previous.lost_frames > self.reacquire_after
+        displacement = self.reach_speed * scene.robot.speed_limit_um_s * dt / calibration.um_per_px
+        farthest_px = max(self.search_radii * scale.radius_px + displacement, self.search_px) * frames
+        near_px = max(self.search_px, 4.0 * scale.radius_px, 6.0 * motion.spread_px)
+        which, joined, missed = None, None, np.zeros((0, 3))
+        for range_px in (math.inf,) if everywhere else (near_px, max(farthest_px, 1.5 * near_px)):
+            box = walls.box if everywhere else _clip_box(expected, range_px, walls.box)
+            region = region_of(frame.image, walls.distance_px, _pad_box(box, scale.margin_px), scale, solid_px)
+            near = None if everywhere else motion.expected_px
+            found = candidates(region, appearance, box, walls.distance_px, _ENERGY_SHARE * previous.energy, near)
+            if everywhere:
+                which = alone(found, previous.energy, self.acquire_score)
+            else:
+                which, missed = assign_objects(found, previous, motion, range_px)
+                if which is not None and not self._is_robot(found, which, previous, motion, near_px, scale.radius_px):
+                    which = None
+            joined = find_merged(found, which, previous, motion, missed, scale.radius_px)
+            if which is not None or joined is not None:
+                break
+        roi = np.array(box, np.float64)
+        seen = replace(previous, stamp_ns=frame.stamp_ns, seen=True, lost_frames=0, roi_px=roi)
+        if joined is not None:
+            neighbours = np.concatenate([neighbours_of(found, joined.which), joined.neighbours.ravel()])
+            return replace(seen, position_um=calibration.to_um(joined.place_px), neighbours_px=neighbours), appearance
+        if which is None:
+            return replace(unseen(previous, frame.stamp_ns), roi_px=roi), appearance
+        blocks, score = locate_robot(region, found, which, appearance)
+        to_px = region.to_px(blocks)
+        covered = hidden_neighbours(missed, to_px, scale.radius_px)
+        neighbours = np.concatenate([neighbours_of(found, which), covered.ravel()])
+        views = updated_views(
+            region,
+            blocks,
+            appearance,
+            score,
+            is_isolated(neighbours, to_px, scale.radius_px),
+            frame.stamp_ns - appearance.stamp_ns >= _UPDATE_NS,
+        )
+        track = replace(
+            seen,
+            position_um=calibration.to_um(to_px),
+            score=min(max(score, 0.01), 1.0),
+            neighbours_px=neighbours,
+        )
+        if not len(covered):
+            track = with_motion(track, previous, motion, place_px, to_px, float(found.energy[which]), dt)
+        return track, appearance if views is None else replace(appearance, stamp_ns=frame.stamp_ns, views=views)
+
+    def _is_robot(
+        self,
+        found: Candidates,
+        which: int,
+        previous: Track,
+        motion: ExpectedMotion,
+        near_px: float,
+        radius_px: float,
+    ) -> bool:
+        """True if the candidate that was assigned to the robot looks like it; beyond `near_px` it must be the only one.
+
+        The neighbours of the frame before are known nearby only.
+        """
+        known = found.similarity[which] >= (self.acquire_score if previous.lost_frames else self.least_score)
+        if not (known or similar(found, which, previous, motion, radius_px)):
+            return False
+        far = math.dist(found.px[which], motion.expected_px) > near_px
+        return not far or alone(found, previous.energy, self.acquire_score) == which
+
+    def _solid_px(self, radius_px: float) -> float:
+        """Distance to the mask's walls (negative: depth in the solid) from which on a pixel may show fluid."""
+        return -self.wall_error_radii * radius_px
+
+    def _dark_disc(self, scene: _Scene, search: DiscSearch, noise: float) -> Disc | None:
+        """The dark disc; where there is none, one that is paler, or nearer to the walls than they permit if exact."""
+        frame, walls = scene.frame, scene.walls
+        found = None
+        if frame.bits == 8:
+            found = best_disc(frame.image, walls, search)
+        if found is None:
+            score, likeness = max(search.least_score, _LENIENT_SCORE), max(search.least_likeness, _LENIENT_LIKENESS)
+            search = replace(search, least_score=score, least_likeness=likeness)
+            found = best_disc_normalised(frame.image, walls, search, noise, self.wall_error_radii * search.nominal_px)
+        return found
+
+    def _everywhere(self, previous: Track | None, scene: _Scene) -> DiscSearch:
+        """A search in the whole channel."""
+        return self._plan(
+            None if previous is None else replace(previous, score=0.0),
+            scene.frame,
+            scene.walls,
+            scene.calibration,
+            scene.robot,
+        )
+
+    @property
+    def _limits(self) -> DiscLimits:
+        return DiscLimits(self.least_contrast, self.size_tolerance, self.candidates)
+
+    def _plan(
+        self, previous: Track | None, frame: Frame, walls: Walls, calibration: Calibration, robot: Robot
+    ) -> DiscSearch:
+        """Area of the search, from the previous message."""
+        nominal = robot.radius_um / calibration.um_per_px
+        margin = min(max(self.wall_margin_um / calibration.um_per_px, 1.0), 0.5 * nominal)
+        # A score of 0 means that the robot was never seen.
+        if previous is None or previous.score <= 0 or previous.lost_frames > self.reacquire_after:
+            expected = nominal if previous is None else previous.radius_px
+            least = (self.acquire_score, self.acquire_likeness)
+            return DiscSearch(walls.box, (0.0, 0.0), math.inf, nominal, expected, margin, *least, self._limits)
+        x, y = calibration.to_px(previous.position_um).tolist()
+        frames = 1 + previous.lost_frames
+        dt = seconds(frame.stamp_ns - previous.stamp_ns) / frames
+        displacement = self.reach_speed * robot.speed_limit_um_s * dt / calibration.um_per_px
+        range_px = max(self.search_radii * previous.radius_px + displacement, self.search_px) * frames
+        x0, y0, x1, y1 = walls.box
+        left, top = max(math.floor(x - range_px), x0), max(math.floor(y - range_px), y0)
+        box = (left, top, min(math.ceil(x + range_px) + 1, x1), min(math.ceil(y + range_px) + 1, y1))
+        # While the robot is lost, an object of low likeness is more probably a piece of debris.
+        least = (self.acquire_score, self.acquire_likeness) if previous.lost_frames else (self.least_score, 0.0)
+        return DiscSearch(box, (x, y), range_px, nominal, previous.radius_px, margin, *least, self._limits)
+
+
+def _seen_track(scene: _Scene, search: DiscSearch, found: Disc) -> Track:
+    radius_px = search.expected_px + _RADIUS_WEIGHT * (found.radius_px - search.expected_px)
+    return Track(
+        stamp_ns=scene.frame.stamp_ns,
+        seen=True,
+        position_um=scene.calibration.to_um((found.x, found.y)),
+        score=found.score,
+        lost_frames=0,
+        radius_px=min(max(radius_px, _SMALLEST * search.nominal_px), LARGEST * search.nominal_px),
+        roi_px=np.array(search.box, np.float64),
+    )
+
+
+def _not_seen(previous: Track | None, scene: _Scene, search: DiscSearch) -> Track:
+    height, width = scene.frame.image.shape
+    middle = scene.calibration.to_um(((width - 1) / 2, (height - 1) / 2))
+    return Track(
+        stamp_ns=scene.frame.stamp_ns,
+        seen=False,
+        position_um=middle if previous is None else previous.position_um,
+        score=0.0 if previous is None else previous.score,
+        lost_frames=1 if previous is None else previous.lost_frames + 1,
+        radius_px=search.expected_px,
+        roi_px=np.array(search.box, np.float64),
+    )
+
+
+def move_neighbours(previous: Track, by_px: NDArray[np.float64]) -> Track:
+    """A track as the next image shows it, which lies `by_px` (2,) farther: the neighbours are places in the image."""
+    if not previous.neighbours_px.size or not by_px.any():
+        return previous
+    moved = previous.neighbours_px.reshape(-1, 3) + np.array([by_px[0], by_px[1], 0.0])
+    return replace(previous, neighbours_px=moved.ravel())
+
+
+def unseen(previous: Track, stamp_ns: int) -> Track:
+    """The track after a frame that shows nothing new."""
+    return replace(previous, stamp_ns=stamp_ns, seen=False, lost_frames=previous.lost_frames + 1)
+
+
+def _clip_box(centre: tuple[float, float], range_px: float, box: Box) -> Box:
+    """The box of a range around a centre, within another box."""
+    x0, y0, x1, y1 = box
+    (x, y), reach = centre, min(range_px, 1e5)
+    left, top = max(math.floor(x - reach), x0), max(math.floor(y - reach), y0)
+    return left, top, max(min(math.ceil(x + reach) + 1, x1), left), max(min(math.ceil(y + reach) + 1, y1), top)
+
+
+def _pad_box(box: Box, margin_px: int) -> Box:
+    return box[0] - margin_px, box[1] - margin_px, box[2] + margin_px, box[3] + margin_px

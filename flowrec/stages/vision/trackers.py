@@ -1,0 +1,30 @@
+"""The table of trackers. Ours is the stage itself (tracker.py); packages of others bring more."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from flowrec.core import Frame, Method, Methods, Track
+from flowrec.physics import Calibration, Chip, Robot
+
+
+class TrackingMethod(Protocol):
+    """Interface of another package's row in TRACKERS: the frozen dataclass of its settings, with this method."""
+
+    def track(self, previous: Track | None, frame: Frame, chip: Chip, calibration: Calibration, robot: Robot) -> Track:
+        """The robot in this frame. Where it is not seen, `tracker.unseen(previous, frame.stamp_ns)` is its track.
+
+        The first track of a run may be unseen, at any place, with a score of 0. It is the only memory: its score,
+        radius_px and other fields, which people see, are the method's to use.
+        """
+        ...
+
+
+TRACKERS = Methods(
+    "tracker.method",
+    Method(
+        "disc_or_look", "flowrec.stages.vision.tracker:Tracker", "a disc of the robot's size, or the look at a point"
+    ),
+    group="flowrec.trackers",
+    verb="track",
+)

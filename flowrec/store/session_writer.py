@@ -1,0 +1,165 @@
+"""Creates a session file: the header with configuration, chip and provenance, and the options of the writer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from flowrec.core import Output, TopicTable, pixel_type, provenance, remove_leftovers_once
+from flowrec.physics import Chip, chip_files
+from flowrec.stages import SIMULATED, ResolvedConfig, calibration_of, facts_of, to_toml, topics_of
+from flowrec.store.frame_encodings import encoding_for
+from flowrec.store.roi import Region
+from flowrec.store.run_files import files_of
+from flowrec.store.session import files_behind, session_sha256
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.session_metadata import SessionHeader, SessionMetadata
+from flowrec.store.writer import SessionWriter
+
+_QUEUE_S = 2.0
+_LARGEST_PICTURE_BYTES = 50_000_000
+_LEAST_QUEUE_BYTES, _LARGEST_QUEUE_BYTES = 256_000_000, 1_000_000_000
+
+
+def session_writer(
+    output: Output,
+    config: ResolvedConfig,
+    chip: Chip,
+    *,
+    parent: Path | None = None,
+    live: bool = False,
+    in_pieces: bool = False,
+    derived: Mapping[str, float] | None = None,
+    facts: Mapping[str, str] | None = None,
+    keep_failed: bool = True,
+    topics: TopicTable | None = None,
+) -> SessionWriter:
+    """Create a session file and write its header.
+
+    Parameters
+    ----------
+    output : the file; neither its inputs nor the files of the parent are replaced.
+    parent : the session that it replays; the header names it by its hash.
+    live : drop images rather than wait for the disk.
+    in_pieces : split the run, or record only around events, as the settings `recording.split_*` and `.snapshot_*` say.
+    derived : settings that were derived because they were not given, by key, for the header.
+    facts : about devices or files that the session is made of, for the header.
+    keep_failed : False: an exception leaves no file.
+    topics : those of the run; None: those that the settings name.
+    """
+    header = session_header(config, chip)
+    if derived:
+        header = replace(header, provenance={**header.provenance, "derived": json.dumps(dict(derived))})
+    if facts:
+        header = replace(header, provenance={**header.provenance, **facts})
+    if parent is not None:
+        files = files_of(parent)
+        named = {"file": parent.name, "sha256": session_sha256(files)}
+        header = replace(header, parent=named, start_unix_ns=_start_unix_ns(files[0]))
+    header = replace(header, provenance={**header.provenance, **_durability(config, live=live)})
+    options = WriterOptions(
+        frames=frames_of(config),
+        flush_s=config.recording.flush_s,
+        sync_s=config.recording.sync_s,
+        overwrite=output.overwrite,
+        block=not live,
+        queue_limit_bytes=queue_bytes_of(config),
+        files=_files_of(config) if in_pieces else Split(),
+        region=region_of(config, chip, again=parent is not None),
+        leave_out=config.recording.leave_out,
+        bits=config.camera.bits,
+        keep_failed=keep_failed,
+        start_by_clocks=parent is None,
+        topics=topics_of(config) if topics is None else topics,
+    )
+    remove_leftovers_once(output.path.absolute().parent)
+    inputs = (*output.inputs, *(files_behind(parent) if parent is not None else ()))
+    return SessionWriter(output.path, header, options, inputs=inputs)
+
+
+def _durability(config: ResolvedConfig, *, live: bool) -> dict[str, str]:
+    """Largest loss if the process is killed, in s of stamps; of a snapshot, counted from its event."""
+    bytes_s, flush_s = image_bytes_s(config), config.recording.flush_s
+    waiting_s = queue_bytes_of(config) / bytes_s if live and bytes_s else 0.0  # only if the disk is too slow
+    return {"durability_state_s": f"{flush_s:g}", "durability_images_s": f"{flush_s + waiting_s:.3g}"}
+
+
+def _start_unix_ns(file: Path) -> int:
+    with SessionMetadata(file) as head:
+        return head.source.start_unix_ns
+
+
+def _files_of(config: ResolvedConfig) -> Split | Snapshot:
+    recording = config.recording
+    if recording.snapshot_before_s:
+        return Snapshot(recording.snapshot_before_s, recording.snapshot_after_s, recording.snapshot_mb)
+    return Split(recording.split_mb, recording.split_s)
+
+
+def region_of(config: ResolvedConfig, chip: Chip, again: bool = False) -> Region | None:
+    """The region of most images that is recorded, by the settings and the tracker; None: whole images.
+
+    `again`: the images were cropped when they were recorded, and are not cropped again.
+    """
+    recording, camera = config.recording, config.camera
+    if recording.region == "whole":
+        return None
+    shape = (camera.height_px, camera.width_px)
+    footprint = config.tracker.footprint(chip, calibration_of(config, chip), config.robot, shape)
+    pad_px = footprint.pad_px + recording.region_pad_px
+    return Region(pad_px, footprint.everywhere_px, recording.full_every_s, cut=not again)
+
+
+def queue_bytes_of(config: ResolvedConfig) -> int:
+    """Largest size of the write queue, in bytes."""
+    chosen_mb = config.recording.queue_mb
+    if chosen_mb is not None:
+        return int(chosen_mb * 1e6)
+    images = int(_QUEUE_S * image_bytes_s(config))
+    return min(max(images, _LEAST_QUEUE_BYTES), _LARGEST_QUEUE_BYTES)
+
+
+def image_bytes_s(config: ResolvedConfig) -> float:
+    """Bytes of the camera's images per second, before they are compressed."""
+    camera = config.camera
+    return camera.width_px * camera.height_px * pixel_type(camera.bits).itemsize * camera.rate_hz
+
+
+def frames_of(config: ResolvedConfig) -> str:
+    """Encoding of the images of a run, a name of store/frame_encodings.py."""
+    camera, chosen = config.camera, config.recording.frames
+    if chosen != "auto":
+        return chosen
+    if config.recording.region == "robot":
+        return "zstd"  # compresses black better than delta in a fifth of its time (python -m tests.perf.store)
+    return encoding_for(camera.width_px, camera.height_px, camera.rate_hz, camera.bits)
+
+
+def session_header(config: ResolvedConfig, chip: Chip) -> SessionHeader:
+    """The header of a new session: configuration, chip and provenance. The session clock starts now."""
+    png, toml = chip_files(chip)
+    facts = provenance(config.recording.anonymous) | {
+        "operator": config.recording.operator,
+        "sample": config.recording.sample,
+        "notes": config.recording.notes,
+    }
+    facts |= facts_of(config)
+    if config.rig == SIMULATED:
+        facts |= {"seed": str(config.simulated.seed), "world": config.simulated.world}
+    if config.refine.weights_sha256:
+        facts[f"weights.{config.refine.method}"] = config.refine.weights_sha256
+    pictures = _pictures(config)
+    return SessionHeader(to_toml(config), png, toml, facts, start_unix_ns=int(facts["wall_ns"]), pictures=pictures)
+
+
+def _pictures(config: ResolvedConfig) -> dict[str, bytes]:
+    """The picture of the registration, if the file that is named has one beside it."""
+    named = Path(config.camera.registration)
+    if not named.name:
+        return {}
+    overlay = named.with_suffix(".png")
+    if not overlay.is_file() or overlay.stat().st_size > _LARGEST_PICTURE_BYTES:
+        return {}
+    return {"registration.png": overlay.read_bytes()}

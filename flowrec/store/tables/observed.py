@@ -1,0 +1,100 @@
+"""Observations of the flow from a person's table: a file, a DataFrame, columns by name, or an array."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import Observations, UsageError, read_table
+
+# Columns in the order of an array's; the first four are needed, the others may be left out.
+OBSERVED = {
+    "x_um": "place of the observation, x in the chip frame",
+    "y_um": "place of the observation, y in the chip frame",
+    "u_um_s": "measured flow along x",
+    "v_um_s": "measured flow along y",
+    "std_um_s": "one standard deviation of each component of the measured flow",
+    "own_u_um_s": "the robot's own motion through the fluid as assumed, along x; it is subtracted already",
+    "own_v_um_s": "the robot's own motion through the fluid as assumed, along y; it is subtracted already",
+    "time_s": "middle of the time that the flow is a mean over, on the session clock",
+}
+_NEEDED = 4
+_DEFAULT_STD = 0.05  # of the rms speed, where no standard deviation is given
+_NAMES = list(OBSERVED)
+_WANTED = f"the columns are {', '.join(_NAMES[:_NEEDED])} and, where known, {', '.join(_NAMES[_NEEDED:])}"
+
+
+def observations_of(given: Any, radius_um: float | None = None) -> Observations:
+    """Observations from a table with a row each, in the columns OBSERVED.
+
+    Without `std_um_s` it is 5 % of the root mean square speed. A column that may be left out may be empty.
+
+    Parameters
+    ----------
+    given : path of a CSV or Excel file; a pandas DataFrame, or anything with columns by name; an array (n, 4 to 8) with
+        the columns in this order; or Observations, which are returned as they are.
+    radius_um : of the robot or particle, which the flow carries as a sphere; None: not stated.
+
+    Raises
+    ------
+    UsageError : one line with the shape and the columns that are wanted: a missing column, another shape, no row, NaN
+        or infinity, a standard deviation that is not more than zero.
+    """
+    if isinstance(given, Observations):
+        return given
+    where, columns = _columns(given)
+    missing = [name for name in _NAMES[:_NEEDED] if name not in columns]
+    if missing:
+        raise UsageError(f"{where}: no column {missing[0]}; {_WANTED}")
+    if ("own_u_um_s" in columns) != ("own_v_um_s" in columns):
+        raise UsageError(f"{where}: own_u_um_s and own_v_um_s belong together; {_WANTED}")
+    n = len(columns["x_um"])
+    if n == 0:
+        raise UsageError(f"{where}: has no row; give at least one observation, {_WANTED}")
+    for name, values in columns.items():
+        if values.shape != (n,):
+            raise UsageError(f"{where}: {name} has the shape {values.shape} where ({n},) belongs, a number a row")
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            more = f" (and {len(bad) - 1} more rows)" if len(bad) > 1 else ""
+            raise UsageError(f"{where}: row {bad[0]}: {name} is {values[bad[0]]:g}{more}; leave these rows out")
+    flow = np.column_stack([columns["u_um_s"], columns["v_um_s"]])
+    rms_um_s = math.sqrt(float((flow**2).sum(axis=1).mean()))
+    std = columns.get("std_um_s", np.full(n, _DEFAULT_STD * rms_um_s))
+    if not (std > 0).all():
+        row = int(np.argmin(std > 0))
+        raise UsageError(f"{where}: row {row}: std_um_s is {std[row]:g}; it must be more than zero")
+    own = np.column_stack([columns["own_u_um_s"], columns["own_v_um_s"]]) if "own_u_um_s" in columns else None
+    place = np.column_stack([columns["x_um"], columns["y_um"]])
+    return Observations(0, place, flow, std, own, columns.get("time_s"), radius_um)
+
+
+def _columns(given: Any) -> tuple[str, dict[str, NDArray[np.float64]]]:
+    """Name of a table for errors, and its columns; what may be left out and is empty is left out."""
+    if isinstance(given, str | Path):
+        table = read_table(Path(given))
+        known = {name: place for name in _NAMES if (place := table.index(name)) is not None}
+        empty = {name for name, place in known.items() if all(row[place] in ("", None) for row in table.rows)}
+        return table.where, {name: table.numbers(name) for name in known if name not in empty or not table.rows}
+    where = f"observations ({type(given).__name__})"
+    names = given.keys() if isinstance(given, Mapping) else getattr(given, "column_names", None)
+    names = getattr(given, "columns", None) if names is None else names
+    try:
+        if names is not None and not isinstance(given, np.ndarray):
+            found = {name: np.asarray(given[name], np.float64) for name in _NAMES if name in list(names)}
+        else:
+            array = np.asarray(given, np.float64)
+            if array.ndim != 2 or not _NEEDED <= array.shape[1] <= len(_NAMES):
+                shape = f"has the shape {array.shape} where (n, {_NEEDED} to {len(_NAMES)}) belongs"
+                raise UsageError(f"{where}: {shape}; {_WANTED}, in this order")
+            found = dict(zip(_NAMES, array.T, strict=False))
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{where}: are no table of numbers ({error}); {_WANTED}") from error
+    optional = _NAMES[_NEEDED:]
+    empty = {name for name in optional if name in found and found[name].size and np.isnan(found[name]).all()}
+    return where, {name: values for name, values in found.items() if name not in empty}

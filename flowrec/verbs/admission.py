@@ -1,0 +1,201 @@
+"""Admission to a live run: whether this machine holds the images of the camera, measured before there is a file.
+
+The images of the camera pass through the whole pipeline, the writer and the disk of the session, at the camera's rate,
+for some seconds. Nothing is energised, and what was written is removed. Besides, the process of the slow stages has
+then done the first order of the mission: it has imported, compiled and factorised what that needs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flowrec.core import (
+    MCAP,
+    FlowField,
+    Output,
+    RigError,
+    Tick,
+    nanoseconds,
+    realtime_priority,
+    seconds,
+    temporary_name,
+    warn,
+)
+from flowrec.physics import Chip
+from flowrec.rigs import Rig, Tried
+from flowrec.run import RunControl, Worker
+from flowrec.stages import Pipeline, ResolvedConfig, step
+from flowrec.store import SessionWriter, session_writer
+
+_ENOUGH = 0.95  # of the camera's rate: the rest is what two seconds can tell
+_TRIES = 3  # a moment without the processor is no lack of it
+_PATIENCE_S = 2.0  # for what waits for the disk after the last image
+_SETTLE_S = 0.1  # after the last image until it is written, on a machine with time to spare
+_POLL_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Rates that a trial has measured, in images a second.
+
+    Attributes
+    ----------
+    asked_hz : rate of the camera.
+    ticks_hz : of the pipeline's ticks.
+    written_hz : of what reached the disk.
+    realtime : whether the loop had real-time priority.
+    """
+
+    asked_hz: float
+    ticks_hz: float
+    written_hz: float
+    realtime: bool = True
+
+    @property
+    def hz(self) -> float:
+        """Rate that the machine holds, in images a second: the least of the three."""
+        return min(self.asked_hz, self.ticks_hz, self.written_hz)
+
+    @property
+    def enough(self) -> bool:
+        """True if no image would be lost."""
+        return self.hz >= _ENOUGH * self.asked_hz
+
+    def __str__(self) -> str:
+        held = self.asked_hz if self.enough else self.hz
+        return f"{held:.0f} of {self.asked_hz:.0f} images a second"
+
+
+def admit(
+    rig: Rig,
+    worker: Worker,
+    of: tuple[ResolvedConfig, Chip, Pipeline],
+    known: Mapping[str, FlowField],
+    folder: Path,
+    control: RunControl,
+) -> dict[str, str]:
+    """Let the worker do the first order, then measure; return the result for the head of the session.
+
+    Nothing is done for a rig whose images can not be had before the run, and after a stop.
+
+    Parameters
+    ----------
+    rig : connected, not entered.
+    known : flow fields of an earlier session, which the run begins with.
+    folder : of the session; a file in it is written, and removed.
+
+    Raises
+    ------
+    FlowrecError : images would be lost, and `recording.accept_losses` is not set; the first order can not be done, the
+        camera gives no image, the folder can not be written.
+    """
+    config, chip, pipeline = of
+    if not isinstance(rig, Tried) or control.reason:
+        return {}
+    known = _after_first_order(rig, pipeline, worker, known, control)
+    best: Held | None = None
+    for _ in range(_TRIES):
+        with _scratch(folder, config, chip) as writer:
+            held = _trial(rig, pipeline, writer, known, config, control)
+        if held is None:
+            return {}
+        best = held if best is None or held.hz > best.hz else best
+        if best.enough:
+            break
+    assert best is not None
+    if not best.enough and not config.recording.accept_losses:
+        raise RigError(refusal(best, config, folder))
+    if not best.enough:
+        warn(f"this machine holds {best}: images will be lost (--accept-losses)")
+    return {"admission": f"holds {best}"}
+
+
+def refusal(held: Held, config: ResolvedConfig, folder: Path) -> str:
+    """Error text for a machine on which images would be lost: in one line what, where, what next."""
+    camera = config.camera
+    slow = "the pipeline" if held.ticks_hz <= held.written_hz else f"writing to {folder}"
+    priority = "" if held.realtime else "allow real-time priority (rtprio 4 in /etc/security/limits.conf), "
+    return (
+        f"this machine holds {held}, and {slow} is the limit ({camera.width_px} x {camera.height_px} pixels): close "
+        f"other programs, {priority}set a lower camera.rate_hz, a smaller image or recording.region = 'robot'; or go "
+        "on with --accept-losses"
+    )
+
+
+def _after_first_order(
+    rig: Tried, pipeline: Pipeline, worker: Worker, known: Mapping[str, FlowField], control: RunControl
+) -> dict[str, FlowField]:
+    """The fields that the run begins with and, if the first order is for one, the one that it gives."""
+    fields = dict(known)
+    with contextlib.closing(rig.tried()) as arriving:
+        arrived = next(arriving)
+        tick = step(pipeline, Tick(), replace(arrived, **_as_adopted(fields, arrived.stamp_ns)))
+    if tick.mission is None or not tick.mission.wanted:
+        return fields
+    worker.submit(tick)
+    while not control.reason:
+        done = worker.due(tick.stamp_ns)
+        if done:
+            return fields | {name: found for name, found in done.items() if isinstance(found, FlowField)}
+        time.sleep(_POLL_S)
+    return fields
+
+
+def _as_adopted(fields: Mapping[str, FlowField], stamp_ns: int) -> dict[str, Any]:
+    return {name: replace(field, stamp_ns=stamp_ns, request=0) for name, field in fields.items()}
+
+
+@contextlib.contextmanager
+def _scratch(folder: Path, config: ResolvedConfig, chip: Chip) -> Iterator[SessionWriter]:
+    """A writer of the run's settings, whose file is gone afterwards."""
+    output = Output(folder / temporary_name(".mcap"), MCAP, ())
+    writer = session_writer(output, config, chip, live=True, keep_failed=False)
+    try:
+        yield writer
+    finally:
+        writer.discard()
+
+
+def _trial(
+    rig: Tried,
+    pipeline: Pipeline,
+    writer: SessionWriter,
+    known: Mapping[str, FlowField],
+    config: ResolvedConfig,
+    control: RunControl,
+) -> Held | None:
+    """Record for `recording.admission_s`, with the priorities of a run."""
+    last, ticks, first, latest = Tick(), 0, None, None
+    with realtime_priority() as granted, contextlib.closing(rig.tried()) as arriving:
+        if granted:
+            writer.prioritise()
+        begin_s = time.monotonic()
+        for arrived in arriving:
+            if arrived.frame is None:
+                continue
+            latest, adopted = arrived.frame, {}
+            if first is None:
+                first, begin_s, adopted = latest, time.monotonic(), _as_adopted(known, arrived.stamp_ns)
+            last = step(pipeline, last, replace(arrived, **adopted))
+            writer.write(replace(last, truth=arrived.truth, true_field=arrived.true_field))
+            ticks += 1
+            if control.reason:
+                return None
+            if latest.stamp_ns - first.stamp_ns >= nanoseconds(config.recording.admission_s):
+                break
+    if first is None or latest is None or ticks < 2:
+        raise RigError("the camera gave no two images; see to its trigger (lab.trigger) and its cable")
+    ticked_s = time.monotonic()
+    while writer.queue_bytes and time.monotonic() < ticked_s + _PATIENCE_S:
+        time.sleep(_POLL_S)
+    written_s = max(time.monotonic() - _SETTLE_S, ticked_s) - begin_s
+    waiting = min(writer.queue_bytes / max(latest.image.nbytes, 1), ticks)
+    asked_hz = (latest.index - first.index) / seconds(latest.stamp_ns - first.stamp_ns)
+    # One image less than the ticks: the time begins with the first.
+    written = ticks - 1 - writer.dropped_frames - waiting
+    return Held(asked_hz, (ticks - 1) / (ticked_s - begin_s), written / written_s, granted)

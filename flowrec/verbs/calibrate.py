@@ -1,0 +1,133 @@
+"""`flowrec calibrate NAME`: verbs that measure settings."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from flowrec.verbs.command import Told, add_verb, verb
+from flowrec.verbs.options import Asked, Overwrite, Sets, WholeDescriptions
+
+TomlOut = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="TOML", help="Write the settings as a section of a configuration.")
+]
+
+
+class _Calibrations(WholeDescriptions):
+    """The group; a table where the name of a command is expected goes to `coils`, as before there was a group."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in self.commands and args[0].lower().endswith(".csv"):
+            typer.echo(f"{ctx.command_path} TABLE is now {ctx.command_path} coils TABLE", err=True)
+            args = ["coils", *args]
+        return super().resolve_command(ctx, args)
+
+
+def _itself(_asked: Asked, told: Told) -> Told:
+    return told
+
+
+@verb(result=_itself)
+def coils(
+    file: Annotated[Path, typer.Argument(metavar="FILE.csv", help="Rows of i_x_a,i_y_a,i_z_a,b_x_mt,b_y_mt,b_z_mt.")],
+    out: TomlOut = None,
+    overwrite: Overwrite = False,
+) -> Told:
+    """Fit the field per ampere of the coils and the bias to measured fields, with standard errors (section coils)."""
+    from flowrec.measure import calibrate_coils as by
+
+    fit = by.calibrate_coils(file, out, overwrite)
+    return Told(lambda: by.figures(fit), lambda: by.show(fit, out))
+
+
+@verb(result=_itself)
+def motion(
+    session: Annotated[Path, typer.Argument(metavar="SESSION", help="Session (.mcap), recorded or imported.")],
+    coils: Annotated[
+        Path | None,
+        typer.Option("--coils", metavar="LOG", help="Another log of the coils (CSV, Excel), on any clock."),
+    ] = None,
+    out: TomlOut = None,
+    overwrite: Overwrite = False,
+) -> Told:
+    """Fit um per revolution, latency and heading offset to the motion of the robot, with standard errors."""
+    from flowrec.measure import calibrate_motion as by
+
+    fit = by.calibrate_motion(session, coils, out, overwrite)
+    return Told(lambda: by.figures(fit), lambda: by.show(fit, session, out))
+
+
+@verb(result=_itself)
+def image(
+    picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
+    config: Annotated[
+        Path | None, typer.Argument(help="Configuration (TOML) with the chip and, roughly, camera.um_per_px.")
+    ] = None,
+    out: TomlOut = None,
+    mirror: Annotated[
+        bool | None,
+        typer.Option("--mirror/--no-mirror", help="Whether the image is mirrored; by default both are tried."),
+    ] = None,
+    pick: Annotated[
+        int | None, typer.Option(metavar="N", help="Which of several equally good poses is meant, from 1.")
+    ] = None,
+    sets: Sets = None,
+    overwrite: Overwrite = False,
+) -> Told:
+    """Find the chip in a picture: um per pixel, angle, mirror and origin (section camera); an overlay shows it."""
+    from flowrec.measure import calibrate_image as by
+    from flowrec.stages import load_config
+
+    inputs = [config] if config is not None else []
+    done = by.calibrate_image(picture, load_config(config, sets or ()), out, mirror, pick, overwrite, inputs)
+    return Told(lambda: by.figures(done), lambda: by.show(done, out), int(done.chosen is None))
+
+
+@verb("flowrec calibrate chip movie.avi --um-per-px 5 --inlet left:0 --inlet-speed 200 -o chip.toml", result=_itself)
+def chip(
+    picture: Annotated[Path, typer.Argument(help="Image file; or a movie or a session, of which the median is taken.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", metavar="TOML", help="Write the chip; mask and overlay (PNG) go beside it."),
+    ] = None,
+    um_per_px: Annotated[
+        float | None, typer.Option("--um-per-px", metavar="UM", help="Micrometres per pixel of the picture.")
+    ] = None,
+    inlet: Annotated[
+        list[str] | None,
+        typer.Option("--inlet", metavar="SIDE:N", help="An opening that is an inlet, as in left:0; may be repeated."),
+    ] = None,
+    inlet_speed: Annotated[
+        float | None, typer.Option("--inlet-speed", metavar="UM_S", help="Mean speed at the inlets, in um/s.")
+    ] = None,
+    walls: Annotated[
+        str,
+        typer.Option(metavar="auto|dark|bright|step|relief", help="How walls show: as lines, or as a step."),
+    ] = "auto",
+    seed_point: Annotated[
+        list[str] | None,
+        typer.Option("--seed-point", metavar="X,Y", help="A point in the channel, in pixels; may be repeated."),
+    ] = None,
+    channel: Annotated[
+        str, typer.Option(metavar="red|green|blue|grey", help="What is used of a picture in colour.")
+    ] = "grey",
+    wall_shift: Annotated[
+        float,
+        typer.Option(metavar="UM", help="Move walls outwards by so much (negative: inwards), if widths are known."),
+    ] = 0.0,
+    overwrite: Overwrite = False,
+) -> Told:
+    """Make a chip of a picture: mask, openings and an overlay; the mask can be corrected in any paint program."""
+    from flowrec.measure import calibrate_chip as by
+
+    done = by.calibrate_chip(
+        picture, out, um_per_px, walls, seed_point or (), inlet or (), inlet_speed, channel, wall_shift, overwrite
+    )
+    return Told(lambda: by.figures(done), lambda: by.show(done, out))
+
+
+calibrate = typer.Typer(
+    cls=_Calibrations, help="Measure settings and write them as a section of a configuration.", no_args_is_help=True
+)
+for _verb in (coils, motion, image, chip):
+    add_verb(calibrate, _verb)

@@ -1,0 +1,327 @@
+"""One file of a session, validated: whether it is whole, what it lacks, and whether it can be replayed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from flowrec.core import (
+    CRYSTAL_PPM,
+    NS_PER_S,
+    NUMERICS_VERSION,
+    Coverage,
+    FlowrecError,
+    Message,
+    Outcome,
+    __version__,
+    camera_summary,
+    doubts_of,
+    finite,
+    irregular_frames,
+    is_growing,
+    seconds,
+    skew_ppm,
+)
+from flowrec.physics import chip_from_files
+from flowrec.stages import ResolvedConfig, config_from_toml, needed_packages
+from flowrec.store import (
+    FRAME_PATH,
+    Audit,
+    audit,
+    is_left_out,
+)
+from flowrec.verbs.check_tally import GAP_PERIODS, Tally
+from flowrec.verbs.check_track import TrackTally
+from flowrec.verbs.verdict import CONSISTENT, DAMAGED, NO_DIGEST, UNFINISHED, CheckFinding, Verdict
+
+_LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
+_RATE_TOLERANCE = 0.05
+_CLOCK_JUMP_S = 1.0
+HEAD = ("configuration", "chip", "provenance", "outcome")
+_CLOCKS = ("wall_ns", "monotonic_ns")
+EXACT = "yes: configuration, chip, and the inputs of every tick"
+NOT_EXACT = "yes, but not exact after the first missing message"
+
+
+class FileCheck:
+    """Reads one file and fills its verdict, one method for each subject.
+
+    Attributes
+    ----------
+    read_bytes : how far it is.
+    """
+
+    def __init__(self, path: Path, progress: Callable[[int], None] | None, before: int) -> None:
+        self.tally, self._track = Tally(), TrackTally()
+        self.found = Audit(path, 0)
+        self.read_bytes = 0
+        self._progress, self._before = progress, before  # of the files before
+        self.verdict = Verdict(path, Coverage(0, 0, "bytes"))
+
+    def _begin(self, found: Audit) -> None:
+        self.found = found
+        self.tally.begin(found)
+        self._track.begin(found)
+
+    def _add(self, name: str, log_ns: int, message: Message) -> None:
+        self.tally.add(name, log_ns, message)
+        self._track.add(log_ns, message)
+
+    def _at(self, read_bytes: int) -> None:
+        self.read_bytes = read_bytes
+        if self._progress is not None:
+            self._progress(self._before + read_bytes)
+
+    @property
+    def topics(self) -> dict[str, int]:
+        """Messages by topic that were read."""
+        return {self._path(name): count for name, count in self.found.counts.items()}
+
+    def _path(self, name: str) -> str:
+        return self.found.topics.by_field[name].path
+
+    def faults_of_messages(self) -> list[CheckFinding]:
+        """Faults of single messages among those that were read so far."""
+        so_far = Verdict(self.found.path, self.verdict.covered)
+        if undecodable := self.found.undecodable.total():
+            so_far.bad(
+                "content", f"{undecodable} messages can not be decoded, the first is {self.found.first_undecodable}"
+            )
+        for what, count in self.tally.not_finite.most_common(_LISTED):
+            so_far.odd("numbers", f"NaN or infinity in {what}, {count} times")
+        return so_far.findings
+
+    def read(self) -> None:
+        """Read the file and judge it."""
+        self.found = audit(self.found.path, self._add, self._at, self._begin)
+        self._at(self.found.size_bytes)
+        self.tally.close()
+        self._track.close()
+        self.verdict.topics = self.topics
+        self.verdict.covered = Coverage(self.read_bytes, self.found.size_bytes, "bytes")
+        self._config = self._header()
+        self._end()
+        self._content()
+        self._digest()
+        self._times()
+        self._images()
+        self._numbers()
+        self._clocks()
+        self._replay()
+
+    def _header(self) -> ResolvedConfig | None:
+        verdict, found = self.verdict, self.found
+        written = f"by flowrec {found.flowrec_version}"
+        if found.flowrec_version != __version__:
+            written += f" (this is {__version__}: flowrec replay --verify shows whether it computes the same)"
+        numerics = found.header.provenance.get("numerics_version", "1") if found.header is not None else None
+        if numerics not in (None, str(NUMERICS_VERSION)):
+            written += f", made by other numerics (version {numerics}; this is {NUMERICS_VERSION})"
+        verdict.fact("written", written)
+        header = found.header
+        if header is None:
+            verdict.bad("head", f"its header is incomplete: {found.header_fault}")
+            return None
+        config = None
+        try:
+            config = config_from_toml(header.config_toml, "its configuration", header.provenance)
+            chip_from_files(header.chip_png, header.chip_toml, "its chip")
+        except FlowrecError as error:
+            verdict.bad("head", str(error))
+        return config
+
+    def _end(self) -> None:
+        verdict, found = self.verdict, self.found
+        how = found.outcome.get("outcome", "")
+        note = found.outcome.get("note") or found.outcome.get("reason", "")
+        why = f" ({note})" if note and how != Outcome.CUT else ""  # findings report a cut
+        verdict.figures |= {"outcome": how, "note": note}
+        verdict.fact("outcome", (how or "not recorded") + why)
+        if not found.finished:
+            if is_growing(found.path):
+                verdict.bad("end", "it is being recorded just now; stop that run with Ctrl-C, then check again")
+            else:
+                fault = found.why_not if found.why_not.startswith(("was ", "has ")) else f"is damaged: {found.why_not}"
+                verdict.bad("end", f"it {fault}; `flowrec recover {found.path}` recovers what is intact")
+        elif not how:
+            verdict.odd("end", "how the run ended was not recorded")
+        elif how == Outcome.FAILED:
+            verdict.odd("end", f"the run failed: {note or 'for a reason that was not recorded'}")
+        source = found.outcome.get("recovered_from")
+        if source is not None and how == Outcome.CUT:
+            verdict.odd("end", f"it was recovered from {source}; {note}")
+        elif source is not None:
+            verdict.fact("recovered", f"from {source}, without a loss")
+        for doubt in dict.fromkeys([*doubts_of(found.outcome), *self._track.doubts()]):
+            verdict.odd("doubts", f"doubtful: {doubt}")
+
+    def _content(self) -> None:
+        verdict, found = self.verdict, self.found
+        if found.lost:
+            text = f"{found.lost} bytes are damaged, the first at {found.first_lost}"
+            if found.finished:
+                verdict.bad("content", f"{text}; `flowrec recover {found.path}` recovers what is intact")
+            else:
+                verdict.odd("content", text)
+        for text in found.contradictions:
+            verdict.bad("index", f"{text}; `flowrec recover {found.path}` makes a new index")
+        for text in found.disagreements:
+            verdict.odd("index", text)
+        verdict.findings += [fault for fault in self.faults_of_messages() if fault.about == "content"]
+        for name, count in (+found.missing).items():
+            verdict.odd("content", f"{count} messages of {self._path(name)} are missing in the middle")
+        agrees = found.finished and not (found.contradictions or found.disagreements or found.lost)
+        count = found.counts.total()
+        verdict.figures |= {"messages": count, "size_bytes": found.size_bytes}
+        text = f"{count} messages on {len(found.counts)} topics in {found.size_bytes / 1e6:.1f} MB"
+        verdict.fact("content", text + ("; index and statistics agree with what was read" if agrees else ""))
+
+    def _digest(self) -> None:
+        verdict, found = self.verdict, self.found
+        if found.edits is None:
+            verdict.fact("digest", "none: recorded by an older flowrec" if found.finished else "none: not finished")
+            verdict.integrity = NO_DIGEST if found.finished else UNFINISHED
+        else:
+            for place in found.edits:
+                verdict.bad("digest", f"{DAMAGED} at {place}")
+            if found.edits:
+                verdict.integrity = f"{DAMAGED} at {found.edits[0]}"
+            else:
+                verdict.fact("digest", f"{CONSISTENT}: whoever can edit the file can edit its digest")
+        if found.finished and found.lost:
+            verdict.integrity = f"{DAMAGED} at byte {found.first_lost}"
+        elif found.contradictions:
+            verdict.integrity = f"{DAMAGED} at its index"
+
+    def _times(self) -> None:
+        verdict, found, tally = self.verdict, self.found, self.tally
+        rate_hz = NS_PER_S / tally.period_ns if tally.period_ns else math.nan
+        verdict.figures |= {"duration_s": found.duration_s, "ticks": tally.ticks, "rate_hz": finite(rate_hz)}
+        rate = f", {rate_hz:.1f} Hz" if tally.period_ns else ""
+        verdict.fact("length", f"{found.duration_s:.2f} s, {tally.ticks} ticks{rate}")
+        if not (found.backwards.total() or found.stamps_backwards.total() or tally.index_backwards):
+            verdict.fact("time", "in order on every topic")
+        for name, count in (+found.backwards).items():
+            verdict.odd("time", f"time goes backwards {count} times in {self._path(name)}")
+        for name, count in (+found.stamps_backwards).items():
+            if not found.backwards[name]:
+                verdict.odd("time", f"the source of {self._path(name)} stamped {count} messages back in time")
+        if tally.index_backwards:
+            verdict.odd("time", f"the numbers of the images go backwards {tally.index_backwards} times")
+        verdict.gaps, verdict.gap_count = tally.gaps(found.first_ns)
+        if verdict.gap_count:
+            longest = sorted(verdict.gaps, key=lambda gap: -gap.length_s)[:_LISTED]
+            listed = [f"{gap.length_s:.3f} s at {gap.at_s:.2f} s" for gap in longest]
+            listed += ["..."] * (verdict.gap_count > len(longest))
+            text = f"{verdict.gap_count} times more than {GAP_PERIODS} periods without a frame: {', '.join(listed)}"
+            verdict.odd("gaps", text)
+        wanted_hz = self._config.camera.rate_hz if self._config is not None else None
+        if wanted_hz and tally.period_ns and abs(rate_hz / wanted_hz - 1.0) > _RATE_TOLERANCE:
+            verdict.odd("rate", f"{rate_hz:.1f} frames per second instead of camera.rate_hz = {wanted_hz:g}")
+
+    def _images(self) -> None:
+        verdict, found, tally = self.verdict, self.found, self.tally
+        images = found.counts["frame"] - tally.repeated["frame"]
+        if not images and found.header is not None and found.header.parent:
+            verdict.fact("images", "none: a replay, the recorded tracks stand in")
+            return
+        leave_out = self._config.recording.leave_out if self._config is not None else ()
+        if not images and is_left_out(FRAME_PATH, leave_out):
+            verdict.fact("images", "none: recording.leave_out, the recorded tracks stand in")
+            return
+        # The outcome of the first release has the count of the writer under both names.
+        dropped = max(tally.dropped, *(_count(found.outcome, key) for key in ("dropped_frames", "frames_dropped")))
+        verdict.figures |= {"frames": images, "frames_dropped": dropped}
+        verdict.fact("images", f"{images} for {tally.ticks} ticks; {dropped} dropped by the writer")
+        if found.region is not None:
+            windows = found.outcome.get("frames_windows", "most of them are black outside of what the tracker read")
+            verdict.fact("windows", f"{windows}; exact for the recorded tracker and robot only")
+        if dropped:
+            verdict.odd("drops", f"{dropped} images were dropped because the disk was too slow (counted by the writer)")
+        if tally.images_missing > dropped:
+            verdict.odd("drops", f"{tally.images_missing - dropped} images are missing without having been counted")
+        unseen = tally.index_steps - tally.images_missing
+        if unseen > 0:
+            verdict.odd("drops", f"{unseen} images of the camera never arrived, as their numbers show")
+        losses = tally.losses
+        if losses is not None:
+            lost = {
+                "on the link": losses.link,
+                "incomplete": losses.incomplete,
+                "by the driver": losses.driver,
+                "by the queue before the loop": losses.backlog,
+            }
+            causes = ", ".join(f"{count} {cause}" for cause, count in lost.items() if count) or "none lost"
+            by_s = seconds(losses.stamp_ns - found.first_ns)
+            counts = f"of {losses.ids} images that the camera has numbered by {by_s:.1f} s, {losses.frames} came"
+            verdict.fact("losses", f"{counts}; {causes}")
+            if losses.triggers:
+                verdict.odd("drops", f"{losses.triggers} triggers that the camera has not answered")
+            if losses.reconnections:
+                verdict.odd("drops", f"the camera was absent {losses.reconnections} times, and came back")
+
+    def _numbers(self) -> None:
+        self.verdict.findings += [fault for fault in self.faults_of_messages() if fault.about == "numbers"]
+        if not self.tally.not_finite:
+            self.verdict.fact("numbers", "finite wherever they must be")
+
+    def _clocks(self) -> None:
+        """Stamps come from one monotonic clock; what the wall clock and the camera's clock do is only reported."""
+        verdict, found, clocks = self.verdict, self.found, self.tally.clocks
+        last = clocks.last
+        if last is not None and last.rate:
+            verdict.fact("camera", camera_summary(last, clocks.late_s, clocks.latest_s))
+            if last.unit or (last.known and abs(skew_ppm(last)) > CRYSTAL_PPM):
+                verdict.odd(
+                    "clocks",
+                    f"a count of the camera's clock is {last.rate:.6g} ns, more than the error of a quartz; stamps are "
+                    "corrected by the fit",
+                )
+        for what, count in irregular_frames(last) if last is not None else ():
+            verdict.odd("clocks", f"{count} frames {what}")
+        for stamp_ns, set_s in clocks.wall_set[:_LISTED]:
+            at_s = seconds(stamp_ns - found.first_ns)
+            verdict.odd("clocks", f"the wall clock was set by {set_s:+.3f} s at {at_s:.2f} s; stamps are not affected")
+        if len(clocks.wall_set) > _LISTED:
+            verdict.odd("clocks", f"and {len(clocks.wall_set) - _LISTED} times more")
+        provenance: Mapping[str, str] = found.header.provenance if found.header is not None else {}
+        began = [_count(provenance, name) for name in _CLOCKS]
+        ended = [_count(found.outcome, name) for name in _CLOCKS]
+        if not all(began):
+            verdict.fact("clocks", "the wall clock was not read together with the monotonic clock")
+            return
+        text = f"wall clock and monotonic clock read at {provenance.get('wall_time', '')[:19].replace('T', ' ')} UTC"
+        if all(ended):
+            jump_s = seconds((ended[0] - began[0]) - (ended[1] - began[1]))
+            text += f" and at the end, {round(1e3 * jump_s):+d} ms apart by then"
+            if abs(jump_s) > _CLOCK_JUMP_S and not clocks.wall_set:
+                set_by = f"the wall clock was set by {jump_s:+.1f} s during the run"
+                verdict.odd("clocks", f"{set_by}; stamps are not affected")
+        verdict.fact("clocks", text)
+
+    def _replay(self) -> None:
+        verdict, tally = self.verdict, self.tally
+        if not tally.ticks and tally.repeated:
+            verdict.odd("replay", "it holds only the tick that it repeats from the part before")
+        elif not tally.ticks:
+            verdict.bad("replay", "there is no tick in it, so nothing to replay")
+        if tally.inputs_missing:
+            text = f"{tally.inputs_missing} of {tally.ticks} ticks lack inputs; a replay leaves them out"
+            verdict.odd("replay", text)
+        if tally.images_alone:
+            verdict.odd("replay", f"{tally.images_alone} ticks have only their image")
+        if tally.unfinished_ticks:
+            verdict.odd("replay", f"{tally.unfinished_ticks} ticks have inputs, but no results of the stages")
+        lacks = tally.inputs_missing or tally.images_alone or self.found.missing.total()
+        exact = NOT_EXACT if lacks else EXACT
+        header = self.found.header
+        packages = [] if self._config is None or header is None else needed_packages(self._config, header.provenance)
+        with_these = f"; its stages need the packages {', '.join(packages)}" if packages else ""
+        verdict.fact("replay", "no" if verdict.word == "bad" else exact + with_these)
+
+
+def _count(text: Mapping[str, str], key: str) -> int:
+    """A number in a header or an outcome, 0 if there is none."""
+    number = text.get(key, "")
+    return int(number) if number.isdecimal() and len(number) < 20 else 0

@@ -1,0 +1,158 @@
+"""The command line: all verbs, the entry point, and its errors in one line.
+
+A verb is a function in the file of its name; command.py makes its command.
+
+Exit status: 0 done, 1 failed (also when the goal is unreachable, found before the run or during it), 2 bad usage,
+3 done but something was lost or differs, 130 stopped by Ctrl-C or a key, 143 by SIGTERM, 129 by a closed terminal.
+A recording that is stopped has ended as it was meant to: 0.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+
+import flowrec
+from flowrec.core import FlowrecError, StoppedError, printable
+from flowrec.store import TIMEOUT_KEY, TRAFFIC
+from flowrec.verbs import outside_verbs
+from flowrec.verbs.calibrate import calibrate
+from flowrec.verbs.check import check
+from flowrec.verbs.command import add_verb
+from flowrec.verbs.compare import compare
+from flowrec.verbs.doctor import doctor
+from flowrec.verbs.export import export
+from flowrec.verbs.import_movie import import_movie
+from flowrec.verbs.info import info
+from flowrec.verbs.ls import ls
+from flowrec.verbs.methods import methods
+from flowrec.verbs.new import new
+from flowrec.verbs.note import note
+from flowrec.verbs.options import (
+    HELP_WIDTH,
+    OUR_VERBS,
+    Stoppable,
+    WholeDescriptions,
+    from_above,
+)
+from flowrec.verbs.record import record
+from flowrec.verbs.recover import recover
+from flowrec.verbs.replay import DEFAULT_REFINE, replay
+from flowrec.verbs.report import report
+from flowrec.verbs.view import view
+
+
+class _Verbs(Stoppable, WholeDescriptions):
+    """Our verbs and those of others."""
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return super().get_command(ctx, cmd_name) or outside_verbs.verb(cmd_name)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        ours = super().list_commands(ctx)
+        return [*ours, *(name for name in outside_verbs.verb_names() if name not in ours)]
+
+    def command_for_help(self, ctx: Any, name: str) -> Any:
+        return super().get_command(ctx, name) or outside_verbs.verb_for_help(name)
+
+
+app = typer.Typer(
+    cls=_Verbs,
+    name="flowrec",
+    help="Record, replay and view missions of magnetic micro-robots in flow.",
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": HELP_WIDTH},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # frames around the help would take as long to draw as all the rest
+)
+app.add_typer(calibrate, name="calibrate")
+app.add_typer(from_above("bench"), name="bench")
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"flowrec {flowrec.__version__}")
+        raise typer.Exit
+
+
+def _timeout(seconds: float | None) -> None:
+    if seconds is not None:
+        os.environ[TIMEOUT_KEY] = str(seconds)  # processes that a verb starts take it over
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+    timeout: Annotated[
+        float | None,
+        typer.Option(metavar="S", callback=_timeout, help="Time limit of each request for a session at a URL; 30."),
+    ] = None,
+) -> None:
+    """Record, replay and view missions of magnetic micro-robots in flow."""
+
+
+add_verb(app, record)
+add_verb(app, replay)
+add_verb(app, import_movie, "import")
+for _verb in (
+    *map(from_above, ("sweep", "push", "catalog", "find")),
+    *(methods, new, doctor, view, export, report, info, ls, note, check, recover, compare),
+):
+    add_verb(app, _verb)
+OUR_VERBS.update(str(each.name) for each in app.registered_commands)
+OUR_VERBS.update(str(each.name) for each in app.registered_groups)
+
+
+def with_default_refine(words: list[str]) -> list[str]:
+    """Insert the default method after a `--refine` without one, so that a session path is not taken for the method."""
+    full: list[str] = []
+    for number, word in enumerate(words):
+        full.append(word)
+        following = words[number + 1] if number + 1 < len(words) else "-"
+        without_method = following.startswith("-") or following.endswith(".mcap")
+        if word == "--refine" and without_method:
+            full.append(DEFAULT_REFINE)
+    return full
+
+
+def main() -> None:
+    """Entry point: run the command line, turn our errors into one line and an exit status."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # the locale's encoding may not have every character
+    TRAFFIC.reasons.clear()  # of a call before, in the same process
+    # click's class, which typer has in its own package since 0.29.
+    usage_error: Any = typer.BadParameter.__base__
+    try:
+        sys.exit(app(args=with_default_refine(sys.argv[1:]), prog_name="flowrec", standalone_mode=False) or 0)
+    except usage_error as error:
+        if type(error).__name__ == "NoArgsIsHelpError":  # typer has moved the class from version to version
+            typer.echo(error.ctx.get_help())
+            sys.exit(0)
+        message = printable(error.format_message()).rstrip(".")
+        if message:  # empty if the help was printed
+            verb = error.ctx.command_path if error.ctx is not None else "flowrec"
+            sys.stderr.write(f"flowrec: {message}; see {verb} --help\n")
+        sys.exit(error.exit_code)
+    except FlowrecError as error:
+        if isinstance(error, StoppedError) and "--json" in sys.argv:
+            print(json.dumps(error.as_json()))
+        sys.stderr.write(f"flowrec: {error}\n")
+        sys.exit(error.exit_status)
+    except BrokenPipeError:
+        # The reader of the output has ended (flowrec info ... | head).
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    finally:
+        if TRAFFIC.line:
+            sys.stderr.write(f"{TRAFFIC.line}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,394 @@
+"""Checks of `flowrec doctor`: every device and all else that a run needs, without energising anything."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flowrec.core import (
+    CameraLosses,
+    FlowrecError,
+    Image,
+    RigError,
+    UsageError,
+    apply_sets,
+    kernels_cached,
+    read_toml,
+    temporary_name,
+    write_all,
+)
+from flowrec.measure import orientation_by_image, registration_state, walls_state
+from flowrec.physics import Chip, ChipSettings, load_chip
+from flowrec.rigs import ONLY_HARDWARE, Guardian
+from flowrec.stages import (
+    AMPLIFIERS,
+    LAB,
+    SIMULATED,
+    Coils,
+    Config,
+    ResolvedConfig,
+    config_from_tree,
+    registration_of,
+    resolve,
+)
+from flowrec.store import frames_of, image_bytes_s
+from flowrec.verbs.preparation import refuse_adrift
+from flowrec.verbs.rehearsal import rehearse
+from flowrec.view import executable, has_display
+
+OK, WARNING, FAILURE = "ok", "warning", "failure"
+_SIGNS = {OK: " ", WARNING: "!", FAILURE: "x"}
+_OF_DEVICES = ("camera", "coils", "lab")  # sections
+_RATE_TOLERANCE = 0.05
+_CLOCK_TOLERANCE = 0.01
+_LOSS_WARNING, _LOSS_FAILURE = 0.001, 0.05  # fraction of the blocks
+_DARK = 0.1  # of the full scale
+_TRIAL_BYTES = 128 << 20
+_HEADROOM = 2.0  # of the disk's speed over the rate of a run
+_LEAST_MINUTES = 10.0
+_SILENT_S = 0.3  # longer than lab.guardian_s
+_OLD_DAYS = 90.0
+# By how much the encodings compress the images of a camera at least; frame_encodings.py has the measurements.
+_PACKED = {"raw": 1.0, "zstd": 1.3, "delta": 1.8, "png": 1.8, "jpeg": 6.0}
+_CAUSES = {
+    "link": "lost in the camera or on its link: see to cable, network card, jumbo frames",
+    "incomplete": "arrived with parts missing: see to cable and bandwidth",
+    "driver": "thrown away by the driver: the computer is too slow or too busy",
+    "backlog": "thrown away before the loop: the computer is too slow or too busy",
+    "triggers": "triggers without an image: the exposure is too long for the rate of the triggers",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line.
+
+    Attributes
+    ----------
+    what : what was looked at.
+    level : ok, warning or failure.
+    text : what was found, with what to do unless it is ok.
+    """
+
+    what: str
+    level: str
+    text: str
+
+    @property
+    def line(self) -> str:
+        """For people."""
+        return f"{_SIGNS[self.level]} {self.what:12s} {self.text}"
+
+
+def diagnose(
+    asked: Config, config_file: Path | None = None, folder: Path | None = None, wrong: str = ""
+) -> Iterator[Finding]:
+    """Look at everything that a run of a configuration needs, and yield what is found, as it is found.
+
+    Parameters
+    ----------
+    config_file : from which the configuration was read, for the age of its calibrations.
+    folder : where sessions are written; None: the present one.
+    wrong : why the configuration was refused, and `asked` is only what is right of it; "" if it was not.
+    """
+    settled: list[tuple[ResolvedConfig, Chip | None]] = []
+    if wrong:
+        yield Finding("settings", FAILURE, wrong)
+    else:
+        yield from _look("settings", lambda: _settings(asked, settled))
+    if not settled and asked.rig == LAB:
+        yield from _look("devices", lambda: _without_settings(asked, settled))
+    if settled:
+        config, chip = settled[0]
+        if chip is not None:
+            known = chip
+            yield from _look("mission", lambda: _mission(config, known))
+            if config.recording.admission_s:
+                yield from _look("kernels", lambda: _kernels(config))
+        if asked.rig == LAB:
+            yield from _look("camera", lambda: _camera(config, chip))
+            yield from _look("coils", lambda: _coils(config))
+        else:
+            text = f"rig = {asked.rig!r}: neither camera nor coils are looked at; give the configuration of the lab"
+            yield Finding("devices", WARNING, f"{text}, with rig = 'lab'")
+        yield from _look("disk", lambda: _disk(config, folder or Path()))
+    yield from _calibrations(asked, config_file)
+    yield _viewer()
+
+
+def _look(what: str, check: Callable[[], Iterator[Finding]]) -> Iterator[Finding]:
+    """The findings of a check; an error, which says in its line what to do, is a failure."""
+    try:
+        yield from check()
+    except FlowrecError as error:
+        yield Finding(what, FAILURE, str(error))
+    except OSError as error:
+        yield Finding(what, FAILURE, f"{error.strerror or error}; see to it, then try again")
+
+
+def _without_settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) -> Iterator[Finding]:
+    settled.append((stand_in(asked), None))
+    text = "what is wrong or missing in the settings is made up to look at them; mission and walls are left out"
+    yield Finding("devices", WARNING, text)
+
+
+def _settings(asked: Config, settled: list[tuple[ResolvedConfig, Chip | None]]) -> Iterator[Finding]:
+    chip = load_chip(asked.chip)
+    config = resolve(asked, chip)
+    settled.append((config, chip))
+    camera = config.camera
+    yield Finding(
+        "settings",
+        OK,
+        f"chip {chip.name}; {camera.width_px} x {camera.height_px} pixels of {camera.bits} bit at {camera.rate_hz:g} "
+        f"Hz, {camera.um_per_px:.4g} um per pixel; robot of radius {config.robot.radius_um:g} um",
+    )
+
+
+def _mission(config: ResolvedConfig, chip: Chip) -> Iterator[Finding]:
+    mission = config.mission
+    if mission.observes:
+        yield Finding("mission", OK, "observes: the coils are not used")
+        return
+    refuse_adrift(config, chip)
+    field = config.flow.solve(chip)
+    start, goal = np.array(mission.start), np.array(mission.goal)
+    route = config.plan.plan(field, start, goal, chip, config.robot)
+    if not route.reachable:
+        yield Finding("mission", FAILURE, f"no route on the assumed flow: {route.reason}; choose another goal")
+        return
+    length_mm = 1e-3 * float(np.linalg.norm(np.diff(route.waypoints_um, axis=0), axis=1).sum())
+    yield Finding(
+        "mission", OK, f"{', '.join(mission.phases)}; a route of {length_mm:.2f} mm in {route.arrival_s[-1]:.1f} s"
+    )
+
+
+def _kernels(config: ResolvedConfig) -> Iterator[Finding]:
+    """Compile what a live run would compile before it begins."""
+    known = kernels_cached()
+    begin_s = time.perf_counter()
+    rehearse(config)
+    if not kernels_cached():
+        text = "can not be kept, no folder for a cache can be written: each run compiles them, half a minute before it"
+        yield Finding("kernels", WARNING, f"{text}; set XDG_CACHE_HOME to a folder of your own")
+        return
+    once = f"compiled in {time.perf_counter() - begin_s:.0f} s, once after an installation"
+    text = "compiled before" if known else once
+    yield Finding("kernels", OK, f"{text}; a short simulated mission with this configuration's methods went through")
+
+
+def _camera(config: ResolvedConfig, chip: Chip | None) -> Iterator[Finding]:
+    from flowrec.rigs import probe_camera
+
+    camera = config.camera
+    seen = probe_camera(camera, config.lab)
+    info = seen.info
+    name = " ".join(filter(None, (info.model, info.serial)))
+    yield Finding("camera", OK, f"{name}: {info.width_px} x {info.height_px} pixels, {info.pixel_format or info.bits}")
+    if (info.width_px, info.height_px, info.bits) != (camera.width_px, camera.height_px, camera.bits):
+        yield Finding(
+            "camera",
+            FAILURE,
+            f"its images are {info.width_px} x {info.height_px} pixels of {info.bits} bit; set camera.width_px, "
+            "camera.height_px and camera.bits to that",
+        )
+    yield from (Finding("camera", WARNING, note) for note in seen.notes)
+    wrong = abs(seen.rate_hz / camera.rate_hz - 1.0) > _RATE_TOLERANCE
+    text = f"{seen.rate_hz:.1f} frames per second, longest interval {seen.arrival_ms:.0f} ms"
+    advice = f", where camera.rate_hz = {camera.rate_hz:g}: set it, a shorter exposure or a smaller image"
+    yield Finding("rate", WARNING if wrong else OK, text + (advice if wrong else ""))
+    yield from _losses(seen.losses)
+    if not seen.clock_slope:
+        yield Finding("clock", WARNING, "the camera has no clock that can be used: frames are stamped by their arrival")
+    elif abs(seen.clock_slope - 1.0) > _CLOCK_TOLERANCE:
+        text = (
+            f"the camera's clock runs at {seen.clock_slope:.4g} of what it states; its true rate is measured in a run"
+        )
+        yield Finding("clock", WARNING, text)
+    else:
+        yield Finding(
+            "clock", OK, f"{1e6 * (seen.clock_slope - 1.0):+.0f} ppm from the host's, within what 2.5 s can tell"
+        )
+    full = 2**info.bits - 1
+    if seen.brightest >= full:
+        yield Finding("image", WARNING, "overexposed: some pixels are at the highest grey level; shorten the exposure")
+    elif seen.brightest < _DARK * full:
+        text = f"dark: the brightest pixel has level {seen.brightest} of {full}; more light, exposure or lab.gain"
+        yield Finding("image", WARNING, text)
+    else:
+        yield Finding("image", OK, f"brightest pixel {seen.brightest} of {full}")
+    if chip is not None and seen.image is not None and seen.image.shape == (camera.height_px, camera.width_px):
+        yield from _walls(config, chip, seen.image)
+
+
+def _walls(config: ResolvedConfig, chip: Chip, image: Image) -> Iterator[Finding]:
+    """The orientation of the chip in the image; and whether it still lies as registered, if the image shows enough."""
+    stated = registration_of(config.camera, chip)
+    seen = orientation_by_image(image, chip, stated)
+    if seen.contradiction:
+        yield Finding("axes", FAILURE, seen.text)
+        return
+    observes = config.mission.observes
+    later = "" if seen.decided or observes else "; the motion tells at the beginning of a run"
+    yield Finding("axes", WARNING if observes and not seen.alike else OK, seen.text + later)
+    found = walls_state(image, chip, stated)
+    if found is not None:
+        yield Finding("walls", OK if found.good else WARNING, found.text)
+
+
+def _losses(losses: CameraLosses | None) -> Iterator[Finding]:
+    if losses is None:
+        return
+    total = max(losses.ids, 1)
+    found = {cause: getattr(losses, cause) for cause in _CAUSES if getattr(losses, cause)}
+    if not found:
+        yield Finding("losses", OK, f"none of {losses.ids} images")
+    for cause, count in found.items():
+        share = count / total
+        level = FAILURE if share > _LOSS_FAILURE else WARNING if share > _LOSS_WARNING else OK
+        yield Finding("losses", level, f"{count} of {losses.ids} images {_CAUSES[cause]}")
+
+
+def _coils(config: ResolvedConfig) -> Iterator[Finding]:
+    if config.mission.observes:
+        yield Finding("coils", OK, "not used by a mission that observes")
+        return
+    from flowrec.rigs import probe_amplifier
+
+    seen = probe_amplifier(config)
+    info = seen.info
+    timer = f"goes to zero by itself after {info.timer_s:g} s" if info.timer_s else "holds its last output by itself"
+    yield Finding("amplifier", OK, f"{' '.join(filter(None, (info.model, info.serial)))}; {timer}")
+    yield Finding(
+        "limits",
+        OK,
+        f"{config.coils.max_current_a:g} A and {config.coils.amplifier.max_voltage_v:g} V a coil: "
+        f"{seen.amplitude_mt:.3g} mT up to {seen.rotation_hz:.3g} Hz, {config.lab.output.longest_on_s:g} s at a time",
+    )
+    yield Finding(
+        "guardian",
+        OK,
+        f"its process starts, and takes the output to zero {1e3 * seen.trip_s:.1f} ms after it is asked to",
+    )
+    yield _silence(config)
+    yield from (Finding("coils", WARNING, text) for text in seen.warnings)
+    yield Finding("interlock", WARNING, f"can not be seen from here: {ONLY_HARDWARE}")
+
+
+def _silence(config: ResolvedConfig) -> Finding:
+    """Tell the guardian that a field is on, which is not, and fall silent."""
+    amplifier = AMPLIFIERS[config.lab.amplifier].load().of(config)
+    amplifier.open()
+    try:
+        action, descriptors = amplifier.guard()
+        with Guardian(action, descriptors, config.lab.guardian_s) as guardian:
+            guardian.beat(energised=True)
+            time.sleep(config.lab.guardian_s + _SILENT_S)
+            try:
+                guardian.beat(energised=False)
+            except RigError as error:
+                return Finding("guardian", OK, f"when a loop falls silent: {error}")
+    finally:
+        amplifier.close()
+    return Finding("guardian", FAILURE, "it does not notice that a loop falls silent; do not record with these coils")
+
+
+def _disk(config: ResolvedConfig, folder: Path) -> Iterator[Finding]:
+    speed = _write_speed(folder)
+    need = image_bytes_s(config) / _PACKED[frames_of(config)]
+    left = max(shutil.disk_usage(folder).free - 1e9 * config.recording.disk_floor_gb, 0.0)
+    minutes = left / max(need, 1.0) / 60.0
+    text = f"writes {speed / 1e6:.0f} MB/s, a run needs {need / 1e6:.0f}; room for {minutes:.0f} min"
+    if speed < need:
+        yield Finding("disk", FAILURE, f"{text}: images would be dropped; use a faster disk or a smaller image")
+    elif speed < _HEADROOM * need or minutes < _LEAST_MINUTES:
+        yield Finding("disk", WARNING, f"{text}: use another disk (--out), or recording.region = 'robot'")
+    else:
+        yield Finding("disk", OK, text)
+
+
+def _write_speed(folder: Path) -> float:
+    """Bytes per second that reach the disk of a folder."""
+    trial = folder / temporary_name()
+    block = np.random.default_rng(0).integers(0, 256, 1 << 22, dtype=np.uint8).tobytes()
+    begin_s = time.perf_counter()
+    try:
+        with trial.open("xb", buffering=0) as file:
+            for _ in range(_TRIAL_BYTES // len(block)):
+                write_all(file.fileno(), block)
+            os.fsync(file.fileno())
+        return _TRIAL_BYTES / (time.perf_counter() - begin_s)
+    finally:
+        trial.unlink(missing_ok=True)
+
+
+def _calibrations(config: Config, file: Path | None) -> Iterator[Finding]:
+    """Calibrations, which only a measurement gives, and the last change of the configuration that holds them."""
+    if config.rig != LAB:
+        return
+    driven = not config.mission.observes
+    if driven and config.coils.mt_per_a == Coils().mt_per_a:
+        yield Finding("coils", WARNING, "coils.mt_per_a is the default; measure it: flowrec calibrate coils TABLE.csv")
+    fresh, text = registration_state(config.camera)
+    yield Finding("registration", OK if fresh else WARNING, text)
+    if file is None:
+        return
+    days = (time.time() - file.stat().st_mtime) / 86_400.0
+    old = days > _OLD_DAYS
+    text = f"{file} was last changed {days:.0f} days ago"
+    yield Finding(
+        "calibrations", WARNING if old else OK, text + ("; measure again what has moved since" if old else "")
+    )
+
+
+def _viewer() -> Finding:
+    if executable() is None:
+        return Finding("viewer", WARNING, "Rerun's viewer is not installed: pip install rerun-sdk")
+    if not has_display():
+        return Finding(
+            "viewer", WARNING, "there is no screen here: record with --view serve and watch from another one"
+        )
+    return Finding("viewer", OK, "Rerun's viewer is there")
+
+
+def of_devices(file: Path | None, sets: Mapping[str, Any], wrong: UsageError) -> Config:
+    """The settings of camera and coils that are right in themselves, where the whole configuration is refused.
+
+    Raises
+    ------
+    UsageError : `wrong`, where the configuration is none of a lab; the file can not be read.
+    """
+    tree: dict[str, Any] = read_toml(file) if file is not None else {}
+    apply_sets(tree, sets)
+    kept: dict[str, Any] = {"rig": tree.get("rig")}
+    if kept["rig"] != LAB:
+        raise wrong
+    for section in _OF_DEVICES:
+        table = tree.get(section)
+        for key, value in table.items() if isinstance(table, dict) else ():
+            more = kept | {section: kept.get(section, {}) | {key: value}}
+            try:
+                config_from_tree(more, str(file))
+            except UsageError:
+                continue  # told already, or after it is mended
+            kept = more
+    return config_from_tree(kept, str(file))
+
+
+def stand_in(asked: Config) -> ResolvedConfig:
+    """The settings of camera, coils and lab that are given, with those of a made-up run for all the rest.
+
+    Raises
+    ------
+    UsageError : these are wrong, too.
+    """
+    devices = {section: getattr(asked, section) for section in _OF_DEVICES}
+    made_up = resolve(replace(Config(), rig=SIMULATED, recording=asked.recording, **devices), load_chip(ChipSettings()))
+    return replace(made_up, rig=LAB)

@@ -1,0 +1,83 @@
+"""`flowrec doctor`: is the lab ready for a run? And the same look at it for `flowrec record --dry-run`."""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from flowrec.core import UsageError
+from flowrec.verbs.command import verb
+from flowrec.verbs.options import Sets
+
+if TYPE_CHECKING:
+    from flowrec.stages import Config
+    from flowrec.verbs.diagnosis import Finding
+
+
+class Diagnosis:
+    """Iterator over findings, each as it is looked at; `findings` holds those so far."""
+
+    def __init__(self, coming: Iterator["Finding"]) -> None:
+        self.findings: list[Finding] = []
+        self._coming = coming
+
+    def lines(self) -> Iterator[str]:
+        """A line for each finding, as it is found."""
+        for finding in self._coming:
+            self.findings.append(finding)
+            yield finding.line
+
+    @property
+    def level(self) -> str:
+        """The worst of all findings."""
+        from flowrec.verbs.diagnosis import FAILURE, OK, WARNING
+
+        self.findings += self._coming
+        levels = {finding.level for finding in self.findings}
+        return next((level for level in (FAILURE, WARNING) if level in levels), OK)
+
+    @property
+    def exit_status(self) -> int:
+        """1 if something has failed."""
+        return int(self.level == "failure")
+
+    def as_json(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"level": self.level, "findings": [asdict(one) for one in self.findings]}
+
+
+@verb("flowrec doctor lab.toml")
+def doctor(
+    config: Annotated[Path | None, typer.Argument(help="Configuration (TOML) of the lab.")] = None,
+    rig: Annotated[str | None, typer.Option(help="Rig to look at: lab.")] = None,
+    sets: Sets = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="Where sessions are written; by default the present folder.")
+    ] = None,
+) -> Diagnosis:
+    """Look at camera, coils, disk and viewer before a run: what is ready, and what to do about the rest.
+
+    Raises
+    ------
+    UsageError : the configuration is wrong, and is none of a lab.
+    """
+    from flowrec.core import settings_of
+    from flowrec.stages import load_config
+    from flowrec.verbs.diagnosis import diagnose, of_devices
+
+    settings = settings_of(sets or ()) | ({"rig": rig} if rig is not None else {})
+    wrong = ""
+    try:
+        chosen = load_config(config, settings, {"rig": "--rig"})
+    except UsageError as error:
+        chosen, wrong = of_devices(config, settings, error), str(error)
+    return Diagnosis(diagnose(chosen, config, folder, wrong))
+
+
+def look_at_lab(chosen: "Config", file: Path | None, out: Path | None) -> Diagnosis:
+    """Diagnose the lab of a run, for `flowrec record --dry-run`."""
+    from flowrec.verbs.diagnosis import diagnose
+
+    return Diagnosis(diagnose(chosen, file, out.parent if out is not None else None))

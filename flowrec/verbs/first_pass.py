@@ -1,0 +1,319 @@
+"""The pass of `flowrec import` through the movie before anything is recorded: shake, which is the robot, its track.
+
+What is found become settings, so the session holds them and a replay does not depend on this step:
+stabilise.first_px, how far the first image is from the mean place of all, because the registration of the chip holds
+for that; and tracker.click_px where a person says which of several bodies is the robot. Where several bodies look alike
+and nobody says it, the import is refused with a picture of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowrec.core import NS_PER_S, PICTURE, Frame, Image, Output, Track, UsageError, say, seconds, shift_px
+from flowrec.rigs import MovieSource
+from flowrec.stages import (
+    MOST,
+    Config,
+    FieldLog,
+    MovieSettings,
+    Pipeline,
+    Sight,
+    TrackQuality,
+    View,
+    bodies_like,
+    bodies_that_stand_out,
+    look,
+    walls_in_view,
+)
+from flowrec.verbs.misfit import Evidence
+from flowrec.verbs.preparation import Prepared, prepare
+
+_SHAKES_PX = 0.1  # root mean square from which on it is told; half a pixel is what a track is off at most
+_PX = "px"
+_SIDE_PX = 1200  # of the picture of candidates, about
+_AMBER, _BLACK = (38, 140, 255), (0, 0, 0)  # blue, green, red
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """The first image that shows the robot, or the first one where none does."""
+
+    frame: Frame
+    sight: Sight
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovieTracks:
+    """Track of the robot in the images of a movie, before anything is recorded.
+
+    Attributes
+    ----------
+    stamps_ns : (n,) session stamps of the images in which it is seen, by movie.clock_rate and clock_offset_s.
+    positions_um : (n, 2) on the chip.
+    log : what the coils did on the same clock, without the robot's delay.
+    evidence : what the images show besides, for a log that does not explain the track.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    positions_um: Floats
+    log: FieldLog
+    evidence: Evidence
+
+    def shifted_by(self, by_um: Floats) -> MovieTracks:
+        """Copy with all positions shifted by (2,), in um."""
+        positions_um = self.positions_um + by_um
+        evidence = replace(self.evidence, positions_um=positions_um)
+        return replace(self, positions_um=positions_um, evidence=evidence)
+
+
+class Looked(NamedTuple):
+    """Result of the first pass.
+
+    Attributes
+    ----------
+    asked : the configuration with what the movie shows.
+    facts : for the head of the session.
+    prepared : the settings of the pass, its chip, and what its images say about the axes.
+    tracks : None where there is no log that they could be compared with.
+    """
+
+    asked: Config
+    facts: Mapping[str, str]
+    prepared: Prepared
+    tracks: MovieTracks | None
+
+
+def first_pass(asked: Config, looked_at: Config, robot: str, folder: Path) -> Looked:
+    """Look through the movie once; the robot is tracked if there is a log to compare with.
+
+    Parameters
+    ----------
+    looked_at : the same configuration with the log where it overlaps the movie.
+    robot : which body is the robot: a number of the picture, "X,Ypx" in pixels of the first image, or "X,Y" in um on
+        the chip; '': the only one that qualifies, or the one of tracker.click_px or box_px.
+    folder : for the picture of the candidates.
+
+    Raises
+    ------
+    UsageError : several bodies qualify, or the given one is not there.
+    FlowrecError : as `import_movie`.
+    """
+    marked = asked.tracker.click_px is not None or asked.tracker.box_px is not None
+    if robot and marked:
+        raise UsageError(f"--robot {robot}: tracker.click_px or box_px is set too; give one of them")
+    prepared = prepare(looked_at, aloud=False)  # the import says it, of the settings that are used
+    place_px = _place_of(robot, asked, prepared.pipeline)
+    if place_px is not None:
+        asked = replace(asked, tracker=replace(asked.tracker, click_px=place_px))
+    p, movie = prepared.pipeline, looked_at.movie
+    if place_px is None and not marked:
+        seen = _first_seen(p, movie, prepared)
+        asked = _with_chosen_body(asked, p, seen, robot, folder) if seen is not None else asked
+    click = asked.tracker
+    p = replace(p, tracker=replace(p.tracker, click_px=click.click_px, click_frame=click.click_frame))
+    passed = _Pass(p, movie, prepared)
+    tracks = passed.tracks()
+    facts: Mapping[str, str] = {}
+    if p.stabiliser.on:
+        first_px = asked.stabilise.first_px
+        asked, facts = _with_mean_shift(asked, passed.shifts_px)
+        if tracks is not None:  # as they are with the shift of the first image that was found
+            tracks = tracks.shifted_by(p.calibration.to_um(first_px) - p.calibration.to_um(asked.stabilise.first_px))
+    return Looked(asked, facts, prepared, tracks)
+
+
+def _first_seen(p: Pipeline, movie: MovieSettings, prepared: Prepared) -> _Seen | None:
+    """The first image that shows the robot, or the first one where none does."""
+    first, sight = None, Sight()
+    with MovieSource(movie, prepared.config.coils) as source:
+        for frame in _within(source, prepared):
+            sight = look(p, sight, frame)
+            first = first or _Seen(frame, sight)
+            if sight.track is not None and sight.track.seen:
+                return _Seen(frame, sight)
+    return first
+
+
+def _within(source: MovieSource, prepared: Prepared) -> Iterator[Frame]:
+    """The images that are imported."""
+    duration_s = prepared.config.duration_s
+    return itertools.takewhile(
+        lambda frame: duration_s is None or seconds(frame.stamp_ns) <= duration_s, source.frames()
+    )
+
+
+class _Pass:
+    """Looks through all images.
+
+    Attributes
+    ----------
+    shifts_px : (n, 2) of all images; (0, 2): they can not be measured.
+    """
+
+    def __init__(self, p: Pipeline, movie: MovieSettings, prepared: Prepared) -> None:
+        self._p = p
+        self._tracks: list[Track] = []
+        self._quality = TrackQuality(p.calibration, p.image_shape, p.robot)
+        sight, shifts = Sight(), list[Floats]()
+        # The shift is measured, too, where it is not taken out of the track.
+        self._stabilised, measures = bool(p.stabiliser.on), replace(p.stabiliser, on=True)
+        shift, background = None, None
+        with MovieSource(movie, prepared.config.coils) as source:
+            self._log = source.log
+            for frame in _within(source, prepared):
+                if self._log is not None:
+                    sight = look(p, sight, frame)
+                    assert sight.track is not None, "the tracker says of every image whether it shows the robot"
+                    self._tracks.append(sight.track)
+                    self._quality.take(sight.track, sight.appearance, sight.shift)
+                if self._log is not None and self._stabilised:
+                    shift, background = sight.shift, sight.background
+                else:
+                    shift, background = measures.register(
+                        shift, background, sight.track, frame, p.chip, p.calibration, p.robot
+                    )
+                blind = background is None or not len(background.pixels)
+                if blind and self._log is None:
+                    break
+                shifts += [shift.shift_px] if shift is not None and not blind else []
+        self.shifts_px = np.array(shifts).reshape(-1, 2)
+
+    def tracks(self) -> MovieTracks | None:
+        """Positions of the robot in the images; None without a log."""
+        if self._log is None:
+            return None
+        seen = [track for track in self._tracks if track.seen]
+        stamps_ns = np.array([each.stamp_ns for each in seen], np.int64)
+        positions_um = np.array([each.position_um for each in seen]).reshape(-1, 2)
+        shake_px = float(np.sqrt(self.shifts_px.var(axis=0).sum())) if len(self.shifts_px) else None
+        um_per_px = self._p.calibration.um_per_px
+        time_s, doubts = stamps_ns / NS_PER_S, self._quality.doubts()
+        evidence = Evidence(time_s, positions_um, shake_px, self._stabilised, um_per_px, doubts)
+        return MovieTracks(stamps_ns, positions_um, self._log, evidence)
+
+
+def _with_mean_shift(asked: Config, shifts_px: Floats) -> tuple[Config, Mapping[str, str]]:
+    """The configuration with the shift of the first image from the mean place of all."""
+    if not len(shifts_px):
+        text = "not known: the image shows no walls of the chip to which it could be registered"
+        say(f"{asked.movie.path}: the image shows no walls of the chip: whether stage or camera shake can not be seen")
+        return asked, {"source_shake": text}
+    off_px = shifts_px - shifts_px.mean(axis=0)
+    rms_px, most_px = math.sqrt(float((off_px**2).sum(axis=1).mean())), float(np.hypot(*off_px.T).max())
+    text = f"{rms_px:.2f} px (root mean square), {most_px:.2f} px at most"
+    if rms_px < _SHAKES_PX:
+        return asked, {"source_shake": text}
+    say(f"{asked.movie.path}: the image shakes by {text}: each image is registered to the walls of the chip")
+    first = asked.stabilise.first_px
+    if not any(first):
+        x, y = (-shifts_px.mean(axis=0)).round(3).tolist()
+        first = (x, y)
+    return replace(asked, stabilise=replace(asked.stabilise, first_px=first)), {"source_shake": text}
+
+
+def _place_of(robot: str, asked: Config, p: Pipeline) -> tuple[float, float] | None:
+    """The place of "X,Ypx" or "X,Y" in the first image, in px; None for a number, and for ''."""
+    parts = robot.removesuffix(_PX).split(",")
+    if not robot or (len(parts) == 1 and robot.isascii() and robot.isdigit()):
+        return None
+    try:
+        x, y = (float(part) for part in parts)
+    except ValueError:
+        x = y = math.nan
+    if not math.isfinite(x) or not math.isfinite(y):
+        raise UsageError(
+            f"--robot {robot}: neither a number of the picture, as in --robot 3, nor a place, as in --robot 320,256px "
+            "(in the first image) or --robot 1250,840 (in um on the chip)"
+        )
+    if not robot.endswith(_PX):
+        x, y = (p.calibration.to_px((x, y)) + np.asarray(asked.stabilise.first_px)).tolist()
+    height, width = p.image_shape
+    if not (0.0 <= x <= width - 1.0 and 0.0 <= y <= height - 1.0):
+        raise UsageError(f"--robot {robot}: at ({x:.0f}, {y:.0f}) px, outside of the image of {width} x {height} px")
+    return round(x, 2), round(y, 2)
+
+
+def _with_chosen_body(asked: Config, p: Pipeline, seen: _Seen, robot: str, folder: Path) -> Config:
+    """The configuration with the body that `robot` numbers; as it is, if only one qualifies."""
+    places, what = _candidates(p, seen)
+    image, name = seen.frame, asked.movie.path
+    if not len(places) or (len(places) == 1 and not robot and seen.sight.appearance is not None):
+        return asked
+    if robot:
+        number = int(robot)
+        if not 1 <= number <= len(places):
+            there = "is 1" if len(places) == 1 else f"are {len(places)}"
+            raise UsageError(f"--robot {robot}: there {there} to choose from in image {image.index} of {name}")
+        x, y = places[number - 1].round(2).tolist()
+        return replace(asked, tracker=replace(asked.tracker, click_px=(x, y), click_frame=image.index))
+    count = f"at least {len(places)}" if len(places) >= MOST - 4 else len(places)  # near the limit some are left out
+    picture = _write_picture(_draw_numbers(image.image, places, p), folder / f"{Path(name).stem}_robots{PICTURE[0]}")
+    raise UsageError(
+        f"{name}: {what.format(count, image.index)}; {picture} shows them with numbers: say which one is the "
+        "robot with --robot N, or by its place: --robot X,Ypx in the first image, --robot X,Y in um on the chip"
+    )
+
+
+def _candidates(p: Pipeline, seen: _Seen) -> tuple[Floats, str]:
+    """Places (n, 2) in px from the top down, and how they are told of."""
+    walls, calibration, sight = walls_in_view(p.chip, p.calibration, p.image_shape), p.calibration, seen.sight
+    if any(off_px := shift_px(sight.shift)):
+        walls, calibration = walls.for_shift(off_px), calibration.for_shift(off_px)
+    radius_px = p.robot.radius_um / calibration.um_per_px
+    view = View(seen.frame.image, walls, radius_px, -p.tracker.wall_error_radii * radius_px)
+    if sight.appearance is None or sight.track is None or not sight.track.seen:
+        found = bodies_that_stand_out(view)
+        what = "no image shows a dark disc or one bright spot; {} bodies stand out in image {}"
+    else:
+        x, y = calibration.to_px(sight.track.position_um).tolist()
+        found, what = bodies_like(view, (x, y), sight.appearance), "{} bodies in image {} look like the robot"
+    return found[np.lexsort((found[:, 0], found[:, 1]))], what
+
+
+def _draw_numbers(image: Image, places_px: Floats, p: Pipeline) -> NDArray[np.uint8]:
+    """The image (h, w, 3) with a circle and a number at each place."""
+    low, high = (float(np.quantile(image, share)) for share in (0.001, 0.999))
+    grey = np.clip((image.astype(np.float32) - low) * (255.0 / max(high - low, 1.0)), 0.0, 255.0).astype(np.uint8)
+    factor = max(1, round(_SIDE_PX / max(image.shape)))
+    shown = cv2.cvtColor(
+        cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR
+    )
+    height, width = shown.shape[:2]
+    radius = max(round(1.5 * factor * p.robot.radius_um / p.calibration.um_per_px), 12)
+    size = 0.5 if len(places_px) > 1 and radius == 12 else 0.7
+    for number, (x, y) in enumerate(places_px.tolist(), 1):
+        at = round(factor * (x + 0.5) - 0.5), round(factor * (y + 0.5) - 0.5)
+        text, (w, h) = str(number), cv2.getTextSize(str(number), cv2.FONT_HERSHEY_SIMPLEX, size, 2)[0]
+        right = at[0] + radius + 3 + w < width
+        corner = at[0] + radius + 3 if right else at[0] - radius - 3 - w, min(max(at[1] + h // 2, h + 1), height - 2)
+        for colour, thick in ((_BLACK, 2), (_AMBER, 1)):
+            cv2.circle(shown, at, radius, colour, thick, cv2.LINE_AA)
+            cv2.putText(shown, text, corner, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thick + 1, cv2.LINE_AA)
+    return np.asarray(shown, np.uint8)
+
+
+def _write_picture(picture: NDArray[np.uint8], path: Path) -> Path:
+    """Write a picture under a name that no other file has; where it is there already, its path."""
+    done, data = cv2.imencode(PICTURE[0], picture)
+    assert done, "OpenCV writes PNG"
+    number, target = 1, path
+    while target.exists():
+        if target.is_file() and target.read_bytes() == data.tobytes():
+            return target
+        number += 1
+        target = path.with_stem(f"{path.stem}_{number}")
+    with Output(target, PICTURE).new_file() as part:
+        part.write_bytes(data.tobytes())
+    return target

@@ -1,0 +1,118 @@
+"""Options that several verbs have, and how the help lists commands."""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Union
+
+import typer
+from typer.core import TyperGroup
+
+from flowrec.core import stopped_in_one_line
+from flowrec.store import session_path
+
+if TYPE_CHECKING:
+    from flowrec.stages import Config
+    from flowrec.store import Session
+
+AnySession = Union[Path, str, "Session"]
+
+
+def readable_toml(file: Path | None) -> Path | None:
+    """Return the file; refuse one that is no TOML, before imports that take a second."""
+    if file is not None:
+        from flowrec.core import read_toml
+
+        read_toml(file)
+    return file
+
+
+AsConfig = Union[Path, str, "Config", None]
+SessionFile = Annotated[
+    AnySession, typer.Argument(metavar="SESSION", callback=session_path, help="Session (.mcap), or its URL.")
+]
+
+_SET = typer.Option("--set", metavar="KEY=VALUE", help="Change one setting, as in --set control.method=ff_fb.")
+Sets = Annotated[list[str] | Mapping[str, Any] | None, _SET]
+SetTexts = Annotated[list[str] | None, _SET]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing output file.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+
+# Verbs that rooms above this one bring: "module:name", imported by name so that no arrow leads upwards.
+ABOVE = {
+    "sweep": "flowrec.archive.sweep_verb:sweep",
+    "push": "flowrec.archive.push_verb:push",
+    "catalog": "flowrec.archive.catalog_verb:catalog",
+    "find": "flowrec.archive.find_verb:find",
+    "report_sweep": "flowrec.archive.sweep.sweep_report:report_sweep",
+    "bench": "flowrec.bench.bench_verb:bench",
+}
+
+OUR_VERBS: set[str] = set()  # names of the commands: cli.py adds them, and no package of others may take one
+HELP_WIDTH = 110  # characters, on a terminal as wide as that
+_LONGEST_DESCRIPTION = 1000  # characters: longer than any
+
+
+Asked = Mapping[str, Any]  # the arguments of a call, by name
+
+
+class Supplied(NamedTuple):
+    """Mark of a parameter that no option sets: at the terminal `make` makes its value for the call."""
+
+    make: Callable[[], Any]
+
+
+def _at_terminal() -> Any:
+    from flowrec.verbs.interactive import AtTerminal
+
+    return AtTerminal()
+
+
+def _bar() -> Any:
+    from flowrec.core import progress
+
+    return progress
+
+
+Bar = Callable[[str, float, str], AbstractContextManager[Callable[[float], None]]]  # what is done, total, unit
+BAR = Supplied(_bar)
+ATTENDED = Supplied(_at_terminal)  # of the parameter `control`: a person attends a command, and nobody a call
+AS_THE_COMMAND = Supplied(lambda: True)  # of what a command does otherwise than a call
+
+
+class WholeDescriptions(TyperGroup):
+    """Commands whose list in the help has the whole first sentence of each, in as many lines as it takes."""
+
+    def command_for_help(self, ctx: Any, name: str) -> Any:
+        """A command for the list of them."""
+        return self.get_command(ctx, name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        named = [(name, self.command_for_help(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [
+            (name, command.get_short_help_str(_LONGEST_DESCRIPTION))
+            for name, command in named
+            if command is not None and not command.hidden
+        ]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+class Stoppable:
+    """Base of a command or a group that a signal leaves as StoppedError; Typer's own end is 130, and says nothing."""
+
+    def make_context(self, *args: Any, **named: Any) -> Any:
+        with stopped_in_one_line():
+            return super().make_context(*args, **named)  # type: ignore[misc]
+
+    def invoke(self, ctx: Any) -> Any:
+        with stopped_in_one_line():
+            return super().invoke(ctx)  # type: ignore[misc]
+
+
+def from_above(name: str) -> Any:
+    """A verb of ABOVE."""
+    return pkgutil.resolve_name(ABOVE[name])

@@ -1,0 +1,164 @@
+"""Preparation of a run before its rig is touched: a resolved configuration, and a mission that is feasible."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from flowrec.core import (
+    MovieError,
+    Phase,
+    UnreachableError,
+    UsageError,
+    say,
+    warn,
+)
+from flowrec.measure import ImageVerdict
+from flowrec.physics import Chip, load_chip, median_width_um
+from flowrec.rigs import fitted_to_movie, open_source
+from flowrec.stages import (
+    MOVIE,
+    SAMPLERS,
+    Config,
+    Pipeline,
+    ResolvedConfig,
+    assemble,
+    derived_values,
+    no_room,
+    registration_of,
+    resolve,
+    swept_out,
+    too_swift,
+)
+from flowrec.verbs.axes import checked_image
+
+if TYPE_CHECKING:
+    from flowrec.measure import WallsState
+
+
+class Prepared(NamedTuple):
+    """Inputs of a run except its rig.
+
+    Attributes
+    ----------
+    derived : settings that were derived because they were not given, by key.
+    facts : about the source of a movie, for the head of the session.
+    image, walls : what the images of a movie say about the axes and the registration; None: not looked at, or nothing.
+    """
+
+    config: ResolvedConfig
+    chip: Chip
+    pipeline: Pipeline
+    derived: dict[str, float]
+    facts: Mapping[str, str]
+    image: ImageVerdict | None = None
+    walls: WallsState | None = None
+
+
+def prepare(asked: Config, aloud: bool = True, known: Prepared | None = None) -> Prepared:
+    """Resolve a configuration and check that the mission is feasible; warn, if `aloud`, where it is likely to fail.
+
+    `known` is what was prepared before for the same movie, chip and registration, whose images are not read again.
+
+    Raises
+    ------
+    UsageError : the method of the sampler needs a recording.
+    UnreachableError : see `refuse_adrift`.
+    ChipError : the images of a movie show the chip in another orientation than stated, or at another scale.
+    """
+    if "recording" in SAMPLERS[asked.sampler.method].needs:
+        able = " or ".join(f"'{row.name}'" for row in SAMPLERS.values() if "recording" not in row.needs)
+        raise UsageError(
+            f"sampler.method = {asked.sampler.method!r} needs the whole recording: use it in flowrec replay --refine; "
+            f"a run takes {able}"
+        )
+    tell, caution = (say, warn) if aloud else (_unsaid, _unsaid)
+    given, facts = asked, dict[str, str]()
+    if asked.rig == MOVIE:
+        asked, found, remarks = fitted_to_movie(given)
+        facts |= found
+        tell(f"{given.movie.path}: {facts['source_images']}, {facts['source_codec']}, times: {facts['source_times']}")
+        for remark in remarks:
+            caution(remark)
+    chip = load_chip(asked.chip)
+    config = resolve(asked, chip)
+    image = walls = None
+    if asked.rig == MOVIE:
+        image, walls = (known.image, known.walls) if known is not None else _looked_at(config, chip)
+        if image is not None:
+            facts["source_axes"] = image.text
+        if walls is not None and not walls.good:
+            caution(walls.text)
+            facts["source_walls"] = walls.text
+    made = derived_values(given, config)
+    if made:
+        what = "derived to fit the movie and the chip" if asked.rig == MOVIE else "derived to fit the chip"
+        unused = ("survey.", "plan.") if config.mission.observes else ()
+        tell(f"{what}: {', '.join(f'{key} = {value:g}' for key, value in made.items() if not key.startswith(unused))}")
+    refuse_adrift(config, chip)
+    full_mt = config.coils.full_mt(config.robot)
+    if full_mt < config.coils.amplitude_mt:
+        caution(
+            f"coils and amplifiers make {full_mt:.2g} of {config.coils.amplitude_mt:g} mT: the robot follows it up to "
+            f"{config.robot.max_speed_um_s:.0f} um/s; see coils.max_current_a and coils.amplifier"
+        )
+    for opening in chip.openings:
+        if opening.kind == "inlet" and opening.value > config.robot.max_speed_um_s:
+            caution(
+                f"inlet {opening.side} {opening.first}-{opening.last}: mean speed {opening.value:.0f} um/s is faster "
+                f"than the robot's {config.robot.max_speed_um_s:.0f} um/s; it can be carried there but not come back"
+            )
+    blind_um = config.robot.delay_s * config.robot.max_speed_um_s
+    if blind_um > 0.5 * median_width_um(chip):
+        caution(
+            f"in the {1e3 * config.robot.delay_s:.0f} ms from command to motion a robot at "
+            f"{config.robot.max_speed_um_s:.0f} um/s goes {blind_um:.0f} um, more than half a channel: expect it to be "
+            "swept into walls; set a smaller robot.delay_s or a slower flow (chip.inlet_speed_um_s)"
+        )
+    return Prepared(config, chip, assemble(config, chip), made, facts, image, walls)
+
+
+def _looked_at(config: ResolvedConfig, chip: Chip) -> tuple[ImageVerdict | None, WallsState | None]:
+    """Verdict of a movie on the axes, and that of its walls on the registration."""
+    from flowrec.measure import walls_state
+
+    try:
+        with open_source(config.movie) as movie:
+            image = movie.median_image()
+    except MovieError:  # an image can not be read: the run tells that
+        return None, None
+    verdict = checked_image(image, config, chip, config.movie.path)
+    return verdict, walls_state(image, chip, registration_of(config.camera, chip))
+
+
+def _unsaid(_text: str) -> None:
+    """In place of `say`."""
+
+
+def refuse_adrift(config: ResolvedConfig, chip: Chip) -> None:
+    """Check before the run that the assumed flow lets the robot reach the goal; a robot that is observed has none.
+
+    Raises
+    ------
+    UnreachableError : the flow at the start is too fast to hold the robot there; the flow carries it out of an outlet
+        before the ramp of the coils is complete; every route to the goal is too narrow, or too fast to be steered on.
+    """
+    if config.mission.observes:
+        return
+    robot, field = config.robot, config.flow.solve(chip)
+    start = np.asarray(config.mission.start, np.float64)
+    course_error = config.plan.swift.course_error(robot, robot.speed_limit_um_s)
+    reason = too_swift(chip, field, start, start, course_error)
+    if reason:
+        raise UnreachableError(f"unreachable: the robot can not be held at the start: {reason}")
+    if {Phase.PLAN, Phase.NAVIGATE} & set(config.mission.phases):
+        goal = np.asarray(config.mission.goal, np.float64)
+        reason = no_room(chip, field, start, goal, robot)
+        reason = reason or too_swift(chip, field, start, goal, course_error)
+        if reason:
+            raise UnreachableError(f"unreachable: {reason}")
+    reason = swept_out(chip, field, start, course_error, 0.0 if config.mission.hold_start_s else config.coils.ramp_s)
+    if reason:
+        raise UnreachableError(f"unreachable: {reason}")

@@ -1,0 +1,110 @@
+"""The result of `flowrec record`: files, figures, exit status, and the table at the end of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flowrec.core import DOUBTS, Coverage, Figures, FlowField, Outcome, doubts_of, rows_for_people, say, table, warn
+from flowrec.physics import Chip
+from flowrec.run import RunReport
+from flowrec.stages import figures_of as figures_of_ticks
+from flowrec.store import is_snapshot
+
+# The mission was completed, or was ended on purpose.
+GOOD_ENDS = frozenset(
+    outcome for outcome in Outcome if outcome.completes_mission or outcome in (Outcome.STOPPED, Outcome.TIME_OVER)
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """The result of a recording.
+
+    Attributes
+    ----------
+    path : of the run, also where it is in several files.
+    report : how the loop went.
+    facts : figures, with the unit in the key.
+    files : in order; none if only the time around events was to be recorded, and there was no event.
+    derived : settings that were derived because they were not given, by key.
+    lost : why the run was ended early by the disk monitor; '' if it was not.
+    stopped : a person or a signal ended it.
+    source : of a movie: facts about it, and the alignment of its log as JSON; as in the head of the session.
+    covered : of a movie: how many of its images were taken; None of a run, which ends when somebody ends it.
+    """
+
+    path: Path
+    report: RunReport
+    facts: Figures
+    files: tuple[Path, ...] = ()
+    derived: Mapping[str, float] = field(default_factory=dict)
+    lost: str = ""
+    stopped: bool = False
+    source: Mapping[str, str] = field(default_factory=dict)
+    covered: Coverage | None = None
+
+    @property
+    def sessions(self) -> tuple[Path, ...]:
+        """Paths that other verbs can open: the run, or each of its snapshots."""
+        return self.files if any(map(is_snapshot, self.files)) else (self.path,) if self.files else ()
+
+    @property
+    def exit_status(self) -> int:
+        """0 reached its end, 1 did not, 3 was ended early by the disk monitor or is doubtful; 130, 143 was stopped."""
+        if self.lost:
+            return 3
+        if self.covered is not None and self.covered.stopped:
+            return self.covered.status
+        if self.report.outcome not in GOOD_ENDS:
+            return 1
+        return 3 if self.doubts else 0
+
+    @property
+    def doubts(self) -> list[str]:
+        """Reasons to doubt the result; none if there is no reason."""
+        return doubts_of(self.facts)
+
+
+def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:
+    """The figures of a run in the order of the table; flow errors are relative to the true flow."""
+    ran: Figures = {
+        "outcome": report.outcome,
+        "note": report.note,
+        "duration_s": report.duration_s,
+        "wall_s": report.wall_s,
+        "ticks": report.ticks,
+    }
+    return ran | figures_of_ticks(chip, report.last, true_field, report.contacts, report.navigating_ns)
+
+
+def files_text(path: Path, files: tuple[Path, ...]) -> str:
+    """Names and sizes of the files of a run, as text."""
+    if not files:
+        return "none: no mark, note, warning or loss of images, and a good end"
+    size = f"{sum(file.stat().st_size for file in files) / 1e6:.1f} MB"
+    if len(files) == 1:
+        return f"{files[0]} ({size})"
+    kind = "snapshots" if is_snapshot(files[0]) else "parts"
+    return f"{len(files)} {kind}, {files[0]} to {files[-1].name} ({size} in all)"
+
+
+def print_summary(recorded: Recorded) -> None:
+    """Print the table at the end of a run, and what to do next."""
+    files = ("file", files_text(recorded.path, recorded.files))
+    facts = {key: value for key, value in recorded.facts.items() if key != DOUBTS}  # they are told below
+    table("Session", ("", "value"), [*rows_for_people(facts), files])
+    sessions, report, covered = recorded.sessions, recorded.report, recorded.covered
+    if recorded.lost:
+        say(
+            f"flowrec: the run was ended early, its file is whole: {recorded.lost}; free some space before the next one"
+        )
+    elif covered is not None and covered.stopped:
+        say(f"flowrec: {covered.text}; the session holds those, and no more is known of the movie")
+    elif report.outcome not in GOOD_ENDS and sessions:
+        say(f"flowrec: the mission ended {report.outcome}: {report.note}; see flowrec view {sessions[-1]}")
+    for doubt in recorded.doubts:
+        warn(f"doubtful: {doubt}")
+    if sessions:
+        say(f"next: flowrec replay {sessions[0]} --refine    flowrec view {sessions[0]}")

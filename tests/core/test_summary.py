@@ -1,0 +1,124 @@
+"""Results are numbers with their unit in the key; words are made of them when they are shown."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flowrec.core.summary import of_text
+from flowrec.store.reader import SessionReader
+from flowrec.store.session import Session
+from flowrec.verbs.cli import main
+from tests.short_missions import SMALL
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+
+
+@pytest.fixture
+def told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):  # type: ignore[no-untyped-def]
+    def run(*words: object) -> str:
+        """What a verb prints on stdout."""
+        monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 0
+        return capsys.readouterr().out
+
+    return run
+
+
+def are_results_of_a_mission(facts: dict[str, Any]) -> None:
+    assert facts.get("outcome") == "reached"
+    for key in ("duration_s", "wall_s", "navigation_s", "planned_s", "route_length_um", "tracking_error_um"):
+        assert isinstance(facts.get(key), float), key
+        assert facts[key] > 0.0, key
+    for key in ("ticks", "contacts", "observations", "frames_dropped"):
+        assert isinstance(facts.get(key), int), key
+    assert 0.0 < facts["refined_flow_error"] < facts["assumed_flow_error"] < 1.0
+    assert facts["assumed_method"] == "fvm"
+    assert 1000.0 < facts["route_length_um"] < 20_000.0
+
+
+def test_info_gives_the_results_of_a_mission_as_numbers(session: Path, told) -> None:  # type: ignore[no-untyped-def]
+    facts = json.loads(told("info", session, "--json"))["facts"]
+    are_results_of_a_mission(facts)
+    assert facts["size_bytes"] == session.stat().st_size
+    assert facts["seed"] == 1
+    assert facts["derived"]["robot.max_speed_um_s"] == 600.0
+    shown = told("info", session)
+    assert f"{100 * facts['refined_flow_error']:.1f} %" in shown
+    assert f"{facts['route_length_um'] / 1000:.2f} mm" in shown
+    assert f"{session.stat().st_size / 1e6:.1f} MB" in shown
+
+
+def test_the_file_holds_numbers_that_read_back_exactly(session: Path, mission) -> None:  # type: ignore[no-untyped-def]
+    kept = SessionReader(session).outcome
+    for key in ("duration_s", "wall_s", "refined_flow_error", "tracking_error_um"):
+        assert kept.get(key) == repr(mission.facts.get(key)), key
+
+
+def test_record_gives_its_results_as_numbers_and_info_who_made_it(tmp_path: Path, told) -> None:  # type: ignore[no-untyped-def]
+    said = {"operator": "Ada", "sample": "chip 7", "notes": "first light"}
+    sets = [*SMALL, "duration_s=0.5", "simulated.seed=42", *(f"recording.{key}={value}" for key, value in said.items())]
+    out = tmp_path / "run.mcap"
+    found = json.loads(told("record", "--json", "--out", out, *(word for text in sets for word in ("--set", text))))
+    assert isinstance(found.get("duration_s"), float)
+    assert isinstance(found.get("ticks"), int)
+    assert found["files"] == [str(out)]
+    assert isinstance(found["derived"]["robot.delay_s"], float)
+    facts = json.loads(told("info", out, "--json"))["facts"]
+    assert {key: facts[key] for key in said} == said
+    assert facts["seed"] == 42
+    assert facts["flowrec"]
+    assert isinstance(facts["local_changes"], bool) == bool(facts["commit"])
+    shown = told("info", out)
+    assert all(text in shown for text in ("Ada", "chip 7", "first light", "42", facts["flowrec"]))
+
+
+def test_a_replay_gives_numbers_before_and_after(told, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    out = tmp_path / "again.mcap"
+    found = json.loads(told("replay", GOLDEN, "--plan", "astar_time", "--out", out, "--json"))
+    assert isinstance(found["duration_s"], float)
+    rows = {row["quantity"]: (row["recorded"], row["replayed"]) for row in found["rows"]}
+    for key in ("refined_flow_error", "residual_um_s", "route_length_um", "travel_time_on_replayed_map_s"):
+        assert all(isinstance(value, float) for value in rows.get(key, ("missing",))), key
+    assert rows["planner"] == ("time_field", "astar_time")
+    assert isinstance(rows["commands_changed"][1], int)
+    assert math.isfinite(float(SessionReader(out).outcome["wall_s"]))
+
+
+def test_an_older_file_that_holds_sentences_is_still_read(told) -> None:  # type: ignore[no-untyped-def]
+    facts = json.loads(told("info", GOLDEN, "--json"))["facts"]
+    assert facts.get("assumed_flow_error") == 0.127
+    assert facts["tracking_error"] == "22.6 um rms"
+    assert facts["seed"] == 5
+    assert facts["commit"].startswith("7bf8e22119")
+    shown = told("info", GOLDEN)
+    assert "12.7 %" in shown
+    assert "golden session" in shown
+
+
+def test_check_gives_what_it_counted_as_numbers(session: Path, told) -> None:  # type: ignore[no-untyped-def]
+    figures = json.loads(told("check", session, "--json")).get("figures")
+    assert figures is not None
+    assert figures["frames"] == figures["ticks"] > 100
+    assert figures["frames_dropped"] == 0
+    assert figures["rate_hz"] == pytest.approx(30.0, rel=0.01)
+    assert figures["duration_s"] == pytest.approx((figures["ticks"] - 1) / 30.0, rel=0.01)
+
+
+def test_a_new_file_holds_the_count_of_dropped_frames_once_and_readers_take_the_names_of_older_files(
+    session: Path,
+) -> None:
+    outcome = Session(session).run.outcome
+    assert outcome["dropped_frames"] == "0"
+    assert "frames_dropped" not in outcome
+    assert Session(session).outcome["frames_dropped"] == 0
+    for older in ({"frames_dropped": "3"}, {"dropped_frames": "3"}, {"frames_dropped": "1", "dropped_frames": "3"}):
+        assert of_text(older) == {"frames_dropped": 3}

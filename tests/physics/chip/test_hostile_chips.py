@@ -1,0 +1,53 @@
+"""Made-up masks and vessel cases: refused before they fill the memory."""
+
+import struct
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from flowrec.core.errors import ChipError
+from flowrec.physics.chip.io import chip_from_files
+from flowrec.physics.chip.vessel_case import KEYS as CASE_KEYS
+from flowrec.physics.chip.vessel_case import read_vessel_case
+
+
+def test_a_mask_that_promises_more_than_it_has_is_refused():
+    for width, height in ((65535, 65535), (32767, 32767), (2**31, 1)):
+        head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", width, height, 8, 0, 0, 0, 0)
+        with pytest.raises(ChipError, match="at most"):
+            chip_from_files(head + bytes(10), "um_per_px = 1.0")
+    for data in (b"BM" + bytes(100), b"\xff\xd8\xff" + bytes(100), b"II*\0" + bytes(100)):
+        with pytest.raises(ChipError, match="is no PNG"):
+            chip_from_files(data, "um_per_px = 1.0")
+
+
+def vessel_case(path, mask_header, zeros):
+    """A case whose mask announces itself like this and has so many MB of zeros."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as case:
+        for key in CASE_KEYS:
+            with case.open(f"{key}.npy", "w") as file:
+                if key == "mask":
+                    np.lib.format.write_array_header_1_0(file, mask_header)
+                    for _ in range(zeros):
+                        file.write(bytes(1 << 20))
+                else:
+                    np.lib.format.write_array(file, np.zeros(3))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("shape", "zeros", "said"),
+    [((270, 1 << 20), 270, "arrays of 2831.* bytes, more than"), ((10**6, 10**6), 0, "announces an array of shape")],
+)
+def test_a_vessel_case_that_would_fill_the_memory_is_refused_before_it_is_unpacked(tmp_path, shape, zeros, said):
+    header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+    path = vessel_case(tmp_path / "case.npz", header, zeros)
+    tracemalloc.start()
+    try:
+        with pytest.raises(ChipError, match=said):
+            read_vessel_case(path)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()

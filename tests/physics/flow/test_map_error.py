@@ -1,0 +1,45 @@
+"""The error of the map that planning, control and estimation count on."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.physics.flow import map_error
+from flowrec.physics.flow.map_error import MapError
+from flowrec.physics.robot import Robot
+from flowrec.stages.control import Controller
+from flowrec.stages.estimation import Kalman
+from flowrec.stages.estimation.step_out import StepOut
+from flowrec.stages.planning import Planner, SurveyPlanner
+from tests.stages.planning import worlds
+
+USES = [value for value in vars(map_error).values() if isinstance(value, MapError)]
+ROBOT = Robot(radius_um=40.0, max_speed_um_s=600.0, step_out_hz=30.0)
+
+
+@pytest.mark.parametrize("use", USES)
+def test_the_error_of_a_map_is_what_the_field_states_within_bounds_and_a_setting_overrides_it(use: MapError) -> None:
+    field = worlds.field_of(worlds.channel(), 100.0)
+    between = 0.5 * (use.least + use.most)
+    assert use.of(None, None) == use.of(field, None) == use.most
+    assert use.of(replace(field, error_share=0.0), None) == use.least
+    assert use.of(replace(field, error_share=9.0), None) == use.most
+    assert use.of(replace(field, error_share=between / use.deviations), None) == pytest.approx(between)
+    assert use.of(replace(field, error_share=0.0), 0.7) == 0.7
+
+
+def test_by_default_every_use_of_a_map_takes_its_error_from_the_field() -> None:
+    stated = (
+        *(Controller().map_error, Kalman().map_share, StepOut().map_error),
+        *(Planner().flow_error_share, Planner().swift.map_error, SurveyPlanner().swift.map_error),
+    )
+    assert stated == (None,) * 6
+
+
+def test_a_map_that_states_a_small_error_needs_less_room_in_a_fast_flow() -> None:
+    swift = replace(Planner().swift, heading_error_rad=0.0, frame_s=0.03, latency_s=0.04)
+    field = worlds.field_of(worlds.open_water(), 400.0)
+    off_um = [swift.course_error(ROBOT, 0.0, replace(field, error_share=share)).um(field) for share in (0.05, 0.1)]
+    straight_um = swift.course_error(ROBOT, 0.0, field).um(field) - 0.07 * 0.2 * 400.0
+    assert np.allclose([off_um[0] - straight_um, off_um[1] - straight_um], [[[2.8]], [[5.6]]], atol=1e-6)

@@ -1,0 +1,33 @@
+import numpy as np
+import pytest
+
+from flowrec.core.messages import FlowField
+from flowrec.physics.flow.sampling import sample
+
+
+@pytest.fixture
+def bilinear():
+    """v = (1 + 2 x - 3 y + x y / 8, 5 - x) in pixels, exact in float32."""
+    rows, columns = np.mgrid[:12, :17].astype(float)
+    velocity = np.stack([1 + 2 * columns - 3 * rows + columns * rows / 8, 5 - columns], axis=-1)
+    return FlowField(0, 0, "test", 4.0, velocity, np.zeros((12, 17)), None, np.zeros(0), 1.0, 1000.0, "")
+
+
+def test_sampling_is_exact_on_bilinear_fields(bilinear):
+    points = np.random.default_rng(1).uniform([0, 0], [16, 11], (5, 40, 2))
+    x, y = points[..., 0], points[..., 1]
+    expected = np.stack([1 + 2 * x - 3 * y + x * y / 8, 5 - x], axis=-1)
+    assert sample(bilinear, points * 4.0) == pytest.approx(expected, abs=1e-12)
+
+
+def test_one_point_and_many_give_the_same_bits(bilinear):
+    points = np.random.default_rng(2).uniform(-8.0, 76.0, (300, 2))
+    many = sample(bilinear, points)
+    assert all(np.array_equal(sample(bilinear, point), value) for point, value in zip(points, many, strict=True))
+
+
+def test_the_border_holds_for_half_a_pixel_and_there_is_nothing_beyond(bilinear):
+    assert sample(bilinear, [-2.0, -2.0]) == pytest.approx([1.0, 5.0])
+    assert sample(bilinear, [66.0, 46.0]) == pytest.approx(sample(bilinear, [64.0, 44.0]))
+    for outside in ([-2.1, 3.0], [3.0, 46.1], [np.nan, 3.0]):
+        assert not sample(bilinear, outside).any() and not sample(bilinear, [outside]).any()

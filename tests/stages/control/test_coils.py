@@ -1,0 +1,205 @@
+import math
+from itertools import groupby
+
+import numpy as np
+import pytest
+
+from flowrec.core.errors import UsageError
+from flowrec.core.messages import Currents, Demand
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.robot import Robot
+from flowrec.stages.config import load_config
+from flowrec.stages.control import Coils
+from flowrec.stages.control.amplifier import AmplifierSettings
+from flowrec.stages.control.coils import field_limits
+from flowrec.stages.resolve import resolve
+
+ROBOT = Robot(radius_um=50.0, um_per_rev=25.0, max_speed_um_s=600.0, step_out_hz=20.0, step_out_margin=0.9)
+SKEWED = ((2.1, 0.1, -0.05), (0.08, 1.9, 0.1), (0.02, -0.1, 1.5))
+BIAS = (0.02, -0.01, -0.045)
+MS = 1_000_000
+
+
+def demand(velocity, stamp=0, error=0.0):
+    return Demand(stamp, np.array(velocity, float), np.zeros(2), 0.0, error, False, np.zeros((0, 2)))
+
+
+def turn(coils, plan, previous=None, step_ms=1, finished=False):
+    """Drive through (velocity, seconds) after seconds of each other."""
+    said = []
+    for velocity, seconds in plan:
+        for _ in range(round(1000 * seconds / step_ms)):
+            stamp = (previous.stamp_ns if previous is not None else -step_ms * MS) + step_ms * MS
+            previous = coils.drive(previous, demand(velocity, stamp), ROBOT, finished)
+            said.append(previous)
+    return said
+
+
+def field_mt(coils, said):
+    return np.array([np.array(coils.mt_per_a) @ c.currents_a + np.array(coils.bias_mt) for c in said])
+
+
+def direction(velocity):
+    phi = math.atan2(velocity[1], velocity[0])
+    return np.array([math.cos(phi), math.sin(phi), 0.0])
+
+
+@pytest.mark.parametrize("velocity", [(120.0, 90.0), (-70.0, 130.0), (0.0, -150.0)])
+@pytest.mark.parametrize("mode", ["roller", "helix"])
+def test_over_a_revolution_the_field_is_a_circle_about_the_axis_of_the_mode(mode, velocity):
+    coils = Coils(mode=mode, mt_per_a=SKEWED, bias_mt=BIAS, ramp_s=0.1)
+    field = field_mt(coils, turn(coils, [(velocity, 0.1 + 0.2)])[110:])
+    np.testing.assert_allclose(np.linalg.norm(field, axis=1), 4.0, rtol=1e-12)
+    along = direction(velocity)
+    axis = np.cross([0.0, 0.0, 1.0], along) if mode == "roller" else along
+    np.testing.assert_allclose(field @ axis, 0.0, atol=1e-12)
+    assert np.cross(field[:-1], field[1:]).mean(0) @ axis > 0.0, "right-handed about it"
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, 2.5, -1.9])
+def test_a_roller_goes_its_way_on_the_floor_and_set_to_the_ceiling_also_there(heading):
+    ahead = np.array([math.cos(heading), math.sin(heading), 0.0])
+    for surface, contact in (("floor", [0.0, 0.0, -1.0]), ("ceiling", [0.0, 0.0, 1.0])):
+        field = Coils(surface=surface).field_mt(np.linspace(0.0, 1.0, 20), heading, 4.0)
+        spin = np.cross(field[:-1], field[1:]).mean(0)
+        # Rolling: the point that touches rests, so the centre moves by spin x (from the contact to the centre).
+        way = np.cross(spin, -np.array(contact))
+        np.testing.assert_allclose(way / np.linalg.norm(way), ahead, atol=1e-12)
+
+
+def test_a_left_handed_helix_turns_the_other_way_about_its_heading():
+    for handedness, sign in (("right", 1.0), ("left", -1.0)):
+        field = Coils(mode="helix", handedness=handedness).field_mt(np.linspace(0.0, 1.0, 20), 0.4, 4.0)
+        spin = np.cross(field[:-1], field[1:])
+        np.testing.assert_allclose(
+            spin / np.linalg.norm(spin, axis=1)[:, None] @ direction((math.cos(0.4), math.sin(0.4))), sign
+        )
+
+
+def test_the_robot_rolls_its_way_in_as_many_revolutions_and_never_past_the_step_out_margin():
+    said = turn(Coils(), [((0.0, 200.0), 1.0), ((900.0, 0.0), 0.1)])
+    assert said[500].frequency_hz == pytest.approx(200.0 / 25.0)
+    assert said[500].heading_rad == pytest.approx(math.pi / 2)
+    assert said[-1].frequency_hz == pytest.approx(0.9 * 20.0)
+
+
+def test_the_phase_never_jumps_whatever_frequency_and_heading_do_and_however_often_it_is_looked_at():
+    plan = [((100.0, 0.0), 0.3), ((-300.0, 50.0), 0.2), ((0.0, 0.0), 0.1), ((0.0, 400.0), 0.25)]
+    said = turn(Coils(), plan)
+    steps = np.abs(np.diff(np.unwrap([c.phase_rad for c in said])))
+    expected = [2 * math.pi * c.frequency_hz * 1e-3 for c in said[:-1]]
+    np.testing.assert_allclose(steps, expected, atol=1e-9)
+    assert all(0.0 <= c.phase_rad < 2 * math.pi for c in said)
+    resting = [c for c in said[500:600] if c.frequency_hz == 0.0]
+    assert {c.heading_rad for c in resting} == {resting[0].heading_rad} and resting[0].heading_rad != 0.0
+    coarse = turn(Coils(ramp_s=0.0), [((100.0, 0.0), 3.0)], step_ms=30)
+    fine = turn(Coils(ramp_s=0.0), [((100.0, 0.0), 2.971)], step_ms=1)
+    assert math.isclose(coarse[-1].phase_rad, fine[-1].phase_rad, abs_tol=1e-6)
+
+
+def test_the_field_itself_never_jumps_not_even_when_the_robot_turns_back():
+    coils = Coils(mt_per_a=SKEWED, bias_mt=BIAS)
+    plan = [((100.0, 0.0), 0.35), ((-300.0, 50.0), 0.2), ((0.0, 0.0), 0.1), ((0.0, 400.0), 0.25), ((1.0, -5.0), 0.2)]
+    said = turn(coils, plan)[250:]
+    jumps = np.linalg.norm(np.diff(field_mt(coils, said), axis=0), axis=1)
+    assert jumps.max() <= 4.0 * 2 * math.pi * 18.0 * 1e-3, "never faster than at the step-out margin"
+    aside = [(c.plane_rad - c.heading_rad) % math.pi for c in said]
+    longest = max(len(list(run)) for away, run in groupby(min(a, math.pi - a) > 1e-9 for a in aside) if away)
+    assert longest <= 30, "a turn is over within half a revolution"
+
+
+def test_at_the_limit_of_one_coil_all_are_scaled_so_that_the_circle_stays_round():
+    coils = Coils(mt_per_a=SKEWED, bias_mt=BIAS, max_current_a=1.5)
+    said = turn(coils, [((120.0, 90.0), 0.6)])[300:]
+    lengths = np.linalg.norm(field_mt(coils, said), axis=1)
+    assert all(c.saturated for c in said)
+    np.testing.assert_allclose(lengths, lengths[0], rtol=1e-12)
+    assert lengths[0] == pytest.approx(said[0].amplitude_mt) and lengths[0] < 3.0
+    highest = np.abs([c.currents_a for c in said]).max()
+    assert 0.95 * 1.5 < highest <= 1.5 + 1e-9
+    assert max(c.frequency_hz for c in turn(coils, [((900.0, 0.0), 0.6)])) < 0.75 * 18.0, (
+        "less torque, earlier step-out"
+    )
+
+
+def test_the_field_ramps_up_rests_with_a_resting_robot_and_ramps_to_nothing_at_the_end_or_without_a_robot():
+    coils = Coils(ramp_s=0.2)
+    up = turn(coils, [((100.0, 0.0), 0.5)])
+    assert up[0].amplitude_mt == 0.0 and not up[0].currents_a.any()
+    assert up[100].amplitude_mt == pytest.approx(2.0) and up[-1].amplitude_mt == 4.0
+    rest = turn(coils, [((0.0, 0.0), 0.5)], up[-1])
+    assert rest[-1].amplitude_mt == 4.0 and rest[-1].frequency_hz == 0.0
+    done = turn(coils, [((0.0, 0.0), 0.3)], rest[-1], finished=True)
+    assert done[99].amplitude_mt == pytest.approx(2.0)
+    assert done[-1].amplitude_mt == 0.0 and not done[-1].currents_a.any()
+    lost: Currents | None = rest[-1]
+    for k in range(1, 11):
+        lost = coils.drive(lost, demand((0.0, 0.0), rest[-1].stamp_ns + 30 * k * MS, math.nan), ROBOT, False)
+    assert lost is not None and lost.amplitude_mt == 0.0
+
+
+def test_voltages_limit_the_field_and_the_frequency_at_once_where_they_agree():
+    amplifier = AmplifierSettings("voltage", resistance_ohm=(2.0, 2.2, 3.0), inductance_mh=(14.0, 15.0, 29.0))
+    coils = Coils(mt_per_a=SKEWED, bias_mt=BIAS, amplifier=amplifier)
+    said = turn(coils, [((900.0, 0.0), 0.5), ((30.0, 60.0), 0.3), ((-900.0, 900.0), 0.5)])
+    fast, slow = said[450], said[750]
+    share = fast.amplitude_mt / 4.0
+    assert fast.saturated and 0.3 < share < 0.95
+    assert fast.frequency_hz == pytest.approx(18.0 * share), "all the frequency that this field lets the robot follow"
+    assert field_limits(coils).max_amplitude_mt(fast.frequency_hz) == pytest.approx(fast.amplitude_mt), (
+        "all the field for it"
+    )
+    assert fast.frequency_hz > 1.05 * 18.0 * field_limits(coils).max_amplitude_mt(18.0) / 4.0, (
+        "more than at the full frequency"
+    )
+    assert slow.amplitude_mt == fast.amplitude_mt, "no waiting for the field when the frequency rises again"
+    assert coils.fastest_um_s(ROBOT) == pytest.approx(25.0 * fast.frequency_hz)
+    volts = np.abs([c.voltages_v for c in said])
+    assert 9.5 < volts.max() <= 10.0, "all that the ramp leaves: here 4 %"
+    frequencies = np.array([c.frequency_hz for c in said[:450]])
+    assert np.all(np.diff(frequencies) >= -1e-12), "no swinging on the way there"
+
+
+def test_a_current_amplifier_is_told_volts_in_proportion_to_the_current_and_kept_within_its_input():
+    coils = Coils(amplifier=AmplifierSettings(a_per_v=(0.5, 0.4, 0.25), max_voltage_v=8.0))
+    said = turn(coils, [((100.0, 50.0), 0.5)])
+    for c in said:
+        np.testing.assert_allclose(c.voltages_v, c.currents_a / np.array([0.5, 0.4, 0.25]), atol=1e-12)
+    assert said[-1].amplitude_mt == pytest.approx(8.0 * 0.25 * 1.5)
+    assert np.abs([c.voltages_v for c in said]).max() <= 8.0 + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("mt_per_a", "[[2.0, 0.0, 2.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]]", "no currents make a field along z"),
+        ("mt_per_a", "[[2.0, 2.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]", r"along \(-0.45, 0.89, 0.00\)"),
+        ("amplitude_mt", "0.0", "must be from 0.001"),
+        ("max_current_a", "0", "must be from 0.001"),
+        ("ramp_s", "-0.1", "must be from 0 to"),
+        ("bias_mt", "[nan, 0.0, 0.0]", "must be from -1000"),
+        ("amplifier.a_per_v", "[1.0, 0.0, 1.0]", "must be from 1e-06"),
+        ("amplifier.max_voltage_v", "-10.0", "must be from 0.001"),
+        ("amplifier.kind", "magic", "one of current, voltage"),
+        ("surface", "wall", "one of floor, ceiling"),
+    ],
+)
+def test_coils_that_can_not_be_are_refused_before_anything_is_switched_on(key, value, says):
+    with pytest.raises(UsageError, match=rf"--set: coils\.{key}.*{says}") as caught:
+        load_config(None, [f"coils.{key}={value}"])
+    assert "\n" not in str(caught.value)
+    with pytest.raises(UsageError, match="a voltage amplifier needs time"):
+        load_config(None, ["coils.amplifier.kind=voltage", "coils.ramp_s=0"])
+    with pytest.raises(UsageError, match=r"max_current_a = 5 A: coil y needs all of it .* \(\+5.05 A\)"):
+        load_config(None, ["coils.bias_mt=[0.0, 9.6, 0.0]"])
+    with pytest.raises(UsageError, match=r"max_voltage_v = 0.05 V: coil z needs all of it against coils\.bias_mt"):
+        load_config(None, ["coils.amplifier.max_voltage_v=0.05", "coils.bias_mt=[0.0, 0.0, 0.1]"])
+
+
+def test_a_plan_is_made_for_the_speed_that_the_coils_leave_the_robot():
+    sets = ["coils.max_current_a=1.5", "robot.max_speed_um_s=600"]
+    config = load_config(None, sets)
+    resolved = resolve(config, load_chip(config.chip))
+    share = 1.5 * 1.5 / 4.0  # of the full field, by the z coil
+    assert resolved.robot.max_speed_um_s == pytest.approx(600.0 * 1.2 * 0.9 * share, abs=0.1)
+    assert resolve(resolved, load_chip(config.chip)).robot == resolved.robot

@@ -1,0 +1,13 @@
+"""Every method of the observer stage."""
+
+import pytest
+
+from flowrec.stages.estimation import Observer
+from flowrec.stages.estimation.observer import OBSERVERS
+from flowrec.stages.outside_settings import with_row
+
+
+@pytest.fixture(params=OBSERVERS.usable())
+def any_observer(request):
+    """An observer of each row of the table, with its default settings."""
+    return with_row(Observer(), OBSERVERS, request.param)

@@ -1,0 +1,77 @@
+"""Noise and gain found from what was recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flowrec.core.errors import UsageError
+from flowrec.core.messages import Applied, Track
+from flowrec.measure.tuning import moving_noise, parked_noise, tune
+from flowrec.stages.estimation import Kalman, Observer, smooth
+from tests.stages.estimation.lap import ROBOT, driven, vortex
+
+
+def test_the_noise_of_a_parked_robot_is_found_under_its_drift_and_despite_jumps() -> None:
+    rng = np.random.default_rng(2)
+    time = np.arange(300) / 30.0
+    place = 4.0 * rng.standard_normal((300, 2)) + np.column_stack([15.0 * time, 3.0 * np.sin(time)])
+    place[::90] += 300.0
+    stamps = [round(at * 1e9) for at in time]
+    tracks = [Track(at, True, where, 0.9, 0, 5.0, np.zeros(4)) for at, where in zip(stamps, place, strict=True)]
+    rest = [Applied(at, 0.0, 0.0, 0.0, np.zeros(3), np.zeros(2)) for at in stamps]
+    noise, rest_s = parked_noise(tracks, rest)
+    assert noise == pytest.approx(4.0, rel=0.2)
+    assert rest_s > 8.0
+    driven = [replace(each, turns=np.ones(2)) for each in rest]
+    assert np.isnan(parked_noise(tracks, driven)[0])
+
+
+def test_tuning_finds_the_noise_of_a_driven_robot_and_brings_the_nis_to_two() -> None:
+    run = driven(6.0)
+    run.tracks[:] = run.tracks[:600]
+    run.applied[:] = run.applied[:600]
+    assert moving_noise(run.tracks, run.applied, ROBOT) == pytest.approx(6.0, rel=0.1)
+    tuned = tune(run.tracks, run.applied, ROBOT, Kalman())
+    assert tuned.source == "moving"
+    assert tuned.nis == pytest.approx(2.0, abs=0.1)
+    assert tuned.nis_before > 5.0
+    assert tuned.sets[0].startswith("observer.kalman.position_noise_um=")
+    with pytest.raises(UsageError, match="too few"):
+        tune(run.tracks[:5], run.applied[:5], ROBOT, Kalman())
+
+
+def test_the_gain_is_found_where_the_headings_vary() -> None:
+    run = driven(10.0, gain=1.1)
+    field = vortex()
+    fixed = Kalman(position_noise_um=10.0)
+    felt = replace(fixed, estimate_gain=True)
+    blind = run.observed(Observer("kalman_map", kalman=fixed), field)
+    found = run.observed(Observer("kalman_map", kalman=felt), field)
+    assert blind[-1].um_per_rev is None
+    assert found[-1].um_per_rev == pytest.approx(1.1 * ROBOT.um_per_rev, rel=0.02)
+    assert found[-1].covariance.shape == (5, 5)
+    flows = [np.array([each.flow_um_s for each in estimates]) for estimates in (blind, found)]
+    assert run.rmse(flows[0]) > 20.0
+    assert run.rmse(flows[1]) < 5.0
+    mapless = run.observed(Observer(kalman=felt))
+    assert run.rmse(np.array([each.flow_um_s for each in mapless])) < 0.65 * run.rmse(flows[0])
+
+
+def test_on_a_straight_way_the_gain_is_not_pretended_to_be_known() -> None:
+    run = driven(5.0)
+    felt = Kalman(position_noise_um=5.0, estimate_gain=True)
+    still = [replace(each, turns=np.zeros(2)) for each in run.applied[:200]]
+    last = None
+    for track, done in zip(run.tracks, still, strict=False):
+        last = felt.estimate(last, replace(track, position_um=np.zeros(2)), done, ROBOT)
+    assert last is not None
+    assert np.sqrt(last.covariance[-1, -1]) > 0.14 * ROBOT.um_per_rev
+
+
+def test_the_smoother_is_within_five_um_s_on_the_lemniscate() -> None:
+    run = driven(10.0)
+    smoothed = smooth(run.tracks, run.applied, Kalman(position_noise_um=10.0), ROBOT)
+    assert run.rmse(smoothed.flow_um_s) < 5.0

@@ -1,0 +1,181 @@
+"""Chunks that recovery copies as they are stored, and those that it has to put together anew."""
+
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+from mcap.opcode import Opcode
+
+from flowrec.core.errors import SessionError
+from flowrec.store.channels import SLOTS
+from flowrec.store.mcap_format import CHUNK_HEAD, LONG, MESSAGE_HEAD, RECORD_HEAD, records_in
+from flowrec.store.mcap_reader import McapReader
+from flowrec.store.recovery import recover
+from flowrec.store.scan import scan
+from flowrec.store.session_file import Snapshot, Split, WriterOptions
+from flowrec.store.session_metadata import DIGEST, OUTCOME, VIEW
+from flowrec.store.split import PartFile
+from flowrec.store.writer import SessionWriter
+from tests.store.made_up import HEADER, ticks_of
+from tests.store.test_damage import names_in
+from tests.store.test_recovery import chunks_of, cut, flush_every
+
+FRAMES, TRACK = SLOTS["/camera/frame"].channel, SLOTS["/robot/track"].channel
+ROBOT = SLOTS["/view/robot_pose"].channel
+AT_END = (OUTCOME, DIGEST, VIEW)
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+RUNS = {
+    "raw": WriterOptions(frames="raw", block=True),
+    "zstd": WriterOptions(frames="zstd", block=True),
+    "delta": WriterOptions(frames="delta", block=True),
+    "jpeg": WriterOptions(frames="jpeg", block=True),
+    "live": WriterOptions(frames="delta"),
+    "no views": WriterOptions(frames="zstd", block=True, leave_out=("/view/*",)),
+    "part": WriterOptions(frames="delta", block=True, files=Split(seconds=0.3)),
+    "snapshot": WriterOptions(frames="delta", block=True, files=Snapshot(0.2, 0.2)),
+}
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The last file of each run, with three ticks a flush."""
+    found = {}
+    for name, options in RUNS.items():
+        folder = tmp_path_factory.mktemp("copies")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(PartFile, "flush_if_due", flush_every(3))
+            with SessionWriter(folder / "s.mcap", HEADER, options) as writer:
+                for tick in ticks_of(40, shape=(8, 8)):
+                    writer.write(tick)
+        found[name] = sorted(folder.iterdir())[-1]
+    return found
+
+
+def contents_of(source):
+    for chunk in scan(source).summary.chunks:
+        yield chunk, source.content(chunk.chunk_start_offset, chunk.chunk_length)
+
+
+def messages_of(path):
+    """Head and payload of each message by channel."""
+    messages = {}
+    for _, content in contents_of(McapReader(path)):
+        for _, at, length in records_in(content):
+            channel, *head = MESSAGE_HEAD.unpack_from(content, at)
+            messages.setdefault(channel, []).append((head, bytes(content[at + MESSAGE_HEAD.size : at + length])))
+    return messages
+
+
+def stored_chunks(path, channels=None):
+    """The chunks as they are in the file, all of them or those of just some channels."""
+    source = McapReader(path)
+    return [
+        bytes(source.body(chunk.chunk_start_offset, chunk.chunk_length, Opcode.CHUNK))
+        for chunk, _ in contents_of(source)
+        if channels in (None, set(chunk.message_index_offsets))
+    ]
+
+
+def head_of(path):
+    """All that a file declares, without what its end says."""
+    source = McapReader(path)
+    index = scan(source).summary
+    metadata = [(each.name, source.metadata(each)) for each in index.metadata if each.name not in AT_END]
+    return metadata, [source.attachment(each) for each in index.attachments], index.channels, index.schemas
+
+
+def places_of_a_cut(path):
+    """In a chunk and after a chunk of each group of topics, and in the index."""
+    ends = {}
+    for start, end, channels in chunks_of(path)[6:]:
+        ends.setdefault(FRAMES if channels == {FRAMES} else min(channels) > 21, (start, end))
+    size = path.stat().st_size
+    return [at for start, end in ends.values() for at in ((start + end) // 2, end)] + [size - 100, int(0.8 * size)]
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_of_a_cut_file_every_chunk_and_all_of_its_head_is_copied_as_it_is(files, run, tmp_path):
+    for number, length in enumerate(places_of_a_cut(files[run])):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        path = cut(files[run], length, folder / "s.mcap.partial")
+        chunks, head = stored_chunks(path), head_of(path)
+        done = recover(path)
+        assert stored_chunks(done.path) == chunks and head_of(done.path) == head
+        assert not recover(done.path).changed
+
+
+@pytest.mark.parametrize(("run", "known"), [("delta", True), ("part", False)])
+def test_the_colour_scale_is_that_of_the_run_where_the_file_tells_it(files, run, known, tmp_path):
+    def scales(path):
+        source = McapReader(path)
+        return [source.metadata(each) for each in scan(source).summary.metadata if each.name == VIEW]
+
+    saved = recover(cut(files[run], chunks_of(files[run])[-1][0], tmp_path / "s.mcap.partial"))
+    # A part does not begin with the first flow field, by which the scale was chosen.
+    assert scales(saved.path) == (scales(files[run]) if known else [])
+
+
+@pytest.mark.parametrize("which", [FRAMES, TRACK, ROBOT])
+def test_a_damaged_chunk_costs_no_byte_of_the_others(files, which, tmp_path):
+    start, end, _ = [chunk for chunk in chunks_of(files["delta"]) if which in chunk[2]][4]
+    content = bytearray(files["delta"].read_bytes())
+    content[(start + end) // 2] ^= 0xFF
+    path = tmp_path / "s.mcap.partial"
+    path.write_bytes(content)
+    done = recover(path)
+    (lost,) = set(stored_chunks(files["delta"])) - set(stored_chunks(done.path))
+    assert lost == files["delta"].read_bytes()[start + RECORD_HEAD.size : end] and not done.complete
+
+
+def test_an_image_that_makes_no_sense_under_a_right_checksum_is_left_out_alone(files, tmp_path):
+    content = bytearray(files["raw"].read_bytes())
+    start, end, _ = [chunk for chunk in chunks_of(files["raw"]) if chunk[2] == {FRAMES}][3]
+    at = content.index(b"mono8", start, end)
+    content[at : at + 5] = b"mono9"
+    begin = start + RECORD_HEAD.size + CHUNK_HEAD.size + LONG.size
+    struct.pack_into("<I", content, start + RECORD_HEAD.size + 24, zlib.crc32(content[begin:end]))
+    path = tmp_path / "s.mcap.partial"
+    path.write_bytes(content[:-100])
+    before = messages_of(path)
+    done = recover(path)
+    assert "1 messages that make no sense, the first is /camera/frame" in done.lost and "1 images" in done.lost
+    (lost,) = [image for image in before[FRAMES] if b"mono9" in image[1]]
+    before[FRAMES].remove(lost)
+    assert messages_of(done.path) == before and not recover(done.path).changed
+
+
+def test_a_chunk_without_a_checksum_gets_one(files, tmp_path):
+    content = bytearray(files["delta"].read_bytes())
+    start = next(chunk[0] for chunk in chunks_of(files["delta"]) if chunk[2] == {FRAMES})
+    struct.pack_into("<I", content, start + RECORD_HEAD.size + 24, 0)
+    path = tmp_path / "s.mcap.partial"
+    path.write_bytes(content[:-100])
+    before = messages_of(path)
+    done = recover(path)
+    assert all(CHUNK_HEAD.unpack_from(chunk)[3] for chunk in stored_chunks(done.path))
+    assert messages_of(done.path) == before
+
+
+def test_a_session_of_an_older_flowrec_stays_as_that_one_wrote_it(tmp_path):
+    path = cut(GOLDEN, GOLDEN.stat().st_size // 3, tmp_path / "s.mcap.partial")
+    chunks, head = stored_chunks(path), head_of(path)
+    done = recover(path)
+    assert stored_chunks(done.path) == chunks and head_of(done.path) == head and not recover(done.path).changed
+
+
+def test_what_reads_back_otherwise_than_it_was_written_is_no_session(files, tmp_path, monkeypatch):
+    path = cut(files["delta"], int(0.8 * files["delta"].stat().st_size), tmp_path / "s.mcap.partial")
+    before, write = path.read_bytes(), os.writev
+    images = {chunk[CHUNK_HEAD.size + 4 + LONG.size :] for chunk in stored_chunks(path, {FRAMES})}
+
+    def damaging(handle, buffers):
+        faulty = [bytes(each[:-9]) + b"\0" + bytes(each[-8:]) if bytes(each) in images else each for each in buffers]
+        return write(handle, faulty)
+
+    monkeypatch.setattr(os, "writev", damaging)
+    with pytest.raises(SessionError, match=r"left as it was.*can not be read back"):
+        recover(path)
+    assert names_in(tmp_path) == ["s.mcap.partial"] and path.read_bytes() == before

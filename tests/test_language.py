@@ -1,0 +1,87 @@
+"""The words of the sources: one class a name, docstrings that state a result, functions that fit on a screen."""
+
+from __future__ import annotations
+
+import ast
+import re
+from functools import cache
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1] / "flowrec"
+LONGEST = 60  # lines of a function without its docstring
+QUESTION = re.compile(r"(Why|What|Of|The same|How|Whether|Where|When|Which|Who|Whose)\b")
+# A participle alone tells neither what a function does nor what it returns. A property may have one.
+PARTICIPLE = re.compile(
+    r"(?!.*(need|feed|speed|seed|embed|exceed)$)([a-z]+ed|begun|bound|broken|built|chosen|done|drawn|driven|flown|found|given|gone"
+    r"|grown|heard|held|hidden|kept|known|left|lost|made|met|said|seen|sent|shown|stuck|swept|taken|thrown|told|woken|worn|written)"
+)
+LONG = "Long because"  # begins the sentence that gives the reason
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+# Exceptions, with the rename or the work that will end them. A list only shrinks: an entry that is not needed fails.
+CAMERAS = ("camera", "genicam", "mmcore", "opencv", "pylon")
+PARTICIPLES = {
+    **{f"rigs/lab/cameras/{name}.py: discarded": "cameras of other packages implement it" for name in CAMERAS},
+    **{f"rigs/{name}.py: connected": "rigs of other packages implement it" for name in ("rig", "lab/rig")},
+    **{f"rigs/{name}.py: tried": "rigs of other packages implement it" for name in ("rig", "lab/rig", "simulated/rig")},
+    "stages/planning/problem.py: timed": "planners of other packages call it",
+    "verbs/template/lab_plugin.py: discarded": "a camera of another package",
+    **dict.fromkeys(("core/", "run/", "store/"), "to be renamed"),
+}
+FUNCTIONS_TO_SPLIT = {"verbs/mission_run.py: run_mission", "verbs/session_replay.py: replay_session"}
+
+
+@cache
+def definitions() -> list[tuple[str, ast.Module | ast.ClassDef | Function]]:
+    """Each module, class and function of the package, with its file."""
+    return [
+        (path.relative_to(PACKAGE).as_posix(), node)
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | Function)
+    ]
+
+
+def length_of(function: Function) -> int:
+    """Lines of a function without its docstring."""
+    first, lines = function.body[0], int(function.end_lineno or 0) - function.lineno + 1
+    return lines if ast.get_docstring(function) is None else lines - (int(first.end_lineno or 0) - first.lineno + 1)
+
+
+def is_property(function: Function) -> bool:
+    return any("property" in ast.unparse(each) for each in function.decorator_list)
+
+
+def test_no_two_classes_have_one_name() -> None:
+    files: dict[str, list[str]] = {}
+    for file, node in definitions():
+        if isinstance(node, ast.ClassDef):
+            files.setdefault(node.name, []).append(file)
+    assert {name: where for name, where in files.items() if len(where) > 1} == {}
+
+
+def test_no_docstring_begins_with_a_question_word() -> None:
+    found = [f"{file}: {text}" for file, node in definitions() if QUESTION.match(text := ast.get_docstring(node) or "")]
+    assert found == []
+
+
+def test_a_long_function_gives_its_reason() -> None:
+    found = {
+        f"{file}: {node.name}"
+        for file, node in definitions()
+        if isinstance(node, Function) and length_of(node) > LONGEST and LONG not in (ast.get_docstring(node) or "")
+    }
+    assert found - FUNCTIONS_TO_SPLIT == set()
+    assert found >= FUNCTIONS_TO_SPLIT, "take it from the list"
+
+
+def test_no_function_is_named_by_a_bare_participle() -> None:
+    found = [
+        f"{file}: {node.name}"
+        for file, node in definitions()
+        if isinstance(node, Function) and PARTICIPLE.fullmatch(node.name.strip("_")) and not is_property(node)
+    ]
+    assert [each for each in found if not each.startswith(tuple(PARTICIPLES))] == []
+    unused = [place for place in PARTICIPLES if not any(each.startswith(place) for each in found)]
+    assert unused == [], "take it from the list"

@@ -1,0 +1,110 @@
+"""From a picture to a chip that can be solved."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flowrec.core.errors import ChipError, FlowrecError, UsageError
+from flowrec.core.system.outputs import OutputError
+from flowrec.measure.calibrate_chip import calibrate_chip
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.chip.registration import Calibration
+from flowrec.physics.flow.sampling import sample
+from flowrec.physics.flow.solver import FlowSolver
+from flowrec.verbs.cli import app
+from tests.physics.chip.looks import LOOKS, picture
+
+CHIP = load_chip(ChipSettings("bifurcation"))
+SIZE_PX, UM_PER_PX = (480, 384), 40.0 / 3.0
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("chip") / "picture.png"
+    camera = Calibration.centre_on(UM_PER_PX, np.array(CHIP.size_um) / 2 - 10.0, SIZE_PX, 0.0, False)
+    look = LOOKS["thick dark lines"]
+    shown = picture(CHIP.mask, 20.0, camera, SIZE_PX, look, np.random.default_rng(1))
+    cv2.imwrite(str(path), cv2.merge((shown, shown // 2, shown)))  # in colour
+    return path
+
+
+@pytest.mark.slow("solves the flow on two chips")
+def test_the_flow_on_the_chip_of_a_picture_is_about_that_on_the_true_one(image, tmp_path):
+    out = tmp_path / "mine.toml"
+    words = ["calibrate", "chip", str(image), "--um-per-px", str(UM_PER_PX), "-o", str(out)]
+    words += ["--inlet", "left:0", "--inlet-speed", "220"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.toml", "mine.png", "mine_overlay.png"}
+    chip = load_chip(ChipSettings(path=str(out)))
+    found, true = FlowSolver().solve(chip), FlowSolver().solve(CHIP)
+    rows, columns = np.nonzero(CHIP.mask)
+    at_um = np.stack((columns, rows), -1) * 20.0
+    # Both chips have their middle where the picture has it.
+    shift_um = (np.array(chip.size_um) - chip.um_per_px - np.array(CHIP.size_um) + 20.0) / 2
+    off = sample(found, at_um + shift_um) - sample(true, at_um)
+    assert np.sqrt(np.sum(off**2) / np.sum(sample(true, at_um) ** 2)) < 0.07
+    assert isinstance(CliRunner().invoke(app, words).exception, OutputError)  # nothing is overwritten
+
+
+def test_what_a_picture_does_not_tell_is_asked_for_and_a_corrected_mask_loads(image, tmp_path):
+    out = tmp_path / "mine.toml"
+    calibrate_chip(image, out, walls="dark")
+    asked = (
+        ("# um_per_px =  ", f"um_per_px = {UM_PER_PX}", "no um_per_px"),
+        ('kind = "?"', 'kind = "outlet"', r"kind = '\?'; it must be one of inlet, outlet"),
+        ('kind = "?"', 'kind = "inlet"', r"kind = '\?'; it must be one of inlet, outlet"),
+        ("# speed_um_s =   # FILL IN", "# none", None),
+        ("# speed_um_s =   # FILL IN", "speed_um_s = 100.0  #", "needs speed_um_s"),
+    )
+    for line, filled, refusal in asked:
+        if refusal is not None:
+            with pytest.raises(ChipError, match=refusal):
+                load_chip(ChipSettings(path=str(out)))
+        out.write_text(out.read_text().replace(line, filled, 1))
+    chip = load_chip(ChipSettings(path=str(out)))
+    assert [(o.side, o.kind, o.value) for o in chip.openings] == [("left", "outlet", 0.0), ("right", "inlet", 100.0)]
+    mask = cv2.imread(str(out.with_suffix(".png")), cv2.IMREAD_GRAYSCALE)
+    island = cv2.circle(mask.copy(), (40, 202), 5, 0, -1)
+    cv2.imwrite(str(out.with_suffix(".png")), island)
+    assert np.array_equal(load_chip(ChipSettings(path=str(out))).mask, island >= 128)
+
+
+@pytest.mark.slow("a picture of several megapixels")
+def test_the_mask_of_a_large_picture_has_larger_pixels_and_says_so(image, tmp_path):
+    large, out = tmp_path / "large.png", tmp_path / "mine.toml"
+    cv2.imwrite(str(large), cv2.resize(cv2.imread(str(image)), None, fx=3.0, fy=3.0, interpolation=cv2.INTER_CUBIC))
+    calibrate_chip(large, out, um_per_px=UM_PER_PX / 3.0, inlets=["left:0"], inlet_speed_um_s=220.0)
+    chip = load_chip(ChipSettings(path=str(out)))
+    assert chip.mask.shape[1] < 3 * SIZE_PX[0]
+    assert chip.size_um == pytest.approx(UM_PER_PX * np.array(SIZE_PX), rel=1e-3)
+
+
+def test_a_known_width_moves_the_walls(image):
+    plain = calibrate_chip(image, None, UM_PER_PX, walls="dark")
+    narrower = calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-UM_PER_PX)
+    assert [o.width_px - 2 for o in plain.openings] == [o.width_px for o in narrower.openings]
+    lost = np.count_nonzero(plain.mask & ~narrower.mask)
+    assert not (narrower.mask & ~plain.mask).any() and 0.05 < lost / np.count_nonzero(plain.mask) < 0.15
+    with pytest.raises(UsageError, match="too much for channels"):
+        calibrate_chip(image, None, UM_PER_PX, walls="dark", wall_shift_um=-150.0)
+
+
+def test_a_refused_picture_leaves_no_file(image, tmp_path):
+    blank = tmp_path / "blank.png"
+    cv2.imwrite(str(blank), np.full((128, 128), 90, np.uint8))
+    out = tmp_path / "mine.toml"
+    for bad, error, why, words in (
+        (blank, ChipError, "is blank", {}),
+        (image, UsageError, "--seed-point", {"seed_points": ["12"]}),
+        (image, UsageError, "--walls", {"walls": "thick"}),
+        (tmp_path / "none.png", FlowrecError, "no such", {}),
+        (image, ChipError, "no opening 'top:3'", {"inlets": ["top:3"], "walls": "dark"}),
+    ):
+        with pytest.raises(error, match=why):
+            calibrate_chip(bad, out, 5.0, **words)
+    assert [path.name for path in tmp_path.iterdir()] == ["blank.png"]

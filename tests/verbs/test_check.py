@@ -1,0 +1,272 @@
+"""`flowrec check`: the verdict, and that it is the one that a person would come to."""
+
+import itertools
+import json
+import signal
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from typer.testing import CliRunner
+
+import flowrec
+from flowrec.core.diagnostics import CameraLosses
+from flowrec.core.errors import SessionError
+from flowrec.core.system.endings import Ended
+from flowrec.core.topics import Tick
+from flowrec.store.channels import SLOTS
+from flowrec.store.reader import SessionReader
+from flowrec.store.recovery import recover
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
+from flowrec.verbs.check import check
+from flowrec.verbs.cli import app
+from tests.store.drafts import METADATA, PERIOD_NS, STATISTICS, TICKS, small_draft, text
+from tests.store.made_up import HEADER, ticks_of
+from tests.store.test_run_files import in_parts
+
+DRAFT = small_draft()
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden_moderate.mcap"
+FRAMES, TRACK = SLOTS["/camera/frame"].channel, SLOTS["/robot/track"].channel
+APPLIED, TIMING = SLOTS["/coils/applied"].channel, SLOTS["/run/timing"].channel
+
+
+def file_of(tmp_path, draft=DRAFT, name="s.mcap"):
+    path = tmp_path / name
+    path.write_bytes(draft.build())
+    return path
+
+
+def only(keep):
+    """The draft with the messages that are to be kept, given channel and number of the tick."""
+    pieces = []
+    for piece in DRAFT.pieces:
+        kept = tuple(s for s in piece.messages if keep(s.channel, (s.log_ns - 10**9) // PERIOD_NS))
+        pieces.append(replace(piece, messages=kept))
+    return replace(DRAFT, pieces=tuple(piece for piece in pieces if piece.messages))
+
+
+def ending(**said):
+    pairs = b"".join(text(key) + text(value) for key, value in said.items())
+    return ((METADATA, text("flowrec.outcome") + struct.pack("<I", len(pairs)) + pairs),)
+
+
+def found(verdict):
+    return [(finding.about, finding.text) for finding in verdict.findings]
+
+
+def typed(*words):
+    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+
+
+def test_a_real_mission_is_good_and_its_verdict_comes_first(session):
+    done = typed("check", session)
+    assert done.exit_code == 0
+    lines = done.stdout.splitlines()
+    assert lines[0] == f"{session.name}: GOOD: consistent, unsigned; can be replayed" and len(lines) < 24
+    assert "index and statistics agree with what was read" in done.stdout
+    told = json.loads(typed("check", session, "--json").stdout)
+    assert (told["verdict"], told["exit_status"], told["findings"], told["gap_count"]) == ("good", 0, [], 0)
+    assert told["topics"] == json.loads(typed("info", session, "--json").stdout)["topics"]
+    covered = told["covered"]
+    assert covered["whole"] and covered["done"] == covered["total"] == session.stat().st_size
+    assert covered["topics"] == list(told["topics"]) and covered["head"]
+
+
+def test_a_check_that_is_stopped_judges_what_it_has_read_and_no_more(session):
+    def stopped_half_way(at):
+        if at > session.stat().st_size / 2:
+            raise Ended(signal.SIGTERM)
+
+    with pytest.raises(Ended) as stopped:
+        check(session, stopped_half_way)
+    verdict = stopped.value.result
+    assert (verdict.word, verdict.exit_status, verdict.findings) == ("stopped", 143, [])
+    assert 0.5 < verdict.covered.done / session.stat().st_size < 1.0 and not verdict.as_json()["covered"]["whole"]
+    assert "(SIGTERM); those are without a fault" in verdict.lines()[0]
+    assert all(word not in " ".join(verdict.lines()) for word in ("GOOD", "consistent", "can be replayed"))
+
+
+def cut_off(session, channel, path):
+    """Write the beginning of a session: up to the first chunk of a channel that ends behind 60 % of the file."""
+    with session.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes
+    ends = [
+        chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+        for chunk in chunks
+        if channel in chunk.message_index_offsets
+    ]
+    path.write_bytes(session.read_bytes()[: next(end for end in sorted(ends) if end > 0.6 * session.stat().st_size)])
+
+
+# A flush writes the images before the state. A file that ends between the two has images of ticks that it lacks.
+@pytest.mark.parametrize(("last", "expected"), [(APPLIED, ["end"]), (FRAMES, ["end", "replay"])])
+def test_the_same_session_cut_off_is_not_usable_and_recovered_it_is_with_a_loss(last, expected, session, tmp_path):
+    path = tmp_path / "s.mcap.partial"
+    cut_off(session, last, path)
+    done = typed("check", path)
+    assert done.exit_code == 1 and "was not finished" in done.stdout and "flowrec recover" in done.stdout
+    saved = recover(path)
+    verdict = check(saved.path)
+    assert verdict.exit_status == 3
+    assert [about for about, _ in found(verdict)] == expected
+    assert "recovered from s.mcap.partial" in found(verdict)[0][1]
+    assert all("ticks have only their image" in text for about, text in found(verdict) if about == "replay")
+
+
+def test_a_run_that_is_going_on_is_told_as_such(tmp_path):
+    with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+        for tick in ticks_of(3, shape=(8, 8)):
+            writer.write(tick)
+        verdict = check(tmp_path / "s.mcap.partial")
+        assert verdict.exit_status == 1
+        assert any("being recorded just now" in said for _, said in found(verdict))
+
+
+def test_what_is_no_session_is_told_in_one_line_and_in_json(tmp_path):
+    foreign = tmp_path / "foreign.mcap"
+    with foreign.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="other")
+        writer.finish()
+    with pytest.raises(SessionError, match=r"of another program .profile 'ros2'"):
+        typed("check", foreign)
+    for path in (foreign, tmp_path / "missing.mcap", tmp_path):
+        done = typed("check", path, "--json")
+        told = json.loads(done.stdout)
+        assert done.exit_code == 1 and told["verdict"] == "bad" and len(told["findings"]) == 1
+
+
+def test_a_gap_is_a_time_of_more_than_one_and_a_half_periods(tmp_path):
+    verdict = check(file_of(tmp_path, only(lambda channel, tick: tick != 3)))
+    assert verdict.exit_status == 3 and verdict.gap_count == 1
+    assert (verdict.gaps[0].at_s, verdict.gaps[0].length_s) == pytest.approx((2 / 30, 2 / 30), rel=1e-6)
+    said = [text for about, text in found(verdict) if about == "gaps"]
+    assert said == ["1 times more than 1.5 periods without a frame: 0.067 s at 0.07 s"]
+    assert any("1 images of the camera never arrived" in text for _, text in found(verdict))
+
+
+def test_gaps_of_a_later_part_are_told_at_the_time_of_the_run(tmp_path):
+    ticks = [tick for number, tick in enumerate(ticks_of(60, shape=(8, 8))) if number not in (10, 50)]
+    in_parts(tmp_path / "run.mcap", [30], ticks)
+    verdict = check(tmp_path / "run.mcap")
+    assert [gap.at_s for gap in verdict.gaps] == pytest.approx([9 / 60, 49 / 60], rel=1e-6)
+
+
+@pytest.mark.parametrize(("rate_hz", "told"), [(28.0, True), (29.0, False), (31.0, False), (32.0, True)])
+def test_another_rate_than_the_stated_one_is_told_from_five_per_cent_on(tmp_path, rate_hz, told):
+    golden = flowrec.open(GOLDEN)
+    stated_hz = golden.config.camera.rate_hz
+    with SessionWriter(tmp_path / "s.mcap", golden.header, WriterOptions(block=True)) as writer:
+        for number, tick in enumerate(ticks_of(30, shape=(8, 8))):
+            now = round(10**9 * (1.0 + number / (rate_hz / 30.0 * stated_hz)))
+            frame = replace(tick.frame, stamp_ns=now)
+            track, applied = replace(tick.track, stamp_ns=now), replace(tick.applied, stamp_ns=now)
+            writer.write(Tick(now, frame=frame, track=track, applied=applied))
+    assert any(about == "rate" for about, _ in found(check(tmp_path / "s.mcap"))) == told
+
+
+def test_images_that_were_dropped_are_told_apart_from_those_that_are_missing(tmp_path):
+    two_missing = only(lambda channel, tick: channel != FRAMES or tick not in (2, 3))
+    counted = replace(two_missing, tail=ending(outcome="reached", dropped_frames="2"))
+    assert found(check(file_of(tmp_path, counted))) == [
+        ("drops", "2 images were dropped because the disk was too slow (counted by the writer)")
+    ]
+    assert ("drops", "2 images are missing without having been counted") in found(check(file_of(tmp_path, two_missing)))
+
+
+def test_what_a_camera_has_lost_is_told_by_cause(tmp_path):
+    losses = [
+        CameraLosses(at_ns, *of)
+        for at_ns, of in ((10**9, (10, 10, 0, 0, 0, 0, 0, 0)), (2 * 10**9, (90, 60, 3, 20, 0, 7, 2, 1)))
+    ]
+    with SessionWriter(tmp_path / "s.mcap", HEADER, WriterOptions(block=True)) as writer:
+        for number, tick in enumerate(ticks_of(20)):
+            writer.write(replace(tick, losses=losses[number >= 10]))
+    verdict = check(tmp_path / "s.mcap")
+    assert verdict.facts["losses"] == (
+        "of 90 images that the camera has numbered by 1.0 s, 60 came; "
+        "3 on the link, 20 incomplete, 7 by the queue before the loop"
+    )
+    said = " ".join(text for _, text in found(verdict))
+    assert "2 triggers that the camera has not answered" in said and "the camera was absent 1 times" in said
+
+
+def test_ticks_that_lack_inputs_are_counted(tmp_path):
+    verdict = check(file_of(tmp_path, only(lambda channel, tick: channel != APPLIED or tick != 4)))
+    assert ("replay", f"1 of {TICKS} ticks lack inputs; a replay leaves them out") in found(verdict)
+    assert ("content", "1 messages of /coils/applied are missing in the middle") in found(verdict)
+    assert verdict.facts["replay"].startswith("yes, but not exact")
+    verdict = check(file_of(tmp_path, only(lambda channel, tick: channel == FRAMES)))
+    assert verdict.exit_status == 1 and verdict.facts["replay"] == "no"
+
+
+def test_a_replay_without_images_is_good(tmp_path):
+    bare = only(lambda channel, tick: channel != FRAMES)
+    pairs = text("file") + text("parent.mcap")
+    parent = METADATA, text("flowrec.parent") + struct.pack("<I", len(pairs)) + pairs
+    head = tuple(part for part in bare.head if not part[1].startswith(text("flowrec.parent")))
+    verdict = check(file_of(tmp_path, replace(bare, head=(*head, parent))))
+    assert found(verdict) == [] and "tracks stand in" in verdict.facts["images"]
+
+
+def test_statistics_that_are_not_what_is_there_are_not_believed(tmp_path):
+    def change(index):
+        number = next(i for i, part in enumerate(index) if part[0] == STATISTICS)
+        body = bytearray(index[number][1])
+        at = body.index(struct.pack("<HQ", TRACK, TICKS)) + 2
+        body[at : at + 8] = struct.pack("<Q", TICKS + 1)
+        index[number] = STATISTICS, bytes(body)
+        return index
+
+    path = file_of(tmp_path, replace(DRAFT, change_index=change))
+    with pytest.raises(SessionError, match=f"{TICKS + 1} messages of /robot/track are announced, {TICKS} were read"):
+        list(SessionReader(path).ticks())
+    verdict = check(path)
+    assert verdict.exit_status == 1 and verdict.findings[0].about == "index"
+
+
+@pytest.mark.parametrize("jump_s", [0, 3600, -86400])
+def test_a_jump_of_the_wall_clock_is_told_and_does_no_harm(tmp_path, jump_s):
+    # The draft's head says that both clocks read 1 ns at its beginning.
+    ended = ending(outcome="reached", monotonic_ns=str(10**14), wall_ns=str(10**14 + jump_s * 10**9))
+    path = file_of(tmp_path, replace(DRAFT, tail=ended))
+    said = [text for about, text in found(check(path)) if about == "clocks"]
+    assert said == (
+        [f"the wall clock was set by {jump_s:+.1f} s during the run; stamps are not affected"] if jump_s else []
+    )
+    assert [tick.stamp_ns for tick in SessionReader(path).ticks()] == [10**9 + i * PERIOD_NS for i in range(TICKS)]
+
+
+def test_how_a_run_ended_is_part_of_the_verdict(tmp_path):
+    for tail, said in (
+        ((), "how the run ended was not recorded"),
+        (ending(outcome="failed", reason="RuntimeError: the pump fell off"), "the run failed: RuntimeError"),
+    ):
+        verdict = check(file_of(tmp_path, replace(DRAFT, tail=tail)))
+        assert verdict.exit_status == 3 and any(text.startswith(said) for _, text in found(verdict))
+
+
+def test_a_configuration_that_is_not_understood_can_not_be_replayed(tmp_path):
+    verdict = check(_made_up(tmp_path))
+    assert verdict.exit_status == 1
+    assert verdict.findings[0].about == "head" and "unknown key name" in verdict.findings[0].text
+
+
+def _made_up(tmp_path):
+    with SessionWriter(tmp_path / "made_up.mcap", HEADER, WriterOptions(block=True)) as writer:
+        for tick in itertools.islice(ticks_of(20, shape=(8, 8)), 20):
+            writer.write(tick)
+    return tmp_path / "made_up.mcap"
+
+
+def test_a_track_at_the_border_is_doubted_also_where_the_session_states_no_doubt(tmp_path):
+    ticks = list(ticks_of(20, shape=(8, 8)))
+    at_border = [replace(tick, track=replace(tick.track, position_um=np.array([0.0, 100.0]))) for tick in ticks]
+    for name, recorded, doubted in (("a.mcap", at_border, True), ("b.mcap", ticks, False)):
+        (file,) = in_parts(tmp_path / name, [], recorded)
+        assert any("cut by the border" in finding.text for finding in check(file).findings) is doubted

@@ -1,0 +1,231 @@
+"""The same words mean the same in every verb, and what is printed can be read wherever it is printed."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from flowrec.bench import plan
+from flowrec.core import REPLAYED, terminal
+from flowrec.verbs.cli import app, main, with_default_refine
+
+SESSIONS = Path(__file__).parents[2] / "sessions"
+
+
+def run(words: list[object], monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_a_bench_prints_its_figures_as_json_like_every_other_verb(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    kept = tmp_path / "figures.json"
+    monkeypatch.setattr("flowrec.bench.solver.measure", lambda: {"rows": [1]})
+    assert run(["bench", "solver", "--json", "--out", kept], monkeypatch) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["rows"] == [1]
+    assert printed["machine"]["cores"]
+    assert json.loads(kept.read_text()) == printed
+
+
+@pytest.mark.parametrize("words", [["-h"], ["record", "-h"], ["bench", "plan", "-h"]])
+def test_help_is_asked_for_in_short(words: list[str]) -> None:
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0
+    assert "Show this message" in done.output
+
+
+def test_the_help_of_replay_and_export_names_every_method_of_every_table() -> None:
+    helps = [CliRunner().invoke(app, [verb, "--help"], env={"COLUMNS": "200"}).output for verb in ("replay", "export")]
+    shown = " ".join("".join(helps).split())
+    for target in (*REPLAYED.values(), "flowrec.exports.formats:EXPORTS"):
+        module, _, table = target.partition(":")
+        for name in getattr(importlib.import_module(module), table):
+            assert f"{name}: " in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["record", "--nosuch"], "--nosuch"),
+        (["replay"], "SESSION"),
+        (["nosuch"], "nosuch"),
+        (["record", "--split", "3"], "as in --split 2GB,10min"),
+        (["record", "--goal", "1,2,3"], "a point is two numbers in um; as in --goal 4400,1500"),
+        (["replay", "a.mcap", "--verify", "--refly"], "--verify only compares"),
+    ],
+)
+def test_wrong_usage_is_told_in_one_line_that_names_the_help(
+    words: list[object], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(words, monkeypatch) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("flowrec: ")
+    assert said in line
+    assert line.endswith("--help")
+
+
+def test_the_help_of_every_verb_ends_with_examples_that_can_be_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lab.toml").touch()
+    group = get_command(app)
+    verbs = {name: verb for name, verb in group.commands.items() if name not in ("bench", "calibrate")}  # type: ignore[attr-defined]
+    assert len(verbs) > 15
+    for name, verb in verbs.items():
+        begin, *examples = verb.epilog.split("\n\n")
+        assert begin == "Examples:" and examples
+        for example in examples:
+            program, first, *words = shlex.split(example)
+            assert (program, first) == ("flowrec", name)
+            verb.make_context(name, with_default_refine(words))
+
+
+def test_the_goal_of_an_example_can_be_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    examples = get_command(app).commands["record"].epilog.split("\n\n")  # type: ignore[attr-defined]
+    (example,) = [shlex.split(each) for each in examples if "--goal" in each]
+    assert run([*example[1:], "--dry-run"], monkeypatch) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("flowrec rec", "record recover"),
+        ("flowrec replay a.mcap --plan astar_t", "astar_time"),
+        ("flowrec export a.mcap --format r", "rrd"),
+    ],
+)
+def test_a_shell_completes_verbs_and_methods(words: str, offered: str) -> None:
+    count = len(words.split()) - 1
+    asked = {"_FLOWREC_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(count)}
+    done = subprocess.run(
+        [sys.executable, "-m", "flowrec"], env={**os.environ, **asked}, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == offered.split()
+
+
+def test_the_help_of_calibrate_coils_names_the_section_that_it_writes() -> None:
+    shown = CliRunner().invoke(app, ["calibrate", "coils", "--help"], env={"COLUMNS": "160"}).output
+    assert "(section coils)" in " ".join(shown.split())
+
+
+def test_calibrate_prints_where_the_encoding_has_no_plus_minus_sign(monkeypatch: pytest.MonkeyPatch) -> None:
+    printed = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
+    monkeypatch.setattr(sys, "stdout", printed)
+    try:
+        assert run(["calibrate", "coils", SESSIONS / "coils.csv"], monkeypatch) == 0
+    except UnicodeEncodeError as error:
+        pytest.fail(str(error))
+    assert b"b_x" in printed.buffer.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_table_given_to_calibrate_itself_is_fitted_and_the_new_command_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["calibrate", SESSIONS / "coils.csv", "--json"], monkeypatch) == 0
+    said = capsys.readouterr()
+    assert said.err.splitlines() == ["flowrec calibrate TABLE is now flowrec calibrate coils TABLE"]
+    assert '"mt_per_a"' in said.out
+    assert run(["calibrate", "coil", SESSIONS / "coils.csv"], monkeypatch) == 2
+    assert "coil" in capsys.readouterr().err
+
+
+def test_a_chip_given_as_a_configuration_is_told_apart(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["record", "--dry-run", SESSIONS / "chips" / "y_junction.toml"], monkeypatch) == 2
+    said = capsys.readouterr().err
+    assert "describes a chip" in said
+    assert "--set chip.path=" in said
+
+
+@pytest.mark.parametrize(("name", "said"), [("own.yaml", "is YAML by its name"), ("run.mcap", "is a session")])
+def test_a_configuration_that_is_no_toml_is_told_apart(
+    name: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text("chip:\n  name: straight\n")
+    assert run(["record", "--dry-run", tmp_path / name], monkeypatch) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_byte_order_mark_is_no_part_of_a_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.toml").write_bytes(b"\xef\xbb\xbf[chip]\nname = 'straight'\n")
+    monkeypatch.setattr(sys, "argv", ["flowrec", "record", "--dry-run", str(tmp_path / "own.toml")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    assert 'name = "straight"' in capsys.readouterr().out
+
+
+@pytest.mark.slow("a bench of planners")
+def test_planners_that_are_not_installed_are_left_out_and_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "find_spec" in vars(plan):  # as on an installation without the extra
+        monkeypatch.setattr(plan, "find_spec", lambda _name: None)
+    try:
+        figures = plan.measure(None, trips=1, tree_channels=1, side_px=128, quick=True)
+    except Exception as error:  # noqa: BLE001 - what a user would see
+        pytest.fail(str(error))
+    assert "rrt" not in figures["summary"]
+    assert "time_field" in figures["summary"]
+    assert "rrt, rrt_star, which need OMPL 2" in capsys.readouterr().err
+
+
+def test_a_refinement_that_changes_nothing_says_why(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "again.mcap"
+    assert run(["replay", session, "--refine", "--out", out], monkeypatch) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the refined map is the recorded one, unchanged" in said
+    assert "--set refine.pi_unet.start=fvm" in said
+
+
+def test_a_bar_that_stands_names_no_time_left() -> None:
+    assert hasattr(terminal, "time_left")
+    assert terminal.time_left(12.4, stands_s=0.2) == "12 s left"
+    assert terminal.time_left(1.0, stands_s=5.0) == ""
+    assert terminal.time_left(None, stands_s=0.0) == ""
+
+
+def test_a_replay_states_the_path_of_its_session(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "again.mcap"
+    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--json"], monkeypatch) == 0
+    assert json.loads(capsys.readouterr().out)["out"] == str(out)
+    assert run(["replay", SESSIONS / "golden.mcap", "--out", out, "--overwrite"], monkeypatch) == 0
+    assert "".join(capsys.readouterr().err.split()).find(f"->{out}") > 0
+    beside = tmp_path / "golden.mcap"
+    shutil.copy(SESSIONS / "golden.mcap", beside)
+    assert run(["replay", beside, "--json"], monkeypatch) == 0
+    made = tmp_path / "golden_replay_001.mcap"
+    assert json.loads(capsys.readouterr().out)["out"] == str(made) and made.is_file()
+    assert run(["replay", beside, "--verify"], monkeypatch) == 3  # other numerics
+    assert len(list(tmp_path.glob("golden_replay*"))) == 1
+
+
+def test_the_names_in_a_table_are_readable_beside_a_value_that_fills_many_lines() -> None:
+    printed = io.StringIO()
+    words = [f"robot.setting_{number}=1.5" for number in range(60)]
+    terminal.table("a.mcap", ("", "value"), [("derived", " ".join(words))], to=printed)
+    assert "derived" in printed.getvalue()
+    assert [word for word in words if word not in printed.getvalue()] == []

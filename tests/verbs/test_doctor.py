@@ -1,0 +1,189 @@
+"""`flowrec doctor`: each device in a line, what to do about it, and an exit status that a script can use."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from flowrec.core.diagnostics import CameraLosses
+from flowrec.physics.chip.chip import ChipSettings
+from flowrec.physics.chip.io import load_chip
+from flowrec.physics.chip.orientation import AS_STATED, ORIENTATIONS, Orientation
+from flowrec.physics.chip.registration import Calibration
+from flowrec.rigs.lab.cameras import probe as camera
+from flowrec.rigs.lab.cameras.camera import CameraInfo
+from flowrec.stages.config import Config, load_config, registration_of, with_sets
+from flowrec.stages.resolve import resolve
+from flowrec.verbs import diagnosis
+from flowrec.verbs.cli import app
+from flowrec.verbs.diagnosis import FAILURE, OK, WARNING, diagnose
+from tests.physics.chip.looks import LOOKS, picture
+
+MEASURED = (
+    "rig=lab",
+    "camera.um_per_px=20.0",
+    "camera.rate_hz=20.0",
+    "robot.radius_um=70.0",
+    "robot.max_speed_um_s=900.0",
+    "robot.step_out_hz=40.0",
+    "robot.delay_s=0.05",
+    "recording.admission_s=0",
+)
+SEEN = camera.CameraProbe(
+    CameraInfo("Maker Model", "7", 640, 512, 8, 20.0, pixel_format="Mono8"),
+    rate_hz=20.0,
+    delivered_hz=20.0,
+    losses=CameraLosses(0, 1000, 1000, 0, 0, 0, 0, 0, 0),
+    clock_slope=1.0,
+    arrival_ms=51.0,
+    brightest=200,
+    notes=(),
+)
+
+
+def levels(config: Config, folder: Path) -> dict[str, str]:
+    order = [OK, WARNING, FAILURE]
+    worst: dict[str, str] = {}
+    for finding in diagnose(config, folder=folder):
+        assert "\n" not in finding.text
+        worst[finding.what] = max(worst.get(finding.what, OK), finding.level, key=order.index)
+    return worst
+
+
+@pytest.mark.parametrize(
+    ("seen", "what", "level"),
+    [
+        (SEEN, "camera", OK),
+        (replace(SEEN, notes=("the gain is 3 dB",)), "camera", WARNING),
+        (replace(SEEN, info=replace(SEEN.info, bits=12)), "camera", FAILURE),
+        (SEEN, "rate", OK),
+        (replace(SEEN, rate_hz=15.0), "rate", WARNING),
+        (SEEN, "losses", OK),
+        (replace(SEEN, losses=replace(SEEN.losses, link=20, frames=980)), "losses", WARNING),
+        (replace(SEEN, losses=replace(SEEN.losses, backlog=200, frames=800)), "losses", FAILURE),
+        (SEEN, "clock", OK),
+        (replace(SEEN, clock_slope=0.0), "clock", WARNING),
+        (replace(SEEN, clock_slope=10.0), "clock", WARNING),
+        (SEEN, "image", OK),
+        (replace(SEEN, brightest=255), "image", WARNING),
+        (replace(SEEN, brightest=9), "image", WARNING),
+    ],
+)
+def test_what_a_camera_shows_is_judged(
+    seen: camera.CameraProbe, what: str, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: seen)
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+    config = load_config(None, [*MEASURED, "mission.phases=observe"])
+    assert levels(config, tmp_path)[what] == level
+
+
+@pytest.mark.parametrize(("turned_deg", "level"), [(0.0, OK), (1.0, WARNING)])
+def test_a_chip_that_was_turned_since_its_registration_is_noticed(
+    turned_deg: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chip = load_chip(ChipSettings())
+    centre_um = (np.array(chip.size_um) - chip.um_per_px) / 2
+    truth = Calibration.centre_on(20.0, centre_um, (320, 256), turned_deg)
+    image = picture(chip.mask, chip.um_per_px, truth, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
+    info = replace(SEEN.info, width_px=320, height_px=256)
+    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+    sets = ["camera.width_px=320", "camera.height_px=256", "mission.phases=observe"]
+    assert levels(load_config(None, [*MEASURED, *sets]), tmp_path)["walls"] == level
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS, ids=lambda each: each.name)
+def test_a_camera_that_shows_the_chip_in_another_orientation_is_a_failure_with_the_setting_that_mends_it(
+    orientation: Orientation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ["chip.path=sessions/chips/y_junction.png", "camera.width_px=320", "camera.height_px=256"]
+    config = load_config(None, [*MEASURED, *asked, "mission.phases=observe"])
+    chip = load_chip(config.chip)
+    true = orientation.about(registration_of(resolve(config, chip).camera, chip), (159.5, 127.5))
+    image = picture(chip.mask, chip.um_per_px, true, (320, 256), LOOKS["dark lines"], np.random.default_rng(1))
+    info = replace(SEEN.info, width_px=320, height_px=256)
+    monkeypatch.setattr("flowrec.rigs.probe_camera", lambda *_: replace(SEEN, info=info, image=image))
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+    axes = {one.what: one for one in diagnose(config, folder=tmp_path)}["axes"]
+    assert (axes.level == OK) == (orientation == AS_STATED)
+    sets = [each.replace(" ", "") for each in axes.text.partition(": set ")[2].split(", ") if each]
+    assert levels(with_sets(config, sets), tmp_path)["axes"] == OK
+
+
+@pytest.mark.parametrize(("speed", "level"), [(1e9, OK), (5e6, WARNING), (1e6, FAILURE)])
+def test_a_disk_is_judged_by_what_the_camera_delivers(
+    speed: float, level: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: speed)
+    assert levels(load_config(None, ["camera.rate_hz=20.0", "recording.admission_s=0"]), tmp_path)["disk"] == level
+
+
+@pytest.mark.slow("flies the rehearsal of a mission")
+def test_the_kernels_of_a_live_run_are_compiled_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(diagnosis, "_write_speed", lambda _folder: 1e9)
+    told = {one.what: one.text for one in diagnose(load_config(), folder=tmp_path)}
+    assert "mission with this configuration's methods went through" in told["kernels"]
+
+
+def test_missing_devices_are_failures_in_one_line_each_and_the_others_are_still_looked_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+    sets = [*MEASURED, "lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
+    words = ["doctor", "--json", "--folder", str(tmp_path), *(word for text in sets for word in ("--set", text))]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert found["level"] == "failure"
+    failures = {one["what"]: one["text"] for one in found["findings"] if one["level"] == "failure"}
+    assert set(failures) == {"camera", "coils"}
+    assert "nowhere.avi" in failures["camera"] and "/dev/nothing" in failures["coils"]
+    assert {"settings", "mission", "disk", "viewer"} <= {one["what"] for one in found["findings"]}
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("days", "residual_um", "level"), [(None, 1.0, WARNING), (1, 1.0, OK), (1, 90.0, WARNING), (3650, 1.0, WARNING)]
+)
+def test_a_registration_is_judged_by_its_age_and_its_residual(
+    days: int | None, residual_um: float, level: str, tmp_path: Path
+) -> None:
+    sets = [*MEASURED, "mission.phases=observe", f"camera.residual_um={residual_um}"]
+    if days is not None:
+        sets.append(f'camera.registered_on="{(datetime.now(UTC) - timedelta(days=days)).isoformat()}"')
+    assert levels(load_config(None, sets), tmp_path)["registration"] == level
+
+
+def test_a_setting_that_is_wrong_is_told_and_the_devices_are_looked_at_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "_TRIAL_BYTES", 1 << 22)
+    devices = ["lab.camera=opencv", "lab.device=nowhere.avi", "lab.serial.port=/dev/nothing"]
+    for wrong, text in {
+        "robot.radius_um=-5.0": "robot.radius_um = -5",
+        "camera.bits=9": "camera.bits = 9",
+        "chip.path=nowhere.png": "nowhere.png: no such file",
+        "mission.goal=[1e6, 0.0]": "goal",
+        "lab.devise=7": "unknown key lab.devise",
+    }.items():
+        sets = [*MEASURED, *devices, wrong]
+        words = ["doctor", "--json", "--folder", str(tmp_path), *(word for each in sets for word in ("--set", each))]
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 1, done.output
+        failures = {one["what"]: one["text"] for one in json.loads(done.stdout)["findings"] if one["level"] == FAILURE}
+        assert text in failures["settings"], wrong
+        assert "nowhere.avi" in failures["camera"], wrong
+        assert "/dev/nothing" in failures["coils"], wrong
+
+
+def test_settings_that_are_not_measured_are_a_failure_that_names_them() -> None:
+    done = CliRunner().invoke(app, ["doctor", "--rig", "lab"])
+    assert done.exit_code == 1
+    assert "x settings" in done.stdout and "robot.radius_um" in done.stdout

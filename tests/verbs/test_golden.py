@@ -1,0 +1,83 @@
+"""The golden sessions: recorded once by a release, replayed by every version since.
+
+The numerics of the first are version 1, in which the velocities of a flow field were means over pixels. All that its
+loop and its planner made of the recorded inputs, fields included, is still computed to the last digit; of the two
+fields themselves, the flow behind them is still the same. The second, of the moderate world, has a survey by
+information, stretch by stretch, and numerics version 3.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import flowrec
+from flowrec.core.units import UM_PER_M
+from flowrec.physics.flow.newton_solver import Scales, System, system
+from flowrec.store.reader import SessionReader
+from flowrec.verbs import session_replay as verb
+from flowrec.verbs.replay_change import Change
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+MODERATE = GOLDEN.with_name("golden_moderate.mcap")
+BY_OTHER_NUMERICS = {"/flow/assumed", "/flow/refined"}
+
+
+@pytest.mark.parametrize("path", [GOLDEN, MODERATE])
+def test_a_golden_session_is_small_and_says_nothing_of_the_machine_it_was_made_on(path: Path) -> None:
+    assert path.stat().st_size < 3_000_000
+    facts = SessionReader(path).header.provenance
+    assert not {"host", "user", "platform", "git_diff"} & set(facts)
+
+
+@pytest.mark.parametrize("from_s", [None, 3.0])
+def test_the_golden_session_replays_the_same_but_for_the_meaning_of_its_fields(from_s: float | None) -> None:
+    done = verb.replay_session(GOLDEN, Change(), from_s=from_s, verify=True)
+    lines = done.lines()
+    assert done.comparison.same and done.digest[0], lines
+    not_recorded = done.as_json()["not_recorded"]  # is not compared
+    assert not_recorded["/run/mission held_ns"] == "not recorded in golden.mcap"
+    assert done.worker is not None
+    different = {path for path, count in done.worker.comparison.topics.items() if count.different}
+    assert different == (BY_OTHER_NUMERICS if from_s is None else set()), lines
+    routes = done.worker.comparison.topics["/plan/route"]
+    assert routes.identical + routes.within_tolerance == (2 if from_s is None else 1)
+    if different:
+        assert not done.same
+        assert "the same within tolerance; results of the worker made by other numerics" in lines[-1]
+    assert done.recorded.mission is not None
+    assert done.recorded.mission.outcome == "reached"
+
+
+def test_the_golden_session_of_the_moderate_world_replays_the_same() -> None:
+    done = verb.replay_session(MODERATE, Change(), verify=True)
+    lines = done.lines()
+    assert done.comparison.same and done.digest[0], lines
+    assert done.worker is not None
+    assert done.same, lines  # on other processors within tolerance
+    routes = done.worker.comparison.topics["/plan/route"]
+    assert routes.identical + routes.within_tolerance > 3
+    assert done.recorded.mission is not None
+    assert done.recorded.mission.outcome == "reached"
+
+
+def means_over_pixels(equations: System, flux: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The velocity (h, w, 2) in m/s as version 1 of the numerics gave it."""
+    grid, padded = equations.grid, np.append(flux, 0.0)
+    u, v = padded[grid.u.number], padded[grid.v.number]
+    cells = np.stack([0.5 * (u[:, 1:] + u[:, :-1]), 0.5 * (v[1:] + v[:-1])], axis=-1)
+    h, w = grid.mask.shape
+    return cells.reshape(h, grid.k, w, grid.k, 2).mean(axis=(1, 3)) * grid.mask[..., None]
+
+
+def test_the_flow_of_the_golden_session_is_the_recorded_one_where_it_is_averaged_over_pixels() -> None:
+    session = flowrec.open(GOLDEN)
+    (assumed,) = session.messages("assumed")
+    solver, chip = session.config.flow, session.chip
+    equations, scales = system(chip, solver.k), Scales.of(chip, solver.k, solver.convection)
+    flux = equations.steady(scales.drive, scales.inertia, solver.max_iterations, solver.tolerance)
+    means = means_over_pixels(equations, flux) * UM_PER_M
+    assert np.abs(means - assumed.velocity_um_s).max() < 1e-4  # its tolerance in a comparison, um/s

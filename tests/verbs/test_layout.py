@@ -1,0 +1,63 @@
+"""Layouts with which other viewers show a session file as it is."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from rerun.chunk import RrdReader
+
+from flowrec.core.system.outputs import OutputError
+from flowrec.exports.layout import write_layouts
+from flowrec.store.channels import SLOTS
+from flowrec.view.bare_plots import EVENTS, IMAGE, MAPS, ON_IMAGE, PLOTS, ROUTE, STATES
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+
+
+def fields_of(topic):
+    return set(SLOTS[topic].schema.wire.DESCRIPTOR.fields_by_name)
+
+
+def strings(data):
+    """All strings in JSON data, keys included."""
+    if isinstance(data, dict):
+        yield from data
+        data = list(data.values())
+    if isinstance(data, list):
+        for each in data:
+            yield from strings(each)
+    elif isinstance(data, str):
+        yield data
+
+
+def test_what_the_layouts_show_is_in_the_files():
+    for plot in (*(plot for group in PLOTS.values() for plot in group), ROUTE):
+        assert set(plot.lines) <= fields_of(plot.topic)
+    assert all(field in fields_of(topic) for topic, (field, _) in STATES.items())
+    assert {IMAGE, *MAPS, *ON_IMAGE, *EVENTS} <= SLOTS.keys()
+
+
+def test_foxglove_gets_panels_topics_and_fields_that_exist_and_rerun_a_blueprint_of_the_same_name(session, tmp_path):
+    made = write_layouts(session, tmp_path)
+    foxglove, rerun = made.foxglove, made.rerun
+    layout = json.loads(foxglove.read_text())
+    panels = layout["configById"]
+    shown = [layout["layout"], *(tab["layout"] for panel in panels.values() for tab in panel.get("tabs", ()))]
+    assert {text for text in strings(shown) if "!" in text} == set(panels)
+    named = [text for text in strings(panels) if text.startswith("/")]
+    for text in named:
+        topic, field = re.fullmatch(r"([\w/]+)(?:\.(\w+)(?:\[:\])?)?", text).groups()
+        assert topic in SLOTS and (field is None or field in fields_of(topic))
+    assert {"/view/camera", "/view/map", "/view/robot_mark", "/view/route_mark", "/view/flow_refined_grid"} <= set(
+        named
+    )
+    (blueprint,) = RrdReader(rerun).blueprints()
+    told = " ".join(made.advice)
+    assert blueprint.application_id == "flowrec" and "--application-id flowrec" in told and str(rerun) in told
+    assert not made.lacks and "older flowrec" in write_layouts(GOLDEN, tmp_path).lacks
+    before = foxglove.read_bytes()
+    rerun.unlink()
+    with pytest.raises(OutputError, match="exists already"):
+        write_layouts(session, tmp_path)
+    assert foxglove.read_bytes() == before and not rerun.exists()

@@ -1,0 +1,207 @@
+"""`flowrec ls`, `flowrec note` and `flowrec recover` as a person types them."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from flowrec.core.errors import SessionError, UsageError
+from flowrec.store.notes import notes_file
+from flowrec.store.session_file import WriterOptions
+from flowrec.store.writer import SessionWriter
+from flowrec.verbs.cli import app
+from flowrec.verbs.listing import read_each
+from flowrec.verbs.ls import ls
+from tests.conftest import HANG_S
+from tests.store.made_up import HEADER, ticks_of
+
+
+def typed(*words: object) -> Result:
+    return CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
+
+
+def write(path: Path, count: int, **figures: float) -> Path:
+    with SessionWriter(path, HEADER, WriterOptions(block=True)) as writer:
+        for tick in ticks_of(count, shape=(8, 8)):
+            writer.write(tick)
+        writer.close({"outcome": "reached", **{key: repr(value) for key, value in figures.items()}})
+    return path
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A whole session, one cut off, the remains of a run, and things that are none."""
+    content = write(tmp_path / "a.mcap", 61).read_bytes()
+    longer = write(tmp_path / "b.mcap", 1000).read_bytes()
+    (tmp_path / "b.mcap").write_bytes(longer[: len(longer) // 2])
+    (tmp_path / "c.mcap.partial").write_bytes(content[:-2000])
+    (tmp_path / "d.mcap").touch()
+    (tmp_path / "notes.txt").write_text("no session")
+    (tmp_path / "e.mcap").mkdir()
+    return tmp_path
+
+
+def test_all_session_files_of_a_directory_are_listed_whatever_state_they_are_in(folder: Path) -> None:
+    rows = ls([folder])
+    assert [(row.name, row.outcome) for row in rows] == [
+        ("a.mcap", "reached"),
+        ("b.mcap", "unreadable"),
+        ("c.mcap.partial", "unfinished"),
+        ("d.mcap", "unreadable"),
+    ]
+    assert rows[0].duration_s == pytest.approx(1.0, abs=1e-3)
+    assert rows[0].size_bytes == (folder / "a.mcap").stat().st_size
+    assert "flowrec recover" in rows[1].note and "is empty" in rows[3].note
+
+
+def test_a_run_that_is_going_on_is_listed_as_such(tmp_path: Path) -> None:
+    with SessionWriter(tmp_path / "s.mcap", HEADER) as writer:
+        for tick in ticks_of(3, shape=(8, 8)):
+            writer.write(tick)
+        assert [row.outcome for row in ls([tmp_path])] == ["recording"]
+    assert [row.outcome for row in ls([tmp_path])] == ["ended"]
+
+
+def test_listing_reads_no_messages(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flowrec.store.mcap_reader.McapReader.messages", None)
+    assert ls([folder])[0].outcome == "reached"
+
+
+def test_a_real_session_is_listed_with_its_chip_and_its_date(session: Path) -> None:
+    (row,) = [row for row in ls([session.parent]) if row.name == session.name]
+    assert (row.outcome, bool(row.chip), bool(row.recorded)) == ("reached", True, True)
+
+
+def test_ls_prints_a_table_or_json(folder: Path) -> None:
+    rows = json.loads(typed("ls", folder, "--json").stdout)
+    assert [row["name"] for row in rows] == ["a.mcap", "b.mcap", "c.mcap.partial", "d.mcap"]
+    assert "a.mcap" in typed("ls", folder).stdout
+    with pytest.raises(SessionError, match="no such directory"):
+        typed("ls", folder / "nowhere")
+
+
+def test_the_exit_status_of_recover_says_whether_something_was_lost(folder: Path) -> None:
+    assert typed("recover", folder / "a.mcap").exit_code == 0
+    assert typed("recover", folder / "b.mcap").exit_code == 3
+    assert typed("recover", folder / "c.mcap.partial", "--out", folder / "f.mcap").exit_code == 0  # all but the index
+    assert {row.name: row.outcome for row in ls([folder])} == {
+        "a.mcap": "reached",
+        "b.mcap": "unreadable",
+        "b_recovered.mcap": "cut",
+        "c.mcap.partial": "unfinished",
+        "d.mcap": "unreadable",
+        "f.mcap": "reached",
+    }
+    with pytest.raises(SessionError, match="is empty"):
+        typed("recover", folder / "d.mcap")
+
+
+@pytest.fixture
+def flown(tmp_path: Path) -> list[Path]:
+    """Three runs in two folders, one of them without a known error."""
+    (tmp_path / "old").mkdir()
+    errors = {"a.mcap": {"refined_flow_error": 0.12}, "old/b.mcap": {"refined_flow_error": 0.03}, "c.mcap": {}}
+    return [write(tmp_path / name, 5 + k, **error) for k, (name, error) in enumerate(errors.items())]
+
+
+def names(*words: object, **options: str) -> list[str]:
+    return [Path(row.name).name for row in ls([*map(Path, words)], **options)]  # type: ignore[arg-type]
+
+
+def test_files_and_folders_are_listed_together_chosen_by_their_facts_and_sorted(flown: list[Path]) -> None:
+    first, second, third = flown
+    assert names(first.parent, second) == ["a.mcap", "c.mcap", "b.mcap"]
+    assert names(first.parent, second, sort="refined_flow_error") == ["b.mcap", "a.mcap", "c.mcap"]
+    assert names(first.parent, second, sort="-refined_flow_error") == ["a.mcap", "b.mcap", "c.mcap"]
+    assert names(*flown, where="refined_flow_error < 0.05 and outcome = 'reached'") == ["b.mcap"]
+    assert names(*flown, where="refined_flow_error is null or name like '%a.mcap'") == ["a.mcap", "c.mcap"]
+    shown = typed("ls", first.parent, second, "--where", "refined_flow_error > 0").stdout
+    assert "12.0 %" in shown and "3.0 %" in shown and third.name not in shown
+
+
+@pytest.mark.parametrize(
+    ("where", "complaint"),
+    [
+        ("refined_error < 0.05", "did you mean refined_flow_error"),
+        ("refined_flow_error <", "syntax error"),
+        ("1) union select name from sqlite_master --", "syntax error"),
+        ("load_extension('x')", "does not exist"),
+        ("exists(from read_text('a.mcap'))", "file system operations are disabled"),
+        ("1=1); copy sessions to 'x.csv'; select (1", "file system operations are disabled"),
+        ("1; drop table sessions", "syntax error"),
+    ],
+)
+def test_an_expression_that_is_wrong_or_does_more_than_choose_is_refused_in_one_line(
+    flown: list[Path], where: str, complaint: str
+) -> None:
+    with pytest.raises(UsageError, match=complaint) as error:
+        ls(flown, where=where)
+    assert len(str(error.value).splitlines()) == 1
+    with pytest.raises(UsageError, match="did you mean outcome"):
+        ls(flown, sort="outcom")
+
+
+def test_without_duckdb_sessions_are_sorted_and_a_choice_names_the_extra(
+    flown: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "duckdb", None)
+    monkeypatch.delitem(sys.modules, "flowrec.verbs.session_table", raising=False)
+    assert names(*flown, sort="refined_flow_error") == ["b.mcap", "a.mcap", "c.mcap"]
+    with pytest.raises(UsageError, match=r"pip install 'flowrec\[catalog\]'"):
+        names(*flown, where="refined_flow_error > 0")
+
+
+def test_a_note_lies_beside_the_recording_which_does_not_change_and_is_listed_with_it(flown: list[Path]) -> None:
+    path, other, _ = flown
+    before = path.read_bytes()
+    typed("note", path, "a bubble at the outlet", "--tag", "bubble")
+    typed("note", path, "used for the talk", "--tag", "talk", "--tag", "bubble")
+    assert path.read_bytes() == before
+    said = typed("note", path).stdout.splitlines()
+    assert len(said) == 2 and said[0].endswith("#bubble a bubble at the outlet")
+    assert names(*flown, where="tags like '%talk%'") == ["a.mcap"]
+    shown = " ".join(typed("ls", *flown).stdout.split())
+    assert "#bubble #talk used for the talk" in shown
+    assert "a bubble at the outlet" in typed("info", path).stdout
+    # A copied note is not that of another session.
+    notes_file(path).rename(notes_file(other))
+    assert typed("note", path).stdout == typed("note", other).stdout == ""
+
+
+def test_a_line_that_was_cut_or_is_damaged_costs_only_itself(flown: list[Path]) -> None:
+    path = flown[0]
+    typed("note", path, "first")
+    with notes_file(path).open("ab") as file:
+        file.write(b'{"session": "x", "tex')  # the power went
+    typed("note", path, "second \x1b[31m\u202e")
+    with notes_file(path).open("ab") as file:
+        file.write(b"[" * 100_000 + b"\n" + b"9" * 300_000 + b"\n\xff\xfe\n[1]\n")
+    rows = json.loads(typed("note", path, "--json").stdout)["notes"]
+    assert [row["text"] for row in rows] == ["first", "second \x1b[31m\u202e"]
+    assert "\x1b" not in typed("note", path).stdout and "\u202e" not in typed("ls", path).stdout
+    for words in (["x" * 10_001], ["", "--tag", ""], [" ", "--tag", "t" * 61]):
+        with pytest.raises(UsageError, match="a note"):
+            typed("note", path, *words)
+
+
+def test_an_interruption_leaves_sessions_at_urls_unread_that_still_wait() -> None:
+    begun: list[int] = []
+    answered = threading.Event()
+
+    def read(number: int) -> int:
+        begun.append(number)
+        answered.wait(HANG_S)
+        return number
+
+    with pytest.raises(KeyboardInterrupt), read_each(read, range(1000), far=True):
+        raise KeyboardInterrupt
+    answered.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("sessions"):
+            thread.join(HANG_S)
+    assert len(begun) < 100

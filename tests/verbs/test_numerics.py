@@ -1,0 +1,109 @@
+"""A session states the numerics that computed it; where these are others, a difference is no error of the recording."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import flowrec
+from flowrec.core.provenance import provenance
+from flowrec.core.version import NUMERICS_VERSION
+from flowrec.stages.estimation.kalman import Kalman
+from flowrec.verbs.cli import main
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+
+
+def run(words: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    monkeypatch.setattr(sys, "argv", ["flowrec", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0), capsys.readouterr().out
+
+
+@pytest.fixture
+def other_numerics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This flowrec computes something else than the one that recorded, and states that."""
+    honest = Kalman.estimate
+
+    def shifted(self, *arguments):  # type: ignore[no-untyped-def]
+        estimate = honest(self, *arguments)
+        return replace(estimate, flow_um_s=estimate.flow_um_s + 1.0)
+
+    monkeypatch.setattr(Kalman, "estimate", shifted)
+    monkeypatch.setattr("flowrec.verbs.comparison.NUMERICS_VERSION", NUMERICS_VERSION + 1)
+    monkeypatch.setattr("flowrec.verbs.check_file.NUMERICS_VERSION", NUMERICS_VERSION + 1)
+    monkeypatch.setattr(sys.modules[provenance.__module__], "NUMERICS_VERSION", NUMERICS_VERSION + 1)
+
+
+def test_a_new_session_states_its_numerics_and_the_first_release_is_version_1(session: Path) -> None:
+    assert flowrec.open(session).numerics == str(NUMERICS_VERSION)
+    assert "numerics_version" not in flowrec.open(GOLDEN).provenance
+    assert flowrec.open(GOLDEN).numerics == "1"
+
+
+@pytest.mark.usefixtures("other_numerics")
+def test_a_verification_by_other_numerics_says_so_instead_of_different(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
+    assert status == 3
+    assert (
+        f"made by other numerics (recorded: version 1, replayed: version {NUMERICS_VERSION + 1})"
+        in said.splitlines()[-1]
+    )
+    assert "DIFFERENT" not in said and "NOT the same" not in said
+    found = json.loads(run(["replay", GOLDEN, "--verify", "--json"], monkeypatch, capsys)[1])
+    assert not found["same"]
+    assert found["other_numerics"].startswith("made by other numerics")
+
+
+@pytest.mark.usefixtures("other_numerics")
+def test_two_sessions_of_other_numerics_are_compared_as_such_and_check_names_them(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    again = tmp_path / "again.mcap"
+    flowrec.replay(GOLDEN, out=again)
+    words = ["compare", GOLDEN, again, "--ignore", "diagnostics", "--ignore", "drawings"]  # differ by nature
+    status, said = run(words, monkeypatch, capsys)
+    assert status == 3
+    assert f"made by other numerics (first: version 1, second: version {NUMERICS_VERSION + 1})" in said
+    assert not [line for line in said.splitlines() if line.startswith("/") and "DIFFERENT" in line]
+    verdict = flowrec.check(GOLDEN)
+    assert verdict.word == "good"
+    assert f"made by other numerics (version 1; this is {NUMERICS_VERSION + 1})" in verdict.facts["written"]
+
+
+@pytest.mark.usefixtures("other_numerics")
+def test_an_edited_file_is_told_as_such_whatever_its_numerics(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("flowrec.verbs.replay_result.digest_faults", lambda path: {path: ["a message was changed"]})
+    _, said = run(["replay", GOLDEN, "--verify"], monkeypatch, capsys)
+    assert "damaged or edited at a message was changed" in said
+    assert "NOT the same" in said.splitlines()[-1]
+
+
+def test_a_difference_by_the_same_numerics_is_one(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    honest = Kalman.estimate
+    monkeypatch.setattr(
+        Kalman, "estimate", lambda self, *arguments: replace(e := honest(self, *arguments), flow_um_s=e.flow_um_s + 1.0)
+    )
+    status, said = run(["replay", session, "--verify"], monkeypatch, capsys)
+    assert status == 3
+    assert "NOT the same" in said and "DIFFERENT" in said
+
+
+def test_a_setting_that_a_session_does_not_have_is_the_old_default() -> None:
+    from flowrec.stages.config import config_from_toml, to_toml
+
+    config = flowrec.open(GOLDEN).config
+    text = to_toml(config)
+    line = next(line for line in text.splitlines() if line.startswith("adopt_after_s"))
+    assert config_from_toml(text.replace(line + "\n", ""), "a session").worker == type(config.worker)()

@@ -1,0 +1,117 @@
+"""`flowrec.replay` from Python: in any thread what the verb makes, with tables and what it changed."""
+
+from __future__ import annotations
+
+import gc
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import flowrec
+from flowrec.core.errors import UsageError
+from flowrec.core.topics import TOPICS
+from flowrec.verbs.cli import app
+from flowrec.verbs.replay_made import BeforeAfter
+from tests.conftest import HANG_S
+from tests.extras import why
+
+GOLDEN = Path(__file__).parents[2] / "sessions" / "golden.mcap"
+CHANGE = {"plan.speed_share": 0.7}
+
+
+def replay_in_notebook(folder: Path) -> None:
+    """The replay to a file 2.mcap there."""
+    nbformat = pytest.importorskip("nbformat", reason=why("nbformat"))  # seconds, with jsonschema: not in each worker
+    from nbclient import NotebookClient
+
+    notebook = nbformat.v4.new_notebook()
+    code = f"import flowrec\nflowrec.replay({str(GOLDEN)!r}, plan='astar_length', out='2.mcap').before_after"
+    notebook.cells.append(nbformat.v4.new_code_cell(code))
+    NotebookClient(notebook, timeout=HANG_S, resources={"metadata": {"path": str(folder)}}).execute()
+
+
+def payloads(path: Path) -> dict[str, list[tuple[int, bytes]]]:
+    """Time on the session clock and bytes of all messages but the diagnostics, by topic, by the mcap library."""
+    from mcap.reader import make_reader
+
+    skipped = {topic.path for topic in TOPICS if topic.role.value == "diagnostic"}
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    start = flowrec.open(path).header.start_unix_ns
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            if channel.topic not in skipped:
+                found.setdefault(channel.topic, []).append((message.log_time - start, message.data))
+    return found
+
+
+@pytest.mark.parametrize("notebook", [False, pytest.param(True, marks=pytest.mark.slow("starts a kernel"))])
+def test_replays_in_threads_and_in_a_notebook_make_the_bytes_that_the_verb_makes(
+    notebook: bool, tmp_path: Path
+) -> None:
+    by_verb = tmp_path / "verb.mcap"
+    words = ["replay", str(GOLDEN), "--plan", "astar_length", "--out", str(by_verb), "--json"]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    with ThreadPoolExecutor(2) as threads:
+        running = [
+            threads.submit(flowrec.replay, GOLDEN, plan="astar_length", out=tmp_path / f"{n}.mcap") for n in range(2)
+        ]
+        if notebook:
+            replay_in_notebook(tmp_path)
+        replays = [each.result() for each in running]
+    made = [each.result.path for each in replays] + [tmp_path / "2.mcap"] * notebook
+    expected = payloads(by_verb)
+    assert len(expected["/robot/estimate"]) == 107 and "/plan/route" in expected
+    stamped = {"/run/events", "/operator/events"}  # hold the time of day, which is that of the replay
+    for path in made:
+        found = payloads(path)
+        assert found.keys() == expected.keys()
+        assert [topic for topic in found if topic not in stamped and found[topic] != expected[topic]] == []
+        assert len(flowrec.open(path).events) == len(flowrec.open(by_verb).events)
+    rows = json.loads(done.stdout)["rows"]
+    assert [list(row.values()) for row in rows] == json.loads(
+        json.dumps([list(row) for row in replays[0].before_after])
+    )
+
+
+def test_a_replay_has_tables_and_its_temporary_file_goes_with_it() -> None:
+    done = flowrec.replay(GOLDEN, sets=CHANGE)
+    path = done.result.path
+    assert path.is_file() and path.parent != GOLDEN.parent
+    table = done.table("estimate")
+    assert table.equals(flowrec.open(path).table("estimate")) and table.num_rows == done.report.ticks
+    assert done.config.plan.speed_share == 0.7
+    frame = done.before_after.to_pandas()
+    assert frame.loc["commands_compared", "replayed"] == done.commands.compared
+    assert list(frame.columns) == ["recorded", "replayed"]
+    assert "planned" in str(done.before_after) or "route length" in str(done.before_after)
+    del done, table
+    gc.collect()
+    assert not path.parent.exists()
+
+
+def test_text_in_the_comparison_is_escaped_in_html() -> None:
+    shown = BeforeAfter([("map", "<script>alert(1)</script>", "fvm")])._repr_html_()
+    assert "<script>" not in shown and "&lt;script&gt;" in shown
+
+
+def test_a_change_is_given_once_and_as_a_list_or_a_dictionary(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="give one of them"):
+        flowrec.replay(GOLDEN, flowrec.Change(plan="astar"), plan="astar")
+    with pytest.raises(UsageError, match=r"give a list, as \['a=1'\], or a dictionary"):
+        flowrec.replay(GOLDEN, sets="a=1")
+    with pytest.raises(UsageError, match=r"unknown key plan\.clearence_um"):
+        flowrec.replay(GOLDEN, sets={"plan.clearence_um": 1})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_typed_change_reaches_the_replay_without_becoming_text() -> None:
+    sets = {"recording.operator": "007", "recording.notes": "true", "plan.speed_share": 0.1 + 0.2}
+    recorded = flowrec.open(GOLDEN).config
+    typed = flowrec.Change(sets=sets).apply(recorded)
+    assert (typed.recording.operator, typed.recording.notes) == ("007", "true")
+    assert typed.plan.speed_share == 0.1 + 0.2
+    assert flowrec.Change(sets=["plan.speed_share=0.5"]) == flowrec.Change(sets={"plan.speed_share": 0.5})
