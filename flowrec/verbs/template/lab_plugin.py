@@ -87,7 +87,7 @@ class DrawnCamera:
     def _image(self) -> np.ndarray:
         settings, size = self._wanted.settings, (self._wanted.height_px, self._wanted.width_px)
         rows, columns = np.ogrid[: size[0], : size[1]]
-        middle = (0.5 * size[0], 0.5 * size[1] + 20.0 * np.sin(0.05 * self._count))
+        middle = (0.5 * size[0], 0.5 * size[1] + 4.0 * np.sin(0.05 * self._count))
         disc = np.hypot(rows - middle[0], columns - middle[1]) < settings.radius_px
         noise = np.random.default_rng(self._count).normal(0.0, 1.0, size)
         return np.clip(np.where(disc, 40.0, settings.background) + noise, 0, 255).astype(np.uint8)
