@@ -128,13 +128,13 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[bool], None
         for table in (TOPIC_ROWS, RIGS):
             table._others.clear()
 
-    def declared(group: str) -> dict[str, tuple[outside.Outside, ...]]:
+    def entry_points_of(group: str) -> dict[str, tuple[outside.Outside, ...]]:
         names = rows.get(group, {}) if there else {}
         return {name: (outside.Outside(name, f"{__name__}:{kind}", "kit", "2"),) for name, kind in names.items()}
 
     for where in ("core.outside", "core.methods"):
-        monkeypatch.setattr(f"flowrec.{where}.declared", declared)
-    monkeypatch.setattr("flowrec.core.declared", declared)
+        monkeypatch.setattr(f"flowrec.{where}.entry_points_of", entry_points_of)
+    monkeypatch.setattr("flowrec.core.entry_points_of", entry_points_of)
     yield install
     for table in (TOPIC_ROWS, RIGS):
         table._others.clear()
@@ -271,7 +271,7 @@ def test_a_stream_is_read_beside_the_loop_and_one_that_fails_is_told(tmp_path: P
     with Streams(rows, told.append) as streams:
         deadline = time.monotonic() + 10.0
         while not taken and time.monotonic() < deadline:
-            taken = [each.extra for each in streams.joined(iter([Inputs(7, None, nothing)])) if each.extra]
+            taken = [each.extra for each in streams.join(iter([Inputs(7, None, nothing)])) if each.extra]
         gate.set()
         while not told and time.monotonic() < deadline:
             time.sleep(0.001)

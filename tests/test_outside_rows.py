@@ -174,15 +174,15 @@ def entries(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, dict[str, str
     def entry(name: str, where: str, number: int) -> outside.Outside:
         return outside.Outside(name, f"{__name__}:{where}", f"kit{number}", "2")
 
-    def declared(group: str) -> dict[str, tuple[outside.Outside, ...]]:
+    def entry_points_of(group: str) -> dict[str, tuple[outside.Outside, ...]]:
         return {
             name: tuple(entry(name, each, number) for number, each in enumerate(classes.split()))
             for name, classes in wanted.get(group, {}).items()
         }
 
     for where in ("outside", "methods"):
-        monkeypatch.setattr(f"flowrec.core.{where}.declared", declared)
-    monkeypatch.setattr("flowrec.core.declared", declared)
+        monkeypatch.setattr(f"flowrec.core.{where}.entry_points_of", entry_points_of)
+    monkeypatch.setattr("flowrec.core.entry_points_of", entry_points_of)
     yield wanted
     for table in (PLANNERS, OBSERVERS, TRACKERS, REFINERS, CONTROLLERS, RIGS):
         table._others.clear()
@@ -206,7 +206,7 @@ def test_an_entry_point_that_is_no_row_is_refused_in_a_line_that_names_its_packa
     with pytest.raises(UsageError, match=r"kit0 2") as refused:
         load_config(None, [f"plan.method={name}"])
     assert said in str(refused.value) and "\n" not in str(refused.value)
-    assert any(said in row.fault for row in PLANNERS.listed())
+    assert any(said in row.fault for row in PLANNERS.list_rows())
     assert load_config(None, ["plan.method=astar_time"]).plan.method == "astar_time"
 
 
@@ -223,7 +223,7 @@ def test_benches_have_the_rows_of_packages_that_can_be_used(entries: dict[str, d
     made = {name: with_row(Observer(kalman=Kalman(agility=0.7)), OBSERVERS, name) for name in names}
     assert all(stage.method == name and stage.kalman.agility == 0.7 for name, stage in made.items())
     assert made["lab"].lab == LabObserver() and not hasattr(made["kalman"], "lab")
-    assert OBSERVERS["lab"].made(made["lab"]) is made["lab"].lab
+    assert OBSERVERS["lab"].build(made["lab"]) is made["lab"].lab
     with pytest.raises(UsageError, match="'Absent'"):
         with_row(Observer(), OBSERVERS, "thin")
 
@@ -231,7 +231,7 @@ def test_benches_have_the_rows_of_packages_that_can_be_used(entries: dict[str, d
 def test_a_name_of_ours_can_not_be_taken(entries: dict[str, dict[str, str]]) -> None:
     entries["flowrec.planners"] = {"astar_time": "LabPlanner", "swift": "LabPlanner"}
     assert PLANNERS["astar_time"].source is None
-    assert ["is taken by flowrec" in row.fault for row in PLANNERS.listed() if row.name == "astar_time"] == [
+    assert ["is taken by flowrec" in row.fault for row in PLANNERS.list_rows() if row.name == "astar_time"] == [
         False,
         True,
     ]
@@ -300,8 +300,8 @@ def test_a_configuration_without_other_packages_is_of_our_class_and_reads_no_ent
     def never(_group: str) -> None:
         raise AssertionError("entry points are read")
 
-    monkeypatch.setattr("flowrec.core.outside.declared", never)
-    monkeypatch.setattr("flowrec.core.methods.declared", never)
+    monkeypatch.setattr("flowrec.core.outside.entry_points_of", never)
+    monkeypatch.setattr("flowrec.core.methods.entry_points_of", never)
     config = with_sets(load_config(None, SMALL), ["plan.method=astar_time"])
     assert type(config) is Config
     with Session(ROOT / "sessions" / "golden.mcap") as session:

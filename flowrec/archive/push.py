@@ -171,7 +171,7 @@ def _check_names(files: Sequence[Path]) -> None:
 def _push_one(bucket: Bucket, session: Path, file: Path, done: Callable[[int], None]) -> PushedFile:
     if file == notes_file(session):
         return _pushed_notes(bucket, file)
-    stored = bucket.stored(file.name)
+    stored = bucket.stat(file.name)
     if stored is None:
         from flowrec.verbs import check  # late: it takes a second
 
@@ -184,7 +184,7 @@ def _push_one(bucket: Bucket, session: Path, file: Path, done: Callable[[int], N
             content, url = sent.content, bucket.url(file.name)
             compared = _read_back(url, file, content, sent.etag)
             return PushedFile(file, url, content.size, sent.sent_bytes, content.sha256, compared)
-        stored = bucket.stored(file.name)  # it has come meanwhile
+        stored = bucket.stat(file.name)  # it has come meanwhile
     return _same(bucket.url(file.name), file, stored, done)
 
 
@@ -244,7 +244,7 @@ def _is(url: UrlPath, content: Content) -> bool:
 
 def _pushed_notes(bucket: Bucket, file: Path) -> PushedFile:
     """Notes are small, and lines are only ever added to them: what is there may be the beginning, or have more."""
-    here, url, stored = content_of_file(file), bucket.url(file.name), bucket.stored(file.name)
+    here, url, stored = content_of_file(file), bucket.url(file.name), bucket.stat(file.name)
     data = notes_content(file)
     forget(url)
     there = b"" if stored is None else notes_content(url)

@@ -48,7 +48,7 @@ from .methods import (
     table_at as table_at,
 )
 from .outside import (
-    FACT as FACT, Outside as Outside, VERBS as VERBS, declared as declared, stated as stated, the_one as the_one,
+    FACT as FACT, Outside as Outside, VERBS as VERBS, entry_points_of as entry_points_of, outside_facts as outside_facts, the_one as the_one,
 )
 from .provenance import provenance as provenance, user_name as user_name
 from .ranges import (
@@ -59,7 +59,7 @@ from .summary import (
     DOUBTS as DOUBTS, Figures as Figures, Row as Row, Value as Value, as_text as as_text,
     comparison_for_people as comparison_for_people, doubts_of as doubts_of, doubts_text as doubts_text,
     finite as finite, is_count as is_count, is_numeric as is_numeric, name_of as name_of, of_text as of_text,
-    rows_for_people as rows_for_people, shown as shown,
+    rows_for_people as rows_for_people, text_of_figure as text_of_figure,
 )
 from .system.blas_threads import one_blas_thread as one_blas_thread
 from .system.bounded_process import BoundedProcess as BoundedProcess
@@ -77,13 +77,13 @@ from .system.leftovers import (
     temporary_name as temporary_name,
 )
 from .system.locks import (
-    held as held, is_growing as is_growing, open_new as open_new, remove_idle as remove_idle, try_lock as try_lock,
+    hold_file as hold_file, is_growing as is_growing, open_new as open_new, remove_idle as remove_idle, try_lock as try_lock,
 )
 from .system.numba_setup import compiled as compiled, kernels_cached as kernels_cached
 from .system.output_folder import OutputFolder as OutputFolder, marker_of as marker_of
 from .system.outputs import (
     FIGURE as FIGURE, JSON as JSON, MCAP as MCAP, Output as Output, OutputError as OutputError, PICTURE as PICTURE,
-    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, taken as taken,
+    RBL as RBL, RRD as RRD, TOML as TOML, WEIGHTS as WEIGHTS, name_taken as name_taken,
 )
 from .system.processes import (
     Priority as Priority, child_command as child_command, child_environment as child_environment,

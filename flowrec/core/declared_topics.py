@@ -65,19 +65,19 @@ class TopicTable:
         self.by_field: Mapping[str, Topic] = BY_FIELD | more if more else BY_FIELD
         self.by_path: Mapping[str, Topic] = BY_PATH | more if more else BY_PATH
 
-    def updated(self, tick: Tick, stamp_ns: int, new: Mapping[str, Any]) -> Tick:
+    def with_messages(self, tick: Tick, stamp_ns: int, new: Mapping[str, Any]) -> Tick:
         """The tick of a later stamp, with new messages by field."""
         if not self.extra:
             return replace(tick, stamp_ns=stamp_ns, **new)
         extra = {name: message for name, message in new.items() if name not in BY_FIELD}
         ours = {name: message for name, message in new.items() if name in BY_FIELD}
-        return replace(tick, stamp_ns=stamp_ns, extra=tick.extra.updated(extra), **ours)
+        return replace(tick, stamp_ns=stamp_ns, extra=tick.extra.with_messages(extra), **ours)
 
     def with_types_of(self, other: TopicTable) -> TopicTable:
         """The table with the declarations of another one, where both have a topic, and with its other extra topics."""
         return TopicTable((self._extra_by_path | other._extra_by_path).values()) if self.extra or other.extra else self
 
-    def typed(self, message: Message, path: str) -> Message:
+    def as_declared(self, message: Message, path: str) -> Message:
         """A message of an extra topic, as a file declares it, in the type that this table declares.
 
         Raises
@@ -103,7 +103,7 @@ class TopicTable:
         if not tick.extra:
             return tick
         known = [path for path in tick.extra if self.by_path[path].source is not Source.SIMULATOR]
-        return replace(tick, extra=Extra({path: self.typed(tick.extra[path], path) for path in known}))
+        return replace(tick, extra=Extra({path: self.as_declared(tick.extra[path], path) for path in known}))
 
     def __reduce__(self) -> tuple[Any, tuple[tuple[Topic, ...]]]:
         return TopicTable, (self.extra,)

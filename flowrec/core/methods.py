@@ -14,7 +14,7 @@ from dataclasses import dataclass, is_dataclass
 from typing import Any
 
 from flowrec.core.errors import UsageError
-from flowrec.core.outside import Outside, declared, the_one
+from flowrec.core.outside import Outside, entry_points_of, the_one
 
 OWN = "flowrec"  # the package that our rows come from
 
@@ -62,7 +62,7 @@ class Method:
                 f"method {self.name} needs {error.name}, which is not installed: pip install 'flowrec[{self.extra}]'"
             ) from error
 
-    def made(self, stage: Any) -> Any:
+    def build(self, stage: Any) -> Any:
         """The method with its settings, which the settings of its stage hold."""
         if self.source is not None:
             return self.section(stage)
@@ -142,7 +142,7 @@ class Methods(Mapping[str, Method]):
         return len(self._rows)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._rows or name in declared(self.group)
+        return name in self._rows or name in entry_points_of(self.group)
 
     def __hash__(self) -> int:
         return hash(self.setting)
@@ -174,22 +174,22 @@ class Methods(Mapping[str, Method]):
 
     def names(self) -> list[str]:
         """All names, ours first."""
-        return [*self._rows, *(name for name in declared(self.group) if name not in self._rows)]
+        return [*self._rows, *(name for name in entry_points_of(self.group) if name not in self._rows)]
 
     def usable(self) -> list[str]:
         """Names of all rows, ours first, without those of packages that can not be used."""
-        return [row.name for row in self.listed() if not row.fault]
+        return [row.name for row in self.list_rows() if not row.fault]
 
-    def listed(self) -> Iterator[ListedMethod]:
+    def list_rows(self) -> Iterator[ListedMethod]:
         """All rows, ours first, with those that can not be used."""
         for row in self._rows.values():
             yield ListedMethod(self.setting, row.name, row.summary, OWN, row.extra)
-        for name, sources in declared(self.group).items():
+        for name, sources in entry_points_of(self.group).items():
             for source in sources:
                 summary = fault = ""
                 try:
                     if name in self._rows:
-                        raise source.refused(f"and the name is taken by {OWN}")
+                        raise source.refusal(f"and the name is taken by {OWN}")
                     the_one(self.group, name)
                     summary = self._row(source).summary
                 except UsageError as error:
@@ -205,16 +205,16 @@ class Methods(Mapping[str, Method]):
         """The row that an entry point declares: the class, whose name is that of the entry point."""
         found = source.load()
         if lack := self.lack_of(found):
-            raise source.refused(lack)
+            raise source.refusal(lack)
         if not source.name.isidentifier():
-            raise source.refused("whose name can be no section of a configuration: use letters, digits and _")
+            raise source.refusal("whose name can be no section of a configuration: use letters, digits and _")
         settings = getattr(found, "Settings", NoSettings) if self.makes_objects else found
         if not is_dataclass(settings) or not settings.__dataclass_params__.frozen:  # type: ignore[attr-defined]
-            raise source.refused("whose settings are no frozen dataclass")
+            raise source.refusal("whose settings are no frozen dataclass")
         try:
             settings()
         except TypeError as error:
-            raise source.refused(f"whose settings must all have defaults ({error})") from error
+            raise source.refusal(f"whose settings must all have defaults ({error})") from error
         return Method(
             source.name,
             source.target,
@@ -230,12 +230,12 @@ class Methods(Mapping[str, Method]):
         """The names, for the validation of a configuration."""
         from pydantic_core import core_schema
 
-        def named(value: object) -> object:
+        def known_name(value: object) -> object:
             if not isinstance(value, str) or value not in self:
                 raise ValueError(f"must be one of {', '.join(self.names())}")
             return value
 
-        return core_schema.no_info_plain_validator_function(named)
+        return core_schema.no_info_plain_validator_function(known_name)
 
 
 # The methods that a replay can change, by the name of the option and of the argument, and their tables.

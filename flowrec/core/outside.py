@@ -53,9 +53,9 @@ class Outside:
             return functools.reduce(getattr, path.split("."), importlib.import_module(module))
         except (Exception, SystemExit) as error:  # the code of others
             why = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
-            raise self.refused(f"which can not be imported ({why})") from error
+            raise self.refusal(f"which can not be imported ({why})") from error
 
-    def refused(self, why: str) -> UsageError:
+    def refusal(self, why: str) -> UsageError:
         """The error that it can not be used; `why` is a relative clause about the package."""
         return UsageError(f"{self.name} ({self.target}) is of the package {self}, {why}; mend or uninstall it")
 
@@ -83,7 +83,7 @@ def _code(folder: Path) -> Iterator[Path]:
 
 
 @functools.cache
-def declared(group: str) -> dict[str, tuple[Outside, ...]]:
+def entry_points_of(group: str) -> dict[str, tuple[Outside, ...]]:
     """The entry points of a group by name; more than one where several packages declare the same name."""
     if not group:
         return {}
@@ -104,13 +104,13 @@ def the_one(group: str, name: str) -> Outside | None:
     ------
     UsageError : several packages declare it.
     """
-    several = declared(group).get(name, ())
+    several = entry_points_of(group).get(name, ())
     if len(several) > 1:
         raise UsageError(f"{name} is declared by {' and by '.join(map(str, several))}; uninstall all but one of them")
     return several[0] if several else None
 
 
-def stated(provenance: Mapping[str, str]) -> dict[str, dict[str, str]]:
+def outside_facts(provenance: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """Facts in the head of a session about each section of others; what is damaged is left out."""
     found = {}
     for key, text in provenance.items():

@@ -27,7 +27,7 @@ class Range:
         return self.low <= value <= self.high
 
     def __str__(self) -> str:
-        return f"from {shown(self.low)} to {shown(self.high)}"
+        return f"from {short_number(self.low)} to {short_number(self.high)}"
 
     def nearest(self, value: Number) -> Number:
         """The nearest valid value; the lower end for NaN."""
@@ -49,7 +49,7 @@ class OneOf(Range):
         return value in self.values
 
     def __str__(self) -> str:
-        return f"one of {', '.join(map(shown, self.values))}"
+        return f"one of {', '.join(map(short_number, self.values))}"
 
     def nearest(self, value: Number) -> Number:
         clipped = min(max(value, self.low), self.high)
@@ -72,8 +72,10 @@ class Fault:
     valid: Range
 
     def __str__(self) -> str:
-        nearest = f"; the nearest is {shown(self.valid.nearest(self.value))}" if not math.isnan(self.value) else ""
-        return f"{self.key} = {shown(self.value)}: must be {self.valid}{nearest}"
+        nearest = (
+            f"; the nearest is {short_number(self.valid.nearest(self.value))}" if not math.isnan(self.value) else ""
+        )
+        return f"{self.key} = {short_number(self.value)}: must be {self.valid}{nearest}"
 
 
 def faults(settings: Any, prefix: str = "") -> Iterator[Fault]:
@@ -112,7 +114,7 @@ def range_of(hint: Any) -> Range | None:
     return None
 
 
-def shown(number: Number) -> str:
+def short_number(number: Number) -> str:
     """A number in its shortest form: 3, 0.55, 1e+06."""
     return str(number) if isinstance(number, int) else f"{number:g}"
 

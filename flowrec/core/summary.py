@@ -67,14 +67,14 @@ def finite(value: float) -> float | None:
 
 def rows_for_people(figures: Mapping[str, Value]) -> list[tuple[str, str]]:
     """Names and values as text; the outcome together with its note."""
-    rows = [(name_of(key), shown(key, value)) for key, value in figures.items() if key not in _HIDDEN]
+    rows = [(name_of(key), text_of_figure(key, value)) for key, value in figures.items() if key not in _HIDDEN]
     note = figures.get("note")
     return [(name, f"{value} ({note})" if name == "outcome" and note else value) for name, value in rows]
 
 
 def comparison_for_people(rows: Iterable[Row]) -> list[tuple[str, str, str]]:
     """Rows of name, recorded value and replayed value of figures, as text with units."""
-    return [(name_of(key), shown(key, was), shown(key, now)) for key, was, now in rows]
+    return [(name_of(key), text_of_figure(key, was), text_of_figure(key, now)) for key, was, now in rows]
 
 
 def name_of(key: str) -> str:
@@ -85,7 +85,7 @@ def name_of(key: str) -> str:
     return key.removesuffix(unit).replace("_", " ")
 
 
-def shown(key: str, value: Value) -> str:
+def text_of_figure(key: str, value: Value) -> str:
     """A value with its unit; `-` if it is None."""
     if value is None:
         return "-"

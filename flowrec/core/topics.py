@@ -78,7 +78,7 @@ class Extra(Mapping[str, Message]):
     def __repr__(self) -> str:
         return f"Extra({self._messages!r})"
 
-    def updated(self, new: Mapping[str, Message]) -> Extra:
+    def with_messages(self, new: Mapping[str, Message]) -> Extra:
         """These messages and newer ones; itself if there is none."""
         return Extra({**self._messages, **new}) if new else self
 

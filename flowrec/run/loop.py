@@ -143,7 +143,7 @@ def run(
         stack.enter_context(control.interrupted_when_overdue())
         arriving = increasing_stamps(rig.inputs(), tick.stamp_ns, reject)
         if streams is not None:
-            arriving = stack.enter_context(streams).joined(arriving)
+            arriving = stack.enter_context(streams).join(arriving)
         if live:
             arriving = checked_images(arriving, pipeline.image_shape, pipeline.image_bits)
             arriving = _and_afterwards(arriving, lambda: tick, paced=paced)

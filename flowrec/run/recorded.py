@@ -71,7 +71,7 @@ class RecordedRig:
 
     def _new_extra(self, before: Tick, tick: Tick) -> dict[str, Message]:
         return {
-            path: self._topics.typed(message, path)
+            path: self._topics.as_declared(message, path)
             for path, message in tick.extra.items()
             if path in self._extra and message is not before.extra.get(path)
         }

@@ -77,7 +77,7 @@ class Signals:
         self._over = False
 
     @contextmanager
-    def handled(self) -> Iterator[None]:
+    def handle(self) -> Iterator[None]:
         """Context in which signals are handled; to be entered in the main thread."""
         wanted: list[int] = [*_ENDING, *(_AT_ONCE if self._watchdog is not None else ())]
         # An ignored signal stays ignored (nohup), except those that a shell without job control ignores in background.

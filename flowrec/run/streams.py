@@ -47,7 +47,7 @@ class Streams:
         for thread in self._threads:
             thread.join(_JOIN_S)  # one that waits for its device is left behind
 
-    def joined(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
+    def join(self, arriving: Iterator[Inputs]) -> Iterator[Inputs]:
         """The inputs with the messages that have come since the last ones."""
         for inputs in arriving:
             new = self._take_latest(inputs.stamp_ns) if self._latest else {}

@@ -22,7 +22,7 @@ from dataclasses import replace
 from typing import Any, BinaryIO
 
 from flowrec.core import WORKER_FIELDS, FlowrecError, Tick, child_command, child_environment
-from flowrec.run.workers import Result, Results, ordered, work
+from flowrec.run.workers import Result, Results, order_of, work
 from flowrec.stages import Pipeline, warm_up
 
 _NAME = "the process that solves and plans"
@@ -66,7 +66,7 @@ class ProcessWorker:
 
     def submit(self, order: Tick) -> None:
         """Start on an order as soon as those before it are done."""
-        mission, name = ordered(order)
+        mission, name = order_of(order)
         needed = {field: getattr(order, field) for field in WORKER_FIELDS[name].reads}
         self._orders.put(Tick(order.stamp_ns, mission=mission, **needed))
         self._fills.append(name)

@@ -35,7 +35,7 @@ Result = FlowField | Route
 Results = Mapping[str, Result]  # by field of Tick
 
 
-def ordered(tick: Tick) -> tuple[Mission, str]:
+def order_of(tick: Tick) -> tuple[Mission, str]:
     """The work order of a tick, and the field of Tick that its result goes to."""
     assert tick.mission is not None and tick.mission.wanted, "only a tick with a pending order is submitted"
     return tick.mission, ANSWERED_BY[WorkOrder(tick.mission.wanted)]
@@ -52,7 +52,7 @@ def work(pipeline: Pipeline, order: Tick) -> Result:
     ------
     FlowrecError : bad settings; nothing is in use that could stay.
     """
-    mission, name = ordered(order)
+    mission, name = order_of(order)
     try:
         for each in ("mission", *WORKER_FIELDS[name].reads):
             message = getattr(order, each)
@@ -143,13 +143,13 @@ class LockstepWorker:
         self._order: Tick | None = None
 
     def submit(self, order: Tick) -> None:
-        if ordered(order)[1] in self._fills:
+        if order_of(order)[1] in self._fills:
             self._order = order
 
     def due(self, stamp_ns: int) -> Results:
         if self._order is None:
             return {}
-        mission, name = ordered(self._order)
+        mission, name = order_of(self._order)
         if stamp_ns < self._schedule.get(mission.request, mission.requested_ns + self._after_ns):
             return {}
         order, self._order = self._order, None
@@ -159,7 +159,7 @@ class LockstepWorker:
         """Nothing is held."""
 
     def _result(self, order: Tick) -> Result:
-        self._announce(ordered(order)[0].wanted.replace("_", " "))
+        self._announce(order_of(order)[0].wanted.replace("_", " "))
         result = work(self._pipeline, order)
         self._announce("")
         return result
@@ -193,7 +193,7 @@ class ReplayWorker(LockstepWorker):
     def submit(self, order: Tick) -> None:
         super().submit(order)
         if self._order is order:
-            mission, name = ordered(order)
+            mission, name = order_of(order)
             recorded, read = self._recorded(), ("mission", *WORKER_FIELDS[name].reads)
             self._unchanged = (
                 mission.wanted in self._same
@@ -202,7 +202,7 @@ class ReplayWorker(LockstepWorker):
             )
 
     def _result(self, order: Tick) -> Result:
-        mission, name = ordered(order)
+        mission, name = order_of(order)
         found: Result | None = getattr(self._recorded(), name)
         if self._unchanged and found is not None and found.request == mission.request:
             return found

@@ -30,9 +30,9 @@ from flowrec.core import (
     UsageError,
     arguments_of,
     hints,
+    outside_facts,
     refuse_unknown,
     remember_call,
-    stated,
 )
 
 _TABLE = dict[str, Any]  # the type of a section that can not be read
@@ -141,7 +141,7 @@ def extend_config(root: Any, tree: Mapping[str, Any], recorded: Callable[[str], 
                 before = more.get(section, {}).get(name)
                 if name in known or (before is not None and before is not kind):
                     assert row.source is not None, "a row of others"
-                    raise row.source.refused(f"and the section {where} of its settings is taken")
+                    raise row.source.refusal(f"and the section {where} of its settings is taken")
             if kind is _TABLE and name in chosen:
                 several = not isinstance(given[selector], str)
                 unread.setdefault(section, {})[selector] = tuple[str, ...] if several else str
@@ -252,7 +252,7 @@ def facts_of(
 
 def needed_packages(config: Any, provenance: Mapping[str, str]) -> list[str]:
     """The packages of others, with their versions, that a replay of a session needs, as its head states them."""
-    known = stated(provenance)
+    known = outside_facts(provenance)
     found = (known.get(key_of_section(setting, name)) for setting, _, name, _ in of_stages(config))
     return sorted({f"{fact['package']} {fact['version']}" for fact in found if fact is not None and _of_stage(fact)})
 
@@ -264,7 +264,7 @@ def other_packages(config: Any, provenance: Mapping[str, str]) -> list[str]:
     ------
     UsageError : a package that a stage needs is not installed, or does not take the recorded settings.
     """
-    lines, known = [], stated(provenance)
+    lines, known = [], outside_facts(provenance)
     for setting, table, name, settings in of_stages(config):
         key = key_of_section(setting, name)
         was = known.get(key, {})

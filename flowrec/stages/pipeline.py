@@ -257,13 +257,13 @@ def with_inputs(last: Tick, inputs: Inputs, topics: TopicTable = FIXED) -> Tick:
     """
     new: dict[str, Any] = {name: message for name in HELD if (message := getattr(inputs, name)) is not None}
     if inputs.extra:
-        new["extra"] = last.extra.updated(_of_source(inputs.extra, topics, Source.RIG))
+        new["extra"] = last.extra.with_messages(_of_source(inputs.extra, topics, Source.RIG))
     return replace(last, stamp_ns=inputs.stamp_ns, frame=inputs.frame, truth=None, true_field=None, **new)
 
 
 def recorded_extra(tick: Tick, inputs: Inputs, topics: TopicTable) -> Extra:
     """The messages of the extra topics that are recorded with a tick: those of a simulator, too."""
-    return tick.extra.updated(_of_source(inputs.extra, topics, Source.SIMULATOR)) if inputs.extra else tick.extra
+    return tick.extra.with_messages(_of_source(inputs.extra, topics, Source.SIMULATOR)) if inputs.extra else tick.extra
 
 
 def _of_source(extra: Mapping[str, Message], topics: TopicTable, source: Source) -> dict[str, Message]:
@@ -282,7 +282,7 @@ def _with_extra_stages(p: Pipeline, last: Tick, tick: Tick) -> Tick:
         kind = p.topics.by_field[path].type
         if type(message) is not kind:
             raise UsageError(f"{path}: its stage returned a {type(message).__name__}, where a {kind.__name__} belongs")
-        tick = replace(tick, extra=tick.extra.updated({path: message}))
+        tick = replace(tick, extra=tick.extra.with_messages({path: message}))
     return tick
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from flowrec.core import SessionError, UsageError
 from flowrec.store.object_requests import NOT_OFFERED, in_a_line, of_status, reason
 from flowrec.store.session_path import UrlPath
-from flowrec.store.traffic import MissingError, RefusedError, TransientError, answered, timeout_s
+from flowrec.store.traffic import MissingError, RefusedError, TransientError, ask_repeatedly, timeout_s
 
 _PART_BYTES = 16 << 20
 _MOST_PARTS = 10_000  # of an upload
@@ -169,7 +169,7 @@ class Bucket:
         """URL of an object in the folder."""
         return self._folder / name
 
-    def stored(self, name: str) -> tuple[int, str] | None:
+    def stat(self, name: str) -> tuple[int, str] | None:
         """Size in bytes and ETag of an object; None if there is none, or this user may not know."""
         head = self._ask(name, "head_object")
         return None if head is None else (head["ContentLength"], _etag(head))
@@ -220,7 +220,7 @@ class Bucket:
                 raise ours from error
 
         try:
-            return answered(self.url(name), once, wanted, timeout_s() + nbytes / _SLOWEST_BYTES_S, "written")
+            return ask_repeatedly(self.url(name), once, wanted, timeout_s() + nbytes / _SLOWEST_BYTES_S, "written")
         except SessionError as error:
             if isinstance(error, MissingError) and verb in _LOOKS:
                 return None

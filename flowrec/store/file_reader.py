@@ -213,7 +213,9 @@ class FileReader:
             if chunk.message_end_time >= start_ns:
                 only_frames = chunk.message_index_offsets and set(chunk.message_index_offsets) <= self._frame_channels
                 if only_frames and chunk.uncompressed_size > largest_bytes:
-                    raise self._source.damaged(chunk.chunk_start_offset, "images of more pixels than flowrec reads")
+                    raise self._source.damage_error(
+                        chunk.chunk_start_offset, "images of more pixels than flowrec reads"
+                    )
                 (frames if only_frames else state).append(chunk)
         return state, frames
 
@@ -360,7 +362,7 @@ def _overlapping(source: McapReader, chunks: list[ChunkIndex]) -> Iterator[list[
         bundle.append(chunk)
         nbytes += chunk.uncompressed_size  # checked before the chunk is decompressed, or at least before it is used
         if nbytes > CHUNK_LIMIT_BYTES and len(bundle) > 1:
-            raise source.damaged(chunk.chunk_start_offset, "too many chunks claim the same time")
+            raise source.damage_error(chunk.chunk_start_offset, "too many chunks claim the same time")
     if bundle:
         yield bundle
 
@@ -390,11 +392,11 @@ def _sorted_messages(source: McapReader, bundle: list[ChunkIndex], contents: lis
     for place, content in sorted(zip(places, contents, strict=True), key=lambda pair: pair[0]):
         records += content if isinstance(content, list) else source.messages_in(content, place)
         if len(records) > MESSAGES_LIMIT:
-            raise source.damaged(place, "too many messages claim the same time")
+            raise source.damage_error(place, "too many messages claim the same time")
     records.sort(key=_by_time)
     # What comes later is merged by the times of the index; they are not to be trusted either.
     first_ns = min(chunk.message_start_time for chunk in bundle)
     last_ns = max(chunk.message_end_time for chunk in bundle)
     if records and not first_ns <= records[0].log_ns <= records[-1].log_ns <= last_ns:
-        raise source.damaged(places[0], "there are messages of other times than the index tells")
+        raise source.damage_error(places[0], "there are messages of other times than the index tells")
     return iter(records)

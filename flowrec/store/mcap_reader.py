@@ -115,10 +115,10 @@ class McapReader:
     def read(self, offset: int, length: int) -> bytes:
         """Exactly that many bytes."""
         if not 0 <= offset <= offset + length <= self.size:
-            raise self.damaged(offset, f"{length} bytes are announced, the file ends at {self.size}")
+            raise self.damage_error(offset, f"{length} bytes are announced, the file ends at {self.size}")
         data = self._bytes.read(offset, length)
         if len(data) < length:
-            raise self.damaged(offset, "the file has become shorter while it was read")
+            raise self.damage_error(offset, "the file has become shorter while it was read")
         return data
 
     def prefetch(self, chunks: Iterable[ChunkIndex], *, indexes: bool = False) -> None:
@@ -129,7 +129,7 @@ class McapReader:
         else:
             self._bytes.prefetch([(chunk.chunk_start_offset, chunk.chunk_length) for chunk, _ in ends])
 
-    def damaged(self, offset: int, why: object) -> DamageError:
+    def damage_error(self, offset: int, why: object) -> DamageError:
         """The error for bytes that can not be parsed."""
         return DamageError(self.path, f"damaged at byte {offset} ({why})")
 
@@ -139,7 +139,7 @@ class McapReader:
         try:
             yield
         except _DAMAGE as error:
-            raise self.damaged(offset, str(error) or type(error).__name__) from error
+            raise self.damage_error(offset, str(error) or type(error).__name__) from error
 
     def read_summary(self) -> Summary:
         """The summary section, checksum verified; nothing in it lies outside the file or over something else."""
@@ -156,10 +156,10 @@ class McapReader:
             raise UnfinishedError(f"{self.path}: has no index; `flowrec recover {self.path}` makes one")
         start = footer.summary_start
         if footer_at - start > _SUMMARY_LIMIT_BYTES:
-            raise self.damaged(start, f"an index of {footer_at - start} bytes, more than {_SUMMARY_LIMIT_BYTES}")
+            raise self.damage_error(start, f"an index of {footer_at - start} bytes, more than {_SUMMARY_LIMIT_BYTES}")
         data = self.read(start, footer_at - start)
         if footer.summary_crc and zlib.crc32(tail[: FOOTER_BYTES - 4], zlib.crc32(data)) != footer.summary_crc:
-            raise self.damaged(start, "the checksum of the index is wrong")
+            raise self.damage_error(start, "the checksum of the index is wrong")
         with self.parsing(start):
             return parse_summary(data, len(MAGIC), start)
 
@@ -172,7 +172,7 @@ class McapReader:
         """The content of one attachment, checksum verified."""
         found = self.attachment_at(index.offset, index.length)
         if len(found.data) != index.data_size or found.name != index.name:
-            raise self.damaged(index.offset, f"{found.name!r} is not what the index describes")
+            raise self.damage_error(index.offset, f"{found.name!r} is not what the index describes")
         return bytes(found.data)
 
     def attachment_at(self, offset: int, length: int) -> Attachment:
@@ -231,7 +231,7 @@ class McapReader:
         """`content` of a chunk of the index, of the size that the index gives."""
         content = self.content(index.chunk_start_offset, index.chunk_length)
         if len(content) != index.uncompressed_size:
-            raise self.damaged(index.chunk_start_offset, "the chunk has another size than the index says")
+            raise self.damage_error(index.chunk_start_offset, "the chunk has another size than the index says")
         return content
 
     def messages_in(self, content: bytes | memoryview, offset: int) -> list[Record]:
@@ -295,7 +295,7 @@ class McapReader:
     def _check_size(self, offset: int, length: int, opcode: Opcode) -> None:
         limit = _LIMIT_BYTES.get(opcode, _SMALL_LIMIT_BYTES)
         if length > limit:
-            raise self.damaged(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
+            raise self.damage_error(offset, f"a {opcode.name.lower()} of {length} bytes, more than {limit}")
 
     def record(self, offset: int, length: int, opcode: Opcode, parse: Callable[..., Any]) -> Any:
         """One small record with that opcode, parsed; `length` includes the head of the record."""

@@ -141,7 +141,7 @@ class SessionReader:
             late_ns = start_ns if start_ns is not None and (start_ns > file.first_ns or not number) else None
             for stamp_ns, new in self._file(number).new_messages(late_ns, with_frames=with_frames):
                 if not number or stamp_ns > file.first_ns:
-                    tick = self.topics.updated(tick, stamp_ns, new)
+                    tick = self.topics.with_messages(tick, stamp_ns, new)
                     yield tick
 
     def tick_before(self, stamp_ns: int, *, with_frames: bool = True) -> Tick:
@@ -159,7 +159,7 @@ class SessionReader:
             if missing:
                 latest_ns, state = self._file(number).state_at(stamp_ns, missing)
                 found_ns, known = max(found_ns, latest_ns), known | state
-        return self.topics.updated(Tick(), found_ns, known)
+        return self.topics.with_messages(Tick(), found_ns, known)
 
     def messages(self, field: str) -> Iterator[Any]:
         """All messages of one topic, named by its field of Tick or by its path.

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, held, put_in_place, refuse_irregular
+from flowrec.core import MCAP, Outcome, Output, OutputError, SessionError, hold_file, put_in_place, refuse_irregular
 from flowrec.store.audit import disagreements
 from flowrec.store.channels import SessionContents
 from flowrec.store.chunk_copies import ChunkCopier
@@ -92,7 +92,7 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
     """
     refuse_irregular(path, SessionError)
     try:
-        with held(path):
+        with hold_file(path):
             return _recover(path, out)
     except BlockingIOError as error:
         raise SessionError(

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from flowrec.core import SessionError
 from flowrec.store.object_requests import CONNECTIONS, Answer, ObjectRequests, requests_for
-from flowrec.store.traffic import TRAFFIC, MissingError, answered, timeout_s
+from flowrec.store.traffic import TRAFFIC, MissingError, ask_repeatedly, timeout_s
 
 _END_BYTES = 256 << 10
 _AHEAD_BYTES = 48 << 20
@@ -200,7 +200,9 @@ class RemoteFile:
         return SessionError(f"{self.path}: was replaced while it was read; open it again")
 
     def _answer(self, asked: ObjectRequests, first: int | None, length: int) -> Answer:
-        answer = answered(self.path, lambda limit_s: asked.get(first, length, limit_s), lambda: self._closer.alive)
+        answer = ask_repeatedly(
+            self.path, lambda limit_s: asked.get(first, length, limit_s), lambda: self._closer.alive
+        )
         TRAFFIC.add(nbytes=len(answer.data))
         return answer
 

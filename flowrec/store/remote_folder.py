@@ -10,7 +10,7 @@ from pathlib import Path
 from flowrec.core import SessionError
 from flowrec.store.object_requests import ListedObject, listing
 from flowrec.store.session_path import UrlPath
-from flowrec.store.traffic import MissingError, answered
+from flowrec.store.traffic import MissingError, ask_repeatedly
 
 _WEB = ("http://", "https://")
 
@@ -33,7 +33,7 @@ def objects_in(folder: UrlPath, begin: str = "") -> list[tuple[UrlPath, ListedOb
     """
     if not is_listed(folder):
         raise SessionError(f"{folder}: a server of http does not list its files; name the sessions one by one")
-    found = answered(folder, lambda limit_s: listing(str(folder), begin, limit_s))
+    found = ask_repeatedly(folder, lambda limit_s: listing(str(folder), begin, limit_s))
     return [(folder / each.name, each) for each in found]
 
 

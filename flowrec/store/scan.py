@@ -180,7 +180,7 @@ def scan(
         opcode, end = _extent(source, at)
         declared += opcode in _DECLARING
         if declared > _TIMES_DECLARED * DECLARED_LIMIT:
-            raise source.damaged(at, f"more than {_TIMES_DECLARED * DECLARED_LIMIT} records besides chunks")
+            raise source.damage_error(at, f"more than {_TIMES_DECLARED * DECLARED_LIMIT} records besides chunks")
         if end and heads_only and opcode == Opcode.CHUNK:
             found.chunks_passed += 1
             at = end

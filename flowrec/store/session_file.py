@@ -24,9 +24,9 @@ from flowrec.core import (
     SessionError,
     TopicTable,
     __version__,
+    name_taken,
     put_in_place,
     sync_directory,
-    taken,
 )
 from flowrec.store.channels import declarations, left_out
 from flowrec.store.chunk import ChunkEncoder, copy_chunks
@@ -214,7 +214,7 @@ class SessionFile:
             try:
                 put_in_place(self.partial_path, self.path, overwrite=self._options.overwrite)
             except (FileExistsError, IsADirectoryError) as error:
-                raise taken(self.path, f" (the finished session stays in {self.partial_path})") from error
+                raise name_taken(self.path, f" (the finished session stays in {self.partial_path})") from error
 
     def close(self) -> None:
         """Close the file without completing it."""
@@ -268,7 +268,7 @@ def refuse_if_taken(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ())
         return
     for file in there:
         if not file.name.endswith(PARTIAL_SUFFIX):
-            raise taken(file)
+            raise name_taken(file)
         raise FileError(
             f"{file}: is left from a run that did not finish; `flowrec recover {file}`"
             " saves it, another --out or --overwrite records without it"

@@ -231,9 +231,9 @@ class SessionMetadata:
                 },
             )
         except KeyError as error:
-            raise self.source.damaged(0, f"the record {error} is missing") from error
+            raise self.source.damage_error(0, f"the record {error} is missing") from error
         except ValueError as error:
-            raise self.source.damaged(0, error) from error
+            raise self.source.damage_error(0, error) from error
 
     def _records(self) -> dict[str, dict[str, str]]:
         """The metadata records by name."""
@@ -243,7 +243,7 @@ class SessionMetadata:
     def _limit(self, what: str, lengths: Iterable[int], limit: int) -> None:
         total = sum(lengths)
         if total > limit:
-            raise self.source.damaged(0, f"{total} bytes of {what}, more than {limit}")
+            raise self.source.damage_error(0, f"{total} bytes of {what}, more than {limit}")
 
     def _check_version(self, version: str) -> None:
         if version == str(FORMAT_VERSION):

@@ -87,7 +87,7 @@ class Traffic:
 TRAFFIC = Traffic()
 
 
-def answered(
+def ask_repeatedly(
     path: Path,
     ask: Callable[[float], _Answered],
     wanted: Callable[[], bool] = lambda: True,

@@ -122,7 +122,7 @@ class WriteQueue:
                     dropped += 1
         return dropped
 
-    def done(self, entry: Entry) -> None:
+    def release(self, entry: Entry) -> None:
         """Free the bytes of an entry that the writer's thread has handled."""
         with self._changed:
             self.nbytes -= entry.nbytes

@@ -346,7 +346,7 @@ class SessionWriter:
                 if (flushed_ns := self._output.flushed_ns) is not None:
                     self._queue.mark_flushed(flushed_ns)
                 if entry is not None:
-                    self._queue.done(entry)
+                    self._queue.release(entry)
         except Exception as error:  # noqa: BLE001  `write` and `close` raise it in the control loop
             self._failure = error
             self._queue.abandon()

@@ -128,7 +128,7 @@ class _VerbCommand(TyperCommand):
         tables = getattr(self.callback, "tables", {})
         for parameter in self.params:
             if parameter.name in tables:
-                rows = table_at(tables[parameter.name]).listed()
+                rows = table_at(tables[parameter.name]).list_rows()
                 parts = (f"{row.name}: {row.summary}" for row in rows if not row.fault)
                 parameter.help = f"{parameter.help} " + "; ".join(parts) + "."  # type: ignore[attr-defined]
         super().format_help(ctx, formatter)

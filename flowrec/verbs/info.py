@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flowrec.core import name_of, of_text, seconds, shown, stated
+from flowrec.core import name_of, of_text, outside_facts, seconds, text_of_figure
 from flowrec.verbs.command import verb
 from flowrec.verbs.options import SessionFile
 
@@ -85,7 +85,7 @@ def info(session: SessionFile) -> Facts:
         "local_changes": _local_changes(provenance),
         **of_text({key: provenance[key] for key in _STATED if key in provenance}),
         "derived": _derived_settings(provenance.get("derived", "{}")),
-        **({"outside": packages} if (packages := stated(provenance)) else {}),
+        **({"outside": packages} if (packages := outside_facts(provenance)) else {}),
         "piece": _piece(run.part, path) if run.part is not None else None,
         "replay_of": header.parent.get("file", "?") if header.parent else None,
         **of_text({key: text for key, text in provenance.items() if key.startswith(_OF_SOURCE)}),
@@ -112,7 +112,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     changed = ", with local changes" if facts["local_changes"] else ""
     words = {
         "outcome": facts["outcome"] + _in_brackets(facts["note"]),
-        "size_bytes": shown("size_bytes", facts["size_bytes"])
+        "size_bytes": text_of_figure("size_bytes", facts["size_bytes"])
         + (f" in {facts['parts']} parts" if facts["parts"] else ""),
         "chip": f"{facts['chip']}{size}, {facts['chip_openings']} openings",
         "recorded": facts["recorded"][:19].replace("T", " "),
@@ -139,7 +139,7 @@ def facts_for_people(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
         "duration",
     )
     return [
-        (names.get(key, name_of(key)), words.get(key) or shown(key, value))
+        (names.get(key, name_of(key)), words.get(key) or text_of_figure(key, value))
         for key, value in facts.items()
         if key not in (*without, *stages[1:], *_CLOCK_READINGS) and value not in (None, "", {}, [])
     ]

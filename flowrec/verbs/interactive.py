@@ -76,7 +76,7 @@ class AtTerminal(Unattended):
         if sys.platform != "win32":
             from flowrec.run import Signals
 
-            handled = Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handled()
+            handled = Signals(self.run_control, watchdog, give_up, lambda: self._leave_terminal()).handle()
         return handled
 
     @contextmanager

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from flowrec.core import DOUBTS, Outcome, is_count, is_numeric, printable, shown
+from flowrec.core import DOUBTS, Outcome, is_count, is_numeric, printable, text_of_figure
 
 INT_LIMIT = 2**63  # of the integers of DuckDB and Parquet
 TEXT_LIMIT = 20_000  # characters of a value; a longer text in a file is damage
@@ -161,7 +161,7 @@ def _outcome(row: ListedSession) -> str:
 def _errors(facts: Mapping[str, Any]) -> str:
     """Error of the assumed and of the refined flow, where the truth is known."""
     errors = [facts.get("assumed_flow_error"), facts.get("refined_flow_error")]
-    texts = [shown("flow_error", error).removesuffix(" %") for error in errors if isinstance(error, float)]
+    texts = [text_of_figure("flow_error", error).removesuffix(" %") for error in errors if isinstance(error, float)]
     return " -> ".join(texts) + " %" * bool(texts)
 
 

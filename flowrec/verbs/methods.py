@@ -68,20 +68,20 @@ def _words(row: "ListedMethod") -> set[str]:
 
 def _rows(our_verbs: Container[str]) -> Iterator["ListedMethod"]:
     """All rows of all tables, and the verbs of others."""
-    from flowrec.core import OWN, VERBS, ListedMethod, declared
+    from flowrec.core import OWN, VERBS, ListedMethod, entry_points_of
     from flowrec.exports import EXPORTS
     from flowrec.stages import Config, all_tables
     from flowrec.verbs import outside_verbs
 
     for _, table in all_tables(Config):
-        yield from table.listed()
-    yield from EXPORTS.listed()
-    for name, sources in declared(VERBS).items():
+        yield from table.list_rows()
+    yield from EXPORTS.list_rows()
+    for name, sources in entry_points_of(VERBS).items():
         for source in sources:
             summary = fault = ""
             try:
                 if name in our_verbs:
-                    raise source.refused(f"and the name is taken by {OWN}")
+                    raise source.refusal(f"and the name is taken by {OWN}")
                 summary = outside_verbs.verb(name).get_short_help_str(200)
             except UsageError as error:
                 fault = str(error)

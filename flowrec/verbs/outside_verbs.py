@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 def verb_names() -> list[str]:
     """The verbs that installed packages bring."""
-    from flowrec.core import VERBS, declared
+    from flowrec.core import VERBS, entry_points_of
 
-    return list(declared(VERBS))
+    return list(entry_points_of(VERBS))
 
 
 def verb(name: str) -> Any:
@@ -55,5 +55,5 @@ def verb_for_help(name: str) -> Any:
 def _function(source: Outside) -> Any:
     found = source.load()
     if isinstance(found, type) or not callable(found):
-        raise source.refused("which declares it as a verb, but it is no function")
+        raise source.refusal("which declares it as a verb, but it is no function")
     return found

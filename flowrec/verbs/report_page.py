@@ -22,7 +22,7 @@ from flowrec.core import (
     name_of,
     progress,
     say,
-    shown,
+    text_of_figure,
 )
 from flowrec.run import ReplayFiles, before_after
 from flowrec.stages import flow_error
@@ -243,10 +243,10 @@ def _key_figures(data: ReportData) -> ReportTable:
         error = flow_error(data.scene.chip, field, data.truth)
         if error is not None:  # of a run that was cut off, its last tick instead of its figures
             figures.setdefault(f"{name}_flow_error", error)
-    rows = [(name_of(key), _micro(shown(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
+    rows = [(name_of(key), _micro(text_of_figure(key, value)), MEANINGS.get(key, "")) for key, value in figures.items()]
     for name, field in (("assumed", data.assumed), ("refined", data.refined)):
         if field is not None and field.error_share is not None:
-            text = shown("_error", field.error_share)
+            text = text_of_figure("_error", field.error_share)
             rows.append((f"{name} flow, stated error", text, f"what the {name} map expects its error to be"))
     if data.truth is None:
         rows.append(("error of the flow", "-", "not known: only a simulation knows the true flow"))
@@ -339,7 +339,7 @@ def _replay_part(pair: ReplayFiles, figure: Any) -> ReplayPart:
 
     stated: Row = ("stated_flow_error", _stated_error(pair.recorded), _stated_error(pair.replayed))
     texts = [
-        (name_of(key), _micro(shown(key, was)), _micro(shown(key, now)), MEANINGS.get(key, ""))
+        (name_of(key), _micro(text_of_figure(key, was)), _micro(text_of_figure(key, now)), MEANINGS.get(key, ""))
         for key, was, now in [*before_after(pair), stated]
     ]
     tables = [ReportTable("Before and after", texts, ("", "recorded", "replayed", ""), narrow_columns=3)]

@@ -81,7 +81,7 @@ def test_each_signal_ends_the_run_by_its_ramp_or_takes_the_field_away_at_once(na
     watchdog = SimpleNamespace(trip=lambda reason: told.append(f"off: {reason}"), timeout_s=None)
     before = signal.signal(number, lambda *_: None)  # nohup ignores SIGHUP
     try:
-        with Signals(cast(RunControl, control), cast(Watchdog, watchdog)).handled():
+        with Signals(cast(RunControl, control), cast(Watchdog, watchdog)).handle():
             signal.raise_signal(number)
             until(lambda: len(told) == (1 if ends else 2))
     finally:
@@ -91,7 +91,7 @@ def test_each_signal_ends_the_run_by_its_ramp_or_takes_the_field_away_at_once(na
 
 
 def test_no_signal_is_lost_where_their_handling_begins_and_ends() -> None:
-    """SIGTERM at each line of `Signals.handled` and before and after it: raised as before, or a request to stop."""
+    """SIGTERM at each line of `Signals.handle` and before and after it: raised as before, or a request to stop."""
     raised = 0
 
     def stopped_at(line: int) -> tuple[bool, bool]:
@@ -103,9 +103,9 @@ def test_no_signal_is_lost_where_their_handling_begins_and_ends() -> None:
                 signal.raise_signal(signal.SIGTERM)
             return at_line
 
-        sys.settrace(lambda frame, *_: at_line if frame.f_code is Signals.handled.__wrapped__.__code__ else None)
+        sys.settrace(lambda frame, *_: at_line if frame.f_code is Signals.handle.__wrapped__.__code__ else None)
         try:
-            with Signals(control).handled():
+            with Signals(control).handle():
                 pass
         except KeyboardInterrupt:
             return True, True

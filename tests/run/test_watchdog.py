@@ -278,7 +278,7 @@ def test_whoever_insists_has_the_process_ended_after_3_s_where_the_main_thread_d
     watchdog = guarded(driver)
     before = signal.signal(signal.SIGQUIT, lambda *_: None)
     try:
-        with Watched(cast(RunControl, Stubborn()), watchdog, clock=lambda: now_s[0]).handled():
+        with Watched(cast(RunControl, Stubborn()), watchdog, clock=lambda: now_s[0]).handle():
             signal.raise_signal(signal.SIGQUIT)
             until(lambda: watchdog.reason)
             seen = looks[0]

@@ -121,7 +121,7 @@ def test_any_declared_type_passes_file_and_table_bit_for_bit_and_needs_no_code(
         table = session.table("/lab/made")
     assert [bits_of(each) for each in read] == [bits_of(each) for each in sent]
     assert type(read[0]) is not kind and type(pickle.loads(pickle.dumps(read[0]))) is type(read[0])
-    assert all(topics.typed(each, "/lab/made").same_as(one) for each, one in zip(read, sent, strict=True))
+    assert all(topics.as_declared(each, "/lab/made").same_as(one) for each, one in zip(read, sent, strict=True))
     assert message_fields(type(read[0])) == tuple(message_fields(kind))
     for each in message_fields(kind):
         column = next((name for name in (each.name, f"made_{each.name}") if name in table.column_names), None)
@@ -144,9 +144,9 @@ def sent_ticks(count: int = 60) -> Iterator[Tick]:
     rng, extra = np.random.default_rng(0), Extra()
     for number, tick in enumerate(ticks_of(count, shape=(8, 8))):
         if number % 9 == 4:
-            extra = extra.updated({PATH: Pressure(tick.stamp_ns, rng.random(), rng.random(number % 4))})
+            extra = extra.with_messages({PATH: Pressure(tick.stamp_ns, rng.random(), rng.random(number % 4))})
         if number % 4 == 1:
-            extra = extra.updated({"/lab/robot2": made_up(Track, tick.stamp_ns, number, rng)})
+            extra = extra.with_messages({"/lab/robot2": made_up(Track, tick.stamp_ns, number, rng)})
         yield replace(tick, extra=extra)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.archive.catalog.format import KEY, PLACE, RELATIONS, SIGNATURE, About, catalog_above, path_of
-from flowrec.core import UsageError, printable, shown
+from flowrec.core import UsageError, printable, text_of_figure
 from flowrec.store import UrlPath
 from flowrec.verbs import (
     AS_LIST,
@@ -171,4 +171,4 @@ def _cell(name: str, row: Mapping[str, Any]) -> str:
     if member:
         found = {key.lower(): each for key, each in (row.get(relation) or {}).items()}
         value = found.get(member)
-    return shown(member or name, text_of_list(map(str, value)) if isinstance(value, list) else value)
+    return text_of_figure(member or name, text_of_list(map(str, value)) if isinstance(value, list) else value)

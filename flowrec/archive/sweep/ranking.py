@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flowrec.archive.sweep.replay_process import Row
-from flowrec.core import UsageError, name_of, shown
+from flowrec.core import UsageError, name_of, text_of_figure
 
 # The figures by which settings are ranked, in order of preference; the smallest is the best.
 RANKED_BY = ("refined_flow_error", "residual_um_s", "travel_time_on_replayed_map_s")
@@ -113,11 +113,13 @@ class Ranking:
         return columns, [
             [
                 each.settings,
-                shown(self.figure, each.mean),
-                shown(self.figure, each.difference),
-                " to ".join(shown(self.figure, end) for end in each.interval) if each.interval is not None else "-",
+                text_of_figure(self.figure, each.mean),
+                text_of_figure(self.figure, each.difference),
+                " to ".join(text_of_figure(self.figure, end) for end in each.interval)
+                if each.interval is not None
+                else "-",
                 str(each.failed or "-"),
-                shown("cpu_s", each.cpu_s),
+                text_of_figure("cpu_s", each.cpu_s),
             ]
             for each in self.rows
         ]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from flowrec.archive.sweep.ranking import Ranking
 from flowrec.archive.sweep.replay_process import Row
 from flowrec.archive.sweep.results import read_rows
-from flowrec.core import Output, UsageError, name_of, say, shown
+from flowrec.core import Output, UsageError, name_of, say, text_of_figure
 from flowrec.verbs import HTML, require_packages
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def _figure(ranking: Ranking) -> Any:
         f"session: every session (small), mean and 95 % interval (large; Student's t). Right of the line is worse. "
         f"{ranking.sessions} sessions."
     )
-    alt = "; ".join(f"{each.settings}: {shown(ranking.figure, each.difference)} more" for each in shown_rows)
+    alt = "; ".join(f"{each.settings}: {text_of_figure(ranking.figure, each.difference)} more" for each in shown_rows)
     return Drawn(name, title, caption, alt, narrow, wide)
 
 
@@ -107,7 +107,7 @@ def _draw(ranking: Ranking, rows: Sequence[Any], width_mm: float) -> Any:
 
     percent = ranking.figure.endswith("_error")
     scale = 100.0 if percent else 1.0
-    unit = "%" if percent else shown(ranking.figure, 0.0).partition(" ")[2]
+    unit = "%" if percent else text_of_figure(ranking.figure, 0.0).partition(" ")[2]
     figure = style.new_figure(width_mm, _MARGIN_MM + _ROW_MM * len(rows))
     ax = figure.subplots()
     ax.axvline(0.0, color=style.QUIET, lw=0.6)

@@ -83,7 +83,7 @@ def remove_idle(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def held(path: Path) -> Iterator[None]:
+def hold_file(path: Path) -> Iterator[None]:
     """Keep every other process from writing, recovering or removing a file; a file that can not be opened is not held.
 
     Raises

@@ -17,7 +17,7 @@ from typing import Any
 from flowrec.core.errors import SessionError
 from flowrec.core.system.durable import sync_directory, sync_file
 from flowrec.core.system.leftovers import MARKER, OLD, remove_leftovers_once, temporary_name
-from flowrec.core.system.outputs import OutputError, taken
+from flowrec.core.system.outputs import OutputError, name_taken
 from flowrec.core.system.written import sha256_of
 
 _WRITTEN = "sha256"  # of the files of a folder, by name
@@ -139,11 +139,11 @@ class OutputFolder:
         if self.overwrite:
             return
         if any(marker.get(key) != value for key, value in self.facts.items()):
-            raise taken(path, ", an export of another session or format")
+            raise name_taken(path, ", an export of another session or format")
         if written is None:
-            raise taken(path, ", and does not say whether it was changed since")
+            raise name_taken(path, ", and does not say whether it was changed since")
         if changed := [name for name in sorted(found) if sha256_of(path / name) != written[name]]:
-            raise taken(path, f", and {changed[0]} was changed since flowrec wrote it")
+            raise name_taken(path, f", and {changed[0]} was changed since flowrec wrote it")
 
 
 def marker_of(folder: Path) -> dict[str, Any] | None:

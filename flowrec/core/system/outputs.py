@@ -106,7 +106,7 @@ class Output:
                 yield part
                 self._check_existing()  # again: somebody may have used the time
         except FileExistsError as error:
-            raise taken(path) from error
+            raise name_taken(path) from error
         except OSError as error:
             named = Path(str(error.filename)) if error.filename is not None else path
             if named != path and not named.name.startswith(PREFIX):
@@ -121,12 +121,12 @@ class Output:
         if self.overwrite or not os.path.lexists(path):
             return
         if not self.replaces:
-            raise taken(path)
+            raise name_taken(path)
         if path.is_symlink() or sha256_of(path) != self.replaces:
-            raise taken(path, ", and was changed since flowrec wrote it")
+            raise name_taken(path, ", and was changed since flowrec wrote it")
 
 
-def taken(path: Path, kept: str = "") -> OutputError:
+def name_taken(path: Path, kept: str = "") -> OutputError:
     """The error for a name that another file has."""
     return OutputError(f"{path}: exists already{kept}; choose another name, or replace it with --overwrite")
 

@@ -182,7 +182,7 @@ class Planner:
             able = " or ".join(f"'{other.name}'" for other in PLANNERS.values() if "cost" in other.options)
             raise UsageError(f"plan: {self.method} knows no energy; cost = 'energy' goes with method = {able}")
         check_ranges(self, "plan")
-        method: PlanningMethod = row.made(self)
+        method: PlanningMethod = row.build(self)
         return method
 
 

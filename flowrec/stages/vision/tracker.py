@@ -117,7 +117,7 @@ class Tracker:
         """The method of another package, if one is chosen."""
         if self.method is None or TRACKERS.own(self.method):
             return None
-        method: TrackingMethod = TRACKERS[self.method].made(self)
+        method: TrackingMethod = TRACKERS[self.method].build(self)
         return method
 
     def not_found_note(self, appearance: Appearance | None) -> str:
