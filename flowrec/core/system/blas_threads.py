@@ -7,14 +7,22 @@ on how many there are, and a session must replay identically on a machine with o
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
+
+
+@lru_cache(maxsize=1)
+def _blas(_modules: int) -> ThreadpoolController:
+    """The BLAS libraries of this process; imports load them, so they are searched anew where the modules are more."""
+    return ThreadpoolController().select(user_api="blas")
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """NumPy and SciPy compute with one thread in this block, or function that it decorates; then as before."""
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _blas(len(sys.modules)).limit(limits=1):
         yield
