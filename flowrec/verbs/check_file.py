@@ -31,8 +31,7 @@ from flowrec.store import (
     audit,
     is_left_out,
 )
-from flowrec.verbs.check_tally import GAP_PERIODS, Tally
-from flowrec.verbs.check_track import TrackTally
+from flowrec.verbs.check_tally import GAP_PERIODS, Tally, TrackTally
 from flowrec.verbs.verdict import CONSISTENT, DAMAGED, NO_DIGEST, UNFINISHED, CheckFinding, Verdict
 
 _LISTED = 4  # gaps, kinds of numbers and settings of a clock that are named one by one
