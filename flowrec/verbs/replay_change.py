@@ -54,7 +54,8 @@ class Change:
         if not given and not self.sets:
             return config
         methods = {key: row for key, (_, row) in given.items()}
-        changed = with_sets(config, methods | settings_of(self.sets), {key: flag for key, (flag, _) in given.items()})
+        assert isinstance(self.sets, Mapping)  # since it was made
+        changed = with_sets(config, {**methods, **self.sets}, {key: flag for key, (flag, _) in given.items()})
         mission = replace(changed.mission, replan_error_um=math.inf)
         if self.refine is not None and not {Phase.REFINE, Phase.OBSERVE} & set(mission.phases):
             phases = tuple(dict.fromkeys((*mission.phases, Phase.REFINE, Phase.PLAN)))
