@@ -29,7 +29,7 @@ PARTICIPLES = {
     "verbs/template/lab_plugin.py: discarded": "a camera of another package",
     "core/system/numba_setup.py: compiled": "a decorator",
 }
-FUNCTIONS_TO_SPLIT = {"verbs/mission_run.py: run_mission", "verbs/session_replay.py: replay_session"}
+FUNCTIONS_TO_SPLIT = {"verbs/mission_run.py: run_mission"}
 
 
 @cache

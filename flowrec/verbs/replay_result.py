@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from flowrec.core import ANSWERED_BY, BY_FIELD, WORKER_FIELDS, Coverage, FlowField, Mission, Tick, WorkOrder, printable
-from flowrec.run import CommandDifference, RunReport, work
+from flowrec.run import CommandDifference, RunControl, RunReport, work
 from flowrec.stages import Pipeline, ResolvedConfig
 from flowrec.store import Session, digest_faults
 from flowrec.verbs.comparison import Comparison
@@ -232,3 +232,26 @@ class Replayed:
             "digest_faults": None if self.digest is None else [] if self.digest[0] else self.digest[1],
             "lines": self.lines(),
         }
+
+
+def coverage_of(
+    session: Session, ticks: int, between_ns: tuple[int | None, int], from_s: float | None, control: RunControl
+) -> Coverage:
+    """Coverage of a replay: the ticks that it has looked at, of those with inputs that it was asked for."""
+    reader, (start_ns, end_ns) = session.reader, between_ns
+    total = reader.counts.get("applied", 0)
+    asked, left_out = total, {}
+    if start_ns is not None or end_ns < reader.last_ns:
+        asked = sum((start_ns or 0) <= stamp_ns <= end_ns for stamp_ns in reader.stamps("applied"))
+    part = ""
+    if from_s is not None:
+        part, left_out = f"from {from_s:g} s on", {f"{total - asked} ticks before {from_s:g} s": "not asked for"}
+    elif ticks < asked and not control.reason:
+        left_out = {f"{asked - ticks} ticks": "hold neither image nor track, so there is nothing to replay"}
+    covered = Coverage(ticks, asked, "ticks", part, left_out=left_out)
+    return with_stop(covered, control) if control.reason else covered
+
+
+def with_stop(covered: Coverage, control: RunControl) -> Coverage:
+    """The coverage, with the stop that ended it."""
+    return replace(covered, stopped=control.reason.removeprefix("stopped by "), status=control.stop_status)

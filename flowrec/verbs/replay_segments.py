@@ -21,8 +21,8 @@ from flowrec.stages import other_packages
 from flowrec.store import Session
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.interactive import Unattended
-from flowrec.verbs.replay_result import Replayed, WorkerResults, digest_lines
-from flowrec.verbs.session_replay import coverage_of, replay_session
+from flowrec.verbs.replay_result import Replayed, WorkerResults, coverage_of, digest_lines
+from flowrec.verbs.session_replay import replay_session
 
 _TICKS = 300  # of a segment at least: restoring its start takes as long as a few of them
 _PER_JOB = 4  # segments, because those with work orders take longer

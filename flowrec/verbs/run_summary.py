@@ -9,6 +9,7 @@ from pathlib import Path
 from flowrec.core import DOUBTS, Coverage, Figures, FlowField, Outcome, doubts_of, rows_for_people, say, table, warn
 from flowrec.physics import Chip
 from flowrec.run import RunReport
+from flowrec.stages import MotionOfRun, Pipeline, TrackQuality
 from flowrec.stages import figures_of as figures_of_ticks
 from flowrec.store import is_snapshot
 
@@ -65,6 +66,11 @@ class Recorded:
     def doubts(self) -> list[str]:
         """Reasons to doubt the result; none if there is no reason."""
         return doubts_of(self.facts)
+
+
+def judges_of(pipeline: Pipeline) -> tuple[TrackQuality, MotionOfRun]:
+    """Sinks of the ticks of a run, whose `doubts` are then the reasons to doubt its track and its axes."""
+    return TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot), MotionOfRun(pipeline.robot)
 
 
 def figures_of(chip: Chip, report: RunReport, true_field: FlowField | None) -> Figures:

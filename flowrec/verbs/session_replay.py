@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +19,6 @@ from flowrec.core import (
     NUMERICS_VERSION,
     WORKER_FIELDS,
     Applied,
-    Coverage,
     Mission,
     Observations,
     Outcome,
@@ -36,14 +35,12 @@ from flowrec.core import (
     seconds,
     warn,
 )
-from flowrec.run import CommandDifference, RecordedRig, ReplayWorker, RunControl, Sink, run, work
+from flowrec.run import CommandDifference, RecordedRig, ReplayWorker, Sink, run, work
 from flowrec.stages import (
     OBSERVERS,
     SAMPLERS,
-    MotionOfRun,
     Pipeline,
     ResolvedConfig,
-    TrackQuality,
     assemble,
     facts_of,
     observe,
@@ -63,8 +60,8 @@ from flowrec.store import (
 from flowrec.verbs.comparison import Comparison, Side
 from flowrec.verbs.interactive import Unattended
 from flowrec.verbs.replay_change import Change
-from flowrec.verbs.replay_result import Replayed, WorkerCheck, WorkerResults, digest_lines
-from flowrec.verbs.run_summary import figures_of
+from flowrec.verbs.replay_result import Replayed, WorkerCheck, WorkerResults, coverage_of, digest_lines, with_stop
+from flowrec.verbs.run_summary import figures_of, judges_of
 
 
 def replay_session(
@@ -103,136 +100,190 @@ def replay_session(
         source = session.path if isinstance(session, Session) else session_path(session)
         output = Output(Path(out), MCAP, tuple(files_behind(source)), overwrite)
         output.check()
-    session, change = Session.of(session), change or Change()
-    control = control or Unattended()
-    config = change.apply(session.config)
-    stale = change.stale_results(session.config, config)
-    if verify and (stale or config != session.config):
-        raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
-    packages = other_packages(config, session.provenance)
-    config = _with_recorded_region(session, config)
-    pipeline = assemble(config, session.chip)
-    if "recording" in SAMPLERS[config.sampler.method].needs:
-        pipeline = replace(pipeline, hindsight=hindsight(session, pipeline))
-    path, reader = session.path, session.reader
-    pipeline = replace(pipeline, topics=reader.topics.with_types_of(pipeline.topics))
-    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
-    end_ns = reader.last_ns
-    if segment_ns is not None:
-        start_ns, end_ns = segment_ns
-    if reader.keyframe_ns is not None:
-        # A part of a run begins with a keyframe, whose inputs the part before holds.
-        start_ns = max(start_ns or 0, reader.keyframe_ns + 1)
-    recorded_start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
-    start = pipeline.topics.typed_tick(recorded_start)
-    rig = RecordedRig(reader, start_ns, stale, end_ns, pipeline.topics)
-    progress = Progress()  # until the bar is shown
-    # Recorded results stand where today's code computes the same of the same. Hindsight is no message of a tick.
-    stands = session.numerics == str(NUMERICS_VERSION) and pipeline.hindsight is None
-    worker = ReplayWorker(
-        pipeline,
-        config.worker.adopt_after_s,
-        adoption_stamps(reader),
-        stale,
-        lambda what: progress.stage(what),
-        lambda: rig.recorded,
-        change.same_orders(session.config, config) if stands else (),
-    )
-    order = _order_under_way(reader, start)
-    if order is not None:
-        worker.submit(order)
-    sides = Side.of("recorded", session), Side.of_replay(pipeline.topics)
-    results = WorkerResults(Comparison(sides=sides))
-    check = WorkerCheck(pipeline, start, order, results) if verify else None
-    comparison, commands = Comparison(sides=sides), CommandDifference()
-    comparison.begin_after(recorded_start, start)
-    first_ns = start_ns if start_ns is not None else reader.first_ns
-
-    def on_tick(tick: Tick) -> None:
-        if check is not None:  # it takes as long as the mission's slow stages did
-            control.run_control.unless_stopped(partial(check.add, tick), None)
-            if control.run_control.reason:
-                return  # perhaps not all of this tick was looked at, so it does not count
-        comparison.add(rig.recorded, tick)
-        commands.add(rig.recorded.demand, tick.demand)
-        progress(seconds(tick.stamp_ns - first_ns))
-
+    replay = _Replay(Session.of(session), change or Change(), from_s, segment_ns, verify, control or Unattended())
     with ExitStack() as stack:
-        stack.enter_context(input_blamed(session, config, "replayed"))
-        sinks: list[Sink] = []
-        writer, doubts = None, list[str]()
+        stack.enter_context(input_blamed(replay.session, replay.config, "replayed"))
+        writer, judges, sinks = None, judges_of(replay.pipeline), list[Sink]()
         if out is not None:
-            writer = stack.enter_context(
-                session_writer(
-                    output,
-                    config,
-                    session.chip,
-                    parent=path,
-                    facts=facts_of(config, session.provenance),
-                    topics=pipeline.topics,
-                )
-            )
-            quality = TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot)
-            motion = MotionOfRun(pipeline.robot)
-            sinks += [writer if frames else WithoutFrames(writer), quality, motion]
-        length_s = max(seconds(end_ns - first_ns), 1e-3)
-        progress = stack.enter_context(control.progress(f"replaying {path.name}", length_s))
-        with control.end_on_signals():
-            report = run(
-                pipeline, rig, worker, sinks, start=start, control=control.run_control, on_tick=on_tick, live=False
-            )
-        if report.ticks == 0 and not control.run_control.reason:
-            raise SessionError(f"{path}: holds no tick to replay after {from_s or 0:g} s; see flowrec info {path}")
-        last = report.last
-        if stale:
-            progress.stage("work that was under way")
-            with control.end_on_signals():
-                closing = partial(_closing_work, pipeline, config, last, rig.recorded, stale)
-                last = control.run_control.unless_stopped(closing, last)
-            if last is not report.last and sinks:
-                sinks[0].write(last)
-        covered = coverage_of(session, comparison.ticks, (start_ns, end_ns), from_s, control.run_control)
+            writer = stack.enter_context(replay.writer_to(output))
+            sinks += [writer if frames else WithoutFrames(writer), *judges]
+        replay.show_progress(stack)
+        result = replay.run(sinks)
         if writer is not None:
-            ended = Outcome.STOPPED if covered.stopped else Outcome.REPLAYED
-            note = f"replay of {path.name}" + (f", {covered.text}" if covered.stopped else "")
-            figures = figures_of(session.chip, replace(report, last=last), rig.recorded.true_field)
-            refined = report.last.refined
-            scale = scale_doubt(refined, config.camera.um_per_px) if refined is not None else ""
-            doubts = [*quality.doubts(), *motion.doubts(), *([scale] if scale else [])]
-            stated = {DOUBTS: doubts_text(doubts)} if doubts else {}
-            writer.close(as_text(figures | {"outcome": ended, "note": note, "covered": covered.amount} | stated))
-    result = Replayed(session, config, report, rig.recorded, last, comparison, commands, rig.frames_missing, covered)
-    result.doubts, result.packages = doubts, packages
-    if verify:
-        result.worker = results
-        if segment_ns is None:
-            with control.end_on_signals():
-                result.digest = control.run_control.unless_stopped(partial(digest_lines, path), None)
-            if control.run_control.reason:
-                result.covered = _with_stop(covered, control.run_control)
+            result.doubts = [doubt for judge in judges for doubt in judge.doubts()] + _scale_doubts(result)
+            _close(writer, result)
+    if verify and segment_ns is None:
+        replay.read_digest(result)
     return result
 
 
-def coverage_of(
-    session: Session, ticks: int, between_ns: tuple[int | None, int], from_s: float | None, control: RunControl
-) -> Coverage:
-    """Coverage of a replay: the ticks that it has looked at, of those with inputs that it was asked for."""
-    reader, (start_ns, end_ns) = session.reader, between_ns
-    total = reader.counts.get("applied", 0)
-    asked, left_out = total, {}
-    if start_ns is not None or end_ns < reader.last_ns:
-        asked = sum((start_ns or 0) <= stamp_ns <= end_ns for stamp_ns in reader.stamps("applied"))
-    part = ""
-    if from_s is not None:
-        part, left_out = f"from {from_s:g} s on", {f"{total - asked} ticks before {from_s:g} s": "not asked for"}
-    elif ticks < asked and not control.reason:
-        left_out = {f"{asked - ticks} ticks": "hold neither image nor track, so there is nothing to replay"}
-    covered = Coverage(ticks, asked, "ticks", part, left_out=left_out)
-    return _with_stop(covered, control) if control.reason else covered
+class _Replay:
+    """A replay of a session: today's stages on the recorded inputs, compared with what was recorded."""
+
+    def __init__(
+        self,
+        session: Session,
+        change: Change,
+        from_s: float | None,
+        segment_ns: tuple[int | None, int] | None,
+        verify: bool,
+        control: Unattended,
+    ) -> None:
+        """Refuse a change that is not possible, then prepare; nothing runs yet."""
+        self.session, self.control, self._from_s = session, control, from_s
+        config = change.apply(session.config)
+        self._stale = change.stale_results(session.config, config)
+        if verify and (self._stale or config != session.config):
+            raise UsageError("--verify compares with what was recorded: it goes without --refine, --plan, --set ...")
+        self._packages = other_packages(config, session.provenance)
+        self.config = _with_recorded_region(session, config)
+        self.pipeline = _pipeline_of(session, self.config)
+        self._between_ns = start_ns, end_ns = _between_ns(session, from_s, segment_ns)
+        reader, topics = session.reader, self.pipeline.topics
+        self._first_ns = start_ns if start_ns is not None else reader.first_ns
+        recorded_start = reader.tick_before(start_ns - 1) if start_ns is not None else Tick()
+        self._start = topics.typed_tick(recorded_start)
+        self._rig = RecordedRig(reader, start_ns, self._stale, end_ns, topics)
+        self._progress = Progress()  # until the bar is shown
+        self._worker = self._worker_with(change)
+        order = _order_under_way(reader, self._start)
+        if order is not None:
+            self._worker.submit(order)
+        sides = Side.of("recorded", session), Side.of_replay(topics)
+        results = WorkerResults(Comparison(sides=sides))
+        self._check = WorkerCheck(self.pipeline, self._start, order, results) if verify else None
+        self._comparison, self._commands = Comparison(sides=sides), CommandDifference()
+        self._comparison.begin_after(recorded_start, self._start)
+
+    def _worker_with(self, change: Change) -> ReplayWorker:
+        """A worker that takes over recorded results where today's code computes the same of the same."""
+        recorded = self.session.config
+        # Hindsight is no message of a tick.
+        stands = self.session.numerics == str(NUMERICS_VERSION) and self.pipeline.hindsight is None
+        return ReplayWorker(
+            self.pipeline,
+            self.config.worker.adopt_after_s,
+            adoption_stamps(self.session.reader),
+            self._stale,
+            lambda what: self._progress.stage(what),
+            lambda: self._rig.recorded,
+            change.same_orders(recorded, self.config) if stands else (),
+        )
+
+    def writer_to(self, output: Output) -> AbstractContextManager[SessionWriter]:
+        """Context of the session file of the replay."""
+        return session_writer(
+            output,
+            self.config,
+            self.session.chip,
+            parent=self.session.path,
+            facts=facts_of(self.config, self.session.provenance),
+            topics=self.pipeline.topics,
+        )
+
+    def show_progress(self, stack: ExitStack) -> None:
+        """Show the bar until the stack is left."""
+        length_s = max(seconds(self._between_ns[1] - self._first_ns), 1e-3)
+        self._progress = stack.enter_context(self.control.progress(f"replaying {self.session.path.name}", length_s))
+
+    def run(self, sinks: list[Sink]) -> Replayed:
+        """Replay all ticks; the first of the sinks also takes results that the recording ended too early for."""
+        control = self.control.run_control
+        with self.control.end_on_signals():
+            report = run(
+                self.pipeline,
+                self._rig,
+                self._worker,
+                sinks,
+                start=self._start,
+                control=control,
+                on_tick=self._compare,
+                live=False,
+            )
+        path, last, recorded = self.session.path, report.last, self._rig.recorded
+        if report.ticks == 0 and not control.reason:
+            raise SessionError(
+                f"{path}: holds no tick to replay after {self._from_s or 0:g} s; see flowrec info {path}"
+            )
+        if self._stale:
+            self._progress.stage("work that was under way")
+            with self.control.end_on_signals():
+                closing = partial(_closing_work, self.pipeline, self.config, last, recorded, self._stale)
+                last = control.unless_stopped(closing, last)
+            if last is not report.last and sinks:
+                sinks[0].write(last)
+        return Replayed(
+            self.session,
+            self.config,
+            report,
+            recorded,
+            last,
+            self._comparison,
+            self._commands,
+            self._rig.frames_missing,
+            coverage_of(self.session, self._comparison.ticks, self._between_ns, self._from_s, control),
+            self._check.results if self._check is not None else None,
+            packages=self._packages,
+        )
+
+    def _compare(self, tick: Tick) -> None:
+        """Take a tick of the replay."""
+        control, recorded = self.control.run_control, self._rig.recorded
+        if self._check is not None:  # it takes as long as the mission's slow stages did
+            control.unless_stopped(partial(self._check.add, tick), None)
+            if control.reason:
+                return  # perhaps not all of this tick was looked at, so it does not count
+        self._comparison.add(recorded, tick)
+        self._commands.add(recorded.demand, tick.demand)
+        self._progress(seconds(tick.stamp_ns - self._first_ns))
+
+    def read_digest(self, result: Replayed) -> None:
+        """Compare the files of the session with their digests."""
+        control = self.control.run_control
+        with self.control.end_on_signals():
+            result.digest = control.unless_stopped(partial(digest_lines, self.session.path), None)
+        if control.reason:
+            result.covered = with_stop(result.covered, control)
 
 
-def _with_stop(covered: Coverage, control: RunControl) -> Coverage:
-    return replace(covered, stopped=control.reason.removeprefix("stopped by "), status=control.stop_status)
+def _pipeline_of(session: Session, config: ResolvedConfig) -> Pipeline:
+    """The stages of a replay, with the message types of the recording."""
+    pipeline = assemble(config, session.chip)
+    if "recording" in SAMPLERS[config.sampler.method].needs:
+        pipeline = replace(pipeline, hindsight=hindsight(session, pipeline))
+    return replace(pipeline, topics=session.reader.topics.with_types_of(pipeline.topics))
+
+
+def _between_ns(
+    session: Session, from_s: float | None, segment_ns: tuple[int | None, int] | None
+) -> tuple[int | None, int]:
+    """Stamps of the first and the last tick to replay; None for the beginning."""
+    start_ns = session.stamp_ns(from_s, "--from") if from_s is not None else None
+    end_ns = session.reader.last_ns
+    if segment_ns is not None:
+        start_ns, end_ns = segment_ns
+    keyframe_ns = session.reader.keyframe_ns
+    if keyframe_ns is not None:
+        # A part of a run begins with a keyframe, whose inputs the part before holds.
+        start_ns = max(start_ns or 0, keyframe_ns + 1)
+    return start_ns, end_ns
+
+
+def _scale_doubts(result: Replayed) -> list[str]:
+    refined = result.report.last.refined
+    scale = scale_doubt(refined, result.config.camera.um_per_px) if refined is not None else ""
+    return [scale] if scale else []
+
+
+def _close(writer: SessionWriter, result: Replayed) -> None:
+    """Close the file of a replay with its figures, its doubts and how it ended."""
+    covered = result.covered
+    ended = Outcome.STOPPED if covered.stopped else Outcome.REPLAYED
+    note = f"replay of {result.session.path.name}" + (f", {covered.text}" if covered.stopped else "")
+    ran = replace(result.report, last=result.replayed)
+    figures = figures_of(result.session.chip, ran, result.recorded.true_field)
+    stated = {DOUBTS: doubts_text(result.doubts)} if result.doubts else {}
+    writer.close(as_text(figures | {"outcome": ended, "note": note, "covered": covered.amount} | stated))
 
 
 def _with_recorded_region(session: Session, config: ResolvedConfig) -> ResolvedConfig:
