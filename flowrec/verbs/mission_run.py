@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from flowrec.console import RunEnded, refuse_without_packages
 from flowrec.core import (
@@ -18,6 +15,7 @@ from flowrec.core import (
     RRD,
     ClockMonitor,
     Coverage,
+    Figures,
     FlowField,
     Outcome,
     Output,
@@ -31,7 +29,6 @@ from flowrec.core import (
     say,
     warn,
 )
-from flowrec.physics import Chip
 from flowrec.rigs import Connecting, MovieRig, Picturing, Rig
 from flowrec.run import (
     DiskMonitor,
@@ -39,67 +36,37 @@ from flowrec.run import (
     Preloaded,
     ProcessWorker,
     RunControl,
+    RunReport,
     Sink,
     Streams,
     Watchdog,
     Worker,
-    refuse_below,
     run,
 )
 from flowrec.stages import (
     MOVIE,
     RIGS,
     Config,
-    MotionOfRun,
     ResolvedConfig,
     RunStatistics,
-    TrackQuality,
     extra_rows,
     scale_doubt,
 )
-from flowrec.store import Session, SessionWriter, files_behind, run_files, run_path, runs_in, session_writer
+from flowrec.store import SessionWriter, session_writer
 from flowrec.verbs.admission import admit
-from flowrec.verbs.auto_recovery import recover_leftovers
 from flowrec.verbs.axes import checked_image
 from flowrec.verbs.interactive import Unattended
+from flowrec.verbs.mission_files import field_of_session, files_of, place_of_session
 from flowrec.verbs.preparation import Prepared, prepare
 from flowrec.verbs.rehearsal import rehearse_aloud
-from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text
+from flowrec.verbs.run_summary import GOOD_ENDS, Recorded, figures_of, files_text, judges_of
 from flowrec.verbs.watching import Watching
-
-if TYPE_CHECKING:
-    pass
 
 # Parts of the 2 s that a run may take to end; the rest is for the coils (run/control.py) and for Python itself.
 CLOSE_TIMEOUT_S = 0.5  # for images that are still queued
 VIEW_TIMEOUT_S = 0.2  # for a viewer to show the last messages
 _GIVE_UP_TIMEOUT_S = 1.0  # to close the file while the main thread hangs
 _LEAST_FRAMES = 3.0  # of the camera within the watchdog's timeout
-
-
-def default_path(config: Config, folder: Path | None = None) -> Path:
-    """The path date_operator_sample_number.mcap with the first free number."""
-    sample = config.recording.sample or Path(config.chip.path).stem or config.chip.name
-    words = [datetime.now().astimezone().strftime("%Y-%m-%d"), config.recording.operator, sample]
-    stem = "_".join(word.replace(" ", "-") for word in words if word)
-    folder = folder or Path()
-    names = runs_in(folder)
-    for number in range(1, 10_000):
-        path = folder / f"{stem}_{number:03d}.mcap"
-        if path not in names:
-            return path
-    raise SessionError(f"{folder}: 9999 sessions named {stem} are here; name one with --out")
-
-
-def field_of_session(path: Path, chip: Chip) -> dict[str, FlowField]:
-    """Assumed and refined flow at the end of an earlier session, on the same chip."""
-    fields = {name: field for name, field in Session(path).fields.items() if name != "true"}
-    if "assumed" not in fields:
-        raise UsageError(f"start.field = {path}: that session holds no flow field; survey and refine first")
-    shape = fields["assumed"].velocity_um_s.shape[:2]
-    if shape != chip.mask.shape or not math.isclose(fields["assumed"].um_per_px, chip.um_per_px):
-        raise UsageError(f"start.field = {path}: its field is for another chip ({shape[1]} x {shape[0]} pixels)")
-    return fields
 
 
 def run_mission(
@@ -139,82 +106,136 @@ def run_mission(
     """
     if console:
         refuse_without_packages()
-    inputs = (*inputs, *_files_of(config))
+    inputs = (*inputs, *files_of(config))
     if out is not None:  # before anything else: to solve the flow takes a while
         Output(out, MCAP, inputs, overwrite).check()
-    resolved, chip, pipeline, made, found, _, walls = prepare(config, known=known)
-    source = {**found, **(given_facts or {})}
+    prepared = prepare(config, known=known)
+    resolved = prepared.config
     realtime = realtime or "realtime" in RIGS[resolved.rig].needs
     timeout_s = _guard_timeout_s(resolved) if realtime and resolved.rig != MOVIE else None
-    path = _place(resolved, out, overwrite)
-    output = Output(path, MCAP, inputs, overwrite)
+    output = Output(place_of_session(resolved, out, overwrite), MCAP, inputs, overwrite)
     if view == "rrd":
-        Output(path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
-    fields = field_of_session(Path(resolved.start.field), chip) if resolved.start.field else {}
-    rig: Rig = RIGS[resolved.rig].load().of(pipeline, resolved, resolved.duration_s, realtime)
-    if isinstance(rig, Connecting):
-        rig.tell = warn
-    folder, floor_gb = path.resolve().parent, resolved.recording.disk_floor_gb
-    control = control if control is not None else Unattended()
-    run_control = control.run_control
-    watchdog = Watchdog(rig, timeout_s, partial(run_control.stop, zero=True), warn)
-    statistics = RunStatistics()
-    clocks = ClockMonitor()
-    streams = Streams(extra_rows(resolved), warn) if resolved.topics else None
-    low: list[str] = []
-    opened: list[SessionWriter] = []
-
-    def disk_low(reason: str) -> None:
-        low.append(reason)
-        run_control.stop(reason)
-
+        Output(output.path.with_suffix(RRD[0]), RRD, inputs, overwrite).check()
+    source = {**prepared.facts, **(given_facts or {})}
+    mission = _Mission(prepared, output, source, realtime, timeout_s, control or Unattended())
     with ExitStack() as stack:
         # From the first byte of the file to the last, every way to end the run leaves a complete file.
-        stack.enter_context(control.end_on_signals(watchdog, lambda: _close_in_thread(opened, run_control.reason)))
+        mission.connect(stack)
+        mission.open_file(stack, keep_failed)
+        watching = stack.enter_context(mission.watching(view, console))
+        report = mission.fly(watching.sinks)
+        facts = mission.figures(report, given_doubts)
+        ended = mission.close_file(report, facts)
+        watching.close(ended, VIEW_TIMEOUT_S if mission.run_control.reason else None)
+    recorded = mission.result(report, facts)
+    if view == "rrd":
+        _export_rrd(recorded, mission.run_control, overwrite)
+    return recorded
+
+
+class _Mission:
+    """One run: its rig, its worker and its file. The methods are called once each, in the order that they stand in."""
+
+    _worker: Worker
+    _writer: SessionWriter
+    _disk: DiskMonitor
+
+    def __init__(
+        self,
+        prepared: Prepared,
+        output: Output,
+        source: dict[str, str],
+        realtime: bool,
+        timeout_s: float | None,
+        control: Unattended,
+    ) -> None:
+        """Make the rig, which is not connected yet.
+
+        Parameters
+        ----------
+        source : facts for the head of the file.
+        timeout_s : of the watchdog; None: it has no timer.
+        """
+        config, pipeline = prepared.config, prepared.pipeline
+        self._prepared, self._config, self._chip, self._pipeline = prepared, config, prepared.chip, pipeline
+        self._output, self._folder = output, output.path.resolve().parent
+        self._source, self._realtime, self._control = source, realtime, control
+        self.run_control = control.run_control
+        self._fields = field_of_session(Path(config.start.field), self._chip) if config.start.field else {}
+        self._rig: Rig = RIGS[config.rig].load().of(pipeline, config, config.duration_s, realtime)
+        if isinstance(self._rig, Connecting):
+            self._rig.tell = warn
+        self._watchdog = Watchdog(self._rig, timeout_s, partial(self.run_control.stop, zero=True), warn)
+        self._statistics, self._clocks, self._judges = RunStatistics(), ClockMonitor(), judges_of(pipeline)
+        self._streams = Streams(extra_rows(config), warn) if config.topics else None
+        self._opened: list[SessionWriter] = []  # the writer, once there is one: the thread of the signals looks here
+        self._lost = ""  # why the disk monitor has ended the run
+        self._priorities: dict[str, str] = {}
+        self._covered: Coverage | None = None
+
+    def connect(self, stack: ExitStack) -> None:
+        """Take the signals, connect the rig and start the worker; refuse what then shows, before there is a file."""
+        config, chip, rig = self._config, self._chip, self._rig
+        stack.enter_context(
+            self._control.end_on_signals(
+                self._watchdog, lambda: _close_in_thread(self._opened, self.run_control.reason)
+            )
+        )
         if isinstance(rig, Connecting):
-            stack.enter_context(rig.connected())  # before there is a file
-        if isinstance(rig, Picturing) and resolved.mission.check_axes:
-            verdict = checked_image(rig.picture(), resolved, chip, "camera")
-            source |= {"source_axes": verdict.text} if verdict is not None else {}
-        tried = realtime and resolved.recording.admission_s > 0.0
+            stack.enter_context(rig.connected())
+        if isinstance(rig, Picturing) and config.mission.check_axes:
+            verdict = checked_image(rig.picture(), config, chip, "camera")
+            self._source |= {"source_axes": verdict.text} if verdict is not None else {}
+        tried = self._realtime and config.recording.admission_s > 0.0
         if tried:
-            rehearse_aloud(resolved, control)
-        worker: Worker
-        worker = ProcessWorker(pipeline) if realtime else LockstepWorker(pipeline, resolved.worker.adopt_after_s)
+            rehearse_aloud(config, self._control)
+        adopt_after_s, pipeline = config.worker.adopt_after_s, self._pipeline
+        worker: Worker = ProcessWorker(pipeline) if self._realtime else LockstepWorker(pipeline, adopt_after_s)
         stack.callback(worker.close)
         if tried:
-            source |= admit(rig, worker, (resolved, chip, pipeline), fields, folder, run_control)
-        writer = stack.enter_context(
+            scene = config, chip, pipeline
+            self._source |= admit(rig, worker, scene, self._fields, self._folder, self.run_control)
+        self._worker = Preloaded(worker, self._fields) if self._fields else worker
+
+    def open_file(self, stack: ExitStack, keep_failed: bool) -> None:
+        """Open the file, and watch the disk that it is on."""
+        self._writer = writer = stack.enter_context(
             session_writer(
-                output,
-                resolved,
-                chip,
-                live=realtime,
+                self._output,
+                self._config,
+                self._chip,
+                live=self._realtime,
                 in_pieces=True,
-                derived=made,
-                facts=source,
+                derived=self._prepared.derived,
+                facts=self._source,
                 keep_failed=keep_failed,
             )
         )
-        opened.append(writer)
-        quality = TrackQuality(pipeline.calibration, pipeline.image_shape, pipeline.robot)
-        motion = MotionOfRun(pipeline.robot)
-        sinks: list[Sink] = [writer, statistics, quality, motion]
-        if fields:
-            worker = Preloaded(worker, fields)
-        disk = stack.enter_context(DiskMonitor(folder, lambda: writer.bytes_written, floor_gb, disk_low).running())
-        watching = stack.enter_context(
-            Watching(
-                view,
-                (resolved, chip, pipeline, path),
-                run_control if console else None,
-                lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": resolved.duration_s},
-            )
+        self._opened.append(writer)
+        floor_gb = self._config.recording.disk_floor_gb
+        disk = DiskMonitor(self._folder, lambda: writer.bytes_written, floor_gb, self._end_for_disk)
+        self._disk = stack.enter_context(disk.running())
+
+    def _end_for_disk(self, reason: str) -> None:
+        self._lost = self._lost or reason
+        self.run_control.stop(reason)
+
+    def watching(self, view: View, console: bool) -> Watching:
+        """Displays of the run."""
+        disk, writer, duration_s = self._disk, self._writer, self._config.duration_s
+        return Watching(
+            view,
+            (self._config, self._chip, self._pipeline, self._output.path),
+            self.run_control if console else None,
+            lambda: {"disk": disk.text, "file_mb": writer.bytes_written / 1e6, "duration_s": duration_s},
         )
-        sinks += watching.sinks
+
+    def fly(self, displays: Sequence[Sink]) -> RunReport:
+        """Run the loop until the mission ends."""
+        writer = self._writer
         # A run that is not in real time never waits: with real-time priority it would occupy a core.
-        priority = realtime_priority() if realtime else nullcontext(enter_result=False)
-        with control.show_run(writer, disk) as show, priority as first:
+        priority = realtime_priority() if self._realtime else nullcontext(enter_result=False)
+        with self._control.show_run(writer, self._disk) as show, priority as first:
             writes_first = first and writer.prioritise()
 
             def on_tick(tick: Tick) -> None:
@@ -222,54 +243,62 @@ def run_mission(
                 _report_remarks(writer)
 
             report = run(
-                pipeline,
-                rig,
-                worker,
-                sinks,
-                control=run_control,
+                self._pipeline,
+                self._rig,
+                self._worker,
+                [writer, self._statistics, *self._judges, *displays],
+                control=self.run_control,
                 on_tick=on_tick,
                 queue_state=lambda: (writer.queue_bytes / 1e6, writer.dropped_frames),
-                clocks=clocks,
-                watchdog=watchdog,
-                paced=realtime,
-                streams=streams,
+                clocks=self._clocks,
+                watchdog=self._watchdog,
+                paced=self._realtime,
+                streams=self._streams,
             )
-        facts = figures_of(chip, report, statistics.true_field)
+        if self._realtime:
+            granted = {"loop_priority": first, "writer_priority": writes_first}
+            self._priorities = {name: "real time" if each else "ordinary" for name, each in granted.items()}
+        return report
+
+    def figures(self, report: RunReport, given_doubts: Sequence[str]) -> Figures:
+        """Figures of the run, with the reasons to doubt it."""
+        config, rig, walls = self._config, self._rig, self._prepared.walls
+        facts = figures_of(self._chip, report, self._statistics.true_field)
         # Without navigation, and for a control law that descends the time to go, there is no reference.
-        if not (resolved.mission.observes or resolved.control.needs):
-            facts["tracking_error_um"] = statistics.tracking_error_um
-        if control.note:
-            facts["note_not_finished"] = control.note
+        if not (config.mission.observes or config.control.needs):
+            facts["tracking_error_um"] = self._statistics.tracking_error_um
+        if self._control.note:
+            facts["note_not_finished"] = self._control.note
         doubted = [walls.text] if walls is not None and walls.other_scale else []
-        refinement_facts, refinement_doubts = _judge_refinement(
-            report.last.refined, resolved, known_doubts=bool(doubted)
-        )
+        refinement_facts, refinement_doubts = _judge_refinement(report.last.refined, config, known_doubts=bool(doubted))
         facts |= refinement_facts
         doubted += refinement_doubts
-        if isinstance(rig, MovieRig) and rig.noticed:
-            facts["note_movie"] = "; ".join(rig.noticed)
-        covered = _coverage_of_movie(rig, run_control) if isinstance(rig, MovieRig) else None
-        if covered is not None:
-            facts["covered"] = covered.amount
-        if doubts := doubts_text([*given_doubts, *doubted, *quality.doubts(), *motion.doubts()]):
+        if isinstance(rig, MovieRig):
+            if rig.noticed:
+                facts["note_movie"] = "; ".join(rig.noticed)
+            self._covered = _coverage_of_movie(rig, self.run_control)
+            facts["covered"] = self._covered.amount
+        doubted += [doubt for judge in self._judges for doubt in judge.doubts()]
+        if doubts := doubts_text([*given_doubts, *doubted]):
             facts[DOUBTS] = doubts
-        outcome = as_text(facts) | clocks.outcome()
-        if realtime:
-            outcome["loop_priority"] = "real time" if first else "ordinary"
-            outcome["writer_priority"] = "real time" if writes_first else "ordinary"
+        return facts
+
+    def close_file(self, report: RunReport, facts: Figures) -> RunEnded:
+        """Close the file with its outcome; soon, if the run was stopped."""
+        writer = self._writer
+        outcome = as_text(facts) | self._clocks.outcome() | self._priorities
         bad = "" if report.outcome in GOOD_ENDS else f"the run ended {report.outcome}: {report.note}".rstrip(": ")
-        writer.close(outcome, CLOSE_TIMEOUT_S if run_control.reason else None, why=bad)
+        writer.close(outcome, CLOSE_TIMEOUT_S if self.run_control.reason else None, why=bad)
         _report_remarks(writer)
         told = report.outcome + (f" ({report.note})" if report.note else "")
-        ended = RunEnded(told, files_text(path, tuple(writer.files)), good=not bad)
-        watching.close(ended, VIEW_TIMEOUT_S if run_control.reason else None)
-    facts["frames_dropped"] = writer.dropped_frames  # the writer has added it to the outcome of the file
-    files = tuple(writer.files)
-    ended_early, stopped_by = (low[0] if low else ""), bool(run_control.reason)
-    recorded = Recorded(path, report, facts, files, made, ended_early, stopped_by, source, covered)
-    if view == "rrd":
-        _export_rrd(recorded, run_control, overwrite)
-    return recorded
+        return RunEnded(told, files_text(self._output.path, tuple(writer.files)), good=not bad)
+
+    def result(self, report: RunReport, facts: Figures) -> Recorded:
+        """The result, after all is closed."""
+        facts["frames_dropped"] = self._writer.dropped_frames  # the writer has added it to the outcome of the file
+        path, files, made = self._output.path, tuple(self._writer.files), self._prepared.derived
+        stopped = bool(self.run_control.reason)
+        return Recorded(path, report, facts, files, made, self._lost, stopped, self._source, self._covered)
 
 
 def _judge_refinement(
@@ -341,36 +370,6 @@ def _close_in_thread(opened: list[SessionWriter], reason: str) -> str:
     return f"the file is whole: {files_text(writer.path, tuple(writer.files))}"
 
 
-def _files_of(config: Config) -> list[Path]:
-    """The files that a configuration names, and those that are read with them."""
-    files: list[Path] = []
-    chip = Path(config.chip.path)
-    if chip.name:
-        files += [chip, chip.with_suffix(".png"), chip.with_suffix(".toml")]
-    if config.start.field:
-        files += files_behind(Path(config.start.field))
-    movie = config.movie
-    return [*files, *(Path(name) for name in (movie.path, movie.times, movie.coils) if name)]
-
-
 def _report_remarks(writer: SessionWriter) -> None:
     while writer.remarks:
         say(writer.remarks.popleft())
-
-
-def _place(config: Config, out: Path | None, overwrite: bool) -> Path:
-    """The path of the session, after unfinished sessions in its folder are recovered and the free space is checked."""
-    folder = out.parent if out is not None else Path()
-    made: dict[Path, str] = {}
-    if config.recording.recover_leftovers:
-        excluded = frozenset(run_files(out.resolve())) if out is not None and overwrite else frozenset()
-        made = recover_leftovers(folder, excluded)
-    path = out if out is not None else default_path(config)
-    same = next((file for file in made if run_path(file) == path), None)
-    if same is not None and not overwrite:
-        raise SessionError(
-            f"{same}: was left by a run that did not finish and has just been recovered ({made[same]}); "
-            "choose another name for this run with --out"
-        )
-    refuse_below(config.recording.disk_floor_gb, path.resolve().parent)
-    return path
