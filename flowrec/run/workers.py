@@ -123,8 +123,11 @@ class LockstepWorker:
     """Adopts each result a fixed time after its order: same seed, same session, however fast the machine is.
 
     `schedule` (request number to stamp) overrides the time: a replay adopts where the recording did. Orders whose
-    result goes to a field outside `fills` are ignored (in a replay: their results are recorded). `announce` takes what
-    is computed, and '' after it.
+    result goes to a field outside `fills` are ignored (in a replay: their results are recorded).
+
+    Attributes
+    ----------
+    announce : takes what is computed, and '' after it.
     """
 
     def __init__(
@@ -133,10 +136,9 @@ class LockstepWorker:
         adopt_after_s: float,
         schedule: Mapping[int, int] | None = None,
         fills: Iterable[str] = WORKER_FIELDS,
-        announce: Callable[[str], None] = lambda _what: None,
     ) -> None:
         self._pipeline = pipeline
-        self._announce = announce
+        self.announce: Callable[[str], None] = lambda _what: None
         self._after_ns = nanoseconds(adopt_after_s)
         self._schedule = dict(schedule or {})
         self._fills = frozenset(fills)
@@ -159,9 +161,9 @@ class LockstepWorker:
         """Nothing is held."""
 
     def _result(self, order: Tick) -> Result:
-        self._announce(order_of(order)[0].wanted.replace("_", " "))
+        self.announce(order_of(order)[0].wanted.replace("_", " "))
         result = work(self._pipeline, order)
-        self._announce("")
+        self.announce("")
         return result
 
 
@@ -181,11 +183,10 @@ class ReplayWorker(LockstepWorker):
         adopt_after_s: float,
         schedule: Mapping[int, int],
         fills: Iterable[str],
-        announce: Callable[[str], None],
         recorded: Callable[[], Tick],
         same: Collection[WorkOrder],
     ) -> None:
-        super().__init__(pipeline, adopt_after_s, schedule, fills, announce)
+        super().__init__(pipeline, adopt_after_s, schedule, fills)
         self._recorded = recorded
         self._same = same
         self._unchanged = False

@@ -169,7 +169,7 @@ class _Mission:
         self._statistics, self._clocks, self._judges = RunStatistics(), ClockMonitor(), judges_of(pipeline)
         self._streams = Streams(extra_rows(config), warn) if config.topics else None
         self._opened: list[SessionWriter] = []  # the writer, once there is one: the thread of the signals looks here
-        self._lost = ""  # why the disk monitor has ended the run
+        self._low: list[str] = []  # why the disk monitor has ended the run
         self._priorities: dict[str, str] = {}
         self._covered: Coverage | None = None
 
@@ -213,12 +213,15 @@ class _Mission:
         )
         self._opened.append(writer)
         floor_gb = self._config.recording.disk_floor_gb
-        disk = DiskMonitor(self._folder, lambda: writer.bytes_written, floor_gb, self._end_for_disk)
-        self._disk = stack.enter_context(disk.running())
+        # Without `self`: a circle of references would keep the whole run in memory after its end.
+        low, run_control = self._low, self.run_control
 
-    def _end_for_disk(self, reason: str) -> None:
-        self._lost = self._lost or reason
-        self.run_control.stop(reason)
+        def disk_low(reason: str) -> None:
+            low.append(reason)
+            run_control.stop(reason)
+
+        disk = DiskMonitor(self._folder, lambda: writer.bytes_written, floor_gb, disk_low)
+        self._disk = stack.enter_context(disk.running())
 
     def watching(self, view: View, console: bool) -> Watching:
         """Displays of the run."""
@@ -297,8 +300,8 @@ class _Mission:
         """The result, after all is closed."""
         facts["frames_dropped"] = self._writer.dropped_frames  # the writer has added it to the outcome of the file
         path, files, made = self._output.path, tuple(self._writer.files), self._prepared.derived
-        stopped = bool(self.run_control.reason)
-        return Recorded(path, report, facts, files, made, self._lost, stopped, self._source, self._covered)
+        lost, stopped = (self._low[0] if self._low else ""), bool(self.run_control.reason)
+        return Recorded(path, report, facts, files, made, lost, stopped, self._source, self._covered)
 
 
 def _judge_refinement(

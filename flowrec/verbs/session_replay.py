@@ -157,7 +157,8 @@ class _Replay:
 
     def _worker_with(self, change: Change) -> ReplayWorker:
         """A worker that takes over recorded results where today's code computes the same of the same."""
-        recorded = self.session.config
+        # The worker does not refer to `self`: a circle would keep the whole replay in memory after its end.
+        rig, recorded = self._rig, self.session.config
         # Hindsight is no message of a tick.
         stands = self.session.numerics == str(NUMERICS_VERSION) and self.pipeline.hindsight is None
         return ReplayWorker(
@@ -165,8 +166,7 @@ class _Replay:
             self.config.worker.adopt_after_s,
             adoption_stamps(self.session.reader),
             self._stale,
-            lambda what: self._progress.stage(what),
-            lambda: self._rig.recorded,
+            lambda: rig.recorded,
             change.same_orders(recorded, self.config) if stands else (),
         )
 
@@ -185,6 +185,7 @@ class _Replay:
         """Show the bar until the stack is left."""
         length_s = max(seconds(self._between_ns[1] - self._first_ns), 1e-3)
         self._progress = stack.enter_context(self.control.progress(f"replaying {self.session.path.name}", length_s))
+        self._worker.announce = self._progress.stage
 
     def run(self, sinks: list[Sink]) -> Replayed:
         """Replay all ticks; the first of the sinks also takes results that the recording ended too early for."""
